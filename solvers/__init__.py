@@ -1,0 +1,8 @@
+"""Backends. Each sees only the compiled program; swapping one for another is one word."""
+
+from unifg.solvers.augmented_lagrangian import AugmentedLagrangian
+from unifg.solvers.gauss_newton import GaussNewton
+from unifg.solvers.levenberg_marquardt import LevenbergMarquardt
+from unifg.solvers.sqp import SQP
+
+__all__ = ["SQP", "AugmentedLagrangian", "GaussNewton", "LevenbergMarquardt"]

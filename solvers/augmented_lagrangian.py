@@ -1,0 +1,145 @@
+"""Augmented Lagrangian inside iterative least squares (Bazzana VI, ecg2o 4.1).
+
+The primal step is a damped Gauss-Newton step on the Powell-Hestenes-Rockafellar objective, the dual step
+lambda <- lambda+. Violations are judged after the step. By default tolerances tighten as in the bound-constrained
+Lagrangian method (Conn, Gould, Toint 1991; Nocedal and Wright, algorithm 17.4); ``schedule="bazzana"`` is the
+paper's own loop: one primal step, one dual step, constant penalty. The papers' costs carry no 1/2: their rho and
+lambda are twice ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from unifg.errors import BackendError
+from unifg.program import Program
+from unifg.solver import Run, Solver
+from unifg.solvers.damping import Damping, damped_step, norm
+from unifg.solvers.primal import Primal
+from unifg.status import Status
+from unifg.typing import Array
+
+LARGEST_PENALTY = 1e10
+
+
+@dataclass(kw_only=True)
+class AugmentedLagrangian(Solver):
+    """Equalities and inequalities by multipliers and penalties.
+
+    Attributes:
+        max_iterations: primal steps over all outer iterations.
+        penalty: initial rho; None balances cost and violation at the start (Birgin and Martinez 2014).
+        penalty_growth: factor on rho when the violation did not fall enough.
+        schedule: "bcl" or "bazzana".
+        step_tolerance, violation_tolerance: Bazzana's stop rule (section VII-D, 1e-4 there): the step's norm
+            and the largest violation. A positive step_tolerance switches it on; it does not grant CONVERGED.
+        damping: initial Levenberg-Marquardt damping of the primal step.
+    """
+
+    max_iterations: int = 300
+    penalty: float | None = None
+    penalty_growth: float = 10.0
+    schedule: Literal["bcl", "bazzana"] = "bcl"
+    step_tolerance: float = 0.0
+    violation_tolerance: float = 1e-4
+    damping: float = 1e-6
+
+    def __post_init__(self) -> None:
+        """Refuse unknown schedules and penalties that are not positive."""
+        super().__post_init__()
+        if self.schedule not in ("bcl", "bazzana"):
+            raise BackendError(f"{self.name}: schedule must be 'bcl' or 'bazzana', found '{self.schedule}'")
+        if self.penalty is not None and not self.penalty > 0.0:
+            raise BackendError(f"{self.name}: penalty must be positive, found {self.penalty}")
+
+    def workspace(self, program: Program) -> Primal:
+        """The factorisation of the primal step."""
+        return Primal(program)
+
+    def iterate(self, run: Run, workspace: Primal) -> Status | None:
+        """Alternate primal and dual steps."""
+        rho = self._initial_penalty(run)
+        if self.schedule == "bazzana":
+            return self._literal(run, workspace, rho)
+        return self._tightening(run, workspace, rho)
+
+    def _literal(self, run: Run, primal: Primal, rho: float) -> Status | None:
+        """One Gauss-Newton step, one dual step, constant rho."""
+        penalty = np.full(run.program.constraints.count, rho)
+        while run.status is None:
+            lin, multipliers = run.lin, run.multipliers
+            step = primal.direction(
+                primal.curvature(lin, multipliers, penalty), primal.gradient(lin, multipliers, penalty)
+            )
+            if step is None:
+                return Status.NOT_FINITE
+            after = run.program.linearize(run.program.retract(lin.values, step))
+            updated = primal.next_multipliers(after.constraints, multipliers, penalty)
+            run.accept(after, updated, norm(step), 1.0, penalty=rho)
+            if run.status is None and self._stop_rule(run, norm(step)):
+                return Status.STOP_RULE
+        return None
+
+    def _tightening(self, run: Run, primal: Primal, rho: float) -> Status | None:
+        """Solve each subproblem only as accurately as its multipliers deserve."""
+        multipliers = run.multipliers
+        damping = Damping(self.damping)
+        gradient_goal, violation_goal = self._goals(run, primal, rho)
+        outer = 0
+        while run.status is None:
+            outer += 1
+            penalty = np.full(len(multipliers), rho)
+            before = len(run.history)
+            stalled = False
+            while largest(primal.gradient(run.lin, multipliers, penalty)) > gradient_goal:
+                taken = damped_step(primal, run.lin, multipliers, penalty, damping)
+                if taken is None:
+                    stalled = True
+                    break
+                values, step, rejected = taken
+                lin = run.program.linearize(values)
+                after = primal.next_multipliers(lin.constraints, multipliers, penalty)
+                run.accept(lin, after, norm(step), 1.0, outer=outer, penalty=rho, damping=damping.value, rejected=rejected)
+                if run.status is None and self._stop_rule(run, norm(step)):
+                    return Status.STOP_RULE
+                if run.status is not None:
+                    return None
+            after = primal.next_multipliers(run.lin.constraints, multipliers, penalty)
+            change = largest((after - multipliers) / penalty)
+            if len(run.history) == before:  # nothing moved: the dual step alone is this iteration
+                run.accept(run.lin, after, 0.0, 0.0, outer=outer, penalty=rho)
+            if stalled and (change == 0.0 or rho >= LARGEST_PENALTY):
+                return Status.STALLED
+            if change <= violation_goal:
+                multipliers = after
+                violation_goal = max(violation_goal / rho**0.9, 0.1 * self.tolerance)
+                gradient_goal = max(0.1 * gradient_goal, 0.1 * self.tolerance)
+            else:
+                rho = min(rho * self.penalty_growth, LARGEST_PENALTY)
+                gradient_goal, violation_goal = self._goals(run, primal, rho)
+            if stalled:
+                damping = Damping(self.damping)
+        return None
+
+    def _initial_penalty(self, run: Run) -> float:
+        if self.penalty is not None:
+            return self.penalty
+        outside = float((run.program.violation(run.lin.constraints) ** 2).sum())
+        return float(np.clip(10.0 * max(1.0, abs(run.lin.cost)) / max(1.0, 0.5 * outside), 1e-3, 1e6))
+
+    def _goals(self, run: Run, primal: Primal, rho: float) -> tuple[float, float]:
+        """First accuracy of the subproblem's gradient, and the violation that earns a dual step."""
+        penalty = np.full(len(run.multipliers), rho)
+        size = largest(primal.gradient(run.lin, run.multipliers, penalty))
+        return max(min(0.1 * size, 1.0), 0.1 * self.tolerance), float(max(rho**-0.1, 0.1 * self.tolerance))
+
+    def _stop_rule(self, run: Run, step_norm: float) -> bool:
+        return step_norm < self.step_tolerance and run.optimality.violation < self.violation_tolerance
+
+
+def largest(vector: Array) -> float:
+    """Infinity norm."""
+    return float(np.abs(vector).max(initial=0.0))

@@ -1,0 +1,73 @@
+"""Levenberg-Marquardt control of the damping by the gain ratio (Nielsen 1999)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from unifg.compiled import Values
+from unifg.program import Linearization
+from unifg.solvers.model import model_step
+from unifg.solvers.primal import Primal
+from unifg.typing import Array
+
+SMALLEST = 1e-12
+LARGEST = 1e12
+SHRINK = 0.1
+ROUNDING = 1e-14
+SUFFICIENT = 1e-4
+
+
+@dataclass
+class Damping:
+    """Damping that grows after rejected steps and shrinks after good ones.
+
+    Attributes:
+        value: present damping, relative to the diagonal of the Hessian.
+        growth: factor of the next rejection; doubles with each.
+    """
+
+    value: float
+    growth: float = 2.0
+
+    def reject(self) -> None:
+        """Grow, faster with every rejection in a row."""
+        self.value = max(self.value, SMALLEST) * self.growth
+        self.growth *= 2.0
+
+    def accept(self, gain: float) -> None:
+        """Shrink by how well the quadratic model predicted the decrease."""
+        self.value = max(self.value * max(SHRINK, 1.0 - (2.0 * gain - 1.0) ** 3), SMALLEST)
+        self.growth = 2.0
+
+
+def damped_step(
+    primal: Primal, lin: Linearization, multipliers: Array, penalty: Array, damping: Damping
+) -> tuple[Values, Array, int] | None:
+    """One accepted step on the augmented objective.
+
+    Returns:
+        The new values, the tangent step and the number of rejected trials; None when no damping helps.
+    """
+    merit = primal.merit(lin, multipliers, penalty)
+    slack = ROUNDING * max(1.0, abs(merit))
+    rejected = 0
+    while damping.value <= LARGEST:
+        found = model_step(primal, lin, multipliers, penalty, damping.value)
+        if found is not None:
+            step, predicted = found
+            values, evaluation = primal.trial(lin, step)
+            actual = merit - primal.merit(evaluation, multipliers, penalty)
+            if evaluation.finite and actual >= SUFFICIENT * predicted - slack:
+                damping.accept(1.0 if predicted <= slack else min(actual / predicted, 1.0))
+                return values, step, rejected
+        rejected += 1
+        damping.reject()
+    damping.value = LARGEST
+    return None
+
+
+def norm(step: Array) -> float:
+    """Euclidean norm."""
+    return float(np.linalg.norm(step))

@@ -1,0 +1,62 @@
+"""Gauss-Newton on the manifold: solve H d = -J'r, move by x Exp(d) (Bazzana III, eq. 2-4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from unifg.program import Program
+from unifg.solver import Run, Solver
+from unifg.solvers.damping import ROUNDING, norm
+from unifg.solvers.least_squares import require_least_squares
+from unifg.solvers.primal import Primal
+from unifg.status import Status
+
+ARMIJO = 1e-4
+SHORTEST = 1e-8
+
+
+@dataclass(kw_only=True)
+class GaussNewton(Solver):
+    """Unconstrained least squares with robust losses.
+
+    Attributes:
+        line_search: halve the step until the cost decreases; False takes full steps, as the papers do.
+        step_tolerance: optional stop rule on the norm of the step; it does not grant CONVERGED.
+    """
+
+    line_search: bool = True
+    step_tolerance: float = 0.0
+
+    def require(self, program: Program) -> None:
+        """Refuse constraints and scalar costs."""
+        require_least_squares(program, self.name)
+
+    def workspace(self, program: Program) -> Primal:
+        """The factorisation of the normal equations."""
+        return Primal(program)
+
+    def iterate(self, run: Run, workspace: Primal) -> Status | None:
+        """Iterate to convergence."""
+        none = np.zeros(0)
+        while run.status is None:
+            lin = run.lin
+            gradient = workspace.gradient(lin, none, none)
+            step = workspace.direction(workspace.curvature(lin, none, none), gradient)
+            if step is None:
+                return Status.NOT_FINITE
+            slope = float(gradient @ step)
+            length = 1.0
+            values, evaluation = workspace.trial(lin, step)
+            while self.line_search and not (
+                evaluation.finite and evaluation.cost <= lin.cost + ARMIJO * length * slope + ROUNDING * max(1.0, lin.cost)
+            ):
+                length *= 0.5
+                if length < SHORTEST:
+                    return Status.STALLED
+                values, evaluation = workspace.trial(lin, length * step)
+            run.accept(run.program.linearize(values), none, length * norm(step), length)
+            if run.status is None and norm(step) < self.step_tolerance:
+                return Status.STOP_RULE
+        return None

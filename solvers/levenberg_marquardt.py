@@ -1,0 +1,50 @@
+"""Levenberg-Marquardt: Gauss-Newton damped by the gain ratio; robust far from the solution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from unifg.program import Program
+from unifg.solver import Run, Solver
+from unifg.solvers.damping import Damping, damped_step, norm
+from unifg.solvers.least_squares import require_least_squares
+from unifg.solvers.primal import Primal
+from unifg.status import Status
+
+
+@dataclass(kw_only=True)
+class LevenbergMarquardt(Solver):
+    """Unconstrained least squares with robust losses.
+
+    Attributes:
+        damping: initial damping, relative to the diagonal of the Hessian.
+        step_tolerance: optional stop rule on the norm of the step; it does not grant CONVERGED.
+    """
+
+    damping: float = 1e-4
+    step_tolerance: float = 0.0
+
+    def require(self, program: Program) -> None:
+        """Refuse constraints and scalar costs."""
+        require_least_squares(program, self.name)
+
+    def workspace(self, program: Program) -> Primal:
+        """The factorisation of the normal equations."""
+        return Primal(program)
+
+    def iterate(self, run: Run, workspace: Primal) -> Status | None:
+        """Iterate to convergence."""
+        none = np.zeros(0)
+        damping = Damping(self.damping)
+        while run.status is None:
+            used = damping.value
+            taken = damped_step(workspace, run.lin, none, none, damping)
+            if taken is None:
+                return Status.STALLED
+            values, step, rejected = taken
+            run.accept(run.program.linearize(values), none, norm(step), 1.0, damping=used, rejected=rejected)
+            if run.status is None and norm(step) < self.step_tolerance:
+                return Status.STOP_RULE
+        return None

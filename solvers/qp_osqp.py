@@ -1,0 +1,77 @@
+"""OSQP, called directly: one workspace per structure, updated and warm-started in primal and dual.
+
+OSQP accepts wrong sizes, crossed limits and NaN without raising and fills x with numbers near 1e9 when a problem
+is infeasible, so nothing it returns is used before :func:`unifg.solvers.qp.qp_error` has measured it. The step
+size rho is adapted at fixed iterations, never by the clock: equal inputs give equal answers.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import osqp
+
+from unifg.program import Program
+from unifg.solvers.qp import QP, QPAnswer, qp_error
+from unifg.typing import Array
+
+INFINITY = 1e20  # OSQP treats larger limits as absent
+TIGHTEST = 1e-9
+
+
+class OsqpRoute:
+    """A persistent OSQP workspace.
+
+    Attributes:
+        name: "osqp".
+    """
+
+    name = "osqp"
+
+    def __init__(self, program: Program, max_iterations: int) -> None:
+        """Remember the pattern; OSQP is set up with the first numbers."""
+        self.program = program
+        self.max_iterations = max_iterations
+        self._workspace: osqp.OSQP | None = None
+        self._accuracy = 0.0
+
+    def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
+        """Solve to ``accuracy``, polish, and measure."""
+        lower, upper = np.maximum(qp.lower, -INFINITY), np.minimum(qp.upper, INFINITY)
+        accuracy = max(accuracy, TIGHTEST)
+        jacobian = self.program.constraints.compress(qp.jacobian)
+        if self._workspace is None:
+            self._workspace = osqp.OSQP()
+            constraints = self.program.constraints.matrix(qp.jacobian)
+            self._workspace.setup(
+                P=self.program.hessian.matrix(qp.hessian),
+                q=qp.gradient,
+                A=constraints,
+                l=lower,
+                u=upper,
+                verbose=False,
+                eps_abs=accuracy,
+                eps_rel=0.0,
+                max_iter=self.max_iterations,
+                polishing=True,
+                adaptive_rho_interval=50,
+                check_termination=25,
+            )
+            self._accuracy = accuracy
+        else:
+            self._workspace.update(q=qp.gradient, l=lower, u=upper, Px=qp.hessian, Ax=jacobian)
+            if accuracy != self._accuracy:
+                self._workspace.update_settings(eps_abs=accuracy)
+                self._accuracy = accuracy
+        self._workspace.warm_start(x=np.zeros(self.program.size), y=multipliers)
+        result = self._workspace.solve(raise_error=False)
+        status = result.info.status_val
+        solved = osqp.SolverStatus.OSQP_SOLVED, osqp.SolverStatus.OSQP_SOLVED_INACCURATE
+        if status in (*solved, osqp.SolverStatus.OSQP_MAX_ITER_REACHED):
+            step, dual = np.array(result.x), np.array(result.y)
+            return QPAnswer(step, dual, self.name, int(result.info.iter), qp_error(qp, step, dual))
+        infeasible = status in (
+            osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE,
+            osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE_INACCURATE,
+        )
+        zero = np.zeros(self.program.size)
+        return QPAnswer(zero, multipliers, self.name, int(result.info.iter), np.inf, infeasible)

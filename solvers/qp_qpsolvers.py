@@ -1,0 +1,114 @@
+"""Any solver that qpsolvers knows, by name; and the elastic subproblem for infeasible linearisations."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import qpsolvers
+import scipy.sparse as sp
+
+from unifg.errors import BackendError
+from unifg.program import Program
+from unifg.solvers.qp import QP, QPAnswer, qp_error
+from unifg.typing import Array
+
+SETTINGS: dict[str, dict[str, float | int | bool]] = {
+    "piqp": {"eps_abs": 1e-9, "eps_rel": 1e-10, "max_iter": 200},
+    "clarabel": {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-10, "tol_feas": 1e-9},
+    "proxqp": {"eps_abs": 1e-9},
+    "osqp": {"eps_abs": 1e-8, "eps_rel": 0.0, "polishing": True},
+}
+
+
+class QpsolversRoute:
+    """Solves through ``qpsolvers.solve_problem``; the workspace is rebuilt each time.
+
+    Attributes:
+        name: the solver's name.
+    """
+
+    def __init__(self, program: Program, name: str) -> None:
+        """Check that the solver is installed.
+
+        Raises:
+            BackendError: naming the installed ones.
+        """
+        if name not in qpsolvers.available_solvers:
+            known = ", ".join(sorted(qpsolvers.available_solvers)) or "none"
+            raise BackendError(f"QP solver '{name}' is not installed (installed: {known}); pip install 'qpsolvers[{name}]'")
+        self.program = program
+        self.name = name
+        self._dense = name in qpsolvers.dense_solvers and name not in qpsolvers.sparse_solvers
+
+    def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
+        """Solve and measure; ``multipliers`` and ``accuracy`` are not used: interior points start cold."""
+        hessian = self._full(qp)
+        jacobian = self.program.constraints.matrix(qp.jacobian).tocsr()
+        answer = self._solve(hessian, qp.gradient, jacobian, qp.lower, qp.upper)
+        if answer is None:
+            return QPAnswer(np.zeros(self.program.size), multipliers, self.name, 0, np.inf)
+        step, dual, iterations = answer
+        return QPAnswer(step, dual, self.name, iterations, qp_error(qp, step, dual))
+
+    def solve_elastic(self, qp: QP, price: float) -> QPAnswer:
+        """Allow constraints (not bounds on unknowns) to be violated at ``price`` per unit.
+
+        With prices above the multipliers the step is that of the QP wherever the QP is feasible. The error
+        reported is that of the elastic problem's own stationarity; the step may violate the linearised rows.
+        """
+        program = self.program
+        n, rows = program.size, np.flatnonzero(~program.bound_rows)
+        m = len(rows)
+        hessian = sp.block_diag([self._full(qp), 1e-8 * sp.eye(2 * m)], format="csc")
+        gradient = np.concatenate([qp.gradient, np.full(2 * m, price)])
+        selector = sp.csr_matrix((np.ones(m), (rows, np.arange(m))), shape=(program.constraints.count, m))
+        jacobian = program.constraints.matrix(qp.jacobian).tocsr()
+        nonnegative = sp.hstack([sp.csr_matrix((2 * m, n)), sp.eye(2 * m)])
+        stacked = sp.vstack([sp.hstack([jacobian, selector, -selector]), nonnegative], format="csr")
+        lower = np.concatenate([qp.lower, np.zeros(2 * m)])
+        upper = np.concatenate([qp.upper, np.full(2 * m, np.inf)])
+        answer = self._solve(hessian, gradient, stacked, lower, upper)
+        if answer is None:
+            return QPAnswer(np.zeros(n), np.zeros(program.constraints.count), "elastic", 0, np.inf)
+        step, dual, iterations = answer[0][:n], answer[1][: program.constraints.count], answer[2]
+        finite = np.isfinite(step).all() and np.isfinite(dual).all()
+        return QPAnswer(step, dual, f"elastic {self.name}", iterations, 0.0 if finite else np.inf)
+
+    def _full(self, qp: QP) -> sp.csc_matrix:
+        upper = self.program.hessian.matrix(qp.hessian)
+        return (upper + sp.triu(upper, 1).T).tocsc()
+
+    def _solve(
+        self, hessian: sp.csc_matrix, gradient: Array, jacobian: sp.csr_matrix, lower: Array, upper: Array
+    ) -> tuple[Array, Array, int] | None:
+        equal = lower == upper
+        above, below = np.flatnonzero(~equal & np.isfinite(upper)), np.flatnonzero(~equal & np.isfinite(lower))
+        fixed = np.flatnonzero(equal)
+        inequalities = sp.vstack([jacobian[above], -jacobian[below]], format="csc") if len(above) + len(below) else None
+        limits = np.concatenate([upper[above], -lower[below]]) if inequalities is not None else None
+        equalities = jacobian[fixed].tocsc() if len(fixed) else None
+        if self._dense:
+            hessian = hessian.toarray()
+            inequalities = None if inequalities is None else inequalities.toarray()
+            equalities = None if equalities is None else equalities.toarray()
+        problem = qpsolvers.Problem(
+            hessian, gradient, inequalities, limits, equalities, lower[fixed] if len(fixed) else None
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                solution = qpsolvers.solve_problem(problem, solver=self.name, **SETTINGS.get(self.name, {}))
+            except (qpsolvers.QPError, ValueError, ArithmeticError):
+                return None
+        if not solution.found or solution.x is None:
+            return None
+        dual = np.zeros(len(lower))
+        if solution.z is not None and len(solution.z):
+            np.add.at(dual, above, solution.z[: len(above)])
+            np.add.at(dual, below, -solution.z[len(above) :])
+        if solution.y is not None and len(solution.y):
+            dual[fixed] = solution.y
+        info = (solution.extras or {}).get("info")
+        iterations = getattr(info, "iter", 0) if info is not None else 0
+        return np.asarray(solution.x, dtype=np.float64), dual, int(iterations)

@@ -1,0 +1,198 @@
+"""Sequential quadratic programming on the graph (Ta et al. 2014, section IV).
+
+Each iteration linearises the graph, solves the quadratic subproblem (OSQP first; an interior-point QP when OSQP
+misses its accuracy; an elastic one when the linearised constraints contradict each other) and accepts a step that
+lowers the l1 merit function, with a second-order correction when curvature of the constraints spoils the full
+step. ``max_iterations=1`` is the real-time iteration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from unifg.errors import BackendError
+from unifg.program import Evaluation, Linearization, Program
+from unifg.solver import Run, Solver
+from unifg.solvers.damping import norm
+from unifg.solvers.qp import QP, QPAnswer, Route, subproblem
+from unifg.solvers.qp_osqp import OsqpRoute
+from unifg.solvers.qp_qpsolvers import QpsolversRoute
+from unifg.status import Status
+from unifg.typing import Array
+
+ARMIJO = 1e-4
+SHORTEST = 1e-6
+ROUNDING = 1e-13
+SMALLEST_DAMPING = 1e-9  # keeps H positive definite without showing in the step
+
+
+@dataclass(kw_only=True)
+class SQP(Solver):
+    """Equalities, inequalities and general costs by quadratic subproblems with a Gauss-Newton Hessian.
+
+    Attributes:
+        qp: "osqp" (called directly, warm-started) or any name qpsolvers knows.
+        fallback: qpsolvers name that repeats a QP which missed its accuracy and solves the elastic ones;
+            None leaves inaccurate answers as they are.
+        qp_iterations: limit for OSQP before the fallback takes over.
+        second_order_correction: try to repair a full step that the merit function rejects.
+        full_steps: take every step in full, as the paper does; no merit function.
+    """
+
+    qp: str = "osqp"
+    fallback: str | None = "piqp"
+    qp_iterations: int = 200
+    second_order_correction: bool = True
+    full_steps: bool = False
+
+    def workspace(self, program: Program) -> Subproblems:
+        """QP workspaces."""
+        return Subproblems(self, program)
+
+    def iterate(self, run: Run, workspace: Subproblems) -> Status | None:
+        """Iterate to convergence."""
+        merit = Merit(run.program, run.multipliers)
+        damping = SMALLEST_DAMPING
+        while run.status is None:
+            lin = run.lin
+            accuracy = self._accuracy(run)
+            qp = subproblem(run.program, lin, damping)
+            answer = workspace.solve(qp, run.multipliers, accuracy)
+            if not np.isfinite(answer.error):
+                if damping > 1e6:
+                    return Status.STALLED
+                damping = max(10.0 * damping, 1e-4)
+                continue
+            merit.raise_prices(answer)
+            taken = self._search(run, workspace, merit, qp, answer, accuracy)
+            if taken is None:
+                if damping > 1e6:
+                    return Status.STALLED
+                damping = max(10.0 * damping, 1e-4)
+                continue
+            after, multipliers, length, corrected = taken
+            run.accept(
+                after,
+                multipliers,
+                length * norm(answer.step),
+                length,
+                qp=answer.route,
+                qp_iterations=answer.iterations,
+                damping=damping,
+                **({"correction": 1} if corrected else {}),
+            )
+            damping = self._next_damping(damping, length)
+        return None
+
+    def _accuracy(self, run: Run) -> float:
+        """Ask the QP for what the outer iteration can use."""
+        size = max(run.optimality.stationarity, run.optimality.violation, run.optimality.complementarity)
+        return float(np.clip(1e-3 * size, 0.1 * self.tolerance, 1e-4))
+
+    def _next_damping(self, damping: float, length: float) -> float:
+        if length < 0.1:
+            return max(4.0 * damping, 1e-3)
+        return max(0.25 * damping, SMALLEST_DAMPING) if length == 1.0 else damping
+
+    def _search(
+        self, run: Run, workspace: Subproblems, merit: Merit, qp: QP, answer: QPAnswer, accuracy: float
+    ) -> tuple[Linearization, Array, float, bool] | None:
+        program, lin = run.program, run.lin
+        values = program.retract(lin.values, answer.step)
+        if self.full_steps:
+            return program.linearize(values), answer.multipliers, 1.0, False
+        here = merit.value(lin)
+        slope = merit.slope(qp, answer.step, lin)
+        slack = ROUNDING * max(1.0, abs(here))
+        if slope > slack:
+            return None
+        trial = program.evaluate(values, lin.weights)
+        if merit.accepts(trial, here, slope, 1.0, slack):
+            return program.linearize(values), answer.multipliers, 1.0, False
+        if self.second_order_correction and trial.finite and program.constraints.count:
+            corrected = workspace.correct(qp, answer, trial, lin, accuracy)
+            if corrected is not None:
+                bent = program.retract(lin.values, corrected.step)
+                if merit.accepts(program.evaluate(bent, lin.weights), here, slope, 1.0, slack):
+                    return program.linearize(bent), corrected.multipliers, 1.0, True
+        length = 0.5
+        while length >= SHORTEST:
+            values = program.retract(lin.values, length * answer.step)
+            if merit.accepts(program.evaluate(values, lin.weights), here, slope, length, slack):
+                multipliers = run.multipliers + length * (answer.multipliers - run.multipliers)
+                return program.linearize(values), multipliers, length, False
+            length *= 0.5
+        return None
+
+
+class Merit:
+    """l1 merit: objective plus a price per unit of violation for every row (Powell 1978)."""
+
+    def __init__(self, program: Program, multipliers: Array) -> None:
+        """Start with the prices the multipliers suggest."""
+        self.program = program
+        self.prices = np.abs(multipliers)
+
+    def raise_prices(self, answer: QPAnswer) -> None:
+        """Keep every price above its multiplier."""
+        size = np.abs(answer.multipliers)
+        self.prices = np.maximum(1.1 * size, 0.5 * (self.prices + size))
+
+    def value(self, point: Linearization | Evaluation) -> float:
+        """Merit at a point."""
+        return point.cost + float(self.prices @ np.abs(self.program.violation(point.constraints)))
+
+    def slope(self, qp: QP, step: Array, lin: Linearization) -> float:
+        """Upper bound of the merit's derivative along ``step``."""
+        linear = lin.constraints + qp.linear(step)
+        change = np.abs(self.program.violation(linear)) - np.abs(self.program.violation(lin.constraints))
+        return float(qp.gradient @ step + self.prices @ change)
+
+    def accepts(self, trial: Evaluation, here: float, slope: float, length: float, slack: float) -> bool:
+        """Armijo's condition."""
+        return trial.finite and self.value(trial) <= here + ARMIJO * length * slope + slack
+
+
+class Subproblems:
+    """The QP routes of one prepared graph and the order they are tried in."""
+
+    def __init__(self, options: SQP, program: Program) -> None:
+        """Open the chosen route and its fallback.
+
+        Raises:
+            BackendError: when a named solver is not installed.
+        """
+        self.program = program
+        self.fallback = None if options.fallback is None else QpsolversRoute(program, options.fallback)
+        self.first: Route = (
+            OsqpRoute(program, options.qp_iterations) if options.qp == "osqp" else QpsolversRoute(program, options.qp)
+        )
+        if program.constraints.count == 0 and options.qp == "osqp" and self.fallback is None:
+            raise BackendError("SQP: OSQP needs at least one constraint; set fallback='piqp' or use GaussNewton")
+
+    def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
+        """Try the first route, then the fallback, then the elastic problem."""
+        if self.program.constraints.count == 0 and self.fallback is not None:
+            return self.fallback.solve(qp, multipliers, accuracy)
+        answer = self.first.solve(qp, multipliers, accuracy)
+        if answer.error <= 10.0 * accuracy or self.fallback is None:
+            return answer
+        if not answer.infeasible:
+            second = self.fallback.solve(qp, multipliers, accuracy)
+            if second.error <= max(10.0 * accuracy, 1e-5):
+                return second
+            if answer.error <= 1e-3 or second.error <= 1e-3:
+                return answer if answer.error <= second.error else second
+        price = max(10.0 * float(np.abs(multipliers).max(initial=0.0)), 1e3)
+        return self.fallback.solve_elastic(qp, price)
+
+    def correct(self, qp: QP, answer: QPAnswer, trial: Evaluation, lin: Linearization, accuracy: float) -> QPAnswer | None:
+        """Second-order correction: aim at the constraints as found after the full step."""
+        bend = trial.constraints - lin.constraints - qp.linear(answer.step)
+        route = self.first if answer.route == self.first.name else self.fallback
+        if route is None:
+            return None
+        corrected = route.solve(qp.shifted(-bend), answer.multipliers, accuracy)
+        return corrected if corrected.error <= 1e-3 else None

@@ -1,0 +1,73 @@
+"""unifg: robot estimation and robot control as one factor graph on Lie groups.
+
+    import unifg as fg
+    from unifg.solvers import SQP
+
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE2, 2)
+    graph.fix(x[0], [0.0, 0.0, 0.0])
+    graph.minimize(fg.between, x[0], x[1], [1.0, 0.0, 0.3], sigma=0.1)
+    solution = SQP().solve(graph, {x: np.zeros((2, 3))})
+"""
+
+from importlib.metadata import PackageNotFoundError, version
+
+from unifg.check import Finding, Report
+from unifg.errors import BackendError, FileFormatError, GraphError, NotConverged, ScenarioError, UnifgError
+from unifg.factors import ManifoldResidual, between, difference, prior
+from unifg.graph import Graph
+from unifg.history import Iteration
+from unifg.kkt import Optimality, optimality
+from unifg.lie import SE2, SO2, LieGroup, Manifold, Product, Rn, wrap_angle
+from unifg.residuals import Residual, residual
+from unifg.robust import Cauchy, Huber, Loss, Reweighted, Tukey
+from unifg.solution import Guess, Solution
+from unifg.solver import Prepared, Solver
+from unifg.status import Status
+from unifg.variables import Data, Family, Selection
+
+try:
+    __version__ = version("unifg")
+except PackageNotFoundError:  # running from a source tree that was never installed
+    __version__ = "0.0.0"
+
+__all__ = [
+    "SE2",
+    "SO2",
+    "BackendError",
+    "Cauchy",
+    "Data",
+    "Family",
+    "FileFormatError",
+    "Finding",
+    "Graph",
+    "GraphError",
+    "Guess",
+    "Huber",
+    "Iteration",
+    "LieGroup",
+    "Loss",
+    "Manifold",
+    "ManifoldResidual",
+    "NotConverged",
+    "Optimality",
+    "Prepared",
+    "Product",
+    "Report",
+    "Residual",
+    "Reweighted",
+    "Rn",
+    "ScenarioError",
+    "Selection",
+    "Solution",
+    "Solver",
+    "Status",
+    "Tukey",
+    "UnifgError",
+    "between",
+    "difference",
+    "optimality",
+    "prior",
+    "residual",
+    "wrap_angle",
+]

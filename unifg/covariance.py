@@ -1,0 +1,76 @@
+"""Covariance of selected unknowns: a block of the inverse Hessian, or of the inverse KKT matrix.
+
+With constraints the (1, 1) block of [[H, A'], [A, 0]]^-1 is taken, A being the active rows: a direction that an
+active constraint forbids has no variance.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.linear import Factorization
+from unifg.program import Linearization, Program
+from unifg.sparse import Symmetric
+from unifg.typing import Array, BoolArray, IntArray
+
+REGULARISATION = 1e-9
+
+
+def covariance(program: Program, lin: Linearization, columns: IntArray, active: BoolArray) -> Array:
+    """Covariance over full tangent ``columns``.
+
+    Args:
+        program: the compiled graph.
+        lin: linearisation at the solution.
+        columns: (k,) full tangent columns, all of them unknowns.
+        active: (M,) rows held as equalities.
+
+    Returns:
+        (k, k) covariance.
+
+    Raises:
+        GraphError: when a column is fixed or the information is singular.
+    """
+    chosen = program.unknown[columns]
+    if (chosen < 0).any():
+        family, index = program.column_name(int(columns[np.argmax(chosen < 0)]))
+        raise GraphError(f"{family}[{index}] is fixed: it has no covariance", family=family, index=index)
+    n = program.size
+    hessian = program.hessian.matrix(program.hessian_entries(lin)).tocoo()
+    jacobian = program.constraints.matrix(lin.constraint_jacobian)[active].tocoo()
+    total = n + jacobian.shape[0]
+    pattern = Symmetric(total, [(hessian.row, hessian.col), (jacobian.col, n + jacobian.row)])
+    data = np.zeros(pattern.nnz)
+    np.add.at(data, pattern.positions(hessian.row, hessian.col), hessian.data)
+    np.add.at(data, pattern.positions(jacobian.col, n + jacobian.row), jacobian.data)
+    exact = pattern.matrix(data.copy())
+    scale = max(float(np.abs(hessian.data).max(initial=0.0)), 1e-300)
+    signs = np.where(np.arange(total) < n, 1.0, -1.0)
+    data[pattern.diagonal] += REGULARISATION * scale * signs
+    factorization = Factorization(pattern)
+    if not factorization.factor(data):
+        raise GraphError("the covariance does not exist: the Hessian is not finite")
+    symmetric = exact + exact.T
+    symmetric.setdiag(exact.diagonal())
+    result = np.empty((len(chosen), len(chosen)))
+    for k, column in enumerate(chosen):
+        right = np.zeros(total)
+        right[column] = 1.0
+        result[:, k] = _refined(factorization, symmetric, right)[chosen]
+    return 0.5 * (result + result.T)
+
+
+def _refined(factorization: Factorization, matrix: Array, right: Array) -> Array:
+    """Solve the unregularised system by iterative refinement."""
+    solution = factorization.solve(right)
+    for _ in range(20):
+        residual = right - matrix @ solution
+        if np.abs(residual).max() <= 1e-12:
+            return solution
+        solution = solution + factorization.solve(residual)
+    if np.abs(right - matrix @ solution).max() > 1e-6:
+        raise GraphError(
+            "the covariance does not exist: some direction is not determined by the costs; run graph.check(guess)"
+        )
+    return solution

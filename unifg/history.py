@@ -1,0 +1,44 @@
+"""What happened during a solve: one row per iteration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """State after one iteration; row 0 is the start.
+
+    Attributes:
+        number: 0 at the start.
+        cost: objective.
+        stationarity, violation, complementarity: KKT numbers with the multipliers of this iteration.
+        step_norm: Euclidean norm of the tangent step taken.
+        step_length: fraction of the computed step that was taken.
+        seconds: since the solve began.
+        terms: residual norm of every term (for constraints, of the violation).
+        details: what the backend adds: damping, penalty, QP route and iterations, ...
+    """
+
+    number: int
+    cost: float
+    stationarity: float
+    violation: float
+    complementarity: float
+    step_norm: float
+    step_length: float
+    seconds: float
+    terms: dict[str, float]
+    details: dict[str, float | int | str] = field(default_factory=dict)
+
+
+HEADER = f"{'iter':>4} {'cost':>13} {'station.':>9} {'violation':>9} {'complem.':>9} {'|step|':>9} {'length':>7}  details"
+
+
+def line(row: Iteration) -> str:
+    """One line of the table that ``verbose=True`` logs."""
+    details = "  ".join(f"{k}={v:.3g}" if isinstance(v, float) else f"{k}={v}" for k, v in row.details.items())
+    return (
+        f"{row.number:4d} {row.cost:13.6e} {row.stationarity:9.2e} {row.violation:9.2e} {row.complementarity:9.2e} "
+        f"{row.step_norm:9.2e} {row.step_length:7.3g}  {details}"
+    )

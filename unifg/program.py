@@ -1,0 +1,453 @@
+"""A compiled graph: offsets, ordering and sparsity once; values, Jacobians and gradients as often as needed.
+
+Backends see only this. Rows of costs are whitened and weighted, so the objective is 1/2 |r|^2 plus scalar
+costs; rows of constraints read ``lower <= g <= upper``. Columns are tangent coordinates of the unknowns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from unifg.compiled import CompiledTerm, Values
+from unifg.errors import GraphError
+from unifg.linear import Factorization
+from unifg.sparse import Gram, Rows, Symmetric
+from unifg.terms import Constraint, Cost, ScalarCost
+from unifg.typing import Array, ArrayLike, IntArray
+from unifg.variables import Data, Family
+
+if TYPE_CHECKING:
+    from unifg.graph import Graph
+
+HeldWeights = dict[str, Array]
+
+
+@dataclass
+class Evaluation:
+    """Objective and constraints at a point, without derivatives.
+
+    Attributes:
+        cost: objective.
+        constraints: (M,) stacked g.
+    """
+
+    cost: float
+    constraints: Array
+
+    @property
+    def finite(self) -> bool:
+        """Whether every number is finite."""
+        return bool(np.isfinite(self.cost) and np.isfinite(self.constraints).all())
+
+
+@dataclass
+class Linearization:
+    """Objective and constraints with their derivatives at ``values``.
+
+    Attributes:
+        values: where.
+        cost: objective.
+        residual: (C,) weighted, whitened cost residuals.
+        jacobian: entries of the cost Jacobian, in the order of ``Program.costs``.
+        constraints: (M,) stacked g.
+        constraint_jacobian: entries of A, in the order of ``Program.constraints``.
+        gradient: gradient of the objective over the full tangent space.
+        scalar_hessian: entries of the Hessian blocks of scalar costs.
+        norms: each term's residual norm; for constraints the norm of the violation.
+        weights: weights of reweighted losses, to be held during the line search.
+    """
+
+    values: Values
+    cost: float
+    residual: Array
+    jacobian: Array
+    constraints: Array
+    constraint_jacobian: Array
+    gradient: Array
+    scalar_hessian: Array
+    norms: dict[str, float]
+    weights: HeldWeights = field(default_factory=dict)
+
+    @property
+    def finite(self) -> bool:
+        """Whether every number is finite."""
+        return bool(
+            np.isfinite(self.cost)
+            and np.isfinite(self.gradient).all()
+            and np.isfinite(self.constraints).all()
+            and np.isfinite(self.constraint_jacobian).all()
+        )
+
+
+class Program:
+    """The compiled form of a graph.
+
+    Attributes:
+        graph: what was compiled.
+        size: number of unknown tangent coordinates.
+        costs, constraints: patterns of the stacked Jacobians.
+        hessian: pattern of the Gauss-Newton Hessian of the objective.
+        normal: pattern of the same plus A'A.
+        lower, upper: (M,) limits with the present data.
+        cost_terms, scalar_terms, constraint_terms: compiled terms in row order.
+        slices: rows of each constraint term.
+        bound_rows: (M,) whether a row bounds an unknown itself.
+    """
+
+    def __init__(self, graph: Graph) -> None:
+        """Compile; see :meth:`unifg.Graph.compile`."""
+        if not graph.families:
+            raise GraphError("the graph has no variables: add a family with graph.variables(...)")
+        self.graph = graph
+        self.families = list(graph.families.values())
+        self._place_columns(graph)
+        compiled = [CompiledTerm(term) for term in graph.terms]
+        self.terms = compiled
+        self.cost_terms = [c for c in compiled if isinstance(c.term, Cost)]
+        self.scalar_terms = [c for c in compiled if isinstance(c.term, ScalarCost)]
+        self.constraint_terms = [c for c in compiled if isinstance(c.term, Constraint)]
+        self._require_touched()
+        self.costs, cost_blocks, self.cost_slices = self._stack(self.cost_terms)
+        self.constraints, constraint_blocks, self.slices = self._stack(self.constraint_terms)
+        self.gram = Gram(cost_blocks, self.costs, self.unknown)
+        self.constraint_gram = Gram(constraint_blocks, self.constraints, self.unknown)
+        self.normal_gram = Gram(cost_blocks, self.costs, self.unknown)
+        self.bound_rows = np.zeros(self.constraints.count, dtype=bool)
+        for term, rows in zip(self.constraint_terms, self.slices, strict=True):
+            self.bound_rows[rows] = term.is_bound
+        self._place_scalar_blocks()
+        scalar = (self._scalar_row, self._scalar_column)
+        self.hessian = Symmetric(self.size, [self.gram.coordinates, scalar])
+        self.normal = Symmetric(self.size, [self.gram.coordinates, self.constraint_gram.coordinates, scalar])
+        self.gram.scatter_into(self.hessian)
+        self.normal_gram.scatter_into(self.normal)
+        self.constraint_gram.scatter_into(self.normal)
+        self._scalar_in_hessian = self.hessian.positions(*scalar)
+        self._scalar_in_normal = self.normal.positions(*scalar)
+        self.bind({})
+
+    # ---------------------------------------------------------------- data and values
+
+    def bind(self, data: Mapping[Data, ArrayLike]) -> None:
+        """Take new data; everything not named returns to its default.
+
+        Raises:
+            GraphError: on unknown data, a changed shape, NaN, or crossed limits.
+        """
+        checked = {}
+        for handle, value in data.items():
+            if self.graph._data.get(getattr(handle, "name", "")) is not handle:
+                raise GraphError(f"data {handle!r} does not belong to this graph")
+            checked[handle] = handle.check(value)
+        self.data = checked
+        for term in self.terms:
+            term.bind(checked)
+        self.lower = _stacked([c.lower for c in self.constraint_terms])
+        self.upper = _stacked([c.upper for c in self.constraint_terms])
+        crossed = np.flatnonzero(self.lower > self.upper)
+        if len(crossed):
+            name, index = self.row_name(int(crossed[0]))
+            raise GraphError(f"term '{name}': lower exceeds upper in factor {index}", term=name, index=index)
+        self.equality = self.lower == self.upper
+        self.fixed_values = [
+            (fix, np.asarray(checked.get(fix.value, fix.value.value) if isinstance(fix.value, Data) else fix.value))
+            for fix in self.graph.fixes
+        ]
+
+    def values_from(self, guess: Mapping[Family, ArrayLike]) -> Values:
+        """Copy and check a guess, and give fixed variables their values.
+
+        Raises:
+            GraphError: naming the family and index of what is missing, misshapen, NaN or off its manifold.
+        """
+        for family in guess:
+            if not isinstance(family, Family) or self.graph.families.get(family.name) is not family:
+                raise GraphError(f"the guess contains {family!r}, which is no family of this graph")
+        values: Values = {}
+        for family in self.families:
+            shape = (family.count, family.manifold.storage)
+            if family not in guess:
+                if not self._all_fixed(family):
+                    raise GraphError(
+                        f"the guess has no values for family '{family.name}': give an array of shape {shape}",
+                        family=family.name,
+                    )
+                values[family] = np.tile(family.manifold.identity(), (family.count, 1))
+                continue
+            array = np.array(guess[family], dtype=np.float64)
+            if array.shape != shape:
+                raise GraphError(
+                    f"the guess for family '{family.name}' has shape {array.shape}, expected {shape}", family=family.name
+                )
+            values[family] = array
+        for fix, value in self.fixed_values:
+            selection = fix.selection
+            values[selection.family][selection.indices, selection.storage] = value
+        for family, array in values.items():
+            valid = family.manifold.is_valid(array)
+            if not valid.all():
+                index = int(np.flatnonzero(~valid)[0])
+                raise GraphError(
+                    f"the guess for {family.name}[{index}] is not on {family.manifold.name}: {array[index]}",
+                    family=family.name,
+                    index=index,
+                )
+        return values
+
+    def retract(self, values: Values, step: Array) -> Values:
+        """Move the unknowns by a tangent step; fixed variables stay."""
+        full = np.zeros(self.width)
+        full[self.free_columns] = step
+        moved: Values = {}
+        for family, array in values.items():
+            offset = self.offsets[family]
+            part = full[offset : offset + family.count * family.manifold.dim]
+            moved[family] = family.manifold.retract(array, part.reshape(family.count, family.manifold.dim))
+        for fix, value in self.fixed_values:  # retract may wrap or renormalise; a fixed value stays as given
+            moved[fix.selection.family][fix.selection.indices, fix.selection.storage] = value
+        return moved
+
+    # ---------------------------------------------------------------- evaluation
+
+    def evaluate(self, values: Values, weights: HeldWeights | None = None) -> Evaluation:
+        """Objective and constraints; ``weights`` are those of the linearisation whose line search this is."""
+        cost = 0.0
+        with np.errstate(all="ignore"):
+            for term in self.cost_terms:
+                assert isinstance(term.term, Cost)
+                whitened = term.whiten(term.residual(values))
+                loss = term.term.robust
+                if loss is None:
+                    cost += 0.5 * float(np.vdot(whitened, whitened))
+                    continue
+                squared = np.einsum("nm,nm->n", whitened, whitened)
+                held = weights.get(term.name) if weights else None
+                cost += 0.5 * float((loss.value(squared) if held is None else held * squared).sum())
+            for term in self.scalar_terms:
+                cost += float(term.residual(values).sum())
+            constraints = [term.residual(values).ravel() for term in self.constraint_terms]
+        return Evaluation(cost, _stacked(constraints))
+
+    def linearize(self, values: Values) -> Linearization:
+        """Everything a backend needs at ``values``; one batched call per term."""
+        residual = np.empty(self.costs.count)
+        jacobian = np.empty(len(self.costs.rows))
+        constraints = np.empty(self.constraints.count)
+        constraint_jacobian = np.empty(len(self.constraints.rows))
+        norms: dict[str, float] = {}
+        weights: HeldWeights = {}
+        cost, at = 0.0, 0
+        with np.errstate(all="ignore"):
+            for term, rows in zip(self.cost_terms, self.cost_slices, strict=True):
+                assert isinstance(term.term, Cost)
+                whitened = term.whiten(term.residual(values))
+                blocks = [term.whiten_jacobian(block) for block in term.jacobians(values)]
+                loss = term.term.robust
+                squared_sum = float(np.vdot(whitened, whitened))
+                norms[term.name] = squared_sum**0.5
+                if loss is None:
+                    cost += 0.5 * squared_sum
+                else:
+                    squared = np.einsum("nm,nm->n", whitened, whitened)
+                    weight = loss.weight(squared)
+                    cost += 0.5 * float(loss.value(squared).sum())
+                    root = np.sqrt(weight)[:, None]
+                    whitened = whitened * root
+                    blocks = [block * root[:, :, None] for block in blocks]
+                    if loss.held:
+                        weights[term.name] = weight
+                residual[rows] = whitened.ravel()
+                at = _write(jacobian, at, blocks)
+            at = 0
+            for term, rows in zip(self.constraint_terms, self.slices, strict=True):
+                value = term.residual(values)
+                constraints[rows] = value.ravel()
+                if term.is_bound:
+                    constraint_jacobian[at : at + value.size] = 1.0
+                    at += value.size
+                else:
+                    at = _write(constraint_jacobian, at, term.jacobians(values))
+                beyond = np.maximum(value - term.upper, term.lower - value)
+                norms[term.name] = float(np.linalg.norm(np.maximum(beyond, 0.0)))
+            gradient = self.costs.transposed_times(jacobian, residual)
+            hessians = []
+            for term, columns in zip(self.scalar_terms, self._scalar_columns, strict=True):
+                value = term.residual(values)
+                cost += float(value.sum())
+                norms[term.name] = float(np.abs(value).sum())
+                slope, curvature = term.scalar_derivatives(values)
+                gradient += np.bincount(columns.ravel(), weights=slope.ravel(), minlength=self.width)
+                hessians.append(_convex(curvature)[self._scalar_keep[term.name]])
+        return Linearization(
+            values, cost, residual, jacobian, constraints, constraint_jacobian, gradient, _stacked(hessians), norms, weights
+        )
+
+    # ---------------------------------------------------------------- products backends need
+
+    def hessian_entries(self, lin: Linearization) -> Array:
+        """Gauss-Newton Hessian of the objective in the order of ``hessian``."""
+        data = self.gram(lin.jacobian)
+        if len(lin.scalar_hessian):
+            np.add.at(data, self._scalar_in_hessian, lin.scalar_hessian)
+        return data
+
+    def normal_entries(self, lin: Linearization, row_weights: Array) -> Array:
+        """Gauss-Newton Hessian plus A' diag(row_weights) A, in the order of ``normal``."""
+        data = self.normal_gram(lin.jacobian) + self.constraint_gram(lin.constraint_jacobian, row_weights)
+        if len(lin.scalar_hessian):
+            np.add.at(data, self._scalar_in_normal, lin.scalar_hessian)
+        return data
+
+    def free_gradient(self, lin: Linearization) -> Array:
+        """Gradient of the objective over the unknowns."""
+        return lin.gradient[self.free_columns]
+
+    def lagrangian_gradient(self, lin: Linearization, multipliers: Array) -> Array:
+        """Gradient of the objective plus A' multipliers, over the full tangent space."""
+        if not self.constraints.count:
+            return lin.gradient
+        return lin.gradient + self.constraints.transposed_times(lin.constraint_jacobian, multipliers)
+
+    def violation(self, constraints: Array) -> Array:
+        """(M,) signed distance outside the limits: positive above, negative below, zero inside."""
+        return np.maximum(constraints - self.upper, 0.0) - np.maximum(self.lower - constraints, 0.0)
+
+    def normal_solver(self) -> Factorization:
+        """A factorisation for matrices in the pattern ``normal``."""
+        return Factorization(self.normal)
+
+    # ---------------------------------------------------------------- names
+
+    def row_name(self, row: int) -> tuple[str, int]:
+        """Term and factor of a constraint row."""
+        for term, rows in zip(self.constraint_terms, self.slices, strict=True):
+            if rows.start <= row < rows.stop:
+                return term.name, (row - rows.start) // term.size
+        raise IndexError(row)
+
+    def column_name(self, column: int) -> tuple[str, int]:
+        """Family and member of a full tangent column."""
+        for family in reversed(self.families):
+            if column >= self.offsets[family]:
+                return family.name, (column - self.offsets[family]) // family.manifold.dim
+        raise IndexError(column)
+
+    # ---------------------------------------------------------------- compilation
+
+    def _place_columns(self, graph: Graph) -> None:
+        self.offsets: dict[Family, int] = {}
+        self.width = 0
+        for family in self.families:
+            self.offsets[family] = self.width
+            self.width += family.count * family.manifold.dim
+        free = np.ones(self.width, dtype=bool)
+        self.fixed_columns: dict[str, IntArray] = {}
+        for fix in graph.fixes:
+            columns = self._columns(fix.selection.family, fix.selection.indices, fix.selection.tangent)
+            free[columns] = False
+            self.fixed_columns[fix.name] = columns
+        self.free_columns = np.flatnonzero(free)
+        self.size = len(self.free_columns)
+        self.unknown = np.full(self.width, -1, dtype=np.intp)
+        self.unknown[self.free_columns] = np.arange(self.size)
+
+    def _columns(self, family: Family, indices: IntArray, tangent: slice) -> IntArray:
+        base = self.offsets[family] + indices * family.manifold.dim
+        return base[:, None] + np.arange(tangent.start, tangent.stop)
+
+    def _term_columns(self, term: CompiledTerm) -> list[IntArray]:
+        """(n, d_k) full columns of each variable argument."""
+        result = []
+        for gather in term.gathers:
+            selection = gather.selection
+            columns = self._columns(selection.family, selection.indices, selection.tangent)
+            result.append(np.broadcast_to(columns, (term.count, columns.shape[1])))
+        return result
+
+    def _stack(self, terms: list[CompiledTerm]) -> tuple[Rows, list[tuple[IntArray, IntArray]], list[slice]]:
+        rows, columns, blocks, slices = [], [], [], []
+        row = entry = 0
+        for term in terms:
+            n, m = term.count, term.size
+            own_rows = row + np.arange(n * m).reshape(n, m)
+            slices.append(slice(row, row + n * m))
+            row += n * m
+            arguments = self._term_columns(term)
+            if term.is_bound:
+                rows.append(own_rows.ravel())
+                columns.append(arguments[0].ravel())
+                blocks.append((entry + np.arange(n * m).reshape(-1, 1, 1), arguments[0].reshape(-1, 1)))
+                entry += n * m
+                continue
+            parts = []
+            for argument in arguments:
+                shape = (n, m, argument.shape[1])
+                rows.append(np.broadcast_to(own_rows[:, :, None], shape).ravel())
+                columns.append(np.broadcast_to(argument[:, None, :], shape).ravel())
+                parts.append(entry + np.arange(n * m * argument.shape[1]).reshape(shape))
+                entry += n * m * argument.shape[1]
+            blocks.append((np.concatenate(parts, axis=2), np.concatenate(arguments, axis=1)))
+        none = [np.zeros(0, dtype=np.intp)]
+        stacked = Rows(row, np.concatenate(rows + none), np.concatenate(columns + none), self.unknown, self.size)
+        return stacked, blocks, slices
+
+    def _place_scalar_blocks(self) -> None:
+        self._scalar_columns: list[IntArray] = []
+        self._scalar_keep: dict[str, tuple[IntArray, IntArray, IntArray]] = {}
+        none = np.zeros(0, dtype=np.intp)
+        rows, columns = [none], [none]
+        for term in self.scalar_terms:
+            full = np.concatenate(self._term_columns(term), axis=1)
+            mapped = self.unknown[full]
+            keep = (mapped[:, :, None] <= mapped[:, None, :]) & (mapped[:, :, None] >= 0)
+            factor, a, b = np.nonzero(keep)
+            self._scalar_columns.append(full)
+            self._scalar_keep[term.name] = (factor, a, b)
+            rows.append(mapped[factor, a])
+            columns.append(mapped[factor, b])
+        self._scalar_row, self._scalar_column = np.concatenate(rows), np.concatenate(columns)
+
+    def _require_touched(self) -> None:
+        touched = np.zeros(self.width, dtype=bool)
+        for term in self.terms:
+            for columns in self._term_columns(term):
+                touched[columns] = True
+        idle = self.free_columns[~touched[self.free_columns]]
+        if len(idle):
+            family, index = self.column_name(int(idle[0]))
+            raise GraphError(
+                f"{family}[{index}] is in no cost or constraint and is not fixed: {len(idle)} tangent coordinates are "
+                "free to be anything; add a term, fix it, or make the family shorter",
+                family=family,
+                index=index,
+            )
+
+    def _all_fixed(self, family: Family) -> bool:
+        offset = self.offsets[family]
+        return bool((self.unknown[offset : offset + family.count * family.manifold.dim] < 0).all())
+
+
+def _write(target: Array, at: int, blocks: list[Array]) -> int:
+    """Copy blocks into ``target`` from position ``at``; return the next position."""
+    for block in blocks:
+        target[at : at + block.size] = block.ravel()
+        at += block.size
+    return at
+
+
+def _stacked(parts: list[Array]) -> Array:
+    """One flat array, also of nothing."""
+    return np.concatenate([part.ravel() for part in parts]) if parts else np.zeros(0)
+
+
+def _convex(blocks: Array) -> Array:
+    """Hessian blocks of scalar costs with negative curvature removed: a Gauss-Newton step must descend."""
+    if not np.isfinite(blocks).all():
+        return blocks
+    eigenvalues, vectors = np.linalg.eigh(blocks)
+    result: Array = (vectors * np.maximum(eigenvalues, 0.0)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    return result

@@ -1,0 +1,49 @@
+"""What a user writes: plain batched functions, with or without their Jacobians."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from unifg.typing import Array
+
+Function: TypeAlias = Callable[..., Array]
+JacobianFunction: TypeAlias = Callable[..., Sequence[Array]]
+
+
+@dataclass(frozen=True)
+class Residual:
+    """A batched residual together with its Jacobians.
+
+    Attributes:
+        function: maps batched arguments to (n, m) residuals.
+        jacobian: maps the same arguments to one (n, m, d_k) array per *variable* argument, in order,
+            each the derivative along the right perturbation ``X Exp(d)``.
+        name: shown in tables and messages.
+    """
+
+    function: Function
+    jacobian: JacobianFunction | None = None
+    name: str = ""
+
+    def __call__(self, *arguments: Any) -> Array:
+        """Evaluate the residual."""
+        return self.function(*arguments)
+
+
+def residual(function: Function, jacobian: JacobianFunction | None = None, name: str = "") -> Residual:
+    """Attach a Jacobian and a name to a plain function.
+
+    Args:
+        function: batched residual, ``(n, ...) -> (n, m)``.
+        jacobian: returns one (n, m, d_k) array for each variable argument, right perturbation.
+            ``graph.check`` compares it with numerical differentiation.
+        name: defaults to the function's own name.
+    """
+    return Residual(function, jacobian, name or getattr(function, "__name__", "residual"))
+
+
+def as_residual(function: Function | Residual) -> Residual:
+    """Wrap a plain function; leave a :class:`Residual` as it is."""
+    return function if isinstance(function, Residual) else residual(function)

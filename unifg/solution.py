@@ -1,0 +1,202 @@
+"""What every backend returns, and what the next solve may start from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from unifg.covariance import covariance
+from unifg.errors import GraphError
+from unifg.history import HEADER, Iteration, line
+from unifg.kkt import Optimality
+from unifg.program import Linearization, Program
+from unifg.status import Status
+from unifg.typing import Array, IntArray
+from unifg.variables import Family, Selection, Variable, as_selection
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Values of the families and multipliers of the constraints, by term name.
+
+    Attributes:
+        values: (count, storage) per family.
+        multipliers: (n, m) per constraint term; absent terms start at zero.
+    """
+
+    values: Mapping[Family, Array]
+    multipliers: Mapping[str, Array] = field(default_factory=dict)
+
+
+class Solution:
+    """The final iterate with its KKT numbers.
+
+    Attributes:
+        status: why the solve ended.
+        cost: objective, with its 1/2.
+        stationarity, violation, complementarity: KKT numbers, see :mod:`unifg.kkt`.
+        iterations: number of iterations taken.
+        history: one row per iteration, row 0 being the start.
+        seconds: wall-clock time of the solve.
+        solver: name of the backend.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        linearization: Linearization,
+        multipliers: Array,
+        status: Status,
+        measured: Optimality,
+        history: list[Iteration],
+        seconds: float,
+        solver: str,
+    ) -> None:
+        """Assembled by :class:`unifg.Solver`."""
+        self._program = program
+        self._lin = linearization
+        self._multipliers = multipliers
+        self._data = dict(program.data)
+        self._equality = program.equality
+        self._lower, self._upper = program.lower, program.upper
+        self._reaction = program.lagrangian_gradient(linearization, multipliers)
+        self.status = status
+        self.cost = linearization.cost
+        self.stationarity = measured.stationarity
+        self.violation = measured.violation
+        self.complementarity = measured.complementarity
+        self._worst_row = measured.worst_row
+        self.history = history
+        self.iterations = history[-1].number if history else 0
+        self.seconds = seconds
+        self.solver = solver
+
+    @property
+    def converged(self) -> bool:
+        """Whether the KKT conditions hold to the tolerance."""
+        return self.status.converged
+
+    @property
+    def values(self) -> dict[Family, Array]:
+        """Copies of the values of every family."""
+        return {family: array.copy() for family, array in self._lin.values.items()}
+
+    @property
+    def multipliers(self) -> dict[str, Array]:
+        """Multipliers of every constraint term, (n, m) each."""
+        program = self._program
+        return {
+            term.name: self._multipliers[rows].reshape(term.count, term.size).copy()
+            for term, rows in zip(program.constraint_terms, program.slices, strict=True)
+        }
+
+    @property
+    def worst(self) -> tuple[str, int] | None:
+        """Term and factor with the largest violation, None without constraints."""
+        return None if self._worst_row < 0 else self._program.row_name(self._worst_row)
+
+    def __getitem__(self, variable: Variable) -> Array:
+        """(n, storage) values of a family or selection."""
+        selection = as_selection(variable)
+        self._require(selection)
+        return self._lin.values[selection.family][selection.indices][:, selection.storage].copy()
+
+    def dual(self, name: str) -> Array:
+        """Multipliers of a constraint or bound (n, m), or reaction of fixed variables (n, d).
+
+        Positive at an active upper limit, negative at an active lower one. A reaction nu makes
+        grad f + A' lambda + nu vanish on the fixed coordinates.
+
+        Raises:
+            GraphError: when no constraint, bound or fix has that name.
+        """
+        multipliers = self.multipliers
+        if name in multipliers:
+            return multipliers[name]
+        if name in self._program.fixed_columns:
+            return -self._reaction[self._program.fixed_columns[name]]
+        known = ", ".join([*multipliers, *self._program.fixed_columns]) or "none"
+        raise GraphError(f"no constraint, bound or fix is called '{name}' (there are: {known})", term=name)
+
+    def shifted(self, *families: Family, by: int = 1) -> Guess:
+        """A guess moved ``by`` stages towards the end of the horizon, for the next control tick.
+
+        Member k of each family takes the value of member k + by, the last ones repeat the end. The
+        multipliers of a factor move with the stage of its first variable.
+
+        Args:
+            *families: the families that run along the horizon.
+            by: number of stages, non-negative.
+        """
+        if by < 0:
+            raise GraphError(f"shifted: by must not be negative, found {by}")
+        values = self.values
+        for family in families:
+            self._require(as_selection(family))
+            stages = np.minimum(np.arange(family.count) + by, family.count - 1)
+            values[family] = values[family][stages]
+        multipliers = self.multipliers
+        for term in self._program.constraint_terms:
+            first = term.gathers[0].selection
+            if first.family in families and len(first) == term.count:
+                multipliers[term.name] = multipliers[term.name][_shifted_rows(first.indices, by)]
+        return Guess(values, multipliers)
+
+    def covariance(self, variable: Variable) -> Array:
+        """Joint covariance of the selected unknowns, in their tangent space.
+
+        Raises:
+            GraphError: when a selected variable is fixed, or the system is singular.
+        """
+        selection = as_selection(variable)
+        self._require(selection)
+        program = self._program
+        offset = program.offsets[selection.family] + selection.indices * selection.family.manifold.dim
+        columns = offset[:, None] + np.arange(selection.tangent.start, selection.tangent.stop)
+        active = self._equality | (np.abs(self._multipliers) > 0.0)
+        return covariance(program, self._lin, columns.ravel(), active)
+
+    def report(self) -> str:
+        """The status sentence with the numbers behind it."""
+        text = (
+            f"{self.solver}: {self.status.value} Cost {self.cost:.6g} after {self.iterations} iterations in "
+            f"{1e3 * self.seconds:.1f} ms; stationarity {self.stationarity:.1e}, violation {self.violation:.1e}, "
+            f"complementarity {self.complementarity:.1e}."
+        )
+        if self.worst is not None and self.violation > 0.0 and not self.converged:
+            name, index = self.worst
+            text += f" Largest violation: '{name}', factor {index}."
+        return text
+
+    def table(self) -> str:
+        """The history as a table."""
+        return "\n".join([HEADER, *map(line, self.history)])
+
+    def __repr__(self) -> str:
+        """The report."""
+        return f"<Solution {self.report()}>"
+
+    def _require(self, selection: Selection) -> None:
+        if selection.family not in self._lin.values:
+            raise GraphError(f"family '{selection.family.name}' is not part of this solution", family=selection.family.name)
+
+
+def _shifted_rows(stages: IntArray, by: int) -> IntArray:
+    """For each factor the factor ``by`` stages later with the same rank within its stage.
+
+    Where no such stage exists, the last stage that has that rank serves.
+    """
+    place: dict[tuple[int, int], int] = {}
+    seen: dict[int, int] = {}
+    keys = []
+    last: dict[int, int] = {}
+    for factor, stage in enumerate(stages.tolist()):
+        rank = seen.get(stage, 0)
+        seen[stage] = rank + 1
+        place[stage, rank] = factor
+        keys.append((stage, rank))
+        if rank not in last or stage >= keys[last[rank]][0]:
+            last[rank] = factor
+    return np.array([place.get((stage + by, rank), last[rank]) for stage, rank in keys], dtype=np.intp)

@@ -1,0 +1,298 @@
+"""The frame every backend runs in: checks before, one loop state during, one judge after."""
+
+from __future__ import annotations
+
+import logging
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from unifg.compiled import Values
+from unifg.errors import BackendError, GraphError, NotConverged
+from unifg.graph import Graph
+from unifg.history import HEADER, Iteration, line
+from unifg.kkt import Optimality, infeasible_stationary, optimality
+from unifg.program import Linearization, Program
+from unifg.solution import Guess, Solution
+from unifg.status import Status
+from unifg.typing import Array, ArrayLike
+from unifg.variables import Data, Family
+
+logger = logging.getLogger("unifg")
+
+Start: TypeAlias = Mapping[Family, ArrayLike] | Guess | Solution
+Callback: TypeAlias = Callable[[Iteration], bool | None]
+
+UNBOUNDED_COST = -1e20
+
+
+@dataclass(kw_only=True)
+class Solver(ABC):
+    """Options common to all backends.
+
+    Attributes:
+        tolerance: for the KKT test of :mod:`unifg.kkt`.
+        max_iterations: iterations (linear systems or subproblems solved) before giving up.
+        time_limit: seconds before giving up, checked once an iteration.
+        verbose: log one line per iteration at level INFO to the logger ``unifg``.
+    """
+
+    tolerance: float = 1e-6
+    max_iterations: int = 100
+    time_limit: float = np.inf
+    verbose: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse options no solve could honour."""
+        if not self.tolerance > 0.0:
+            raise BackendError(f"{self.name}: tolerance must be positive, found {self.tolerance}")
+        if self.max_iterations < 0:
+            raise BackendError(f"{self.name}: max_iterations must not be negative, found {self.max_iterations}")
+
+    @property
+    def name(self) -> str:
+        """The backend's class name."""
+        return type(self).__name__
+
+    def solve(
+        self,
+        graph: Graph,
+        guess: Start,
+        *,
+        data: Mapping[Data, ArrayLike] | None = None,
+        duals: Mapping[str, ArrayLike] | None = None,
+        check: bool = False,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """Solve once; a control loop uses :meth:`prepare` and keeps structure and workspaces.
+
+        Args:
+            graph: the problem.
+            guess: values per family, or a guess or solution that carries multipliers too.
+            data: values of data for this solve; others keep their defaults.
+            duals: multipliers by term name, overriding those of the guess.
+            check: raise instead of returning a solution that did not converge.
+            callback: called with every row of the history; returning True ends the solve.
+
+        Raises:
+            GraphError: when the graph, guess or data is malformed.
+            BackendError: when this backend cannot take this class of problem.
+            NotConverged: with ``check=True``.
+        """
+        return self.prepare(graph).solve(guess, data=data, duals=duals, check=check, callback=callback)
+
+    def prepare(self, graph: Graph) -> Prepared:
+        """Compile the graph and allocate the backend's workspaces for repeated solves."""
+        program = graph.compile()
+        self.require(program)
+        return Prepared(self, program)
+
+    def require(self, program: Program) -> None:
+        """Raise BackendError when the backend cannot take this class of problem."""
+
+    @abstractmethod
+    def workspace(self, program: Program) -> Any:
+        """What the backend keeps between solves of one structure."""
+
+    @abstractmethod
+    def iterate(self, run: Run, workspace: Any) -> Status | None:
+        """Improve ``run`` until it has a status, or return the reason to stop."""
+
+
+class Run:
+    """State of one solve: the present iterate, its KKT numbers, and what has been recorded.
+
+    A backend moves with :meth:`accept`; the solve is over when ``status`` is set.
+
+    Attributes:
+        program: the compiled graph with its data bound.
+        lin: linearisation at the present iterate.
+        multipliers: (M,) present multipliers.
+        optimality: KKT numbers of both.
+        status: None while the solve goes on.
+        history: rows so far.
+        tolerance: of the KKT test.
+    """
+
+    def __init__(self, solver: Solver, program: Program, values: Values, multipliers: Array, callback: Callback | None):
+        """Linearise at the start and test it."""
+        self._solver = solver
+        self._callback = callback
+        self._started = time.perf_counter()
+        self.program = program
+        self.tolerance = solver.tolerance
+        self.history: list[Iteration] = []
+        self.status: Status | None = None
+        self._best: tuple[float, float] | None = None
+        if solver.verbose:
+            logger.info(HEADER)
+        self.accept(program.linearize(values), multipliers, 0.0, 0.0)
+
+    @property
+    def values(self) -> Values:
+        """Values at the present iterate."""
+        return self.lin.values
+
+    @property
+    def seconds(self) -> float:
+        """Time since the solve began."""
+        return time.perf_counter() - self._started
+
+    def accept(
+        self,
+        lin: Linearization,
+        multipliers: Array,
+        step_norm: float,
+        step_length: float,
+        **details: float | int | str,
+    ) -> None:
+        """Make ``lin`` the present iterate: measure it, record a row, decide whether to go on."""
+        self.lin, self.multipliers = lin, multipliers
+        self.optimality = optimality(self.program, lin, multipliers)
+        row = Iteration(
+            len(self.history),
+            lin.cost,
+            self.optimality.stationarity,
+            self.optimality.violation,
+            self.optimality.complementarity,
+            step_norm,
+            step_length,
+            self.seconds,
+            lin.norms,
+            dict(details),
+        )
+        self.history.append(row)
+        if self._solver.verbose:
+            logger.info(line(row))
+        self._keep_best()
+        self.status = self._decide()
+        if self._callback is not None and self._callback(row) and self.status is None:
+            self.status = Status.INTERRUPTED
+
+    def finish(self, reason: Status | None) -> Solution:
+        """Return the best iterate, judged by a fresh evaluation of the original problem."""
+        status = self.status or reason or Status.STALLED
+        if not status.converged:
+            self.lin, self.multipliers = self._best_lin, self._best_multipliers
+        measured = optimality(self.program, self.lin, self.multipliers)
+        if measured.passes(self.tolerance):
+            status = Status.CONVERGED
+        elif status.converged:
+            status = Status.STALLED
+        elif status is Status.STALLED and infeasible_stationary(self.program, self.lin, self.tolerance):
+            status = Status.LOCALLY_INFEASIBLE
+        return Solution(
+            self.program, self.lin, self.multipliers, status, measured, self.history, self.seconds, self._solver.name
+        )
+
+    def _decide(self) -> Status | None:
+        if not self.optimality.finite:
+            return Status.NOT_FINITE
+        if self.optimality.passes(self.tolerance):
+            return Status.CONVERGED
+        if self.lin.cost < UNBOUNDED_COST:
+            return Status.UNBOUNDED
+        if len(self.history) > self._solver.max_iterations:
+            return Status.ITERATION_LIMIT
+        if self.seconds > self._solver.time_limit:
+            return Status.TIME_LIMIT
+        return None
+
+    def _keep_best(self) -> None:
+        """Feasible iterates rank by cost, others by violation."""
+        feasible = self.optimality.violation <= self.tolerance
+        rank = (0.0, self.lin.cost) if feasible else (self.optimality.violation, self.lin.cost)
+        if self._best is None or (self.optimality.finite and rank <= self._best):
+            self._best, self._best_lin, self._best_multipliers = rank, self.lin, self.multipliers
+
+
+class Prepared:
+    """A backend bound to one compiled graph; solves repeatedly without rebuilding structure.
+
+    Attributes:
+        solver: the backend and its options.
+        program: the compiled graph.
+    """
+
+    def __init__(self, solver: Solver, program: Program) -> None:
+        """Made by :meth:`Solver.prepare`."""
+        self.solver = solver
+        self.program = program
+        self._workspace: Any = None
+
+    def solve(
+        self,
+        guess: Start,
+        *,
+        data: Mapping[Data, ArrayLike] | None = None,
+        duals: Mapping[str, ArrayLike] | None = None,
+        check: bool = False,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """Solve from ``guess``; arguments and errors as for :meth:`Solver.solve`."""
+        program = self.program
+        program.bind(data or {})
+        carried = {} if isinstance(guess, Mapping) else dict(guess.multipliers)
+        start = guess if isinstance(guess, Mapping) else guess.values
+        values = program.values_from(start)
+        multipliers = self._multipliers({**carried, **(duals or {})})
+        run = Run(self.solver, program, values, multipliers, callback)
+        self._refuse_not_finite(run)
+        reason = None
+        if run.status is None:
+            if self._workspace is None:
+                self._workspace = self.solver.workspace(program)
+            try:
+                reason = self.solver.iterate(run, self._workspace)
+            except KeyboardInterrupt:
+                run.status = Status.INTERRUPTED
+        solution = run.finish(reason)
+        if check and not solution.converged:
+            raise NotConverged(solution)
+        return solution
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Workspaces hold compiled objects that do not pickle; they are rebuilt on first use."""
+        return {**self.__dict__, "_workspace": None}
+
+    def _multipliers(self, duals: Mapping[str, ArrayLike]) -> Array:
+        result = np.zeros(self.program.constraints.count)
+        terms = {t.name: (t, s) for t, s in zip(self.program.constraint_terms, self.program.slices, strict=True)}
+        for name, value in duals.items():
+            if name not in terms:
+                known = ", ".join(terms) or "none"
+                raise GraphError(f"multipliers given for '{name}', which is no constraint (there are: {known})", term=name)
+            term, rows = terms[name]
+            array = np.asarray(value, dtype=np.float64)
+            if array.shape != (term.count, term.size):
+                raise GraphError(
+                    f"multipliers of '{name}' have shape {array.shape}, expected {(term.count, term.size)}", term=name
+                )
+            if not np.isfinite(array).all():
+                raise GraphError(f"multipliers of '{name}' are not finite", term=name)
+            result[rows] = array.ravel()
+        return result
+
+    def _refuse_not_finite(self, run: Run) -> None:
+        if run.status is not Status.NOT_FINITE:
+            return
+        for term in self.program.terms:
+            with np.errstate(all="ignore"):
+                value = term.residual(run.values)
+                bad = ~np.isfinite(value.reshape(len(value), -1)).all(axis=1)
+            if bad.any():
+                index = int(np.flatnonzero(bad)[0])
+                selection = term.gathers[0].selection
+                raise GraphError(
+                    f"term '{term.name}': the residual of factor {index} is not finite at the guess "
+                    f"(its first variable is {selection.family.name}[{selection.indices[index % len(selection)]}]); "
+                    "move the guess away from the singularity",
+                    term=term.name,
+                    family=selection.family.name,
+                    index=index,
+                )
+        raise GraphError("a Jacobian is not finite at the guess: run graph.check(guess) to find the term")

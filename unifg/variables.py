@@ -1,0 +1,172 @@
+"""Families of unknowns, selections from them, and data that can be replaced between solves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.lie import Manifold, Product
+from unifg.typing import Array, ArrayLike, IntArray
+
+Index: TypeAlias = int | slice | Sequence[int] | IntArray
+
+
+class Selection:
+    """Some members of a family, or one component of each.
+
+    Attributes:
+        family: the family selected from.
+        indices: (n,) positions in the family, non-negative.
+        component: name of the selected component of a product manifold, or None for the whole.
+    """
+
+    def __init__(self, family: Family, indices: IntArray, component: str | None = None) -> None:
+        """Select ``indices`` of ``family``; use ``family[...]`` instead of calling this."""
+        self.family = family
+        self.indices = indices
+        self.component = component
+        if component is None:
+            self.manifold: Manifold = family.manifold
+            self.storage = slice(0, family.manifold.storage)
+            self.tangent = slice(0, family.manifold.dim)
+        else:
+            assert isinstance(family.manifold, Product)
+            part = family.manifold.component(component)
+            self.manifold, self.storage, self.tangent = part.manifold, part.storage, part.tangent
+
+    def __len__(self) -> int:
+        """Number of selected members."""
+        return len(self.indices)
+
+    def __getitem__(self, index: Index) -> Selection:
+        """Select again within this selection; an int keeps length 1."""
+        return Selection(self.family, pick(self.indices, index, self.family.name), self.component)
+
+    def __getattr__(self, name: str) -> Selection:
+        """Select a component of a product manifold by its name."""
+        if name.startswith("_") or "component" not in self.__dict__:
+            raise AttributeError(name)
+        if self.component is not None or not has_component(self.family.manifold, name):
+            raise AttributeError(no_component(self.family, name))
+        return Selection(self.family, self.indices, name)
+
+    def __repr__(self) -> str:
+        """Family, component and number of members."""
+        part = f".{self.component}" if self.component else ""
+        return f"<{len(self)} of {self.family.name}{part}>"
+
+
+class Family:
+    """An array of unknowns on one manifold; made by :meth:`unifg.Graph.variables`.
+
+    Attributes:
+        name: unique name within its graph.
+        manifold: manifold of every member.
+        count: number of members.
+    """
+
+    def __init__(self, name: str, manifold: Manifold, count: int) -> None:
+        """Describe ``count`` unknowns on ``manifold``."""
+        self.name = name
+        self.manifold = manifold
+        self.count = count
+
+    def __len__(self) -> int:
+        """Number of members."""
+        return self.count
+
+    def __getitem__(self, index: Index) -> Selection:
+        """Select members as NumPy would; an int gives a selection of length 1."""
+        return Selection(self, pick(np.arange(self.count), index, self.name))
+
+    def __getattr__(self, name: str) -> Selection:
+        """Select one component of every member of a product family."""
+        if name.startswith("_") or "manifold" not in self.__dict__:
+            raise AttributeError(name)
+        if not has_component(self.manifold, name):
+            raise AttributeError(no_component(self, name))
+        return Selection(self, np.arange(self.count), name)
+
+    def __repr__(self) -> str:
+        """Name, length and manifold."""
+        return f"<Family {self.name}: {self.count} x {self.manifold.name}>"
+
+
+class Data:
+    """A named array that may change between solves without rebuilding structure.
+
+    Attributes:
+        name: unique name within its graph.
+        value: present default; a solve may override it.
+        each: whether the first axis runs over the factors of every term that uses it.
+    """
+
+    def __init__(self, name: str, value: ArrayLike, each: bool) -> None:
+        """Hold a default value; made by :meth:`unifg.Graph.data`."""
+        array = np.asarray(value)
+        self.name = name
+        self.each = each
+        self.value: Array = array if array.dtype == bool else array.astype(np.float64)
+        if each and self.value.ndim == 0:
+            raise GraphError(f"data '{name}' is declared each=True but is a scalar: give it one row per factor")
+        self.check(self.value)
+
+    def check(self, value: ArrayLike) -> Array:
+        """Return ``value`` as an array of the declared shape.
+
+        Raises:
+            GraphError: when the shape differs or an entry is NaN.
+        """
+        array: Array = np.asarray(value, dtype=self.value.dtype)
+        if array.shape != self.value.shape:
+            raise GraphError(
+                f"data '{self.name}' has shape {array.shape}, but was declared with {self.value.shape}: "
+                "the structure is compiled for that shape; declare new data or keep the shape and use active="
+            )
+        if array.dtype != bool and not np.isfinite(array).all() and np.isnan(array).any():
+            where = np.argwhere(np.isnan(array))[0]
+            raise GraphError(
+                f"data '{self.name}' contains NaN at {tuple(map(int, where))}", index=int(where[0]) if where.size else None
+            )
+        return array
+
+    def __repr__(self) -> str:
+        """Name and shape."""
+        return f"<Data {self.name} {self.value.shape}{' each' if self.each else ''}>"
+
+
+Variable: TypeAlias = Family | Selection
+
+
+def as_selection(variable: Variable) -> Selection:
+    """View a whole family as a selection of all its members."""
+    return variable if isinstance(variable, Selection) else variable[:]
+
+
+def is_variable(argument: Any) -> bool:
+    """Whether a term's argument is an unknown rather than a constant."""
+    return isinstance(argument, Family | Selection)
+
+
+def pick(indices: IntArray, index: Index, family: str) -> IntArray:
+    """Apply a NumPy index to ``indices``, always returning one axis."""
+    try:
+        chosen = indices[index]
+    except IndexError as error:
+        raise GraphError(f"family '{family}' has {len(indices)} members here: {error}", family=family) from error
+    return np.atleast_1d(np.asarray(chosen, dtype=np.intp))
+
+
+def has_component(manifold: Manifold, name: str) -> bool:
+    """Whether ``manifold`` is a product with a component of that name."""
+    return isinstance(manifold, Product) and name in manifold.components
+
+
+def no_component(family: Family, name: str) -> str:
+    """Explain which components exist."""
+    manifold = family.manifold
+    names = ", ".join(manifold.components) if isinstance(manifold, Product) else "none: it is not a product"
+    return f"family '{family.name}' has no component '{name}' (components: {names})"
