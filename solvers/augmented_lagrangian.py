@@ -18,11 +18,14 @@ from unifg.errors import BackendError
 from unifg.program import Program
 from unifg.solver import Run, Solver
 from unifg.solvers.damping import Damping, damped_step, norm
+from unifg.solvers.least_squares import require_squares
 from unifg.solvers.primal import Primal
 from unifg.status import Status
 from unifg.typing import Array
 
 LARGEST_PENALTY = 1e10
+COLD_PENALTY = 1000.0
+WARM_PENALTY = 100.0
 
 
 @dataclass(kw_only=True)
@@ -36,6 +39,7 @@ class AugmentedLagrangian(Solver):
         schedule: "bcl" or "bazzana".
         step_tolerance, violation_tolerance: Bazzana's stop rule (section VII-D, 1e-4 there): the step's norm
             and the largest violation. A positive step_tolerance switches it on; it does not grant CONVERGED.
+        inner_iterations: primal steps before the next dual step, converged or not.
         damping: initial Levenberg-Marquardt damping of the primal step.
     """
 
@@ -45,6 +49,7 @@ class AugmentedLagrangian(Solver):
     schedule: Literal["bcl", "bazzana"] = "bcl"
     step_tolerance: float = 0.0
     violation_tolerance: float = 1e-4
+    inner_iterations: int = 20
     damping: float = 1e-6
 
     def __post_init__(self) -> None:
@@ -54,6 +59,10 @@ class AugmentedLagrangian(Solver):
             raise BackendError(f"{self.name}: schedule must be 'bcl' or 'bazzana', found '{self.schedule}'")
         if self.penalty is not None and not self.penalty > 0.0:
             raise BackendError(f"{self.name}: penalty must be positive, found {self.penalty}")
+
+    def require(self, program: Program) -> None:
+        """Refuse scalar costs: the primal step is least squares."""
+        require_squares(program, self.name)
 
     def workspace(self, program: Program) -> Primal:
         """The factorisation of the primal step."""
@@ -94,7 +103,10 @@ class AugmentedLagrangian(Solver):
             penalty = np.full(len(multipliers), rho)
             before = len(run.history)
             stalled = False
-            while largest(primal.gradient(run.lin, multipliers, penalty)) > gradient_goal:
+            while (
+                largest(primal.gradient(run.lin, multipliers, penalty)) > gradient_goal
+                and len(run.history) - before < self.inner_iterations
+            ):
                 taken = damped_step(primal, run.lin, multipliers, penalty, damping)
                 if taken is None:
                     stalled = True
@@ -118,6 +130,8 @@ class AugmentedLagrangian(Solver):
                 violation_goal = max(violation_goal / rho**0.9, 0.1 * self.tolerance)
                 gradient_goal = max(0.1 * gradient_goal, 0.1 * self.tolerance)
             else:
+                if run.infeasible_stationary():
+                    return Status.LOCALLY_INFEASIBLE
                 rho = min(rho * self.penalty_growth, LARGEST_PENALTY)
                 gradient_goal, violation_goal = self._goals(run, primal, rho)
             if stalled:
@@ -127,8 +141,12 @@ class AugmentedLagrangian(Solver):
     def _initial_penalty(self, run: Run) -> float:
         if self.penalty is not None:
             return self.penalty
+        pull = largest(run.multipliers)
+        if pull > 0.0:  # warm start: below this, curvature of the constraints can outweigh the penalty
+            return float(np.clip(WARM_PENALTY * pull, 1e-3, 1e6))
         outside = float((run.program.violation(run.lin.constraints) ** 2).sum())
-        return float(np.clip(10.0 * max(1.0, abs(run.lin.cost)) / max(1.0, 0.5 * outside), 1e-3, 1e6))
+        balance = max(1.0, abs(run.lin.cost)) / max(1.0, 0.5 * outside)
+        return float(np.clip(COLD_PENALTY * balance, 1e-3, 1e6))
 
     def _goals(self, run: Run, primal: Primal, rho: float) -> tuple[float, float]:
         """First accuracy of the subproblem's gradient, and the violation that earns a dual step."""

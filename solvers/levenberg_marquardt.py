@@ -9,7 +9,7 @@ import numpy as np
 from unifg.program import Program
 from unifg.solver import Run, Solver
 from unifg.solvers.damping import Damping, damped_step, norm
-from unifg.solvers.least_squares import require_least_squares
+from unifg.solvers.least_squares import require_squares, require_unconstrained
 from unifg.solvers.primal import Primal
 from unifg.status import Status
 
@@ -28,7 +28,8 @@ class LevenbergMarquardt(Solver):
 
     def require(self, program: Program) -> None:
         """Refuse constraints and scalar costs."""
-        require_least_squares(program, self.name)
+        require_unconstrained(program, self.name)
+        require_squares(program, self.name)
 
     def workspace(self, program: Program) -> Primal:
         """The factorisation of the normal equations."""

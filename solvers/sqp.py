@@ -53,6 +53,10 @@ class SQP(Solver):
 
     def iterate(self, run: Run, workspace: Subproblems) -> Status | None:
         """Iterate to convergence."""
+        # Bounds are linear: once they hold they hold along every step, and leave the line search to the rest.
+        within = run.program.within_bounds(run.values)
+        if within is not run.values and not self.full_steps:
+            run.accept(run.program.linearize(within), run.multipliers, 0.0, 0.0, qp="none: moved within bounds")
         merit = Merit(run.program, run.multipliers)
         damping = SMALLEST_DAMPING
         while run.status is None:
@@ -65,6 +69,8 @@ class SQP(Solver):
                     return Status.STALLED
                 damping = max(10.0 * damping, 1e-4)
                 continue
+            if answer.route.startswith("elastic") and run.infeasible_stationary():
+                return Status.LOCALLY_INFEASIBLE
             merit.raise_prices(answer)
             taken = self._search(run, workspace, merit, qp, answer, accuracy)
             if taken is None:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unifg.program import Linearization, Program
-from unifg.typing import Array
+from unifg.typing import Array, BoolArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -78,11 +78,26 @@ def complementarity(program: Program, constraints: Array, multipliers: Array) ->
 def infeasible_stationary(program: Program, lin: Linearization, tolerance: float) -> bool:
     """Whether the point is stationary for 1/2 |violation|^2 without being feasible.
 
-    The gradient A' v is compared with the size of v and of the rows of A it is made of.
+    Descent directions that satisfied bounds of the unknowns block do not count. The gradient A' v is compared with
+    the size of v and of the rows of A it is made of.
     """
     outside = program.violation(lin.constraints)
     if np.abs(outside).max(initial=0.0) <= tolerance:
         return False
     pull = program.constraints.transposed_times(lin.constraint_jacobian, outside)[program.free_columns]
+    columns, at_lower, at_upper = _walls(program, lin.constraints)
+    blocked = ((pull[columns] > 0.0) & at_lower) | ((pull[columns] < 0.0) & at_upper)
+    pull[columns[blocked]] = 0.0
     size = np.abs(lin.constraint_jacobian).max(initial=0.0) * np.abs(outside).max()
-    return bool(np.abs(pull).max(initial=0.0) <= max(tolerance, 1e-4 * size))
+    return bool(np.abs(pull).max(initial=0.0) <= 1e-6 * size)
+
+
+def _walls(program: Program, constraints: Array) -> tuple[IntArray, BoolArray, BoolArray]:
+    """Unknowns with bounds, and whether each rests on its lower or upper one."""
+    rows, columns = program.constraints.free_rows, program.constraints.free_columns
+    bounds = program.bound_rows[rows]
+    rows, columns = rows[bounds], columns[bounds]
+    near = 1e-9 * np.maximum(1.0, np.abs(constraints[rows]))
+    at_lower = np.abs(constraints[rows] - program.lower[rows]) <= near
+    at_upper = np.abs(constraints[rows] - program.upper[rows]) <= near
+    return columns, at_lower, at_upper

@@ -15,7 +15,7 @@ import numpy as np
 from unifg.compiled import CompiledTerm, Values
 from unifg.errors import GraphError
 from unifg.linear import Factorization
-from unifg.sparse import Gram, Rows, Symmetric
+from unifg.sparse import Gram, Rows, Symmetric, scatter
 from unifg.terms import Constraint, Cost, ScalarCost
 from unifg.typing import Array, ArrayLike, IntArray
 from unifg.variables import Data, Family
@@ -211,6 +211,23 @@ class Program:
             moved[fix.selection.family][fix.selection.indices, fix.selection.storage] = value
         return moved
 
+    def within_bounds(self, values: Values) -> Values:
+        """The nearest values that respect every bound of an unknown; ``values`` itself when all do."""
+        moved: Values = {}
+        for term in self.constraint_terms:
+            if not term.is_bound:
+                continue
+            selection = term.gathers[0].selection
+            array = moved.get(selection.family, values[selection.family]).copy()
+            part = array[selection.indices, selection.storage]
+            array[selection.indices, selection.storage] = np.clip(part, term.lower, term.upper)
+            for fix, value in self.fixed_values:
+                if fix.selection.family is selection.family:
+                    array[fix.selection.indices, fix.selection.storage] = value
+            if not np.array_equal(array, values[selection.family]):
+                moved[selection.family] = array
+        return {**values, **moved} if moved else values
+
     # ---------------------------------------------------------------- evaluation
 
     def evaluate(self, values: Values, weights: HeldWeights | None = None) -> Evaluation:
@@ -280,7 +297,7 @@ class Program:
                 cost += float(value.sum())
                 norms[term.name] = float(np.abs(value).sum())
                 slope, curvature = term.scalar_derivatives(values)
-                gradient += np.bincount(columns.ravel(), weights=slope.ravel(), minlength=self.width)
+                gradient += scatter(columns.ravel(), slope.ravel(), self.width)
                 hessians.append(_convex(curvature)[self._scalar_keep[term.name]])
         return Linearization(
             values, cost, residual, jacobian, constraints, constraint_jacobian, gradient, _stacked(hessians), norms, weights
@@ -292,14 +309,14 @@ class Program:
         """Gauss-Newton Hessian of the objective in the order of ``hessian``."""
         data = self.gram(lin.jacobian)
         if len(lin.scalar_hessian):
-            np.add.at(data, self._scalar_in_hessian, lin.scalar_hessian)
+            data += scatter(self._scalar_in_hessian, lin.scalar_hessian, len(data))
         return data
 
     def normal_entries(self, lin: Linearization, row_weights: Array) -> Array:
         """Gauss-Newton Hessian plus A' diag(row_weights) A, in the order of ``normal``."""
         data = self.normal_gram(lin.jacobian) + self.constraint_gram(lin.constraint_jacobian, row_weights)
         if len(lin.scalar_hessian):
-            np.add.at(data, self._scalar_in_normal, lin.scalar_hessian)
+            data += scatter(self._scalar_in_normal, lin.scalar_hessian, len(data))
         return data
 
     def free_gradient(self, lin: Linearization) -> Array:

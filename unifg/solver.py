@@ -173,18 +173,22 @@ class Run:
         if self._callback is not None and self._callback(row) and self.status is None:
             self.status = Status.INTERRUPTED
 
+    def infeasible_stationary(self) -> bool:
+        """Whether no nearby point violates the constraints less, though they are violated."""
+        return infeasible_stationary(self.program, self.lin, self.tolerance)
+
     def finish(self, reason: Status | None) -> Solution:
         """Return the best iterate, judged by a fresh evaluation of the original problem."""
         status = self.status or reason or Status.STALLED
-        if not status.converged:
+        if status is Status.STALLED and self.infeasible_stationary():
+            status = Status.LOCALLY_INFEASIBLE
+        if status not in (Status.CONVERGED, Status.LOCALLY_INFEASIBLE):
             self.lin, self.multipliers = self._best_lin, self._best_multipliers
         measured = optimality(self.program, self.lin, self.multipliers)
         if measured.passes(self.tolerance):
             status = Status.CONVERGED
         elif status.converged:
             status = Status.STALLED
-        elif status is Status.STALLED and infeasible_stationary(self.program, self.lin, self.tolerance):
-            status = Status.LOCALLY_INFEASIBLE
         return Solution(
             self.program, self.lin, self.multipliers, status, measured, self.history, self.seconds, self._solver.name
         )

@@ -15,6 +15,13 @@ import scipy.sparse as sp
 from unifg.typing import Array, IntArray
 
 
+def scatter(slots: IntArray, numbers: Array, size: int) -> Array:
+    """Sum ``numbers`` into ``size`` slots."""
+    if not len(slots):  # bincount of nothing counts in integers
+        return np.zeros(size)
+    return np.bincount(slots, weights=numbers, minlength=size)
+
+
 class Symmetric:
     """Pattern of the upper triangle of a symmetric matrix, compressed by columns.
 
@@ -77,7 +84,7 @@ class Rows:
 
     def compress(self, flat: Array) -> Array:
         """Entries by columns (CSC order), repeated ones summed."""
-        return np.bincount(self._slots, weights=self._restrict(flat), minlength=self.nnz)
+        return scatter(self._slots, self._restrict(flat), self.nnz)
 
     def matrix(self, flat: Array) -> sp.csc_matrix:
         """The Jacobian over the unknowns as a SciPy matrix."""
@@ -85,13 +92,11 @@ class Rows:
 
     def times(self, flat: Array, vector: Array) -> Array:
         """J v for a vector over the unknowns."""
-        return np.bincount(
-            self.free_rows, weights=self._restrict(flat) * vector[self.free_columns], minlength=self.count
-        )
+        return scatter(self.free_rows, self._restrict(flat) * vector[self.free_columns], self.count)
 
     def transposed_times(self, flat: Array, vector: Array) -> Array:
         """J' v over the full tangent space, fixed variables included."""
-        return np.bincount(self.columns, weights=flat * vector[self.rows], minlength=self.width)
+        return scatter(self.columns, flat * vector[self.rows], self.width)
 
     def _restrict(self, flat: Array) -> Array:
         return flat if self.all_free else flat[self.free]
@@ -138,4 +143,4 @@ class Gram:
         products = flat[self.first] * flat[self.second]
         if weights is not None:
             products *= weights[self._weight]
-        return np.bincount(self._slots, weights=products, minlength=self._nnz)
+        return scatter(self._slots, products, self._nnz)

@@ -1,0 +1,158 @@
+"""An independent judge of optimality: nothing but term functions and dense central differences.
+
+It shares no code with the compiled program: it reads what the graph states, moves one tangent coordinate at a
+time, and measures the KKT conditions of L = f + lambda' g.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+import unifg as fg
+from unifg.terms import Constraint, Cost, ScalarCost
+from unifg.typing import Array
+from unifg.variables import Data, Selection
+
+STEP = 1e-5
+
+
+@dataclass
+class Verdict:
+    """KKT numbers found by the judge."""
+
+    stationarity: float
+    violation: float
+    complementarity: float
+    wrong_sign: float
+
+    def worst(self) -> float:
+        """The largest of them."""
+        return max(self.stationarity, self.violation, self.complementarity, self.wrong_sign)
+
+
+def judge(graph: fg.Graph, solution: fg.Solution, data: dict[Data, Array] | None = None) -> Verdict:
+    """Measure the KKT conditions of ``graph`` at ``solution``."""
+    data = data or {}
+    values = solution.values
+    moved = [(family, row, column) for family, row, column in _free(graph)]
+    gradient = np.array([(_f(graph, _at(values, m, STEP), data) - _f(graph, _at(values, m, -STEP), data)) for m in moved])
+    gradient /= 2.0 * STEP
+    duals = _duals(graph, solution)
+    scale = max(1.0, float(np.abs(duals).mean()) / 100.0) if len(duals) else 1.0
+    if len(duals):
+        columns = [(_g(graph, _at(values, m, STEP), data) - _g(graph, _at(values, m, -STEP), data)) for m in moved]
+        gradient = gradient + np.array(columns) @ duals / (2.0 * STEP)
+    lower, upper = _limits(graph, data)
+    g = _g(graph, values, data)
+    outside = np.maximum(np.maximum(g - upper, lower - g), 0.0)
+    wrong = np.where((duals > 0.0) & np.isinf(upper) | (duals < 0.0) & np.isinf(lower), np.abs(duals), 0.0)
+    limit = np.where(duals > 0.0, upper, lower)
+    slack = np.where(np.isfinite(limit) & (lower != upper), np.abs(g - np.where(np.isfinite(limit), limit, 0.0)), 0.0)
+    return Verdict(
+        float(np.abs(gradient).max(initial=0.0)) / scale,
+        float(outside.max(initial=0.0)),
+        float((np.abs(duals) * slack).max(initial=0.0)) / scale,
+        float(wrong.max(initial=0.0)),
+    )
+
+
+def _free(graph: fg.Graph) -> list[tuple[fg.Family, int, int]]:
+    held = {
+        (fix.selection.family.name, int(row), column)
+        for fix in graph.fixes
+        for row in fix.selection.indices
+        for column in range(fix.selection.tangent.start, fix.selection.tangent.stop)
+    }
+    return [
+        (family, row, column)
+        for family in graph.families.values()
+        for row in range(family.count)
+        for column in range(family.manifold.dim)
+        if (family.name, row, column) not in held
+    ]
+
+
+def _at(values: dict[fg.Family, Array], moved: tuple[fg.Family, int, int], size: float) -> dict[fg.Family, Array]:
+    family, row, column = moved
+    direction = np.zeros(family.manifold.dim)
+    direction[column] = size
+    array = values[family].copy()
+    array[row] = family.manifold.retract(array[row], direction)
+    return {**values, family: array}
+
+
+def _call(term: Any, values: dict[fg.Family, Array], data: dict[Data, Array]) -> Array:
+    arguments: list[Any] = []
+    for argument in term.arguments:
+        if isinstance(argument, Selection):
+            part = values[argument.family][argument.indices][:, argument.storage]
+            arguments.append(np.repeat(part, term.count, axis=0) if len(part) == 1 and term.count > 1 else part)
+        elif isinstance(argument, Data):
+            arguments.append(data.get(argument, argument.value))
+        else:
+            arguments.append(argument)
+    return np.asarray(term.residual.function(*arguments), dtype=np.float64)
+
+
+def _active(term: Any, data: dict[Data, Array]) -> Array:
+    mask = term.active
+    if isinstance(mask, Data):
+        mask = data.get(mask, mask.value)
+    return np.ones(term.count, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
+
+
+def _parameter(value: Any, data: dict[Data, Array]) -> Array:
+    return np.asarray(data.get(value, value.value) if isinstance(value, Data) else value, dtype=np.float64)
+
+
+def _f(graph: fg.Graph, values: dict[fg.Family, Array], data: dict[Data, Array]) -> float:
+    total = 0.0
+    for term in graph.terms:
+        if isinstance(term, ScalarCost):
+            total += float(_call(term, values, data)[_active(term, data)].sum())
+        if isinstance(term, Cost):
+            r = _call(term, values, data)
+            if term.sigma is not None:
+                squared = ((r / _parameter(term.sigma, data)) ** 2).sum(axis=1)
+            elif term.information is not None:
+                omega = np.broadcast_to(_parameter(term.information, data), (len(r), r.shape[1], r.shape[1]))
+                squared = np.array([row @ matrix @ row for row, matrix in zip(r, omega, strict=True)])
+            else:
+                squared = (r**2).sum(axis=1)
+            if term.robust is not None:
+                squared = term.robust.value(squared)
+            total += 0.5 * float(squared[_active(term, data)].sum())
+    return total
+
+
+def _constraints(graph: fg.Graph) -> list[Constraint]:
+    return [term for term in graph.terms if isinstance(term, Constraint)]
+
+
+def _g(graph: fg.Graph, values: dict[fg.Family, Array], data: dict[Data, Array]) -> Array:
+    parts = [np.where(_active(t, data)[:, None], _call(t, values, data), 0.0).ravel() for t in _constraints(graph)]
+    return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def _limits(graph: fg.Graph, data: dict[Data, Array]) -> tuple[Array, Array]:
+    lower, upper = [], []
+    for term in _constraints(graph):
+        shape = _call_shape(term, data)
+        mask = _active(term, data)[:, None]
+        lower.append(np.where(mask, np.broadcast_to(_parameter(term.lower, data), shape), -np.inf).ravel())
+        upper.append(np.where(mask, np.broadcast_to(_parameter(term.upper, data), shape), np.inf).ravel())
+    return (np.concatenate(lower), np.concatenate(upper)) if lower else (np.zeros(0), np.zeros(0))
+
+
+def _call_shape(term: Constraint, data: dict[Data, Array]) -> tuple[int, ...]:
+    values = {s.family: np.tile(s.family.manifold.identity(), (s.family.count, 1)) for s in term.selections}
+    with np.errstate(all="ignore"):
+        return _call(term, values, data).shape
+
+
+def _duals(graph: fg.Graph, solution: fg.Solution) -> Array:
+    parts = [solution.dual(term.name).ravel() for term in _constraints(graph)]
+    return np.concatenate(parts) if parts else np.zeros(0)

@@ -1,0 +1,177 @@
+"""Every backend on one table of problems, judged by :mod:`judge`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from judge import judge
+from problems import PROBLEMS, Problem, ecg2o, inactive_inequality, short_drive
+
+import unifg as fg
+from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, LevenbergMarquardt
+
+BACKENDS: list[fg.Solver] = [
+    GaussNewton(),
+    LevenbergMarquardt(),
+    AugmentedLagrangian(),
+    SQP(),
+    SQP(qp="piqp"),
+]
+IDS = ["gn", "lm", "alm", "sqp", "sqp-piqp"]
+
+
+def takes(solver: fg.Solver, problem: Problem) -> bool:
+    """Which class of problem a backend claims."""
+    if isinstance(solver, SQP):
+        return True
+    if isinstance(solver, AugmentedLagrangian):
+        return not problem.scalar
+    return not (problem.constrained or problem.scalar)
+
+
+@pytest.mark.parametrize("problem", PROBLEMS, ids=lambda p: p.name)
+@pytest.mark.parametrize("solver", BACKENDS, ids=IDS)
+def test_backend_solves_or_refuses(solver: fg.Solver, problem: Problem) -> None:
+    graph, guess = problem.build()
+    if not takes(solver, problem):
+        with pytest.raises(fg.BackendError):
+            solver.solve(graph, guess)
+        return
+    untouched = {family: np.array(array) for family, array in guess.items()}
+    solution = solver.solve(graph, guess)
+    assert solution.converged, solution.report()
+    assert judge(graph, solution).worst() < 2e-6
+    if np.isfinite(problem.cost):
+        assert solution.cost == pytest.approx(problem.cost, rel=1e-6, abs=1e-7)
+    for name, expected in problem.answer.items():
+        family = graph.families[name]
+        distance = family.manifold.local(np.asarray(expected, dtype=float), solution[family])
+        assert np.abs(distance).max() < 2e-4 if problem.name == "hs48" else np.abs(distance).max() < 1e-5
+    for name, expected in problem.duals.items():
+        np.testing.assert_allclose(solution.dual(name), expected, atol=1e-4)
+    for family, array in untouched.items():
+        np.testing.assert_array_equal(guess[family], array)
+
+
+@pytest.mark.parametrize("solver", [AugmentedLagrangian(), SQP()], ids=["alm", "sqp"])
+def test_started_at_the_answer_takes_no_step(solver: fg.Solver) -> None:
+    graph, guess = short_drive()
+    first = solver.solve(graph, guess, check=True)
+    again = solver.solve(graph, first)
+    assert again.converged
+    assert again.iterations == 0
+    assert again.cost == first.cost
+
+
+def test_bazzana_schedule_is_the_literal_loop() -> None:
+    """One primal and one dual step per iteration at constant penalty, in PHR form."""
+    graph, guess = inactive_inequality()
+    solution = AugmentedLagrangian(schedule="bazzana", penalty=10.0).solve(graph, guess)
+    assert solution.converged
+    assert solution[graph.families["x"]][0, 0] == pytest.approx(0.2, abs=1e-7)
+    graph, guess = ecg2o((-0.2, -0.2))
+    solution = AugmentedLagrangian(schedule="bazzana", penalty=10.0).solve(graph, guess)
+    assert solution.converged
+    assert {row.details["penalty"] for row in solution.history[1:]} == {10.0}
+
+
+def test_bazzana_stop_rule_does_not_claim_convergence() -> None:
+    graph, guess = short_drive(disc=False)
+    solver = AugmentedLagrangian(
+        schedule="bazzana", penalty=100.0, step_tolerance=1e-2, violation_tolerance=1e-2, tolerance=1e-10
+    )
+    solution = solver.solve(graph, guess)
+    assert solution.status is fg.Status.STOP_RULE
+    assert solution.violation < 1e-2
+    assert not solution.converged
+
+
+@pytest.mark.parametrize("solver", [AugmentedLagrangian(), SQP()], ids=["alm", "sqp"])
+def test_infeasible_problem_is_named(solver: fg.Solver) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(fg.prior, x, [0.0, 0.0])
+    graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, upper=1.0, name="inside")
+    graph.bound(x, lower=[2.0, -9.0], upper=[9.0, 9.0], name="outside")
+    solution = solver.solve(graph, {x: np.array([[0.5, 0.0]])})
+    assert solution.status is fg.Status.LOCALLY_INFEASIBLE, solution.report()
+    assert solution.worst is not None
+    assert solution.violation > 0.5
+
+
+def test_sqp_history_names_the_route() -> None:
+    graph, guess = short_drive()
+    solution = SQP(qp_iterations=25).solve(graph, guess)
+    assert solution.converged
+    routes = {str(row.details["qp"]) for row in solution.history[1:]}
+    assert routes <= {"osqp", "piqp", "elastic piqp"}
+    assert "piqp" in routes, "25 iterations are too few for OSQP here, so the fallback must appear"
+
+
+def test_sqp_is_elastic_when_the_linearisation_is_infeasible() -> None:
+    """At the origin the linearised circle asks for an impossible step within the box."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(fg.prior, x, [1.0, 1.0])
+    graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0)
+    graph.bound(x, lower=-2.0, upper=2.0)
+    solution = SQP().solve(graph, {x: np.array([[0.01, 0.02]])})
+    assert solution.converged, solution.report()
+    assert any("elastic" in str(row.details.get("qp")) for row in solution.history)
+    np.testing.assert_allclose(solution[x], 0.5**0.5, atol=1e-6)
+
+
+def test_real_time_iteration_takes_one_step() -> None:
+    graph, guess = short_drive()
+    solution = SQP(max_iterations=1).solve(graph, guess)
+    assert solution.iterations == 1
+    assert solution.status is fg.Status.ITERATION_LIMIT
+
+
+def test_warm_start_needs_fewer_iterations() -> None:
+    graph, guess = short_drive()
+    x, u = graph.families["x"], graph.families["u"]
+    for solver in (AugmentedLagrangian(), SQP()):
+        run = solver.prepare(graph)
+        cold = run.solve(guess)
+        shifted = cold.shifted(x, u, by=0)
+        values = {**shifted.values, u: shifted.values[u] + 1e-4}
+        warm = run.solve(fg.Guess(values, shifted.multipliers))
+        assert warm.converged
+        assert warm.iterations < cold.iterations
+
+
+def test_unbounded_objective_is_reported() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize_scalar(lambda p: -(p[:, 0] ** 3), x)
+    graph.bound(x, lower=0.0)
+    solution = SQP(max_iterations=500).solve(graph, {x: np.array([[1.0]])})
+    assert solution.status is fg.Status.UNBOUNDED, solution.report()
+
+
+def test_time_limit_and_callback_end_a_solve() -> None:
+    graph, guess = short_drive()
+    assert AugmentedLagrangian(time_limit=0.0).solve(graph, guess).status is fg.Status.TIME_LIMIT
+    rows: list[fg.Iteration] = []
+
+    def stop(row: fg.Iteration) -> bool:
+        rows.append(row)
+        return row.number == 2
+
+    solution = SQP().solve(graph, guess, callback=stop)
+    assert solution.status is fg.Status.INTERRUPTED
+    assert [row.number for row in rows] == [0, 1, 2]
+
+
+def test_full_steps_and_no_fallback_are_options() -> None:
+    graph, guess = ecg2o((0.5, -0.5))
+    solution = SQP(full_steps=True, fallback=None, qp_iterations=4000).solve(graph, guess)
+    assert solution.converged, solution.report()
+    assert {row.details["qp"] for row in solution.history[1:]} == {"osqp"}
+
+
+def test_missing_qp_solver_is_named() -> None:
+    graph, guess = short_drive()
+    with pytest.raises(fg.BackendError, match="not installed"):
+        SQP(qp="no-such-solver").solve(graph, guess)

@@ -1,0 +1,124 @@
+"""Trajectories in the TUM format: one line ``t tx ty tz qx qy qz qw`` per pose, read by evo and most SLAM tools.
+
+Exactly eight fields separated by single blanks, no trailing blank, the quaternion with its scalar LAST (xyzw). Planar poses are
+lifted to z = 0 and a rotation about z. Format: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from unifg.errors import FileFormatError
+from unifg.typing import Array, ArrayLike
+
+__all__ = ["Trajectory", "read_tum", "write_tum"]
+
+_FIELDS = ("t", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
+_SMALLEST_NORM = 1e-6  # below it a quaternion says nothing about a rotation
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses over time.
+
+    Attributes:
+        time: (n,) [s].
+        position: (n, 3) [m].
+        quaternion_xyzw: (n, 4), of norm one, scalar last.
+    """
+
+    time: Array
+    position: Array
+    quaternion_xyzw: Array
+
+    def planar(self) -> Array:
+        """The poses seen from above: (n, 3) x, y, heading [m, m, rad]; height and tilt are dropped."""
+        x, y, z, w = self.quaternion_xyzw.T
+        heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        return np.column_stack([self.position[:, :2], heading])
+
+
+def write_tum(path: str | Path, time: ArrayLike, poses: ArrayLike) -> Path:
+    """Write planar poses, lifted to z = 0, with nine decimals.
+
+    Args:
+        path: file to write; an existing one is replaced.
+        time: (n,) [s].
+        poses: (n, 3) x, y, heading [m, m, rad].
+
+    Returns:
+        The path written.
+
+    Raises:
+        FileFormatError: the arrays do not fit each other, or a number is not finite.
+    """
+    path = Path(path)
+    times, planar = np.asarray(time, dtype=np.float64), np.asarray(poses, dtype=np.float64)
+    if times.ndim != 1 or planar.shape != (len(times), 3):
+        raise FileFormatError(
+            f"{path}: time {times.shape} and poses {planar.shape} must be (n,) and (n, 3) of the same n"
+        )
+    bad = np.flatnonzero(~(np.isfinite(times) & np.isfinite(planar).all(axis=1)))
+    if bad.size:
+        raise FileFormatError(f"{path}: pose {bad[0]} is not finite (t = {times[bad[0]]}, pose {planar[bad[0]]})")
+    zero = np.zeros_like(times)
+    half = planar[:, 2] / 2.0
+    rows = np.column_stack([times, planar[:, :2], zero, zero, zero, np.sin(half), np.cos(half)])
+    rows = np.round(rows, 9) + 0.0  # the sum turns -0.0 into 0.0
+    lines = [" ".join(f"{value:.9f}" for value in row) for row in rows.tolist()]
+    path.write_text("".join(line + "\n" for line in lines), encoding="ascii", newline="\n")
+    return path
+
+
+def read_tum(path: str | Path) -> Trajectory:
+    """Read a trajectory; empty lines and lines starting with ``#`` are skipped, quaternions are normalised.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The trajectory, in the order of the file.
+
+    Raises:
+        FileFormatError: the file is missing or a line is not eight finite numbers with a usable quaternion; names the line.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise FileFormatError(f"{path}: no such file; give a trajectory in the TUM format") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise FileFormatError(f"{path}: cannot be read as text ({error})") from error
+    rows = [
+        _parse(f"{path}, line {number}", line)
+        for number, line in enumerate(text.splitlines(), start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    table = np.array(rows, dtype=np.float64).reshape(-1, len(_FIELDS))
+    return Trajectory(table[:, 0], table[:, 1:4], table[:, 4:])
+
+
+def _parse(place: str, line: str) -> list[float]:
+    """The eight numbers of one line, its quaternion normalised."""
+    words = line.split()
+    if len(words) != len(_FIELDS):
+        hint = "; fields are separated by blanks, not commas" if "," in line else ""
+        raise FileFormatError(
+            f"{place}: {len(words)} fields, expected {len(_FIELDS)} ({' '.join(_FIELDS)}){hint}"
+        )
+    values = []
+    for name, word in zip(_FIELDS, words, strict=True):
+        try:
+            value = float(word)
+        except ValueError:
+            raise FileFormatError(f"{place}: field {name} is {word!r}, not a number") from None
+        if not np.isfinite(value):
+            raise FileFormatError(f"{place}: field {name} is {word}, not a finite number")
+        values.append(value)
+    norm = float(np.linalg.norm(values[4:]))
+    if norm < _SMALLEST_NORM:
+        raise FileFormatError(f"{place}: the quaternion {' '.join(words[4:])} has norm {norm:g}; expected one")
+    return values[:4] + [value / norm for value in values[4:]]
