@@ -1,9 +1,10 @@
-"""Hard clearance from discs and from the walls of a map."""
+"""Clearance from discs and from the walls of a map, as hard constraints and as soft margins."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from unifg.models.distance_map import DistanceMap
 from unifg.residuals import Residual, residual
 from unifg.typing import Array
 
@@ -42,3 +43,48 @@ disc_clearance = residual(_disc_clearance, _disc_clearance_jacobian, "disc clear
 x: (n, 3) SE(2) poses. centre: (M, 2) shared by all poses or (n, M, 2), one set for each, as for moving discs.
 radius: (M,) or (n, M); give the sum of the disc's and the robot's radii for hull clearance.
 """
+
+
+class _Wall:
+    def __init__(self, distance_map: DistanceMap) -> None:
+        self.distance_map = distance_map
+
+    def __call__(self, x: Array) -> Array:
+        return self.distance_map.distance(x[:, :2])[:, None]
+
+    def jacobian(self, x: Array) -> list[Array]:
+        _, gradient = self.distance_map.distance_and_gradient(x[:, :2])
+        block = np.zeros((len(x), 1, 3))
+        block[:, :, :2] = _in_body(x, gradient[:, None, :])
+        return [block]
+
+
+def wall_distance(distance_map: DistanceMap) -> Residual:
+    """``wall_distance(map)(x)``: signed distance of each SE(2) position to the nearest wall, (n, 1) [m]."""
+    function = _Wall(distance_map)
+    return residual(function, function.jacobian, "wall distance")
+
+
+class _Shortfall:
+    def __init__(self, distance: Residual, margin: float) -> None:
+        self.distance = distance
+        self.margin = margin
+
+    def __call__(self, *arguments: Array) -> Array:
+        return np.maximum(self.margin - self.distance.function(*arguments), 0.0)
+
+    def jacobian(self, *arguments: Array) -> list[Array]:
+        assert self.distance.jacobian is not None
+        short = self.distance.function(*arguments) < self.margin
+        return [np.where(short[:, :, None], -block, 0.0) for block in self.distance.jacobian(*arguments)]
+
+
+def shortfall(distance: Residual, margin: float) -> Residual:
+    """Turn a clearance into a soft margin: max(0, margin - distance), same shape, in metres.
+
+    Args:
+        distance: a residual with an attached Jacobian, such as ``disc_clearance``.
+        margin: distance below which the cost begins [m]; its square is continuously differentiable there.
+    """
+    function = _Shortfall(distance, margin)
+    return residual(function, function.jacobian, f"{distance.name} margin")

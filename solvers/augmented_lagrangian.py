@@ -114,7 +114,16 @@ class AugmentedLagrangian(Solver):
                 values, step, rejected = taken
                 lin = run.program.linearize(values)
                 after = primal.next_multipliers(lin.constraints, multipliers, penalty)
-                run.accept(lin, after, norm(step), 1.0, outer=outer, penalty=rho, damping=damping.value, rejected=rejected)
+                run.accept(
+                    lin,
+                    after,
+                    norm(step),
+                    1.0,
+                    outer=outer,
+                    penalty=rho,
+                    damping=damping.value,
+                    rejected=rejected,
+                )
                 if run.status is None and self._stop_rule(run, norm(step)):
                     return Status.STOP_RULE
                 if run.status is not None:

@@ -51,7 +51,8 @@ class GaussNewton(Solver):
             length = 1.0
             values, evaluation = workspace.trial(lin, step)
             while self.line_search and not (
-                evaluation.finite and evaluation.cost <= lin.cost + ARMIJO * length * slope + ROUNDING * max(1.0, lin.cost)
+                evaluation.finite
+                and evaluation.cost <= lin.cost + ARMIJO * length * slope + ROUNDING * max(1.0, lin.cost)
             ):
                 length *= 0.5
                 if length < SHORTEST:

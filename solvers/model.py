@@ -28,7 +28,8 @@ def model_step(
     Args:
         primal: the augmented objective and its factorisation.
         lin: where the model is built.
-        multipliers, penalty: (M,) of the augmented objective.
+        multipliers: (M,) of the augmented objective.
+        penalty: (M,) rho of every row.
         damping: relative to the diagonal of the Gauss-Newton Hessian at ``lin``.
 
     Returns:

@@ -49,7 +49,8 @@ class Primal:
 
     def active(self, constraints: Array, multipliers: Array, penalty: Array) -> BoolArray:
         """(M,) rows that contribute to the augmented objective."""
-        return self.program.equality | (self.next_multipliers(constraints, multipliers, penalty) != 0.0)
+        active: BoolArray = self.program.equality | (self.next_multipliers(constraints, multipliers, penalty) != 0.0)
+        return active
 
     def barrier(self, constraints: Array, multipliers: Array, penalty: Array) -> float:
         """Sum of the PHR terms."""
@@ -61,7 +62,8 @@ class Primal:
     def damping_diagonal(self, curvature: Array, damping: float) -> Array:
         """(size,) what Marquardt's damping adds to the diagonal."""
         entries = curvature[self.program.normal.diagonal]
-        return damping * np.maximum(entries, DIAGONAL_FLOOR * entries.max(initial=0.0) + 1e-300)
+        added: Array = damping * np.maximum(entries, DIAGONAL_FLOOR * entries.max(initial=0.0) + 1e-300)
+        return added
 
     def direction(self, curvature: Array, gradient: Array, added: Array | None = None) -> Array | None:
         """Solve (H + diag(added)) d = -gradient; None when the matrix cannot be factorised."""

@@ -37,8 +37,7 @@ class QP:
 
     def curved(self, step: Array) -> Array:
         """H d."""
-        upper = self.program.hessian.matrix(self.hessian)
-        return np.asarray(upper @ step + upper.T @ step - upper.diagonal() * step)
+        return self.program.hessian.times(self.hessian, step)
 
     def linear(self, step: Array) -> Array:
         """A d."""
@@ -94,7 +93,9 @@ def qp_error(qp: QP, step: Array, multipliers: Array) -> float:
     slack = np.where(np.isfinite(limit), np.abs(value - limit), 1.0)
     slip = np.where(program.equality, 0.0, np.abs(multipliers) * slack)
     return max(
-        float(np.abs(dual).max(initial=0.0)) / scale, float(outside.max(initial=0.0)), float(slip.max(initial=0.0)) / scale
+        float(np.abs(dual).max(initial=0.0)) / scale,
+        float(outside.max(initial=0.0)),
+        float(slip.max(initial=0.0)) / scale,
     )
 
 

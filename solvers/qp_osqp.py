@@ -38,14 +38,12 @@ class OsqpRoute:
         """Solve to ``accuracy``, polish, and measure."""
         lower, upper = np.maximum(qp.lower, -INFINITY), np.minimum(qp.upper, INFINITY)
         accuracy = max(accuracy, TIGHTEST)
-        jacobian = self.program.constraints.compress(qp.jacobian)
         if self._workspace is None:
             self._workspace = osqp.OSQP()
-            constraints = self.program.constraints.matrix(qp.jacobian)
             self._workspace.setup(
                 P=self.program.hessian.matrix(qp.hessian),
                 q=qp.gradient,
-                A=constraints,
+                A=self.program.constraints.matrix(qp.jacobian),
                 l=lower,
                 u=upper,
                 verbose=False,
@@ -58,7 +56,13 @@ class OsqpRoute:
             )
             self._accuracy = accuracy
         else:
-            self._workspace.update(q=qp.gradient, l=lower, u=upper, Px=qp.hessian, Ax=jacobian)
+            self._workspace.update(
+                q=qp.gradient,
+                l=lower,
+                u=upper,
+                Px=qp.hessian,
+                Ax=self.program.constraints.compress(qp.jacobian),
+            )
             if accuracy != self._accuracy:
                 self._workspace.update_settings(eps_abs=accuracy)
                 self._accuracy = accuracy

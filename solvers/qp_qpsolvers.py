@@ -36,7 +36,9 @@ class QpsolversRoute:
         """
         if name not in qpsolvers.available_solvers:
             known = ", ".join(sorted(qpsolvers.available_solvers)) or "none"
-            raise BackendError(f"QP solver '{name}' is not installed (installed: {known}); pip install 'qpsolvers[{name}]'")
+            raise BackendError(
+                f"QP solver '{name}' is not installed (installed: {known}); pip install 'qpsolvers[{name}]'"
+            )
         self.program = program
         self.name = name
         self._dense = name in qpsolvers.dense_solvers and name not in qpsolvers.sparse_solvers
@@ -83,7 +85,10 @@ class QpsolversRoute:
         self, hessian: sp.csc_matrix, gradient: Array, jacobian: sp.csr_matrix, lower: Array, upper: Array
     ) -> tuple[Array, Array, int] | None:
         equal = lower == upper
-        above, below = np.flatnonzero(~equal & np.isfinite(upper)), np.flatnonzero(~equal & np.isfinite(lower))
+        above, below = (
+            np.flatnonzero(~equal & np.isfinite(upper)),
+            np.flatnonzero(~equal & np.isfinite(lower)),
+        )
         fixed = np.flatnonzero(equal)
         inequalities = sp.vstack([jacobian[above], -jacobian[below]], format="csc") if len(above) + len(below) else None
         limits = np.concatenate([upper[above], -lower[below]]) if inequalities is not None else None

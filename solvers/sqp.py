@@ -18,6 +18,7 @@ from unifg.solver import Run, Solver
 from unifg.solvers.damping import norm
 from unifg.solvers.qp import QP, QPAnswer, Route, subproblem
 from unifg.solvers.qp_osqp import OsqpRoute
+from unifg.solvers.qp_piqp import PiqpRoute
 from unifg.solvers.qp_qpsolvers import QpsolversRoute
 from unifg.status import Status
 from unifg.typing import Array
@@ -25,6 +26,9 @@ from unifg.typing import Array
 ARMIJO = 1e-4
 SHORTEST = 1e-6
 ROUNDING = 1e-13
+GOOD_ENOUGH = 1e-5  # QP error that is always accepted from the fallback
+USABLE = 1e-3  # QP error below which a step may still be tried
+MISSES = 2  # in a row within one solve, after which the first route is no longer asked
 SMALLEST_DAMPING = 1e-9  # keeps H positive definite without showing in the step
 
 
@@ -57,6 +61,7 @@ class SQP(Solver):
         within = run.program.within_bounds(run.values)
         if within is not run.values and not self.full_steps:
             run.accept(run.program.linearize(within), run.multipliers, 0.0, 0.0, qp="none: moved within bounds")
+        workspace.start()
         merit = Merit(run.program, run.multipliers)
         damping = SMALLEST_DAMPING
         while run.status is None:
@@ -171,34 +176,54 @@ class Subproblems:
             BackendError: when a named solver is not installed.
         """
         self.program = program
-        self.fallback = None if options.fallback is None else QpsolversRoute(program, options.fallback)
-        self.first: Route = (
-            OsqpRoute(program, options.qp_iterations) if options.qp == "osqp" else QpsolversRoute(program, options.qp)
-        )
-        if program.constraints.count == 0 and options.qp == "osqp" and self.fallback is None:
+        unconstrained = program.constraints.count == 0
+        if unconstrained and options.qp == "osqp" and options.fallback is None:
             raise BackendError("SQP: OSQP needs at least one constraint; set fallback='piqp' or use GaussNewton")
+        self.fallback = None if options.fallback is None else _route(program, options.fallback, 0)
+        first = options.fallback if unconstrained and options.fallback is not None else options.qp
+        self.first = _route(program, first, options.qp_iterations)
+        self.elastic = None if options.fallback is None else QpsolversRoute(program, options.fallback)
+        self._misses = 0
+
+    def start(self) -> None:
+        """Begin a new solve: the first route is trusted again."""
+        self._misses = 0
 
     def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
         """Try the first route, then the fallback, then the elastic problem."""
-        if self.program.constraints.count == 0 and self.fallback is not None:
-            return self.fallback.solve(qp, multipliers, accuracy)
-        answer = self.first.solve(qp, multipliers, accuracy)
-        if answer.error <= 10.0 * accuracy or self.fallback is None:
-            return answer
-        if not answer.infeasible:
-            second = self.fallback.solve(qp, multipliers, accuracy)
-            if second.error <= max(10.0 * accuracy, 1e-5):
-                return second
-            if answer.error <= 1e-3 or second.error <= 1e-3:
-                return answer if answer.error <= second.error else second
-        price = max(10.0 * float(np.abs(multipliers).max(initial=0.0)), 1e3)
-        return self.fallback.solve_elastic(qp, price)
+        enough = max(10.0 * accuracy, GOOD_ENOUGH)
+        if self.fallback is None or self.elastic is None:
+            return self.first.solve(qp, multipliers, accuracy)
+        answers = []
+        if self._misses < MISSES:
+            answers.append(self.first.solve(qp, multipliers, accuracy))
+            if answers[-1].error <= 10.0 * accuracy:
+                self._misses = 0
+                return answers[-1]
+            self._misses += 1
+        if not any(answer.infeasible for answer in answers):
+            answers.append(self.fallback.solve(qp, multipliers, accuracy))
+            if answers[-1].error <= enough:
+                return answers[-1]
+        best = min(answers, key=lambda answer: answer.error)
+        if best.error <= USABLE:
+            return best
+        return self.elastic.solve_elastic(qp, max(10.0 * float(np.abs(multipliers).max(initial=0.0)), 1e3))
 
-    def correct(self, qp: QP, answer: QPAnswer, trial: Evaluation, lin: Linearization, accuracy: float) -> QPAnswer | None:
+    def correct(
+        self, qp: QP, answer: QPAnswer, trial: Evaluation, lin: Linearization, accuracy: float
+    ) -> QPAnswer | None:
         """Second-order correction: aim at the constraints as found after the full step."""
         bend = trial.constraints - lin.constraints - qp.linear(answer.step)
-        route = self.first if answer.route == self.first.name else self.fallback
-        if route is None:
-            return None
-        corrected = route.solve(qp.shifted(-bend), answer.multipliers, accuracy)
-        return corrected if corrected.error <= 1e-3 else None
+        for route in (self.first, self.fallback):
+            if route is not None and route.name == answer.route:
+                corrected = route.solve(qp.shifted(-bend), answer.multipliers, accuracy)
+                return corrected if corrected.error <= USABLE else None
+        return None
+
+
+def _route(program: Program, name: str, osqp_iterations: int) -> Route:
+    """OSQP and PIQP are called directly, everything else through qpsolvers."""
+    if name == "osqp":
+        return OsqpRoute(program, osqp_iterations)
+    return PiqpRoute(program) if name == "piqp" else QpsolversRoute(program, name)

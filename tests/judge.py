@@ -38,7 +38,9 @@ def judge(graph: fg.Graph, solution: fg.Solution, data: dict[Data, Array] | None
     data = data or {}
     values = solution.values
     moved = [(family, row, column) for family, row, column in _free(graph)]
-    gradient = np.array([(_f(graph, _at(values, m, STEP), data) - _f(graph, _at(values, m, -STEP), data)) for m in moved])
+    gradient = np.array(
+        [(_f(graph, _at(values, m, STEP), data) - _f(graph, _at(values, m, -STEP), data)) for m in moved]
+    )
     gradient /= 2.0 * STEP
     duals = _duals(graph, solution)
     scale = max(1.0, float(np.abs(duals).mean()) / 100.0) if len(duals) else 1.0

@@ -133,7 +133,10 @@ def hs48() -> tuple[fg.Graph, Guess]:
     x = graph.variables("x", fg.Rn(5), 1)
     graph.minimize(lambda p: np.stack([p[:, 0] - 1.0, p[:, 1] - p[:, 2], p[:, 3] - p[:, 4]], axis=1), x)
     graph.constrain(
-        lambda p: np.stack([p.sum(axis=1), p[:, 2] - 2.0 * (p[:, 3] + p[:, 4])], axis=1), x, lower=[5, -3], upper=[5, -3]
+        lambda p: np.stack([p.sum(axis=1), p[:, 2] - 2.0 * (p[:, 3] + p[:, 4])], axis=1),
+        x,
+        lower=[5, -3],
+        upper=[5, -3],
     )
     return graph, {x: np.array([[3.0, 5.0, -3.0, 2.0, -2.0]])}
 
@@ -162,9 +165,7 @@ def pose_beside_disc() -> tuple[fg.Graph, Guess]:
     graph = fg.Graph()
     x = graph.variables("x", fg.SE2, 1)
     graph.minimize(fg.prior, x, [0.1, 0.0, 0.3], sigma=0.5)
-    graph.constrain(
-        obstacles.disc_clearance, x, np.array([[0.0, 0.0]]), np.array([0.5]), lower=0.0, name="keep-out"
-    )
+    graph.constrain(obstacles.disc_clearance, x, np.array([[0.0, 0.0]]), np.array([0.5]), lower=0.0, name="keep-out")
     return graph, {x: np.array([[1.0, 0.4, 0.0]])}
 
 
@@ -223,10 +224,21 @@ HUBER = 0.5 * (INLIERS + 2.0 * 0.5 * (8.0 - 0.8 / 3.0) - 0.25)
 
 PROBLEMS = [
     *[
-        Problem(f"ecg2o{start}", lambda start=start: ecg2o(start), 1.0, answer={"x": [[0, 0]]}, duals={"curve": [[-1]]})  # type: ignore[misc]
+        Problem(
+            f"ecg2o{start}",
+            lambda start=start: ecg2o(start),
+            1.0,
+            answer={"x": [[0, 0]]},
+            duals={"curve": [[-1]]},
+        )  # type: ignore[misc]
         for start in STARTS
     ],
-    Problem("ecg2o inequality", ecg2o_inequality, 0.5 * ((ROOT5 - 1) ** 2 + (2 * ROOT5 - 1) ** 2), answer={"x": [[ROOT5, 2 * ROOT5]]}),
+    Problem(
+        "ecg2o inequality",
+        ecg2o_inequality,
+        0.5 * ((ROOT5 - 1) ** 2 + (2 * ROOT5 - 1) ** 2),
+        answer={"x": [[ROOT5, 2 * ROOT5]]},
+    ),
     Problem(
         "three-variable qp",
         three_variable_qp,
@@ -235,7 +247,13 @@ PROBLEMS = [
         duals={"first": [[69.0]], "second": [[-26.0]]},
     ),
     Problem("inactive inequality", inactive_inequality, 0.0, answer={"x": [[0.2]]}, duals={"limit": [[0.0]]}),
-    Problem("active bounds", active_bounds, 4.0, answer={"x": [[1.0, -1.0, 0.5]]}, duals={"box": [[2.0, -2.0, 0.0]]}),
+    Problem(
+        "active bounds",
+        active_bounds,
+        4.0,
+        answer={"x": [[1.0, -1.0, 0.5]]},
+        duals={"box": [[2.0, -2.0, 0.0]]},
+    ),
     Problem("rosenbrock", rosenbrock, 0.0, constrained=False, answer={"x": [[1.0, 1.0]]}),
     Problem("hs6", hs6, 0.0, answer={"x": [[1.0, 1.0]]}),
     Problem("hs65", hs65, 0.5 * 0.9535288567, answer={"x": [[3.650461821, 3.650461821, 4.6204170507]]}),
@@ -249,7 +267,12 @@ PROBLEMS = [
     ),
     Problem("huber line", huber_line, HUBER, constrained=False, answer={"x": [[0.8 / 3.0]]}),
     Problem("pose beside disc", pose_beside_disc, 0.32, duals={"keep-out": [[-1.6]]}),
-    Problem("rotation within limits", rotation_within_limits, 0.5 * (3.0 - 2 * np.pi / 3) ** 2, answer={"r": [[2 * np.pi / 3]]}),
+    Problem(
+        "rotation within limits",
+        rotation_within_limits,
+        0.5 * (3.0 - 2 * np.pi / 3) ** 2,
+        answer={"r": [[2 * np.pi / 3]]},
+    ),
     Problem("product state", product_state, 3.0, duals={"speed": [[0.0], [1.0]]}),
     Problem("short drive", short_drive, np.nan),
     Problem("inverse distance", inverse_distance, 1.5, scalar=True, answer={"x": [[1.0]]}),

@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from judge import judge
-from problems import short_drive
 
 import unifg as fg
+from judge import judge
+from problems import short_drive
 from unifg.models import obstacles, unicycle
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, LevenbergMarquardt
 from unifg.typing import Array
@@ -222,25 +222,49 @@ REFUSALS: list[tuple[str, Breaks, str]] = [
     ("no members", lambda g, x: g.variables("y", fg.Rn(1), 0), "at least one"),
     ("no variable", lambda g, x: g.minimize(fg.prior, np.zeros(2), [0.0, 0.0]), "no variable"),
     ("lengths", lambda g, x: g.minimize(fg.difference, x[:2], x[:3]), "unclear.*has 2.*has 3"),
-    ("sigma and information", lambda g, x: g.minimize(fg.prior, x, [0, 0], sigma=1.0, information=np.eye(2)), "not both"),
+    (
+        "sigma and information",
+        lambda g, x: g.minimize(fg.prior, x, [0, 0], sigma=1.0, information=np.eye(2)),
+        "not both",
+    ),
     ("lower above upper", lambda g, x: g.bound(x, lower=[0.0, 2.0], upper=1.0), "lower exceeds upper"),
     ("nan limit", lambda g, x: g.bound(x, upper=np.nan), "NaN"),
     ("fixed twice", lambda g, x: (g.fix(x[0], [0.0, 0.0]), g.fix(x[:2], [0.0, 0.0])), r"x\[0\] is fixed"),
     ("fix shape", lambda g, x: g.fix(x[0], [0.0, 0.0, 0.0]), "shape"),
     ("fix nan", lambda g, x: g.fix(x[1], [0.0, np.nan]), r"x\[1\]"),
     ("out of range", lambda g, x: x[7], "family 'x' has 4"),
-    ("name taken", lambda g, x: (g.bound(x, upper=1, name="a"), g.bound(x, lower=0, name="a")), "'a' is taken"),
+    (
+        "name taken",
+        lambda g, x: (g.bound(x, upper=1, name="a"), g.bound(x, lower=0, name="a")),
+        "'a' is taken",
+    ),
     ("other graph", lambda g, x: g.minimize(fg.prior, line()[1], [0.0, 0.0]), "another graph"),
     ("data nan", lambda g, x: g.data("z", [np.nan]), "NaN"),
-    ("residual shape", lambda g, x: (g.minimize(lambda p: p[:, 0], x), g.compile()), r"returned shape \(4,\)"),
-    ("sigma shape", lambda g, x: (g.minimize(fg.prior, x, [0, 0], sigma=np.ones(3)), g.compile()), "sigma has shape"),
-    ("negative sigma", lambda g, x: (g.minimize(fg.prior, x, [0, 0], sigma=-1.0), g.compile()), "must be positive"),
+    (
+        "residual shape",
+        lambda g, x: (g.minimize(lambda p: p[:, 0], x), g.compile()),
+        r"returned shape \(4,\)",
+    ),
+    (
+        "sigma shape",
+        lambda g, x: (g.minimize(fg.prior, x, [0, 0], sigma=np.ones(3)), g.compile()),
+        "sigma has shape",
+    ),
+    (
+        "negative sigma",
+        lambda g, x: (g.minimize(fg.prior, x, [0, 0], sigma=-1.0), g.compile()),
+        "must be positive",
+    ),
     (
         "indefinite information",
         lambda g, x: (g.minimize(fg.prior, x, [0, 0], information=np.diag([1.0, -1.0])), g.compile()),
         "negative eigenvalue",
     ),
-    ("untouched", lambda g, x: (g.minimize(fg.prior, x[:2], [0.0, 0.0]), g.compile()), r"x\[2\] is in no cost"),
+    (
+        "untouched",
+        lambda g, x: (g.minimize(fg.prior, x[:2], [0.0, 0.0]), g.compile()),
+        r"x\[2\] is in no cost",
+    ),
     ("bound on a group", lambda g, x: g.bound(g.variables("p", fg.SE2, 1), upper=1.0), "not Rn"),
 ]
 
@@ -369,7 +393,10 @@ def test_check_finds_dependent_constraints_and_bad_residuals() -> None:
     graph.constrain(lambda p: p[:, :1], x[0], lower=1.0, upper=1.0, name="once")
     graph.constrain(lambda p: 2.0 * p[:, :1], x[0], lower=2.0, upper=2.0, name="twice")
     found = graph.check({x: np.zeros((2, 2))}).findings
-    assert {(f.kind, f.term) for f in found} == {("dependent constraints", "once"), ("dependent constraints", "twice")}
+    assert {(f.kind, f.term) for f in found} == {
+        ("dependent constraints", "once"),
+        ("dependent constraints", "twice"),
+    }
     graph.minimize(lambda p: 1.0 / p[:, :1], x, name="inverse")
     with np.errstate(all="ignore"):
         found = graph.check({x: np.array([[1.0, 1.0], [0.0, 1.0]])}).findings

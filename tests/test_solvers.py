@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from judge import judge
-from problems import PROBLEMS, Problem, ecg2o, inactive_inequality, short_drive
 
 import unifg as fg
+from judge import judge
+from problems import PROBLEMS, Problem, ecg2o, inactive_inequality, short_drive
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, LevenbergMarquardt
 
 BACKENDS: list[fg.Solver] = [

@@ -1,13 +1,13 @@
 """unifg: robot estimation and robot control as one factor graph on Lie groups.
 
-    import unifg as fg
-    from unifg.solvers import SQP
+import unifg as fg
+from unifg.solvers import SQP
 
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 2)
-    graph.fix(x[0], [0.0, 0.0, 0.0])
-    graph.minimize(fg.between, x[0], x[1], [1.0, 0.0, 0.3], sigma=0.1)
-    solution = SQP().solve(graph, {x: np.zeros((2, 3))})
+graph = fg.Graph()
+x = graph.variables("x", fg.SE2, 2)
+graph.fix(x[0], [0.0, 0.0, 0.0])
+graph.minimize(fg.between, x[0], x[1], [1.0, 0.0, 0.3], sigma=0.1)
+solution = SQP().solve(graph, {x: np.zeros((2, 3))})
 """
 
 from importlib.metadata import PackageNotFoundError, version

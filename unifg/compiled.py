@@ -83,12 +83,10 @@ class CompiledTerm:
     def bind(self, data: Bound) -> None:
         """Take the present value of every data argument."""
         self._data = data
-        self._arguments: list[Any] = [
-            data.get(a, a.value) if isinstance(a, Data) else a for a in self.term.arguments
-        ]
+        self._arguments: list[Any] = [data.get(a, a.value) if isinstance(a, Data) else a for a in self.term.arguments]
         active = self.term.active
         mask = data.get(active, active.value) if isinstance(active, Data) else active
-        self.active: BoolArray | None = None if mask is None or mask.all() else mask.astype(bool)  # type: ignore[assignment]
+        self.active: BoolArray | None = None if mask is None or mask.all() else mask.astype(bool)
         if hasattr(self, "size"):
             self._bind_parameters(data)
 
@@ -179,16 +177,20 @@ class CompiledTerm:
         if (lowest < -1e-9).any():
             index = int(np.argmin(np.atleast_1d(lowest)))
             raise GraphError(
-                f"term '{self.name}': information of factor {index} has a negative eigenvalue", term=self.name, index=index
+                f"term '{self.name}': information of factor {index} has a negative eigenvalue",
+                term=self.name,
+                index=index,
             )
-        return np.sqrt(np.maximum(eigenvalues, 0.0))[..., :, None] * np.swapaxes(vectors, -1, -2)
+        root: Array = np.sqrt(np.maximum(eigenvalues, 0.0))[..., :, None] * np.swapaxes(vectors, -1, -2)
+        return root
 
     def _limit(self, limit: Array, which: str, none: float) -> Array:
         try:
             full = np.array(np.broadcast_to(limit, (self.count, self.size)))
         except ValueError as error:
             raise GraphError(
-                f"term '{self.name}': {which} has shape {limit.shape}, which does not fit {self.shape}", term=self.name
+                f"term '{self.name}': {which} has shape {limit.shape}, which does not fit {self.shape}",
+                term=self.name,
             ) from error
         if self.active is not None:
             full[~self.active] = none
@@ -207,7 +209,7 @@ class CompiledTerm:
     def _checked(self, residual: Array) -> Array:
         if residual.shape != self.shape:
             raise GraphError(
-                f"term '{self.name}': its function returned shape {residual.shape} where it returned {self.shape} before",
+                f"term '{self.name}': its function returned shape {residual.shape}, and {self.shape} before",
                 term=self.name,
             )
         return residual

@@ -144,7 +144,12 @@ class Graph:
         return self._add(Constraint(unique, wrapped, normal, active, count, lower, upper))
 
     def bound(
-        self, variable: Variable, *, lower: Parameter = -np.inf, upper: Parameter = np.inf, name: str | None = None
+        self,
+        variable: Variable,
+        *,
+        lower: Parameter = -np.inf,
+        upper: Parameter = np.inf,
+        name: str | None = None,
     ) -> str:
         """Limit Rn variables, or Rn components of a product, entry by entry.
 

@@ -32,7 +32,9 @@ class Iteration:
     details: dict[str, float | int | str] = field(default_factory=dict)
 
 
-HEADER = f"{'iter':>4} {'cost':>13} {'station.':>9} {'violation':>9} {'complem.':>9} {'|step|':>9} {'length':>7}  details"
+HEADER = (
+    f"{'iter':>4} {'cost':>13} {'station.':>9} {'violation':>9} {'complem.':>9} {'|step|':>9} {'length':>7}  details"
+)
 
 
 def line(row: Iteration) -> str:

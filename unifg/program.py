@@ -154,7 +154,10 @@ class Program:
             raise GraphError(f"term '{name}': lower exceeds upper in factor {index}", term=name, index=index)
         self.equality = self.lower == self.upper
         self.fixed_values = [
-            (fix, np.asarray(checked.get(fix.value, fix.value.value) if isinstance(fix.value, Data) else fix.value))
+            (
+                fix,
+                np.asarray(checked.get(fix.value, fix.value.value) if isinstance(fix.value, Data) else fix.value),
+            )
             for fix in self.graph.fixes
         ]
 
@@ -181,7 +184,8 @@ class Program:
             array = np.array(guess[family], dtype=np.float64)
             if array.shape != shape:
                 raise GraphError(
-                    f"the guess for family '{family.name}' has shape {array.shape}, expected {shape}", family=family.name
+                    f"the guess for family '{family.name}' has shape {array.shape}, expected {shape}",
+                    family=family.name,
                 )
             values[family] = array
         for fix, value in self.fixed_values:
@@ -300,7 +304,16 @@ class Program:
                 gradient += scatter(columns.ravel(), slope.ravel(), self.width)
                 hessians.append(_convex(curvature)[self._scalar_keep[term.name]])
         return Linearization(
-            values, cost, residual, jacobian, constraints, constraint_jacobian, gradient, _stacked(hessians), norms, weights
+            values,
+            cost,
+            residual,
+            jacobian,
+            constraints,
+            constraint_jacobian,
+            gradient,
+            _stacked(hessians),
+            norms,
+            weights,
         )
 
     # ---------------------------------------------------------------- products backends need

@@ -180,7 +180,9 @@ class Solution:
 
     def _require(self, selection: Selection) -> None:
         if selection.family not in self._lin.values:
-            raise GraphError(f"family '{selection.family.name}' is not part of this solution", family=selection.family.name)
+            raise GraphError(
+                f"family '{selection.family.name}' is not part of this solution", family=selection.family.name
+            )
 
 
 def _shifted_rows(stages: IntArray, by: int) -> IntArray:

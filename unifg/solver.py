@@ -15,7 +15,7 @@ from unifg.compiled import Values
 from unifg.errors import BackendError, GraphError, NotConverged
 from unifg.graph import Graph
 from unifg.history import HEADER, Iteration, line
-from unifg.kkt import Optimality, infeasible_stationary, optimality
+from unifg.kkt import infeasible_stationary, optimality
 from unifg.program import Linearization, Program
 from unifg.solution import Guess, Solution
 from unifg.status import Status
@@ -91,7 +91,7 @@ class Solver(ABC):
         self.require(program)
         return Prepared(self, program)
 
-    def require(self, program: Program) -> None:
+    def require(self, program: Program) -> None:  # noqa: B027 - most backends take everything
         """Raise BackendError when the backend cannot take this class of problem."""
 
     @abstractmethod
@@ -190,7 +190,14 @@ class Run:
         elif status.converged:
             status = Status.STALLED
         return Solution(
-            self.program, self.lin, self.multipliers, status, measured, self.history, self.seconds, self._solver.name
+            self.program,
+            self.lin,
+            self.multipliers,
+            status,
+            measured,
+            self.history,
+            self.seconds,
+            self._solver.name,
         )
 
     def _decide(self) -> Status | None:
@@ -269,12 +276,15 @@ class Prepared:
         for name, value in duals.items():
             if name not in terms:
                 known = ", ".join(terms) or "none"
-                raise GraphError(f"multipliers given for '{name}', which is no constraint (there are: {known})", term=name)
+                raise GraphError(
+                    f"multipliers given for '{name}', which is no constraint (there are: {known})", term=name
+                )
             term, rows = terms[name]
             array = np.asarray(value, dtype=np.float64)
             if array.shape != (term.count, term.size):
                 raise GraphError(
-                    f"multipliers of '{name}' have shape {array.shape}, expected {(term.count, term.size)}", term=name
+                    f"multipliers of '{name}' have shape {array.shape}, expected {(term.count, term.size)}",
+                    term=name,
                 )
             if not np.isfinite(array).all():
                 raise GraphError(f"multipliers of '{name}' are not finite", term=name)

@@ -19,7 +19,8 @@ def scatter(slots: IntArray, numbers: Array, size: int) -> Array:
     """Sum ``numbers`` into ``size`` slots."""
     if not len(slots):  # bincount of nothing counts in integers
         return np.zeros(size)
-    return np.bincount(slots, weights=numbers, minlength=size)
+    sums: Array = np.bincount(slots, weights=numbers, minlength=size)
+    return sums
 
 
 class Symmetric:
@@ -38,6 +39,7 @@ class Symmetric:
         self._keys = np.unique(np.concatenate(keys))
         self.indices = self._keys % max(size, 1)
         self.indptr = np.searchsorted(self._keys, np.arange(size + 1) * size)
+        self._column = self._keys // max(size, 1)
         self.diagonal = self.positions(diagonal, diagonal)
 
     @property
@@ -48,6 +50,13 @@ class Symmetric:
     def positions(self, rows: IntArray, columns: IntArray) -> IntArray:
         """Where the given entries are stored."""
         return np.searchsorted(self._keys, columns * self.size + rows)
+
+    def times(self, data: Array, vector: Array) -> Array:
+        """The symmetric matrix with upper triangle ``data`` times a vector."""
+        above = data * vector[self._column]
+        below = data * vector[self.indices]
+        below[self.diagonal] = 0.0
+        return scatter(self.indices, above, self.size) + scatter(self._column, below, self.size)
 
     def matrix(self, data: Array) -> sp.csc_matrix:
         """Upper triangle as a SciPy matrix sharing ``data``."""

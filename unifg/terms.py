@@ -126,6 +126,7 @@ def prepare_arguments(name: str, arguments: tuple[Any, ...], active: Any) -> tup
     if len({length for _, length in lengths}) > 1:
         found = ", ".join(f"{what} has {length}" for what, length in lengths)
         raise GraphError(
-            f"term '{name}': the number of factors is unclear: {found}. Only selections of length 1 are shared", term=name
+            f"term '{name}': the number of factors is unclear: {found}. Only selections of length 1 are shared",
+            term=name,
         )
     return normal, active, lengths[0][1] if lengths else 1

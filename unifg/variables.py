@@ -129,7 +129,8 @@ class Data:
         if array.dtype != bool and not np.isfinite(array).all() and np.isnan(array).any():
             where = np.argwhere(np.isnan(array))[0]
             raise GraphError(
-                f"data '{self.name}' contains NaN at {tuple(map(int, where))}", index=int(where[0]) if where.size else None
+                f"data '{self.name}' contains NaN at {tuple(map(int, where))}",
+                index=int(where[0]) if where.size else None,
             )
         return array
 

@@ -1,0 +1,76 @@
+# Everything needs only make and Python >= 3.11: the first target you call builds a virtual environment in .venv.
+#
+#   make demo     drive a robot through the shipped building, write out/demo/scene.html
+#   make test     run the tests
+#   make lint     check style (ruff) and types (mypy)
+#   make bench    run the timing scripts in benchmarks/
+#   make fences   run the shell commands shown in README.md and docs/
+#   make clean    remove everything made here
+#
+# Choose the interpreter with PYTHON=/path/to/python3, the number of test processes with WORKERS=4, and what pytest
+# gets besides with PYTEST='-k planner'.
+
+# The first of these that is new enough; python3 when none is, so that the message below names its version.
+PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 python; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo $$p; exit; }; done; echo python3)
+WORKERS ?= 2
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+# Matrices here are small: more threads per process only make the processes wait for each other.
+ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
+
+.PHONY: help demo test lint types bench fences clean
+.DELETE_ON_ERROR:
+
+help:
+	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
+
+demo: $(VENV)/ready
+	$(BIN)/unifg run navigation --obstacles 3 --seed 0 --out out/demo
+
+test: $(VENV)/ready
+	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(PYTEST)
+
+lint: $(VENV)/ready-dev
+	$(BIN)/ruff check --output-format concise .
+	$(BIN)/mypy
+
+types: $(VENV)/ready-dev
+	$(BIN)/mypy
+
+bench: $(VENV)/ready-bench
+	@found=no; for script in benchmarks/bench_*.py; do \
+		test -f "$$script" || continue; found=yes; \
+		echo "$(BIN)/python $$script"; $(ONE_THREAD) $(BIN)/python "$$script" || exit 1; \
+	done; test $$found = yes || echo "benchmarks/ holds no bench_*.py"
+
+fences: $(VENV)/ready
+	$(BIN)/python docs/check_shell_fences.py
+
+clean:
+	rm -rf $(VENV) out build dist unifg.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage htmlcov
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Each file marks one finished installation; a change of pyproject.toml repeats it.
+$(VENV)/ready: pyproject.toml
+	@command -v $(PYTHON) >/dev/null || { \
+		echo "unifg needs Python 3.11 or newer and found no '$(PYTHON)'. Install one, or name it: make PYTHON=/path/to/python3" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; v = sys.version.split()[0]; sys.exit(None if sys.version_info >= (3, 11) else \
+		f"unifg needs Python 3.11 or newer, and $(PYTHON) is {v}. Name a newer one: make PYTHON=/path/to/python3")'
+	@echo "Building $(VENV) and installing unifg into it (once, a minute or two)"
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
+		echo "$(PYTHON) cannot build virtual environments; on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
+	@$(PIP) install --editable ".[scenarios,test]"
+	@touch $@
+
+$(VENV)/ready-dev: $(VENV)/ready
+	@echo "Installing ruff and mypy into $(VENV)"
+	@$(PIP) install --editable ".[scenarios,dev]"
+	@touch $@
+
+$(VENV)/ready-bench: $(VENV)/ready
+	@echo "Installing the packages we compare with into $(VENV)"
+	@$(PIP) install --editable ".[scenarios,test,bench]"
+	@touch $@

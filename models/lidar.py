@@ -1,0 +1,88 @@
+"""Lidar end-points on a distance map: localisation as registration (Bazzana et al. 2022, sections IV and VII-A).
+
+A beam's end-point, carried into the world by the estimated pose, should lie on an occupied surface: its signed
+distance on the map is the residual (eq. 5, signed so that it stays smooth across the surface). The paper's rules
+for outliers - a quarter of the information below one cell, nothing beyond 0.3 m, no beams beyond 10 m - are a loss
+whose weights are held during one linearisation and its line search.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from unifg.models.distance_map import DistanceMap
+from unifg.residuals import Residual, residual
+from unifg.robust import Reweighted
+from unifg.typing import Array, BoolArray
+
+DISCARD_BEYOND = 0.3  # [m] to the nearest surface
+DROP_BEYOND = 10.0  # [m] range
+NEAR_WEIGHT = 0.25
+
+
+class _Endpoint:
+    def __init__(self, distance_map: DistanceMap) -> None:
+        self.distance_map = distance_map
+
+    def __call__(self, x: Array, beams: Array) -> Array:
+        return self.distance_map.distance(in_world(x, beams))[:, None]
+
+    def jacobian(self, x: Array, beams: Array) -> list[Array]:
+        _, gradient = self.distance_map.distance_and_gradient(in_world(x, beams))
+        cosine, sine = np.cos(x[:, 2]), np.sin(x[:, 2])
+        block = np.empty((len(x), 1, 3))
+        along = cosine * gradient[:, 0] + sine * gradient[:, 1]
+        across = cosine * gradient[:, 1] - sine * gradient[:, 0]
+        block[:, 0, 0], block[:, 0, 1] = along, across
+        block[:, 0, 2] = across * beams[:, 0] - along * beams[:, 1]
+        return [block]
+
+
+def endpoint(distance_map: DistanceMap) -> Residual:
+    """``endpoint(map)(x, beams)``: distance of each end-point to the nearest surface, (n, 1) [m].
+
+    Args:
+        distance_map: signed distance of the map.
+
+    Returns:
+        A residual of SE(2) poses x (n, 3) and end-points (n, 2) [m] in the sensor frame.
+    """
+    function = _Endpoint(distance_map)
+    return residual(function, function.jacobian, "lidar end-points")
+
+
+def in_world(x: Array, points: Array) -> Array:
+    """Carry (n, 2) points of the body frame into the world with (n, 3) or (1, 3) poses."""
+    cosine, sine = np.cos(x[:, 2]), np.sin(x[:, 2])
+    world = np.empty((max(len(x), len(points)), 2))
+    world[:, 0] = x[:, 0] + cosine * points[:, 0] - sine * points[:, 1]
+    world[:, 1] = x[:, 1] + sine * points[:, 0] + cosine * points[:, 1]
+    return world
+
+
+class _Rule:
+    """The paper's weights as a function of the squared whitened residual."""
+
+    def __init__(self, sigma: float, resolution: float) -> None:
+        self.near = (resolution / sigma) ** 2
+        self.far = (DISCARD_BEYOND / sigma) ** 2
+
+    def __call__(self, squared: Array) -> Array:
+        return np.where(squared < self.near, NEAR_WEIGHT, np.where(squared < self.far, 1.0, 0.0))
+
+
+def endpoint_loss(sigma: float, resolution: float) -> Reweighted:
+    """Weights of section VII-A for beams of standard deviation ``sigma`` [m] on cells of ``resolution`` [m]."""
+    return Reweighted(_Rule(sigma, resolution))
+
+
+def usable(ranges: Array) -> BoolArray:
+    """(n,) beams that take part: a return was measured, and not beyond 10 m."""
+    with np.errstate(invalid="ignore"):
+        return np.isfinite(ranges) & (ranges <= DROP_BEYOND)
+
+
+def beam_endpoints(ranges: Array, angles: Array) -> Array:
+    """(n, 2) end-points in the sensor frame [m]; unusable beams end at the origin."""
+    lengths = np.where(usable(ranges), ranges, 0.0)
+    return np.stack([lengths * np.cos(angles), lengths * np.sin(angles)], axis=1)

@@ -1,0 +1,241 @@
+"""Where to go? A model-predictive controller as a factor graph (Bazzana et al. 2022, section V).
+
+Costs: distance to reference poses along the path (eq. 8), control effort, control rate, soft margins to walls and
+discs. Constraints: unicycle dynamics, velocity limits, hard clearance from walls and from tracked discs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+import unifg as fg
+from unifg.models import obstacles, unicycle
+from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.perception import Tracks, nearest
+from unifg.solvers import SQP, AugmentedLagrangian
+from unifg.typing import Array
+
+FAR_AWAY = 1e3  # [m]; where an unused disc waits
+LEFT_BEHIND = 0.6  # [m] between the ends of plan and reference
+PATIENCE = 5  # ticks of being left behind before the plan starts over from the reference
+
+
+@dataclass(frozen=True)
+class ControllerSettings:
+    """Weights and limits of the controller.
+
+    Attributes:
+        horizon: steps N.
+        dt: sampling time [s].
+        speed: reference speed along the path [m/s].
+        limits: greatest |v| [m/s] and |omega| [rad/s].
+        pose_sigma: (x, y, theta) of the stage cost [m, m, rad].
+        terminal_sigma: the same at the end of the horizon.
+        control_sigma: (v, omega) deviation from the reference control [m/s, rad/s].
+        rate_sigma: (v, omega) change between samples [m/s, rad/s].
+        robot_radius: [m].
+        wall_clearance: least distance of the hull to walls [m].
+        disc_clearance: least distance of the hull to tracked discs [m].
+        margin: distance of the hull below which the soft costs begin [m].
+        margin_sigma: [m].
+        discs: tracked discs considered at once.
+        relaxation: how fast the robot must regain a clearance it finds violated [m per step].
+        tolerance: of the KKT test.
+        feasible: largest violation of a plan that may be driven.
+    """
+
+    horizon: int = 30
+    dt: float = 0.1
+    speed: float = 0.9
+    limits: tuple[float, float] = (1.0, 1.0)
+    pose_sigma: tuple[float, float, float] = (0.3, 0.3, 0.6)
+    terminal_sigma: tuple[float, float, float] = (0.1, 0.1, 0.2)
+    control_sigma: tuple[float, float] = (0.5, 1.0)
+    rate_sigma: tuple[float, float] = (0.3, 0.5)
+    robot_radius: float = 0.17
+    wall_clearance: float = 0.01
+    disc_clearance: float = 0.06
+    margin: float = 0.2
+    margin_sigma: float = 0.15
+    discs: int = 3
+    relaxation: float = 0.005
+    tolerance: float = 1e-4
+    feasible: float = 5e-4
+
+
+def backend(name: str, tolerance: float) -> fg.Solver:
+    """The backend of a control loop by its short name.
+
+    Raises:
+        ScenarioError: for an unknown name.
+    """
+    if name == "sqp":
+        return SQP(tolerance=tolerance, max_iterations=20)
+    if name == "alm":
+        return AugmentedLagrangian(tolerance=tolerance, max_iterations=60)
+    raise fg.ScenarioError(f"unknown solver '{name}': choose alm or sqp")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a tick decided.
+
+    Attributes:
+        control: (2,) to be applied now [m/s, rad/s].
+        states: (N + 1, 3) predicted poses [m, m, rad].
+        status: status of the solve.
+        iterations: of the backend.
+        bound_violation: of the solver's controls, before any clipping.
+        emergency: whether the stored plan is being driven instead.
+        worst: largest violated constraint of the solve, for the record.
+    """
+
+    control: Array
+    states: Array
+    status: fg.Status
+    iterations: int
+    bound_violation: float
+    emergency: bool
+    worst: str
+
+
+class Controller:
+    """A compiled control graph that is warm-started with its shifted solution."""
+
+    def __init__(self, distance_map: DistanceMap, solver: str, settings: ControllerSettings) -> None:
+        """State the graph and prepare the backend."""
+        self.settings = s = settings
+        n, m = s.horizon, s.discs
+        graph = fg.Graph()
+        self._x = x = graph.variables("pose", fg.SE2, n + 1)
+        self._u = u = graph.variables("control", fg.Rn(2), n)
+        self._start = graph.data("start", np.zeros(3))
+        self._reference = graph.data("reference", np.zeros((n - 1, 3)), each=True)
+        self._end = graph.data("end of reference", np.zeros(3))
+        self._cruise = graph.data("reference control", np.zeros((n, 2)), each=True)
+        self._last = graph.data("last control", np.zeros(2))
+        self._wall_limit = graph.data("wall clearance", np.zeros((n, 1)), each=True)
+        self._disc_limit = graph.data("disc clearance", np.zeros((n, m)), each=True)
+        self._centres = graph.data("disc centres", np.full((n, m, 2), FAR_AWAY), each=True)
+        self._radii = graph.data("disc radii", np.zeros(m))
+        graph.fix(x[0], self._start)
+        graph.minimize(unicycle.tracking, x[1:-1], self._reference, sigma=s.pose_sigma, name="path")
+        graph.minimize(unicycle.tracking, x[-1], self._end, sigma=s.terminal_sigma, name="end of path")
+        graph.minimize(fg.prior, u, self._cruise, sigma=s.control_sigma, name="effort")
+        graph.minimize(fg.prior, u[0], self._last, sigma=s.rate_sigma, name="first change")
+        graph.minimize(unicycle.rate, u[:-1], u[1:], sigma=s.rate_sigma, name="change")
+        walls = obstacles.wall_distance(distance_map)
+        wall_margin = obstacles.shortfall(walls, s.robot_radius + s.margin)
+        disc_margin = obstacles.shortfall(obstacles.disc_clearance, s.robot_radius + s.margin)
+        graph.minimize(wall_margin, x[1:], sigma=s.margin_sigma, name="wall margin")
+        graph.minimize(disc_margin, x[1:], self._centres, self._radii, sigma=s.margin_sigma, name="disc margin")
+        graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], s.dt, lower=0.0, upper=0.0, name="dynamics")
+        graph.bound(u, lower=[-limit for limit in s.limits], upper=s.limits, name="limits")
+        graph.constrain(walls, x[1:], lower=self._wall_limit, name="walls")
+        graph.constrain(
+            obstacles.disc_clearance, x[1:], self._centres, self._radii, lower=self._disc_limit, name="discs"
+        )
+        self._distance_map = distance_map
+        self._run = backend(solver, s.tolerance).prepare(graph)
+        self._guess: fg.Guess | None = None
+        self._applied = np.zeros(2)
+        self._stored = np.zeros((n, 2))
+        self._age = n
+        self._lagging = 0
+
+    def plan(self, pose: Array, reference: Array, tracks: Tracks) -> Plan:
+        """Decide the next control.
+
+        Args:
+            pose: (3,) estimate [m, m, rad].
+            reference: (N + 1, 3) poses along the path, the first beside the robot.
+            tracks: discs the robot has seen.
+        """
+        s = self.settings
+        data = self._data(pose, reference, tracks)
+        guess = self._guess or self._along(pose, reference)
+        solution = self._run.solve(guess, data=data)
+        controls = solution[self._u]
+        bound_violation = float(np.maximum(np.abs(controls) - s.limits, 0.0).max())
+        worst = "" if solution.worst is None else solution.worst[0]
+        if solution.violation <= s.feasible:
+            self._stored, self._age = controls, 0
+            emergency = False
+            states = solution[self._x]
+            self._guess = None if self._left_behind(states, reference) else solution.shifted(self._x, self._u)
+        else:
+            self._age += 1
+            self._guess = None
+            emergency = True
+            states = unicycle.rollout(pose, self._braking(), s.dt)
+        self._applied = np.clip(controls[0], *_box(s)) if not emergency else self._braking()[0]
+        return Plan(self._applied, states, solution.status, solution.iterations, bound_violation, emergency, worst)
+
+    def forget(self) -> None:
+        """Drop the warm start, as when a new goal makes it misleading."""
+        self._guess = None
+
+    def _left_behind(self, states: Array, reference: Array) -> bool:
+        """Whether plans have ended far from the reference for so long that they must be caught in a dead end."""
+        far = float(np.hypot(*(states[-1] - reference[-1])[:2])) > LEFT_BEHIND
+        self._lagging = self._lagging + 1 if far else 0
+        if self._lagging < PATIENCE:
+            return False
+        self._lagging = 0
+        return True
+
+    def _braking(self) -> Array:
+        """What remains of the stored plan, slowed to rest by its end; the path keeps its shape."""
+        n = self.settings.horizon
+        remaining = self._stored[min(self._age, n) :]
+        fade = 1.0 - (np.arange(self._age, n) + 1.0) / n if len(remaining) else np.zeros(0)
+        controls = np.zeros((n, 2))
+        controls[: len(remaining)] = remaining * fade[:, None]
+        return controls
+
+    def _along(self, pose: Array, reference: Array) -> fg.Guess:
+        """Guess the reference itself: it leads around whatever the route leads around."""
+        states = reference.copy()
+        states[0] = pose
+        controls = np.zeros((self.settings.horizon, 2))
+        controls[:, 0] = self._cruising(reference)
+        return fg.Guess({self._x: states, self._u: np.clip(controls, *_box(self.settings))})
+
+    def _cruising(self, reference: Array) -> Array:
+        """(N,) speeds between reference poses [m/s]."""
+        return np.hypot(*np.diff(reference[:, :2], axis=0).T) / self.settings.dt
+
+    def _data(self, pose: Array, reference: Array, tracks: Tracks) -> dict[fg.Data, Array]:
+        s = self.settings
+        n, m = s.horizon, s.discs
+        stages = s.dt * np.arange(1, n + 1)
+        centres, radii = np.full((n, m, 2), FAR_AWAY), np.zeros(m)
+        chosen = nearest(tracks, pose, m)
+        k = len(chosen)
+        centres[:, :k] = chosen.centre + stages[:, None, None] * chosen.velocity
+        radii[:k] = chosen.radius
+        regained = s.relaxation * np.arange(1, n + 1)
+        wall_now = float(self._distance_map.distance(pose[None, :2])[0])
+        disc_now = np.hypot(*(pose[:2] - centres[0]).T) - radii
+        wall_limit = np.minimum(s.robot_radius + s.wall_clearance, wall_now - s.relaxation + regained)
+        disc_limit = np.minimum(s.robot_radius + s.disc_clearance, disc_now[None, :] - s.relaxation + regained[:, None])
+        cruise = np.zeros((n, 2))
+        cruise[:, 0] = self._cruising(reference)
+        return {
+            self._start: pose,
+            self._reference: reference[1:-1],
+            self._end: reference[-1],
+            self._cruise: cruise,
+            self._last: self._applied,
+            self._wall_limit: wall_limit[:, None],
+            self._disc_limit: disc_limit,
+            self._centres: centres,
+            self._radii: radii,
+        }
+
+
+def _box(settings: ControllerSettings) -> tuple[Array, Array]:
+    limits = np.array(settings.limits)
+    return -limits, limits

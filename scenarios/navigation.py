@@ -1,0 +1,207 @@
+"""Scenario ``navigation``: a unicycle localises itself by lidar and drives through a building under MPC.
+
+Each tick: odometry predicts, the scan corrects (one factor graph), tracked discs are updated, the route is
+repaired if a disc stands on it, and the controller (a second factor graph, conditioned on the estimate) decides.
+Bazzana et al. 2022, sections IV, V and VII.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from unifg.errors import ScenarioError
+from unifg.files.ros_map import OccupancyMap, load_map
+from unifg.models.distance_map import DistanceMap
+from unifg.models.unicycle import step
+from unifg.scenarios.building import DEMO_GOALS, DEMO_START, building_map
+from unifg.scenarios.controller import Controller, ControllerSettings
+from unifg.scenarios.episode import EpisodeLog
+from unifg.scenarios.localiser import Localiser
+from unifg.scenarios.path import path_length
+from unifg.scenarios.perception import Tracker
+from unifg.scenarios.recording import Recording
+from unifg.scenarios.route import Route
+from unifg.scenarios.unforeseen import place_obstacles
+from unifg.scenarios.world import World
+from unifg.typing import Array
+
+Progress = Callable[[float, str], None]
+
+INITIAL_SIGMA = (0.1, 0.1, 0.05)  # [m, m, rad]
+REACHED_DISTANCE = 0.1  # [m], by the estimate
+REACHED_HEADING = 0.1  # [rad]
+TRUE_DISTANCE = 0.2  # [m], what the truth must confirm
+TRUE_HEADING = 0.2  # [rad]
+SLOWEST = 0.25  # [m/s]; an episode that needs longer than this, and a minute, has failed
+
+
+@dataclass(frozen=True)
+class NavigationSettings:
+    """One episode.
+
+    Attributes:
+        map: ROS map file; None for the building that ships with the package.
+        start: true start pose [m, m, rad]; None for the demonstration's.
+        goals: poses to be reached in order; None for the demonstration's.
+        solver: "alm" or "sqp".
+        coupling: "sequential": estimation first, then control conditioned on it.
+        obstacles: number of unforeseen obstacles.
+        seed: of everything random.
+        controller: weights and limits.
+    """
+
+    map: Path | None = None
+    start: tuple[float, float, float] | None = None
+    goals: tuple[tuple[float, float, float], ...] | None = None
+    solver: str = "sqp"
+    coupling: str = "sequential"
+    obstacles: int = 0
+    seed: int = 0
+    controller: ControllerSettings = field(default_factory=ControllerSettings)
+
+
+def run_navigation(settings: NavigationSettings, progress: Progress | None = None) -> EpisodeLog:
+    """Run one episode.
+
+    Args:
+        settings: what to run.
+        progress: called with the fraction done and a short text, once a tick.
+
+    Raises:
+        ScenarioError: when start, goals or obstacles do not fit the map, or an option is unknown.
+    """
+    return Episode(settings).run(progress or (lambda done, text: None))
+
+
+class Episode:
+    """World, robot and goals of one run."""
+
+    def __init__(self, settings: NavigationSettings) -> None:
+        """Load the map, plan the legs, place the obstacles, wake the robot."""
+        if settings.coupling != "sequential":
+            raise ScenarioError(f"unknown coupling '{settings.coupling}': choose sequential")
+        self.settings = settings
+        control = settings.controller
+        self.occupancy = building_map() if settings.map is None else load_map(settings.map)
+        self.start = _pose(settings.start, DEMO_START if settings.map is None else None, "start")
+        if settings.goals is None and settings.map is not None:
+            raise ScenarioError("a map of your own needs at least one --goal=X,Y,THETA")
+        goals = DEMO_GOALS if settings.goals is None else settings.goals
+        self.goals = np.array([_pose(goal, None, "goal") for goal in goals])
+        if not len(self.goals):
+            raise ScenarioError("at least one goal is needed")
+        self.distance_map = DistanceMap.from_occupancy(
+            self.occupancy.occupied, self.occupancy.resolution, self.occupancy.origin
+        )
+        legs = zip([self.start, *self.goals[:-1]], self.goals, strict=True)
+        self.legs = [self._route(begin, end) for begin, end in legs]
+        self.path = np.concatenate([leg.path for leg in self.legs])
+        placement, sensors, belief = np.random.default_rng(settings.seed).spawn(3)
+        discs = place_obstacles(
+            self.occupancy,
+            self.distance_map,
+            self.path,
+            settings.obstacles,
+            placement,
+            start=self.start,
+            goals=self.goals,
+        )
+        self.world = World(self.occupancy, self.start, discs, sensors, robot_radius=control.robot_radius)
+        sigma = np.array(INITIAL_SIGMA)
+        believed = self.start + sigma * belief.standard_normal(3)
+        self.localiser = Localiser(self.distance_map, believed, sigma, self.world.lidar.beams)
+        self.tracker = Tracker(self.distance_map)
+        self.controller = Controller(self.distance_map, settings.solver, control)
+
+    def run(self, progress: Progress) -> EpisodeLog:
+        """Tick until the last goal is reached or time is up."""
+        dt = self.settings.controller.dt
+        length = path_length(self.path)
+        limit = int((length / SLOWEST + 60.0) / dt)
+        recording = Recording(self.world, len(self.goals))
+        dead_reckoning = self.localiser.pose
+        goal, driven, interrupted = 0, 0.0, False
+        try:
+            for tick in range(limit):
+                if tick:
+                    odometry = np.array(self.world.odometry())
+                    dead_reckoning = step(dead_reckoning[None], odometry[None], dt)[0]
+                    driven += abs(odometry[0]) * dt
+                else:
+                    odometry = np.zeros(2)
+                control = self._tick(tick, goal, odometry, dead_reckoning, recording)
+                if self._arrived(goal):
+                    recording.reached[goal] = self._confirmed(goal)
+                    goal += 1
+                    if goal == len(self.goals):
+                        break
+                    self.legs[goal] = self._route(self.localiser.pose, self.goals[goal])
+                    self.controller.forget()
+                self.world.step(float(control[0]), float(control[1]), dt)
+                progress(min(driven / length, 0.99), f"goal {goal + 1}/{len(self.goals)}")
+        except KeyboardInterrupt:
+            interrupted = True
+        progress(1.0, "done")
+        return recording.log(self, interrupted)
+
+    def _tick(self, tick: int, goal: int, odometry: Array, dead_reckoning: Array, recording: Recording) -> Array:
+        """Estimate and plan; the measured time is what a robot would spend."""
+        control = self.settings.controller
+        scan = self.world.scan()
+        begin = time.perf_counter()
+        if tick:
+            self.localiser.predict(odometry, control.dt)
+        self.localiser.correct(scan)
+        estimated = time.perf_counter()
+        pose = self.localiser.pose
+        tracks = self.tracker.update(scan, pose, control.dt)
+        perceived = time.perf_counter()
+        route = self.legs[goal]
+        route.repair(pose, tracks)
+        repaired = time.perf_counter()
+        reference = route.reference(pose, control.speed * control.dt, control.horizon + 1)
+        plan = self.controller.plan(pose, reference, tracks)
+        planned = time.perf_counter()
+        recording.add(
+            goal, self.localiser, dead_reckoning, scan, tracks, plan,
+            localise_ms=1e3 * (estimated - begin),
+            perceive_ms=1e3 * (perceived - estimated),
+            route_ms=1e3 * (repaired - perceived),
+            plan_ms=1e3 * (planned - repaired),
+        )  # fmt: skip
+        return plan.control
+
+    def _route(self, begin: Array, end: Array) -> Route:
+        return Route(self.occupancy, self.distance_map, begin, end, self.settings.controller.robot_radius)
+
+    def _arrived(self, goal: int) -> bool:
+        return _near(self.localiser.pose, self.goals[goal], REACHED_DISTANCE, REACHED_HEADING)
+
+    def _confirmed(self, goal: int) -> bool:
+        """Whether the robot truly is where it believes to have arrived."""
+        return _near(self.world.pose, self.goals[goal], TRUE_DISTANCE, TRUE_HEADING)
+
+
+def _near(pose: Array, goal: Array, distance: float, heading: float) -> bool:
+    error = pose - goal
+    turn = abs((error[2] + np.pi) % (2.0 * np.pi) - np.pi)
+    return bool(np.hypot(error[0], error[1]) < distance and turn < heading)
+
+
+def _pose(given: object, default: tuple[float, float, float] | None, what: str) -> Array:
+    if given is None:
+        if default is None:
+            raise ScenarioError(f"a map of your own needs --{what}=X,Y,THETA")
+        given = default
+    pose = np.asarray(given, dtype=np.float64)
+    if pose.shape != (3,) or not np.isfinite(pose).all():
+        raise ScenarioError(f"{what} must be three finite numbers x, y, theta; found {given!r}")
+    return pose
+
+
+__all__ = ["Episode", "NavigationSettings", "OccupancyMap", "run_navigation"]

@@ -1,0 +1,30 @@
+"""One colour for one thing, the same in scenes and plots; chosen from colour-blind-safe sets (Okabe and Ito 2008)."""
+
+from __future__ import annotations
+
+__all__ = ["COLOURS", "css"]
+
+COLOURS = {
+    "floor": 0xF6F4EF,
+    "wall": 0x9AA3AE,
+    "plan": 0x4D4D4D,
+    "start": 0x4D4D4D,
+    "goal": 0xF0C000,
+    "pole": 0x4D4D4D,
+    "robot": 0x0A56A8,
+    "heading": 0xFFFFFF,
+    "trail": 0x3D95E0,
+    "estimate": 0xB0399F,
+    "odometry": 0x7F7F7F,
+    "horizon": 0x009E4F,
+    "scan": 0x00A7C7,
+    "fixed": 0xF09000,
+    "moving": 0xD62718,
+    "detected": 0x000000,
+}
+"""Name to 0xRRGGBB."""
+
+
+def css(name: str) -> str:
+    """The colour as ``#rrggbb``."""
+    return f"#{COLOURS[name]:06x}"

@@ -1,0 +1,113 @@
+"""The global route: Dijkstra on the map, repaired where tracked discs stand in the way."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from unifg.errors import ScenarioError
+from unifg.files.ros_map import OccupancyMap
+from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.path import PathFollower
+from unifg.scenarios.perception import Tracks
+from unifg.scenarios.planner import SPACING, plan
+from unifg.typing import Array
+
+LOOK_AHEAD = 4.0  # [m] of path checked against tracked discs
+REJOIN = 2.0  # [m] beyond the disc where the detour meets the path again
+WINDOW = 3.0  # [m] of map kept around the detour's ends
+STANDING = 0.15  # [m/s]; faster discs are left to the controller, which predicts them
+GAP = 0.10  # [m] between hull and disc that a path must leave
+PATIENCE = 5  # ticks between two repairs
+
+
+class Route:
+    """The path to one goal and the robot's progress on it.
+
+    Attributes:
+        path: (P, 3) present path [m, m, rad].
+        repairs: number of detours planned so far.
+    """
+
+    def __init__(
+        self,
+        occupancy: OccupancyMap,
+        distance_map: DistanceMap,
+        start: Array,
+        goal: Array,
+        robot_radius: float,
+    ) -> None:
+        """Plan from ``start`` (3,) to ``goal`` (3,).
+
+        Raises:
+            ScenarioError: when there is no way.
+        """
+        self._occupancy = occupancy
+        self._distance_map = distance_map
+        self._radius = robot_radius
+        self.repairs = 0
+        self._rest = 0
+        self._follow(plan(occupancy, distance_map, start, goal, robot_radius=robot_radius))
+
+    def _follow(self, path: Array) -> None:
+        self.path = path
+        self._follower = PathFollower(path)
+        self._reached = 0.0
+
+    def reference(self, pose: Array, spacing: float, count: int) -> Array:
+        """(count, 3) poses along the path, the first beside the robot at ``pose``."""
+        poses, self._reached = self._follower.reference(pose, spacing, count, self._reached)
+        return poses
+
+    def repair(self, pose: Array, tracks: Tracks) -> bool:
+        """Plan a detour if a standing disc blocks the path ahead; whether the path changed."""
+        self._rest = max(self._rest - 1, 0)
+        standing = tracks.at(np.hypot(*tracks.velocity.T) < STANDING)
+        if self._rest or not len(standing):
+            return False
+        arc = SPACING * np.arange(len(self.path))
+        ahead = (arc >= self._reached) & (arc <= self._reached + LOOK_AHEAD)
+        offsets = self.path[ahead, None, :2] - standing.centre
+        room = np.hypot(offsets[..., 0], offsets[..., 1]) - standing.radius
+        blocked = (room < self._radius + GAP).any(axis=1)
+        if not blocked.any():
+            return False
+        self._rest = PATIENCE
+        last = float(arc[ahead][np.flatnonzero(blocked)[-1]])
+        return self._detour(pose, min(last + REJOIN, float(arc[-1])), standing)
+
+    def _detour(self, pose: Array, rejoin: float, standing: Tracks) -> bool:
+        index = min(round(rejoin / SPACING), len(self.path) - 1)
+        target = self.path[index]
+        corners = np.stack([pose[:2], target[:2], *self.path[self._index() : index + 1, :2]])
+        discs = np.column_stack([standing.centre, standing.radius + 0.5 * GAP])
+        occupancy, distance_map = self._window(corners)
+        try:
+            detour = plan(occupancy, distance_map, pose, target, robot_radius=self._radius, extra_discs=discs)
+        except ScenarioError:
+            return False  # the controller stops before the disc; the next scan may see a way
+        self._follow(np.concatenate([detour[:-1], self.path[index:]]))
+        self.repairs += 1
+        return True
+
+    def _index(self) -> int:
+        return min(int(self._reached / SPACING), len(self.path) - 1)
+
+    def _window(self, corners: Array) -> tuple[OccupancyMap, DistanceMap]:
+        """The part of the map around some points."""
+        cells = self._occupancy.world_to_grid(corners)
+        margin = WINDOW / self._occupancy.resolution
+        height, width = self._occupancy.shape
+        low = np.maximum(np.floor(cells.min(axis=0) - margin), 0).astype(int)
+        high = np.minimum(np.ceil(cells.max(axis=0) + margin), [width, height]).astype(int)
+        columns, rows = slice(low[0], high[0]), slice(low[1], high[1])
+        corner = self._occupancy.grid_to_world(low.astype(np.float64))
+        origin = (float(corner[0]), float(corner[1]), self._occupancy.origin[2])
+        occupancy = OccupancyMap(
+            self._occupancy.occupied[rows, columns],
+            self._occupancy.free[rows, columns],
+            self._occupancy.resolution,
+            origin,
+            self._occupancy.name,
+        )
+        values = self._distance_map.values[rows, columns]
+        return occupancy, DistanceMap(values, self._distance_map.resolution, origin)

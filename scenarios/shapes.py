@@ -1,0 +1,142 @@
+"""Meshes for scenes: an occupancy grid extruded into walls, and flat ribbons where a browser would draw hair-thin lines.
+
+A mesh is a pair (vertices (n, 3) [m], faces (m, 3)). Quads share no vertices, so that shading keeps edges sharp.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from unifg.files.ros_map import OccupancyMap
+from unifg.typing import Array, BoolArray, IntArray
+
+__all__ = ["Mesh", "cover", "extrude", "flat", "merge", "ribbon", "ring", "wedge"]
+
+Mesh = tuple[Array, IntArray]
+
+
+def cover(mask: BoolArray) -> IntArray:
+    """Disjoint rectangles whose union is the mask: equal runs of neighbouring rows, merged.
+
+    Args:
+        mask: (H, W).
+
+    Returns:
+        (n, 4) rectangles (row_low, row_high, column_low, column_high) in cells, high ends exclusive.
+    """
+    padded = np.zeros((mask.shape[0], mask.shape[1] + 2), dtype=np.int8)
+    padded[:, 1:-1] = mask
+    steps = np.diff(padded, axis=1)
+    finished: list[tuple[int, int, int, int]] = []
+    growing: dict[tuple[int, int], int] = {}
+    for row in range(mask.shape[0] + 1):
+        runs: list[tuple[int, int]] = []
+        if row < mask.shape[0]:
+            begins, ends = np.flatnonzero(steps[row] == 1), np.flatnonzero(steps[row] == -1)
+            runs = list(zip(begins.tolist(), ends.tolist(), strict=True))
+        still = {run: growing.get(run, row) for run in runs}
+        finished += [(low, row, *run) for run, low in growing.items() if run not in still]
+        growing = still
+    return np.array(finished, dtype=np.intp).reshape(-1, 4)
+
+
+def flat(occupancy: OccupancyMap, mask: BoolArray, z: float) -> Mesh:
+    """The cells of a mask as a level surface at height z [m]."""
+    low_row, high_row, low_column, high_column = cover(mask).T
+    corners = np.stack(
+        [
+            np.stack([low_column, low_row], axis=-1),
+            np.stack([high_column, low_row], axis=-1),
+            np.stack([high_column, high_row], axis=-1),
+            np.stack([low_column, high_row], axis=-1),
+        ],
+        axis=1,
+    )
+    points = occupancy.grid_to_world(corners.astype(np.float64))
+    return _quads(np.concatenate([points, np.full((*points.shape[:2], 1), z)], axis=-1))
+
+
+def extrude(occupancy: OccupancyMap, height: float) -> Mesh:
+    """The occupied cells as solid walls from the floor up, without their undersides.
+
+    Args:
+        occupancy: the map.
+        height: of the walls [m].
+
+    Returns:
+        Tops and sides in one mesh, sides merged along each straight run.
+    """
+    occupied = occupancy.occupied
+    sides = [_edges(occupied, forward) for forward in (False, True)]
+    turned = [_edges(occupied.T, forward)[:, ::-1, ::-1] for forward in (False, True)]
+    ends = occupancy.grid_to_world(np.concatenate(sides + turned).astype(np.float64))
+    low = np.concatenate([ends, np.zeros((len(ends), 2, 1))], axis=-1)
+    high = np.concatenate([ends, np.full((len(ends), 2, 1), height)], axis=-1)
+    walls = _quads(np.concatenate([low, high[:, ::-1]], axis=1))
+    return merge([flat(occupancy, occupied, height), walls])
+
+
+def ribbon(points: Array, width: float, z: float) -> Mesh:
+    """A level strip along a polyline.
+
+    Args:
+        points: (n, 2 or 3) [m], n >= 2; only x and y count, neighbours may coincide.
+        width: of the strip [m].
+        z: height of the strip [m].
+
+    Returns:
+        2 n vertices and 2 (n - 1) faces.
+    """
+    places = points[:, :2]
+    tangent = np.gradient(places, axis=0)
+    norm = np.linalg.norm(tangent, axis=1, keepdims=True)
+    across = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1) / np.maximum(norm, 1e-9) * (width / 2.0)
+    sides = np.stack([places - across, places + across], axis=1).reshape(-1, 2)
+    first = 2 * np.arange(len(places) - 1)[:, None]
+    faces = np.concatenate([first + [0, 2, 1], first + [1, 2, 3]])
+    return np.column_stack([sides, np.full(len(sides), z)]), faces
+
+
+def ring(centre: Array, radius: float, width: float, z: float, corners: int = 16) -> Mesh:
+    """A level ring of the given inner radius around (2,) [m]."""
+    angles = np.linspace(0.0, 2.0 * np.pi, corners + 1)
+    circle = np.column_stack([np.cos(angles), np.sin(angles)])
+    vertices = np.stack([centre + radius * circle, centre + (radius + width) * circle], axis=1).reshape(-1, 2)
+    first = 2 * np.arange(corners)[:, None]
+    faces = np.concatenate([first + [0, 1, 2], first + [1, 3, 2]])
+    return np.column_stack([vertices, np.full(len(vertices), z)]), faces
+
+
+def wedge(length: float, z: float) -> Mesh:
+    """A level arrow head of that length [m] around the origin, pointing along x."""
+    outline = np.array([[0.6, 0.0], [-0.4, 0.42], [-0.15, 0.0], [-0.4, -0.42]]) * length
+    return np.column_stack([outline, np.full(4, z)]), np.array([[0, 1, 2], [0, 2, 3]], dtype=np.intp)
+
+
+def merge(meshes: list[Mesh]) -> Mesh:
+    """Several meshes as one."""
+    offsets = np.cumsum([0] + [len(vertices) for vertices, _ in meshes[:-1]])
+    faces = [faces + offset for (_, faces), offset in zip(meshes, offsets, strict=True)]
+    return np.concatenate([vertices for vertices, _ in meshes]), np.concatenate(faces)
+
+
+def _edges(solid: BoolArray, forward: bool) -> IntArray:
+    """Runs of solid cells whose neighbour in the next (forward) or previous row is not: (n, 2, 2) ends (column, row)."""
+    beyond = np.zeros_like(solid)
+    if forward:
+        beyond[:-1] = solid[1:]
+    else:
+        beyond[1:] = solid[:-1]
+    padded = np.zeros((solid.shape[0], solid.shape[1] + 2), dtype=np.int8)
+    padded[:, 1:-1] = solid & ~beyond
+    steps = np.diff(padded, axis=1)
+    rows, begins = np.nonzero(steps == 1)
+    _, ends = np.nonzero(steps == -1)
+    rows = rows + int(forward)
+    return np.stack([np.stack([begins, rows], axis=-1), np.stack([ends, rows], axis=-1)], axis=1)
+
+
+def _quads(corners: Array) -> Mesh:
+    """Quadrilaterals (n, 4, 3) as two triangles each."""
+    first = 4 * np.arange(len(corners))[:, None]
+    return corners.reshape(-1, 3), np.concatenate([first + [0, 1, 2], first + [0, 2, 3]])

@@ -1,0 +1,92 @@
+"""A made-up episode: a robot that drives an arc through a small room, with everything a real loop would record."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from unifg.files.ros_map import OccupancyMap
+from unifg.lie import wrap_angle
+from unifg.scenarios.episode import EpisodeLog
+from unifg.typing import Array
+
+RESOLUTION = 0.1
+BEAMS, HORIZON, DT = 72, 10, 0.1
+
+
+def room(width: float = 8.0, height: float = 6.0, yaw: float = 0.0) -> OccupancyMap:
+    """A walled room with a pillar, of cells of 0.1 m, its lower-left corner at (-1, -1)."""
+    shape = (round(height / RESOLUTION), round(width / RESOLUTION))
+    occupied = np.zeros(shape, dtype=bool)
+    occupied[:2] = occupied[-2:] = True
+    occupied[:, :2] = occupied[:, -2:] = True
+    occupied[20:26, 50:56] = True
+    return OccupancyMap(occupied, ~occupied, RESOLUTION, (-1.0, -1.0, yaw), "room")
+
+
+def episode(ticks: int = 40, obstacles: int = 2, *, map_yaw: float = 0.0, seed: int = 3) -> EpisodeLog:
+    """An arc from (0, 0) at 0.5 m/s with a known drift of dead reckoning and a constant error of the estimate."""
+    rng = np.random.default_rng(seed)
+    time = DT * np.arange(ticks)
+    sweep = 1.2 * max(ticks * DT, 1.0)
+    phase = 0.5 * time / sweep * 2.4
+    truth = np.column_stack([2.4 * np.sin(phase), 2.4 * (1.0 - np.cos(phase)), phase])
+    estimate = truth + np.array([0.03, 0.04, -0.01])
+    drift = truth + np.column_stack([0.02 * time, 0.01 * time, 0.005 * time])
+    ahead = DT * np.arange(HORIZON + 1)
+    heading = truth[:, 2:] + np.zeros(HORIZON + 1)
+    horizon = np.stack(
+        [
+            truth[:, :1] + 0.5 * ahead * np.cos(truth[:, 2:]),
+            truth[:, 1:2] + 0.5 * ahead * np.sin(truth[:, 2:]),
+            wrap_angle(heading),
+        ],
+        axis=-1,
+    )
+    scan = 2.0 + 0.02 * rng.standard_normal((ticks, BEAMS))
+    scan[:, 0], scan[:, 1] = np.nan, np.inf
+    places = np.empty((ticks, obstacles, 3))
+    for k in range(obstacles):
+        places[:, k] = (4.0, 1.0 + k, 0.2)
+        if k % 3 == 0:
+            places[:, k, 1] += 0.3 * np.minimum(time, 3.0)
+    solve = 5.0 + np.arange(ticks, dtype=np.float64) % 7
+    emergency = np.zeros(ticks, dtype=bool)
+    emergency[-1] = True
+    return EpisodeLog(
+        occupancy=room(yaw=map_yaw),
+        path=truth.copy(),
+        goals=truth[-1:].copy(),
+        start=truth[0].copy(),
+        dt=DT,
+        robot_radius=0.17,
+        solver="alm",
+        coupling="sequential",
+        seed=seed,
+        time=time,
+        true_pose=truth,
+        estimate=estimate,
+        dead_reckoning=drift,
+        control=np.column_stack([np.full(ticks, 0.5), np.full(ticks, 0.2)]),
+        horizon=horizon,
+        scan=scan,
+        scan_angles=np.linspace(-np.pi, np.pi, BEAMS, endpoint=False),
+        obstacles=places,
+        detected=[_seen(places[k], k) for k in range(ticks)],
+        solve_ms=solve,
+        localise_ms=solve * 0.25,
+        plan_ms=solve * 0.75,
+        localisation_iterations=np.full(ticks, 2, dtype=np.intp),
+        plan_iterations=1 + np.arange(ticks, dtype=np.intp) % 3,
+        status=["converged"] * (ticks - 1) + ["stalled"],
+        bound_violation=np.full(ticks, -1e-9),
+        clearance=0.6 - 0.2 * np.sin(phase),
+        collisions=0,
+        goal_index=np.zeros(ticks, dtype=np.intp),
+        reached=[True],
+        emergency=emergency,
+    )
+
+
+def _seen(obstacles: Array, tick: int) -> Array:
+    """What a tracker would report: nothing at first, then the first obstacle."""
+    return obstacles[: min(1, tick // 5)].copy()

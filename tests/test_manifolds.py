@@ -1,0 +1,216 @@
+"""Manifolds as values, exact wrapping of angles, products by name, and a manifold of the user's own."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.random import Generator
+
+from groups import BATCHES, CASES, PI, Batch, Case, assert_close
+from unifg.errors import UnifgError
+from unifg.lie import SE2, SO2, LieGroup, Manifold, Product, ProductGroup, Rn, wrap_angle
+from unifg.typing import Array, BoolArray
+
+# -- wrapping --
+
+TURN = Fraction(2 * PI)
+
+
+@given(st.floats(-1e6, 1e6))
+def test_wrap_angle_is_exact(theta: float) -> None:
+    wrapped = float(wrap_angle(theta))
+    assert -PI <= wrapped < PI
+    assert ((Fraction(theta) - Fraction(wrapped)) / TURN).denominator == 1  # whole turns, to the last bit
+    assert float(wrap_angle(wrapped)) == wrapped
+
+
+def test_wrap_angle_at_the_ends() -> None:
+    below, above = float(np.nextafter(PI, 0)), float(np.nextafter(PI, 4))
+    ends = np.array([PI, -PI, below, -below, above, -above, 3 * PI, -3 * PI, 2 * PI, 0.0, 1e-300, 5e-324])
+    wrapped = wrap_angle(ends)
+    assert np.all((wrapped >= -PI) & (wrapped < PI))
+    np.testing.assert_array_equal(wrapped[[0, 1, 2, 3]], [-PI, -PI, below, -below])
+    np.testing.assert_array_equal(wrapped[[4, 5]], [-below, below])
+    np.testing.assert_array_equal(wrapped[8:], [0.0, 0.0, 1e-300, 5e-324])
+    assert wrap_angle(np.zeros((2, 0, 3))).shape == (2, 0, 3)
+
+
+# -- values: equality, hashing, pickling --
+
+
+@pytest.mark.parametrize("case", list(CASES.values()), ids=list(CASES))
+def test_manifolds_are_values(case: Case) -> None:
+    group = case.group
+    again = pickle.loads(pickle.dumps(group))
+    assert again == group
+    assert hash(again) == hash(group)
+    assert copy.deepcopy(group) == group
+    assert repr(group) == group.name
+    assert isinstance(group, Manifold)
+    assert [other.group == group for other in CASES.values()].count(True) == 1
+    assert group != "SE2"
+
+
+def test_singletons_survive_pickling() -> None:
+    for group in (SE2, SO2):
+        assert pickle.loads(pickle.dumps(group)) is group
+        assert copy.copy(group) is group
+
+
+def test_equal_arguments_make_equal_manifolds() -> None:
+    assert Rn(2) == Rn(2) != Rn(3)
+    assert len({Rn(2), Rn(2), Rn(3), SE2, SO2}) == 4
+    assert Product(p=Rn(2), R=SO2) == Product(p=Rn(2), R=SO2)
+    assert hash(Product(p=Rn(2), R=SO2)) == hash(Product(p=Rn(2), R=SO2))
+    assert Product(p=Rn(2), R=SO2) != Product(R=SO2, p=Rn(2))  # another storage order
+    assert Product(p=Rn(2), R=SO2) != Product(q=Rn(2), R=SO2)
+    assert Rn(np.int64(2)) == Rn(2)
+
+
+# -- products --
+
+
+def test_components_have_their_places() -> None:
+    state = Product(pose=SE2, motion=Product(v=Rn(2), bias=Rn(1)), heading=SO2)
+    assert (state.storage, state.dim) == (7, 7)
+    assert list(state.components) == ["pose", "motion", "heading"]
+    motion = state.component("motion")
+    assert motion.manifold == Product(v=Rn(2), bias=Rn(1))
+    assert (motion.storage, motion.tangent) == (slice(3, 6), slice(3, 6))
+    assert state.name == "Product(pose=SE2, motion=Product(v=Rn(2), bias=Rn(1)), heading=SO2)"
+    with pytest.raises(UnifgError, match="no component 'speed': it has pose, motion, heading"):
+        state.component("speed")
+
+
+def test_product_is_componentwise(rng: Generator) -> None:
+    state = Product(p=Rn(2), T=SE2)
+    x, d = state.random(rng, (6,)), rng.standard_normal((6, 5))
+    expected = np.concatenate([x[:, :2] + d[:, :2], SE2.retract(x[:, 2:], d[:, 2:])], axis=1)
+    np.testing.assert_array_equal(state.retract(x, d), expected)
+    # The translation of a product does not turn with its rotation: it is no SE2.
+    loose = Product(p=Rn(2), R=SO2).retract([0, 0, PI / 2], [1, 0, 0])
+    np.testing.assert_array_equal(loose, [1, 0, PI / 2])
+
+
+def test_pack_and_unpack(rng: Generator) -> None:
+    state = Product(p=Rn(2), T=SE2)
+    pose = SE2.random(rng, (4,))
+    x = state.pack(p=[1.0, 2.0], T=pose)
+    assert x.shape == (4, 5)
+    np.testing.assert_array_equal(state.unpack(x)["T"], pose)
+    np.testing.assert_array_equal(state.unpack(x)["p"], np.tile([1.0, 2.0], (4, 1)))
+    with pytest.raises(UnifgError, match="packs p, T; got p"):
+        state.pack(p=[1.0, 2.0])
+    with pytest.raises(UnifgError, match=r"'T' of .* stores 3 numbers; got shape \(4, 2\)"):
+        state.pack(p=[1.0, 2.0], T=pose[:, :2])
+
+
+def test_bad_manifolds_are_refused() -> None:
+    with pytest.raises(UnifgError, match="no components"):
+        Product()
+    with pytest.raises(UnifgError, match="'p' of Product is 3: give a manifold"):
+        Product(p=3)  # type: ignore[call-overload]
+    with pytest.raises(UnifgError, match=r"'p' of Product is .*Rn.*: give a manifold"):
+        Product(p=Rn)  # type: ignore[call-overload]
+    with pytest.raises(UnifgError, match="underscore"):
+        Product(_p=SE2)
+    with pytest.raises(UnifgError, match=r"Rn\(0\)"):
+        Rn(0)
+    with pytest.raises(TypeError):
+        Rn(2.5)  # type: ignore[arg-type]
+
+
+# -- a manifold of the user's own --
+
+
+class Sphere:
+    """Unit vectors in R^3: storage 3, tangent 2, not a group. Inherits from nothing."""
+
+    name = "Sphere"
+    storage = 3
+    dim = 2
+
+    def identity(self) -> Array:
+        return np.array([0.0, 0.0, 1.0])
+
+    def retract(self, x: Array, d: Array) -> Array:
+        step = (self._basis(x) @ d[..., None])[..., 0]
+        angle = np.linalg.norm(d, axis=-1, keepdims=True)
+        moved: Array = np.cos(angle) * x + np.sinc(angle / PI) * step
+        return moved
+
+    def local(self, x: Array, y: Array) -> Array:
+        across = (np.swapaxes(self._basis(x), -1, -2) @ y[..., None])[..., 0]
+        sine = np.linalg.norm(across, axis=-1, keepdims=True)
+        angle = np.arctan2(sine, (x * y).sum(axis=-1, keepdims=True))
+        step: Array = across / np.sinc(angle / PI)
+        return step
+
+    def random(self, rng: Generator, shape: Batch = ()) -> Array:
+        x = rng.standard_normal((*shape, 3))
+        unit: Array = x / np.linalg.norm(x, axis=-1, keepdims=True)
+        return unit
+
+    def is_valid(self, x: Array) -> BoolArray:
+        return np.asarray(np.abs(np.linalg.norm(x, axis=-1) - 1.0) < 1e-9)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sphere)
+
+    def __hash__(self) -> int:
+        return hash(Sphere)
+
+    @staticmethod
+    def _basis(x: Array) -> Array:
+        """Two orthonormal tangent directions, (..., 3, 2); Duff et al. 2017, equation 7."""
+        sign = np.where(x[..., 2] < 0, -1.0, 1.0)
+        a = -1.0 / (sign + x[..., 2])
+        b = x[..., 0] * x[..., 1] * a
+        first = np.stack([1 + sign * x[..., 0] ** 2 * a, sign * b, -sign * x[..., 0]], axis=-1)
+        second = np.stack([b, sign + x[..., 1] ** 2 * a, -x[..., 1]], axis=-1)
+        return np.stack([first, second], axis=-1)
+
+
+MIXED: dict[str, Manifold] = {
+    "alone": Sphere(),
+    "with groups": Product(T=SE2, normal=Sphere(), scale=Rn(1)),
+    "nested": Product(a=Product(normal=Sphere(), R=SO2), b=Sphere(), p=Rn(2)),
+}
+
+
+@pytest.mark.parametrize("batch", BATCHES, ids=str)
+@pytest.mark.parametrize("manifold", list(MIXED.values()), ids=list(MIXED))
+def test_storage_may_differ_from_dimension(manifold: Manifold, batch: Batch, rng: Generator) -> None:
+    assert isinstance(manifold, Manifold)
+    assert manifold.storage > manifold.dim
+    assert manifold.identity().shape == (manifold.storage,)
+    assert manifold.is_valid(manifold.identity())
+    x, y = manifold.random(rng, batch), manifold.random(rng, batch)
+    d = 0.5 * rng.standard_normal((*batch, manifold.dim))
+    assert x.shape == (*batch, manifold.storage)
+    moved = manifold.retract(x, d)
+    assert np.all(manifold.is_valid(moved))
+    assert_close(manifold.local(x, moved), d)
+    assert_close(manifold.retract(x, manifold.local(x, y)), y)
+    assert manifold.local(x, y).shape == (*batch, manifold.dim)
+    if x.size:
+        assert not np.all(manifold.is_valid(2.0 * x + 1.0))
+
+
+def test_product_with_a_manifold_has_no_group_operations() -> None:
+    mixed = Product(T=SE2, normal=Sphere())
+    assert (mixed.storage, mixed.dim) == (6, 5)
+    assert mixed.component("normal").storage == slice(3, 6)
+    assert mixed.component("normal").tangent == slice(3, 5)
+    assert not isinstance(mixed, LieGroup)
+    for operation in ("exp", "log", "compose", "inverse", "act", "adjoint", "right_jacobian"):
+        assert not hasattr(mixed, operation)
+    assert isinstance(Product(T=SE2, p=Rn(1)), ProductGroup)
+    assert mixed == Product(T=SE2, normal=Sphere()) == pickle.loads(pickle.dumps(mixed))
+    assert not isinstance(object(), Manifold)
