@@ -58,7 +58,7 @@ $(VENV)/ready: pyproject.toml
 	@command -v $(PYTHON) >/dev/null || { \
 		echo "unifg needs Python 3.11 or newer and found no '$(PYTHON)'. Install one, or name it: make PYTHON=/path/to/python3" >&2; exit 1; }
 	@$(PYTHON) -c 'import sys; v = sys.version.split()[0]; sys.exit(None if sys.version_info >= (3, 11) else \
-		f"unifg needs Python 3.11 or newer, and $(PYTHON) is {v}. Name a newer one: make PYTHON=/path/to/python3")'
+		"unifg needs Python 3.11 or newer, and $(PYTHON) is %s. Name a newer one: make PYTHON=/path/to/python3" % v)'
 	@echo "Building $(VENV) and installing unifg into it (once, a minute or two)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
 		echo "$(PYTHON) cannot build virtual environments; on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }

@@ -38,6 +38,7 @@ class ControllerSettings:
         robot_radius: [m].
         wall_clearance: least distance of the hull to walls [m].
         disc_clearance: least distance of the hull to tracked discs [m].
+        mover_allowance: added to the radius of discs that move: they may turn round [m].
         margin: distance of the hull below which the soft costs begin [m].
         margin_sigma: [m].
         discs: tracked discs considered at once.
@@ -48,17 +49,18 @@ class ControllerSettings:
 
     horizon: int = 30
     dt: float = 0.1
-    speed: float = 0.9
+    speed: float = 1.0
     limits: tuple[float, float] = (1.0, 1.0)
     pose_sigma: tuple[float, float, float] = (0.3, 0.3, 0.6)
     terminal_sigma: tuple[float, float, float] = (0.1, 0.1, 0.2)
-    control_sigma: tuple[float, float] = (0.5, 1.0)
-    rate_sigma: tuple[float, float] = (0.3, 0.5)
+    control_sigma: tuple[float, float] = (1.0, 2.0)
+    rate_sigma: tuple[float, float] = (0.5, 1.0)
     robot_radius: float = 0.17
-    wall_clearance: float = 0.01
+    wall_clearance: float = 0.03
     disc_clearance: float = 0.06
+    mover_allowance: float = 0.12
     margin: float = 0.2
-    margin_sigma: float = 0.15
+    margin_sigma: float = 0.1
     discs: int = 3
     relaxation: float = 0.005
     tolerance: float = 1e-4
@@ -205,7 +207,8 @@ class Controller:
 
     def _cruising(self, reference: Array) -> Array:
         """(N,) speeds between reference poses [m/s]."""
-        return np.hypot(*np.diff(reference[:, :2], axis=0).T) / self.settings.dt
+        lengths: Array = np.hypot(*np.diff(reference[:, :2], axis=0).T)
+        return lengths / self.settings.dt
 
     def _data(self, pose: Array, reference: Array, tracks: Tracks) -> dict[fg.Data, Array]:
         s = self.settings
@@ -215,7 +218,8 @@ class Controller:
         chosen = nearest(tracks, pose, m)
         k = len(chosen)
         centres[:, :k] = chosen.centre + stages[:, None, None] * chosen.velocity
-        radii[:k] = chosen.radius
+        moving = np.hypot(*chosen.velocity.T) > 0.0
+        radii[:k] = chosen.radius + np.where(moving, s.mover_allowance, 0.0)
         regained = s.relaxation * np.arange(1, n + 1)
         wall_now = float(self._distance_map.distance(pose[None, :2])[0])
         disc_now = np.hypot(*(pose[:2] - centres[0]).T) - radii

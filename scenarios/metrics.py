@@ -95,6 +95,8 @@ class EpisodeMetrics(TypedDict):
     solve_ms: Timing
     localise_ms: Timing
     plan_ms: Timing
+    perceive_ms: Timing
+    route_ms: Timing
 
 
 def episode_metrics(log: EpisodeLog) -> EpisodeMetrics:
@@ -148,6 +150,8 @@ def episode_metrics(log: EpisodeLog) -> EpisodeMetrics:
         solve_ms=_timing(log.solve_ms),
         localise_ms=_timing(log.localise_ms),
         plan_ms=_timing(log.plan_ms),
+        perceive_ms=_timing(log.perceive_ms),
+        route_ms=_timing(log.route_ms),
     )
 
 

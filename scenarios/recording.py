@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -71,7 +71,7 @@ class Recording:
         """The finished record."""
         settings, columns = episode.settings, dict(self._columns)
         detected, status = columns.pop("detected"), columns.pop("status")
-        arrays = {name: np.array(values) for name, values in columns.items()}
+        arrays: dict[str, Any] = {name: np.array(values) for name, values in columns.items()}
         return EpisodeLog(
             occupancy=episode.occupancy,
             path=episode.path,

@@ -157,7 +157,7 @@ class _Scene:
         # A pin hovers above the robot, which would be a few pixels in a whole building.
         point = 0.25 * self.pin
         self._cylinder("robot/pin", 0.75 * self.pin, 0.0, COLOURS["robot"], z=_WALL + 0.05, top=point)
-        self._cylinder("estimate/body", _BODY + 0.12, radius + 0.06, COLOURS["estimate"], opacity=0.4)
+        self._cylinder("estimate/body", _BODY + 0.12, radius + 0.06, COLOURS["estimate"], opacity=0.3)
         marker = shapes.wedge(1.2 * radius, _BODY + 0.14)
         self._mesh("estimate/heading", marker, COLOURS["estimate"], flat=True, opacity=0.55)
         self._cylinder("odometry/body", _BODY, radius, COLOURS["odometry"], opacity=0.55)
@@ -217,7 +217,7 @@ class _Scene:
     def _points(self, path: str, points: Array) -> None:
         from meshcat.geometry import GenericMaterial, Points, PointsGeometry
 
-        material = GenericMaterial(color=COLOURS["scan"], size=1.1 * self.stroke)
+        material = GenericMaterial(color=COLOURS["scan"], size=4, sizeAttenuation=False)  # [pixels]
         material._type = "PointsMaterial"  # meshcat's own insists on a colour per point
         self.viewer[path].set_object(Points(PointsGeometry(points.T), material))
 

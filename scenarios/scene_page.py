@@ -62,7 +62,7 @@ def scene_page(log: EpisodeLog, ticks: IntArray, commands: list[str], script: st
     }
     page = _PAGE
     for name, text in parts.items():  # the viewer last: it is code in which no placeholder may be looked for
-        page = page.replace(f"@@{name}@@", text, 1)
+        page = page.replace(f"@@{name}@@", text)
     return page
 
 
@@ -157,6 +157,7 @@ li { display: flex; gap: 9px; align-items: center; margin: 4px 0; line-height: 1
 #readout { font-variant-numeric: tabular-nums; white-space: pre; } #readout b { color: #b3261e; }
 .label { position: absolute; left: 0; top: 0; padding: 0 5px; border-radius: 4px; background: rgba(255, 255, 255, .82);
   font-weight: 600; font-size: 12px; pointer-events: none; white-space: nowrap; }
+.minor { color: #6b7280; font-weight: 400; font-size: 11px; background: rgba(255, 255, 255, .6); }
 </style>
 </head>
 <body>
@@ -216,9 +217,10 @@ slider.oninput = () => { animator.pause(); seek(Number(slider.value)); };
 const toCamera = (p) => new THREE.Vector3(p[0], p[2], -p[1]);
 const robot = viewer.scene_tree.find(["meshcat", "robot"]).object;
 const robotPlace = () => toCamera(robot.position.toArray());
+const odometry = viewer.scene_tree.find(["meshcat", "odometry"]).object;
 const corners = DATA.corners.flatMap((c) => [toCamera([...c, 0]), toCamera([...c, 0.6])]);
 const centre = corners.reduce((sum, c) => sum.add(c), new THREE.Vector3()).divideScalar(corners.length);
-const towardsCamera = new THREE.Vector3(0, Math.sin(1.0), Math.cos(1.0));
+const towardsCamera = new THREE.Vector3(0, Math.sin(1.1), Math.cos(1.1));
 let followed = null, touched = false;
 function size() {
   const width = window.innerWidth, height = window.innerHeight;
@@ -226,7 +228,7 @@ function size() {
   return { width, height, left, bottom };
 }
 function look(target, distance) {
-  viewer.camera.fov = 30;
+  viewer.camera.fov = 20;
   viewer.camera.near = 0.2;
   viewer.camera.far = 10 * distance + 100;
   viewer.controls.target.copy(target);
@@ -236,7 +238,7 @@ function look(target, distance) {
 }
 function wholeBuilding() {
   const { width, height, left, bottom } = size();
-  const half = Math.tan(Math.PI / 12);
+  const half = Math.tan(Math.PI / 18);
   const across = half * (width - left) / height * 0.95, along = half * (height - bottom) / height * 0.95;
   const up = new THREE.Vector3(0, towardsCamera.z, -towardsCamera.y);
   let distance = 1;
@@ -257,7 +259,7 @@ function follow(on) {
   followed = on ? robotPlace() : null;
   byId("follow").textContent = on ? "Whole building" : "Follow robot";
   touched = false;
-  if (on) { look(followed, 13); } else { wholeBuilding(); }
+  if (on) { look(followed, 30); } else { wholeBuilding(); }
 }
 byId("follow").onclick = () => follow(!followed);
 byId("pane").addEventListener("pointerdown", () => { touched = true; });
@@ -267,10 +269,11 @@ window.addEventListener("load", arrange);
 
 // Labels and the line of numbers.
 const labels = DATA.labels.map((label) => ({ text: label.text, place: () => toCamera([...label.at, 0]) }));
+labels.push({ text: "odometry alone", place: () => toCamera(odometry.position.toArray()), minor: true });
 labels.push({ text: "robot", place: robotPlace });
 for (const label of labels) {
   label.element = document.createElement("div");
-  label.element.className = "label";
+  label.element.className = label.minor ? "label minor" : "label";
   label.element.textContent = label.text;
   byId("labels").appendChild(label.element);
 }

@@ -150,12 +150,11 @@ class AugmentedLagrangian(Solver):
     def _initial_penalty(self, run: Run) -> float:
         if self.penalty is not None:
             return self.penalty
-        pull = largest(run.multipliers)
-        if pull > 0.0:  # warm start: below this, curvature of the constraints can outweigh the penalty
-            return float(np.clip(WARM_PENALTY * pull, 1e-3, 1e6))
         outside = float((run.program.violation(run.lin.constraints) ** 2).sum())
-        balance = max(1.0, abs(run.lin.cost)) / max(1.0, 0.5 * outside)
-        return float(np.clip(COLD_PENALTY * balance, 1e-3, 1e6))
+        balance = COLD_PENALTY * max(1.0, abs(run.lin.cost)) / max(1.0, 0.5 * outside)
+        # With large multipliers the curvature of the constraints can outweigh a small penalty.
+        curvature = WARM_PENALTY * largest(run.multipliers)
+        return float(np.clip(max(balance, curvature), 1e-3, 1e6))
 
     def _goals(self, run: Run, primal: Primal, rho: float) -> tuple[float, float]:
         """First accuracy of the subproblem's gradient, and the violation that earns a dual step."""

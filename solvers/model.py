@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.program import Linearization
+from unifg.linearization import Linearization
 from unifg.solvers.primal import Primal
 from unifg.typing import Array
 
@@ -46,7 +46,7 @@ def model_step(
         gradient = program.costs.transposed_times(lin.jacobian, residual)
         if program.constraints.count:
             gradient += program.constraints.transposed_times(lin.constraint_jacobian, after)
-        gradient = gradient[program.free_columns]
+        gradient = gradient[program.columns.free]
         curvature = program.normal_entries(lin, np.where(active, penalty, 0.0))
         if added is None:
             added = primal.damping_diagonal(curvature, damping)

@@ -11,7 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.compiled import Values
-from unifg.program import Evaluation, Linearization, Program
+from unifg.linearization import Evaluation, Linearization
+from unifg.program import Program
 from unifg.typing import Array, BoolArray
 
 DIAGONAL_FLOOR = 1e-9  # of the largest diagonal entry: damping must act on unknowns with little curvature too
@@ -40,7 +41,7 @@ class Primal:
     def gradient(self, lin: Linearization, multipliers: Array, penalty: Array) -> Array:
         """Gradient of the augmented objective over the unknowns."""
         after = self.next_multipliers(lin.constraints, multipliers, penalty)
-        return self.program.lagrangian_gradient(lin, after)[self.program.free_columns]
+        return self.program.lagrangian_gradient(lin, after)[self.program.columns.free]
 
     def curvature(self, lin: Linearization, multipliers: Array, penalty: Array) -> Array:
         """Gauss-Newton Hessian entries J'J + A' diag(rho, active rows) A."""

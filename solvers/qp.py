@@ -12,7 +12,8 @@ from typing import Protocol
 
 import numpy as np
 
-from unifg.program import Linearization, Program
+from unifg.linearization import Linearization
+from unifg.program import Program
 from unifg.typing import Array
 
 
@@ -86,7 +87,7 @@ def qp_error(qp: QP, step: Array, multipliers: Array) -> float:
     scale = max(1.0, float(np.abs(multipliers).mean()) / 100.0) if len(multipliers) else 1.0
     program = qp.program
     dual = qp.curved(step) + qp.gradient
-    dual = dual + program.constraints.transposed_times(qp.jacobian, multipliers)[program.free_columns]
+    dual = dual + program.constraints.transposed_times(qp.jacobian, multipliers)[program.columns.free]
     value = qp.linear(step)
     outside = np.maximum(np.maximum(value - qp.upper, qp.lower - value), 0.0)
     limit = np.where(multipliers > 0.0, qp.upper, qp.lower)

@@ -13,7 +13,7 @@ import scipy.sparse as sp
 
 from unifg.program import Program
 from unifg.solvers.qp import QP, QPAnswer, qp_error
-from unifg.typing import Array, BoolArray
+from unifg.typing import Array, BoolArray, IntArray
 
 INFINITY = 1e30  # PIQP treats larger limits as absent
 TIGHTEST = 1e-9
@@ -81,7 +81,7 @@ class PiqpRoute:
         self._solver.settings.eps_duality_gap_rel = 0.0
         self._solver.settings.max_iter = 100
 
-    def _part(self, rows: BoolArray) -> tuple[Array, sp.csc_matrix]:
+    def _part(self, rows: BoolArray) -> tuple[IntArray, sp.csc_matrix]:
         """Positions of the entries of chosen rows, and the matrix they make."""
         constraints = self.program.constraints
         chosen = np.flatnonzero(rows[constraints.indices])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import numpy as np
 import qpsolvers
@@ -13,7 +14,7 @@ from unifg.program import Program
 from unifg.solvers.qp import QP, QPAnswer, qp_error
 from unifg.typing import Array
 
-SETTINGS: dict[str, dict[str, float | int | bool]] = {
+SETTINGS: dict[str, dict[str, Any]] = {
     "piqp": {"eps_abs": 1e-9, "eps_rel": 1e-10, "max_iter": 200},
     "clarabel": {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-10, "tol_feas": 1e-9},
     "proxqp": {"eps_abs": 1e-9},

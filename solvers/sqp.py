@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from unifg.errors import BackendError
-from unifg.program import Evaluation, Linearization, Program
+from unifg.linearization import Evaluation, Linearization
+from unifg.program import Program
 from unifg.solver import Run, Solver
 from unifg.solvers.damping import norm
 from unifg.solvers.qp import QP, QPAnswer, Route, subproblem

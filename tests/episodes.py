@@ -75,6 +75,8 @@ def episode(ticks: int = 40, obstacles: int = 2, *, map_yaw: float = 0.0, seed: 
         solve_ms=solve,
         localise_ms=solve * 0.25,
         plan_ms=solve * 0.75,
+        perceive_ms=solve * 0.1,
+        route_ms=solve * 0.05,
         localisation_iterations=np.full(ticks, 2, dtype=np.intp),
         plan_iterations=1 + np.arange(ticks, dtype=np.intp) % 3,
         status=["converged"] * (ticks - 1) + ["stalled"],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -224,13 +225,7 @@ HUBER = 0.5 * (INLIERS + 2.0 * 0.5 * (8.0 - 0.8 / 3.0) - 0.25)
 
 PROBLEMS = [
     *[
-        Problem(
-            f"ecg2o{start}",
-            lambda start=start: ecg2o(start),
-            1.0,
-            answer={"x": [[0, 0]]},
-            duals={"curve": [[-1]]},
-        )  # type: ignore[misc]
+        Problem(f"ecg2o{start}", partial(ecg2o, start), 1.0, answer={"x": [[0, 0]]}, duals={"curve": [[-1]]})
         for start in STARTS
     ],
     Problem(

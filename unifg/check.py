@@ -141,7 +141,7 @@ def _undetermined(program: Program, values: Values) -> list[Finding]:
         loose = np.flatnonzero(np.abs(_null_direction(factorization, program.size)) > 0.1)
     result, seen = [], set()
     for column in loose.tolist():
-        family, member = program.column_name(int(program.free_columns[column]))
+        family, member = program.columns.name(int(program.columns.free[column]))
         if (family, member) not in seen:
             seen.add((family, member))
             result.append(

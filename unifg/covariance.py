@@ -10,7 +10,8 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.linear import Factorization
-from unifg.program import Linearization, Program
+from unifg.linearization import Linearization
+from unifg.program import Program
 from unifg.sparse import Symmetric
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -32,9 +33,9 @@ def covariance(program: Program, lin: Linearization, columns: IntArray, active: 
     Raises:
         GraphError: when a column is fixed or the information is singular.
     """
-    chosen = program.unknown[columns]
+    chosen = program.columns.unknown[columns]
     if (chosen < 0).any():
-        family, index = program.column_name(int(columns[np.argmax(chosen < 0)]))
+        family, index = program.columns.name(int(columns[np.argmax(chosen < 0)]))
         raise GraphError(f"{family}[{index}] is fixed: it has no covariance", family=family, index=index)
     n = program.size
     hessian = program.hessian.matrix(program.hessian_entries(lin)).tocoo()

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.program import Linearization, Program
+from unifg.linearization import Linearization
+from unifg.program import Program
 from unifg.typing import Array, BoolArray, IntArray
 
 
@@ -52,7 +53,7 @@ def optimality(program: Program, lin: Linearization, multipliers: Array) -> Opti
     finite = lin.finite and bool(np.isfinite(multipliers).all())
     if not finite:
         return Optimality(np.inf, np.inf, np.inf, -1, False)
-    gradient = program.lagrangian_gradient(lin, multipliers)[program.free_columns]
+    gradient = program.lagrangian_gradient(lin, multipliers)[program.columns.free]
     stationarity = float(np.abs(gradient).max(initial=0.0))
     if not program.constraints.count:
         return Optimality(stationarity, 0.0, 0.0, -1, True)
@@ -84,7 +85,7 @@ def infeasible_stationary(program: Program, lin: Linearization, tolerance: float
     outside = program.violation(lin.constraints)
     if np.abs(outside).max(initial=0.0) <= tolerance:
         return False
-    pull = program.constraints.transposed_times(lin.constraint_jacobian, outside)[program.free_columns]
+    pull = program.constraints.transposed_times(lin.constraint_jacobian, outside)[program.columns.free]
     columns, at_lower, at_upper = _walls(program, lin.constraints)
     blocked = ((pull[columns] > 0.0) & at_lower) | ((pull[columns] < 0.0) & at_upper)
     pull[columns[blocked]] = 0.0

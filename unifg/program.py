@@ -7,15 +7,16 @@ costs; rows of constraints read ``lower <= g <= upper``. Columns are tangent coo
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from unifg.columns import Columns
 from unifg.compiled import CompiledTerm, Values
 from unifg.errors import GraphError
 from unifg.linear import Factorization
-from unifg.sparse import Gram, Rows, Symmetric, scatter
+from unifg.linearization import Evaluation, HeldWeights, Linearization
+from unifg.sparse import Gram, Rows, Symmetric, scatter, upper_pairs
 from unifg.terms import Constraint, Cost, ScalarCost
 from unifg.typing import Array, ArrayLike, IntArray
 from unifg.variables import Data, Family
@@ -23,72 +24,14 @@ from unifg.variables import Data, Family
 if TYPE_CHECKING:
     from unifg.graph import Graph
 
-HeldWeights = dict[str, Array]
-
-
-@dataclass
-class Evaluation:
-    """Objective and constraints at a point, without derivatives.
-
-    Attributes:
-        cost: objective.
-        constraints: (M,) stacked g.
-    """
-
-    cost: float
-    constraints: Array
-
-    @property
-    def finite(self) -> bool:
-        """Whether every number is finite."""
-        return bool(np.isfinite(self.cost) and np.isfinite(self.constraints).all())
-
-
-@dataclass
-class Linearization:
-    """Objective and constraints with their derivatives at ``values``.
-
-    Attributes:
-        values: where.
-        cost: objective.
-        residual: (C,) weighted, whitened cost residuals.
-        jacobian: entries of the cost Jacobian, in the order of ``Program.costs``.
-        constraints: (M,) stacked g.
-        constraint_jacobian: entries of A, in the order of ``Program.constraints``.
-        gradient: gradient of the objective over the full tangent space.
-        scalar_hessian: entries of the Hessian blocks of scalar costs.
-        norms: each term's residual norm; for constraints the norm of the violation.
-        weights: weights of reweighted losses, to be held during the line search.
-    """
-
-    values: Values
-    cost: float
-    residual: Array
-    jacobian: Array
-    constraints: Array
-    constraint_jacobian: Array
-    gradient: Array
-    scalar_hessian: Array
-    norms: dict[str, float]
-    weights: HeldWeights = field(default_factory=dict)
-
-    @property
-    def finite(self) -> bool:
-        """Whether every number is finite."""
-        return bool(
-            np.isfinite(self.cost)
-            and np.isfinite(self.gradient).all()
-            and np.isfinite(self.constraints).all()
-            and np.isfinite(self.constraint_jacobian).all()
-        )
-
 
 class Program:
     """The compiled form of a graph.
 
     Attributes:
         graph: what was compiled.
-        size: number of unknown tangent coordinates.
+        columns: numbering of the tangent coordinates.
+        size: number of unknown ones.
         costs, constraints: patterns of the stacked Jacobians.
         hessian: pattern of the Gauss-Newton Hessian of the objective.
         normal: pattern of the same plus A'A.
@@ -104,30 +47,24 @@ class Program:
             raise GraphError("the graph has no variables: add a family with graph.variables(...)")
         self.graph = graph
         self.families = list(graph.families.values())
-        self._place_columns(graph)
-        compiled = [CompiledTerm(term) for term in graph.terms]
-        self.terms = compiled
-        self.cost_terms = [c for c in compiled if isinstance(c.term, Cost)]
-        self.scalar_terms = [c for c in compiled if isinstance(c.term, ScalarCost)]
-        self.constraint_terms = [c for c in compiled if isinstance(c.term, Constraint)]
+        self.columns = Columns(self.families, graph.fixes)
+        self.size = self.columns.size
+        self.terms = [CompiledTerm(term) for term in graph.terms]
+        self.cost_terms = [c for c in self.terms if isinstance(c.term, Cost)]
+        self.scalar_terms = [c for c in self.terms if isinstance(c.term, ScalarCost)]
+        self.constraint_terms = [c for c in self.terms if isinstance(c.term, Constraint)]
         self._require_touched()
-        self.costs, cost_blocks, self.cost_slices = self._stack(self.cost_terms)
-        self.constraints, constraint_blocks, self.slices = self._stack(self.constraint_terms)
-        self.gram = Gram(cost_blocks, self.costs, self.unknown)
-        self.constraint_gram = Gram(constraint_blocks, self.constraints, self.unknown)
-        self.normal_gram = Gram(cost_blocks, self.costs, self.unknown)
+        self.costs, self._cost_gram, self._cost_slices = self._stack(self.cost_terms)
+        self.constraints, self._constraint_gram, self.slices = self._stack(self.constraint_terms)
         self.bound_rows = np.zeros(self.constraints.count, dtype=bool)
         for term, rows in zip(self.constraint_terms, self.slices, strict=True):
             self.bound_rows[rows] = term.is_bound
-        self._place_scalar_blocks()
-        scalar = (self._scalar_row, self._scalar_column)
-        self.hessian = Symmetric(self.size, [self.gram.coordinates, scalar])
-        self.normal = Symmetric(self.size, [self.gram.coordinates, self.constraint_gram.coordinates, scalar])
-        self.gram.scatter_into(self.hessian)
-        self.normal_gram.scatter_into(self.normal)
-        self.constraint_gram.scatter_into(self.normal)
-        self._scalar_in_hessian = self.hessian.positions(*scalar)
-        self._scalar_in_normal = self.normal.positions(*scalar)
+        costs, constraints = self._cost_gram.coordinates, self._constraint_gram.coordinates
+        scalars = self._scalar_blocks()
+        self.hessian = Symmetric(self.size, [costs, scalars])
+        self.normal = Symmetric(self.size, [costs, constraints, scalars])
+        self._in_hessian = [self.hessian.positions(*part) for part in (costs, scalars)]
+        self._in_normal = [self.normal.positions(*part) for part in (costs, constraints, scalars)]
         self.bind({})
 
     # ---------------------------------------------------------------- data and values
@@ -174,7 +111,7 @@ class Program:
         for family in self.families:
             shape = (family.count, family.manifold.storage)
             if family not in guess:
-                if not self._all_fixed(family):
+                if not self.columns.all_fixed(family):
                     raise GraphError(
                         f"the guess has no values for family '{family.name}': give an array of shape {shape}",
                         family=family.name,
@@ -204,11 +141,11 @@ class Program:
 
     def retract(self, values: Values, step: Array) -> Values:
         """Move the unknowns by a tangent step; fixed variables stay."""
-        full = np.zeros(self.width)
-        full[self.free_columns] = step
+        full = np.zeros(self.columns.width)
+        full[self.columns.free] = step
         moved: Values = {}
         for family, array in values.items():
-            offset = self.offsets[family]
+            offset = self.columns.offsets[family]
             part = full[offset : offset + family.count * family.manifold.dim]
             moved[family] = family.manifold.retract(array, part.reshape(family.count, family.manifold.dim))
         for fix, value in self.fixed_values:  # retract may wrap or renormalise; a fixed value stays as given
@@ -263,7 +200,7 @@ class Program:
         weights: HeldWeights = {}
         cost, at = 0.0, 0
         with np.errstate(all="ignore"):
-            for term, rows in zip(self.cost_terms, self.cost_slices, strict=True):
+            for term, rows in zip(self.cost_terms, self._cost_slices, strict=True):
                 assert isinstance(term.term, Cost)
                 whitened = term.whiten(term.residual(values))
                 blocks = [term.whiten_jacobian(block) for block in term.jacobians(values)]
@@ -301,7 +238,7 @@ class Program:
                 cost += float(value.sum())
                 norms[term.name] = float(np.abs(value).sum())
                 slope, curvature = term.scalar_derivatives(values)
-                gradient += scatter(columns.ravel(), slope.ravel(), self.width)
+                gradient += scatter(columns.ravel(), slope.ravel(), self.columns.width)
                 hessians.append(_convex(curvature)[self._scalar_keep[term.name]])
         return Linearization(
             values,
@@ -320,21 +257,21 @@ class Program:
 
     def hessian_entries(self, lin: Linearization) -> Array:
         """Gauss-Newton Hessian of the objective in the order of ``hessian``."""
-        data = self.gram(lin.jacobian)
-        if len(lin.scalar_hessian):
-            data += scatter(self._scalar_in_hessian, lin.scalar_hessian, len(data))
-        return data
+        parts = [self._cost_gram.products(lin.jacobian), lin.scalar_hessian]
+        return _summed(self._in_hessian, parts, self.hessian.nnz)
 
     def normal_entries(self, lin: Linearization, row_weights: Array) -> Array:
         """Gauss-Newton Hessian plus A' diag(row_weights) A, in the order of ``normal``."""
-        data = self.normal_gram(lin.jacobian) + self.constraint_gram(lin.constraint_jacobian, row_weights)
-        if len(lin.scalar_hessian):
-            data += scatter(self._scalar_in_normal, lin.scalar_hessian, len(data))
-        return data
+        parts = [
+            self._cost_gram.products(lin.jacobian),
+            self._constraint_gram.products(lin.constraint_jacobian, row_weights),
+            lin.scalar_hessian,
+        ]
+        return _summed(self._in_normal, parts, self.normal.nnz)
 
     def free_gradient(self, lin: Linearization) -> Array:
         """Gradient of the objective over the unknowns."""
-        return lin.gradient[self.free_columns]
+        return lin.gradient[self.columns.free]
 
     def lagrangian_gradient(self, lin: Linearization, multipliers: Array) -> Array:
         """Gradient of the objective plus A' multipliers, over the full tangent space."""
@@ -359,46 +296,14 @@ class Program:
                 return term.name, (row - rows.start) // term.size
         raise IndexError(row)
 
-    def column_name(self, column: int) -> tuple[str, int]:
-        """Family and member of a full tangent column."""
-        for family in reversed(self.families):
-            if column >= self.offsets[family]:
-                return family.name, (column - self.offsets[family]) // family.manifold.dim
-        raise IndexError(column)
-
     # ---------------------------------------------------------------- compilation
-
-    def _place_columns(self, graph: Graph) -> None:
-        self.offsets: dict[Family, int] = {}
-        self.width = 0
-        for family in self.families:
-            self.offsets[family] = self.width
-            self.width += family.count * family.manifold.dim
-        free = np.ones(self.width, dtype=bool)
-        self.fixed_columns: dict[str, IntArray] = {}
-        for fix in graph.fixes:
-            columns = self._columns(fix.selection.family, fix.selection.indices, fix.selection.tangent)
-            free[columns] = False
-            self.fixed_columns[fix.name] = columns
-        self.free_columns = np.flatnonzero(free)
-        self.size = len(self.free_columns)
-        self.unknown = np.full(self.width, -1, dtype=np.intp)
-        self.unknown[self.free_columns] = np.arange(self.size)
-
-    def _columns(self, family: Family, indices: IntArray, tangent: slice) -> IntArray:
-        base = self.offsets[family] + indices * family.manifold.dim
-        return base[:, None] + np.arange(tangent.start, tangent.stop)
 
     def _term_columns(self, term: CompiledTerm) -> list[IntArray]:
         """(n, d_k) full columns of each variable argument."""
-        result = []
-        for gather in term.gathers:
-            selection = gather.selection
-            columns = self._columns(selection.family, selection.indices, selection.tangent)
-            result.append(np.broadcast_to(columns, (term.count, columns.shape[1])))
-        return result
+        parts = [self.columns.of(selection) for selection in term.term.selections]
+        return [np.broadcast_to(part, (term.count, part.shape[1])) for part in parts]
 
-    def _stack(self, terms: list[CompiledTerm]) -> tuple[Rows, list[tuple[IntArray, IntArray]], list[slice]]:
+    def _stack(self, terms: list[CompiledTerm]) -> tuple[Rows, Gram, list[slice]]:
         rows, columns, blocks, slices = [], [], [], []
         row = entry = 0
         for term in terms:
@@ -407,7 +312,7 @@ class Program:
             slices.append(slice(row, row + n * m))
             row += n * m
             arguments = self._term_columns(term)
-            if term.is_bound:
+            if term.is_bound:  # the Jacobian is the identity: one entry a row
                 rows.append(own_rows.ravel())
                 columns.append(arguments[0].ravel())
                 blocks.append((entry + np.arange(n * m).reshape(-1, 1, 1), arguments[0].reshape(-1, 1)))
@@ -422,43 +327,39 @@ class Program:
                 entry += n * m * argument.shape[1]
             blocks.append((np.concatenate(parts, axis=2), np.concatenate(arguments, axis=1)))
         none = [np.zeros(0, dtype=np.intp)]
-        stacked = Rows(row, np.concatenate(rows + none), np.concatenate(columns + none), self.unknown, self.size)
-        return stacked, blocks, slices
+        unknown = self.columns.unknown
+        stacked = Rows(row, np.concatenate(rows + none), np.concatenate(columns + none), unknown, self.size)
+        return stacked, Gram(blocks, stacked, unknown), slices
 
-    def _place_scalar_blocks(self) -> None:
+    def _scalar_blocks(self) -> tuple[IntArray, IntArray]:
+        """(row, column) of the Hessian entries of scalar costs, and how to pick them from the blocks."""
         self._scalar_columns: list[IntArray] = []
         self._scalar_keep: dict[str, tuple[IntArray, IntArray, IntArray]] = {}
         none = np.zeros(0, dtype=np.intp)
         rows, columns = [none], [none]
         for term in self.scalar_terms:
             full = np.concatenate(self._term_columns(term), axis=1)
-            mapped = self.unknown[full]
-            keep = (mapped[:, :, None] <= mapped[:, None, :]) & (mapped[:, :, None] >= 0)
-            factor, a, b = np.nonzero(keep)
+            mapped, factor, a, b = upper_pairs(full, self.columns.unknown)
             self._scalar_columns.append(full)
             self._scalar_keep[term.name] = (factor, a, b)
             rows.append(mapped[factor, a])
             columns.append(mapped[factor, b])
-        self._scalar_row, self._scalar_column = np.concatenate(rows), np.concatenate(columns)
+        return np.concatenate(rows), np.concatenate(columns)
 
     def _require_touched(self) -> None:
-        touched = np.zeros(self.width, dtype=bool)
+        touched = np.zeros(self.columns.width, dtype=bool)
         for term in self.terms:
             for columns in self._term_columns(term):
                 touched[columns] = True
-        idle = self.free_columns[~touched[self.free_columns]]
+        idle = self.columns.free[~touched[self.columns.free]]
         if len(idle):
-            family, index = self.column_name(int(idle[0]))
+            family, index = self.columns.name(int(idle[0]))
             raise GraphError(
-                f"{family}[{index}] is in no cost or constraint and is not fixed: {len(idle)} tangent coordinates are "
-                "free to be anything; add a term, fix it, or make the family shorter",
+                f"{family}[{index}] is in no cost or constraint and is not fixed: {len(idle)} tangent coordinates "
+                "are free to be anything; add a term, fix it, or make the family shorter",
                 family=family,
                 index=index,
             )
-
-    def _all_fixed(self, family: Family) -> bool:
-        offset = self.offsets[family]
-        return bool((self.unknown[offset : offset + family.count * family.manifold.dim] < 0).all())
 
 
 def _write(target: Array, at: int, blocks: list[Array]) -> int:
@@ -472,6 +373,15 @@ def _write(target: Array, at: int, blocks: list[Array]) -> int:
 def _stacked(parts: list[Array]) -> Array:
     """One flat array, also of nothing."""
     return np.concatenate([part.ravel() for part in parts]) if parts else np.zeros(0)
+
+
+def _summed(slots: list[IntArray], parts: list[Array], size: int) -> Array:
+    """Scatter several lists of numbers into one array."""
+    total = scatter(slots[0], parts[0], size)
+    for place, numbers in zip(slots[1:], parts[1:], strict=True):
+        if len(place):
+            total += scatter(place, numbers, size)
+    return total
 
 
 def _convex(blocks: Array) -> Array:

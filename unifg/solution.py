@@ -11,7 +11,8 @@ from unifg.covariance import covariance
 from unifg.errors import GraphError
 from unifg.history import HEADER, Iteration, line
 from unifg.kkt import Optimality
-from unifg.program import Linearization, Program
+from unifg.linearization import Linearization
+from unifg.program import Program
 from unifg.status import Status
 from unifg.typing import Array, IntArray
 from unifg.variables import Family, Selection, Variable, as_selection
@@ -115,9 +116,9 @@ class Solution:
         multipliers = self.multipliers
         if name in multipliers:
             return multipliers[name]
-        if name in self._program.fixed_columns:
-            return -self._reaction[self._program.fixed_columns[name]]
-        known = ", ".join([*multipliers, *self._program.fixed_columns]) or "none"
+        if name in self._program.columns.fixed:
+            return -self._reaction[self._program.columns.fixed[name]]
+        known = ", ".join([*multipliers, *self._program.columns.fixed]) or "none"
         raise GraphError(f"no constraint, bound or fix is called '{name}' (there are: {known})", term=name)
 
     def shifted(self, *families: Family, by: int = 1) -> Guess:
@@ -153,10 +154,8 @@ class Solution:
         selection = as_selection(variable)
         self._require(selection)
         program = self._program
-        offset = program.offsets[selection.family] + selection.indices * selection.family.manifold.dim
-        columns = offset[:, None] + np.arange(selection.tangent.start, selection.tangent.stop)
         active = self._equality | (np.abs(self._multipliers) > 0.0)
-        return covariance(program, self._lin, columns.ravel(), active)
+        return covariance(program, self._lin, program.columns.of(selection).ravel(), active)
 
     def report(self) -> str:
         """The status sentence with the numbers behind it."""

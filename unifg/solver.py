@@ -16,7 +16,8 @@ from unifg.errors import BackendError, GraphError, NotConverged
 from unifg.graph import Graph
 from unifg.history import HEADER, Iteration, line
 from unifg.kkt import infeasible_stationary, optimality
-from unifg.program import Linearization, Program
+from unifg.linearization import Linearization
+from unifg.program import Program
 from unifg.solution import Guess, Solution
 from unifg.status import Status
 from unifg.typing import Array, ArrayLike

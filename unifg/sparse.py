@@ -19,8 +19,7 @@ def scatter(slots: IntArray, numbers: Array, size: int) -> Array:
     """Sum ``numbers`` into ``size`` slots."""
     if not len(slots):  # bincount of nothing counts in integers
         return np.zeros(size)
-    sums: Array = np.bincount(slots, weights=numbers, minlength=size)
-    return sums
+    return np.asarray(np.bincount(slots, weights=numbers, minlength=size), dtype=np.float64)
 
 
 class Symmetric:
@@ -111,45 +110,53 @@ class Rows:
         return flat if self.all_free else flat[self.free]
 
 
+def upper_pairs(columns: IntArray, unknown: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Pairs (a, b) of columns of each factor that fall into the upper triangle over the unknowns.
+
+    Args:
+        columns: (n, D) full columns of each factor.
+        unknown: full column to unknown, or -1.
+
+    Returns:
+        The (n, D) unknowns, and for every pair its factor, a and b.
+    """
+    mapped = unknown[columns]
+    keep = (mapped[:, :, None] <= mapped[:, None, :]) & (mapped[:, :, None] >= 0)
+    factor, a, b = np.nonzero(keep)
+    return mapped, factor, a, b
+
+
 class Gram:
-    """Forms the stored entries of J' D J from the entries of J."""
+    """Products of Jacobian entries that share a row: what the entries of J' D J are sums of.
+
+    Attributes:
+        coordinates: (row, column) of every product among the unknowns, row <= column.
+    """
 
     def __init__(self, blocks: Sequence[tuple[IntArray, IntArray]], rows: Rows, unknown: IntArray) -> None:
-        """Enumerate products of entries that share a row.
+        """Enumerate the products.
 
         Args:
             blocks: for each term, entry numbers (n, m, D) and their full columns (n, D).
             rows: the pattern the entries belong to.
             unknown: full column to unknown, or -1.
         """
-        first, second, self._row, self._column = [], [], [], []
+        none = np.zeros(0, dtype=np.intp)
+        first, second, row, column = [none], [none], [none], [none]
         for entries, columns in blocks:
-            mapped = unknown[columns]
-            keep = (mapped[:, :, None] <= mapped[:, None, :]) & (mapped[:, :, None] >= 0)
-            factor, a, b = np.nonzero(keep)
+            mapped, factor, a, b = upper_pairs(columns, unknown)
+            size = entries.shape[1]
             first.append(entries[factor, :, a].ravel())
             second.append(entries[factor, :, b].ravel())
-            size = entries.shape[1]
-            self._row.append(np.repeat(mapped[factor, a], size))
-            self._column.append(np.repeat(mapped[factor, b], size))
-        self.first = np.concatenate([*first, np.zeros(0, dtype=np.intp)])
-        self.second = np.concatenate([*second, np.zeros(0, dtype=np.intp)])
-        self._weight = rows.rows[self.first] if len(self.first) else self.first
+            row.append(np.repeat(mapped[factor, a], size))
+            column.append(np.repeat(mapped[factor, b], size))
+        self._first, self._second = np.concatenate(first), np.concatenate(second)
+        self._weight = rows.rows[self._first]
+        self.coordinates = np.concatenate(row), np.concatenate(column)
 
-    @property
-    def coordinates(self) -> tuple[IntArray, IntArray]:
-        """(row, column) of every product, row <= column."""
-        empty = [np.zeros(0, dtype=np.intp)]
-        return np.concatenate(self._row + empty), np.concatenate(self._column + empty)
-
-    def scatter_into(self, pattern: Symmetric) -> None:
-        """Fix where the products go."""
-        self._slots = pattern.positions(*self.coordinates)
-        self._nnz = pattern.nnz
-
-    def __call__(self, flat: Array, weights: Array | None = None) -> Array:
-        """Entries of J' diag(weights) J in the pattern's order."""
-        products = flat[self.first] * flat[self.second]
+    def products(self, flat: Array, weights: Array | None = None) -> Array:
+        """J[p] J[q], times the weight of their row."""
+        products: Array = flat[self._first] * flat[self._second]
         if weights is not None:
             products *= weights[self._weight]
-        return scatter(self._slots, products, self._nnz)
+        return products

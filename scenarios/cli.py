@@ -1,0 +1,249 @@
+"""The command ``unifg``: run a scenario, watch its progress, keep its results.
+
+Exit status: 0 if every goal was reached without a collision, 1 if not, 2 for arguments that cannot be served, 130 after an
+interrupt (what was driven until then is written all the same).
+
+Commands and scenarios are tables: to add one, write a function that describes its arguments and one that runs it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING
+
+from unifg import __version__
+from unifg.errors import UnifgError
+from unifg.scenarios.results import summary, write_results
+
+if TYPE_CHECKING:
+    from unifg.scenarios.episode import EpisodeLog
+
+__all__ = ["SCENARIOS", "SOLVERS", "Scenario", "main"]
+
+SUCCEEDED, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
+SOLVERS = ("alm", "sqp")
+COUPLINGS = ("sequential",)
+
+Pose = tuple[float, float, float]
+Progress = Callable[[float, str], None]
+
+_POSE_OPTIONS = ("--start", "--goal")
+_NEGATIVE = re.compile(r"-[\d.]")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One entry of `SCENARIOS`.
+
+    Attributes:
+        summary: one line for the help.
+        arguments: adds the scenario's arguments to its parser.
+        run: runs one episode.
+    """
+
+    summary: str
+    arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace, Progress], EpisodeLog]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit status.
+
+    Args:
+        argv: arguments without the program's name; None takes those of the process.
+    """
+    arguments = _join_negative(list(sys.argv[1:] if argv is None else argv))
+    try:
+        chosen = _parser().parse_args(arguments)
+    except SystemExit as stop:  # argparse has said what is wrong, or has printed help
+        return stop.code if isinstance(stop.code, int) else REFUSED
+    command: Callable[[argparse.Namespace], int] = chosen.command
+    try:
+        return command(chosen)
+    except UnifgError as error:
+        return _refuse(str(error))
+    except KeyboardInterrupt:
+        print("unifg: interrupted before there was anything to write", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="unifg", description="Robot estimation and control as one factor graph.", allow_abbrev=False
+    )
+    parser.add_argument("--version", action="version", version=f"unifg {__version__}")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    run = commands.add_parser("run", help="run a scenario", description="Run a scenario.", allow_abbrev=False)
+    scenarios = run.add_subparsers(title="scenarios", required=True, metavar="SCENARIO")
+    for name, scenario in SCENARIOS.items():
+        one = scenarios.add_parser(
+            name, help=scenario.summary, description=scenario.summary, allow_abbrev=False
+        )
+        scenario.arguments(one)
+        one.add_argument("--solver", choices=SOLVERS, default="sqp", help="backend (default: %(default)s)")
+        one.add_argument("--seed", type=_count, default=0, metavar="S", help="of everything random (default: 0)")
+        one.add_argument(
+            "--out", type=Path, default=Path("out"), metavar="DIR", help="folder for results (default: %(default)s)"
+        )
+        one.set_defaults(command=_run, scenario=name)
+    return parser
+
+
+def _run(chosen: argparse.Namespace) -> int:
+    """Run the chosen scenario, write what it left and say how it went."""
+    folder: Path = chosen.out
+    try:
+        folder.mkdir(parents=True, exist_ok=True)  # better refused now than after the run
+    except OSError as error:
+        return _refuse(f"--out {folder}: cannot make this folder ({error.strerror})")
+    with _progress_bar(chosen.scenario) as progress:
+        log = SCENARIOS[chosen.scenario].run(chosen, progress)
+    if log.ticks == 0:
+        print("unifg: interrupted before there was anything to write", file=sys.stderr)
+        return INTERRUPTED
+    try:
+        files = write_results(folder, log)
+    except OSError as error:
+        return _refuse(f"--out {folder}: cannot write the results ({error})")
+    print(summary(log))
+    print()
+    for file in files:
+        print(file)
+    if log.interrupted:
+        return INTERRUPTED
+    return SUCCEEDED if log.succeeded else FAILED
+
+
+@contextmanager
+def _progress_bar(name: str) -> Iterator[Progress]:
+    """A bar on stderr; the first interrupt waits for the end of a tick, so that the record stays whole."""
+    from tqdm import tqdm
+
+    wanted = False
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal wanted
+        if wanted:  # it does not come to an end: stop at once
+            raise KeyboardInterrupt
+        wanted = True
+
+    layout = "{desc} {percentage:3.0f}%|{bar}| {elapsed} {postfix}"
+    with tqdm(total=1.0, desc=name, bar_format=layout, file=sys.stderr) as bar:
+
+        def progress(done: float, text: str) -> None:
+            nonlocal wanted
+            bar.set_postfix_str(text, refresh=False)
+            bar.update(max(0.0, min(done, 1.0) - bar.n))
+            if wanted:
+                wanted = False
+                raise KeyboardInterrupt
+
+        try:
+            before = signal.signal(signal.SIGINT, interrupt)
+        except ValueError:  # not in the main thread, where no interrupt arrives either
+            yield progress
+            return
+        try:
+            yield progress
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+
+def _refuse(message: str) -> int:
+    print(f"unifg: error: {message}", file=sys.stderr)
+    return REFUSED
+
+
+def _join_negative(arguments: list[str]) -> list[str]:
+    """``--start -2,-0.5,0`` as ``--start=-2,-0.5,0``: argparse would take the value for an option."""
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and joined[-1] in _POSE_OPTIONS and _NEGATIVE.match(argument):
+            joined[-1] += f"={argument}"
+        else:
+            joined.append(argument)
+    return joined
+
+
+def _pose(text: str) -> Pose:
+    words = text.split(",")
+    try:
+        x, y, theta = (float(word) for word in words)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a pose: expected three numbers X,Y,THETA [m, m, rad], without blanks"
+        ) from None
+    if not all(abs(value) < float("inf") for value in (x, y, theta)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a pose: every number must be finite")
+    return x, y, theta
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 0")
+    return int(text)
+
+
+def _map_file(text: str) -> Path:
+    path = Path(text)
+    if not path.is_file():
+        raise argparse.ArgumentTypeError(f"{text}: no such file; give the YAML file of a ROS map")
+    return path
+
+
+def _navigation_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--map", type=_map_file, metavar="F.yaml", help="ROS map (default: the building that ships with unifg)"
+    )
+    parser.add_argument(
+        "--start", type=_pose, metavar="X,Y,TH", help="start pose [m, m, rad]; has a default only for the shipped map"
+    )
+    parser.add_argument(
+        "--goal",
+        type=_pose,
+        action="append",
+        dest="goals",
+        metavar="X,Y,TH",
+        help="goal pose; repeat it for several goals, reached in this order",
+    )
+    parser.add_argument("--coupling", choices=COUPLINGS, default=COUPLINGS[0], help="of estimation and control")
+    parser.add_argument(
+        "--obstacles", type=_count, default=3, metavar="K", help="obstacles that are not on the map (default: 3)"
+    )
+
+
+def _run_navigation(chosen: argparse.Namespace, progress: Progress) -> EpisodeLog:
+    from unifg.scenarios import navigation  # imports solvers and the physics engine: not for --help
+
+    settings = navigation.NavigationSettings(
+        map=chosen.map,
+        start=chosen.start,
+        goals=None if chosen.goals is None else tuple(chosen.goals),
+        solver=chosen.solver,
+        coupling=chosen.coupling,
+        obstacles=chosen.obstacles,
+        seed=chosen.seed,
+    )
+    return navigation.run_navigation(settings, progress=progress)
+
+
+SCENARIOS = {
+    "navigation": Scenario(
+        "A robot localises itself by lidar and drives through a building under MPC.",
+        _navigation_arguments,
+        _run_navigation,
+    ),
+}
+"""Everything ``unifg run`` can run."""
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,70 @@
+"""What a program says about a point: with and without derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+
+from unifg.compiled import Values
+from unifg.typing import Array
+
+HeldWeights: TypeAlias = dict[str, Array]
+
+
+@dataclass
+class Evaluation:
+    """Objective and constraints at a point, without derivatives.
+
+    Attributes:
+        cost: objective.
+        constraints: (M,) stacked g.
+    """
+
+    cost: float
+    constraints: Array
+
+    @property
+    def finite(self) -> bool:
+        """Whether every number is finite."""
+        return bool(np.isfinite(self.cost) and np.isfinite(self.constraints).all())
+
+
+@dataclass
+class Linearization:
+    """Objective and constraints with their derivatives at ``values``.
+
+    Attributes:
+        values: where.
+        cost: objective.
+        residual: (C,) weighted, whitened cost residuals.
+        jacobian: entries of the cost Jacobian, in the order of ``Program.costs``.
+        constraints: (M,) stacked g.
+        constraint_jacobian: entries of A, in the order of ``Program.constraints``.
+        gradient: gradient of the objective over the full tangent space.
+        scalar_hessian: entries of the Hessian blocks of scalar costs.
+        norms: each term's residual norm; for constraints the norm of the violation.
+        weights: weights of reweighted losses, to be held during the line search.
+    """
+
+    values: Values
+    cost: float
+    residual: Array
+    jacobian: Array
+    constraints: Array
+    constraint_jacobian: Array
+    gradient: Array
+    scalar_hessian: Array
+    norms: dict[str, float]
+    weights: HeldWeights = field(default_factory=dict)
+
+    @property
+    def finite(self) -> bool:
+        """Whether every number is finite."""
+        return bool(
+            np.isfinite(self.cost)
+            and np.isfinite(self.gradient).all()
+            and np.isfinite(self.constraints).all()
+            and np.isfinite(self.constraint_jacobian).all()
+        )
