@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.models.distance_map import DistanceMap
+from unifg.models.smooth_field import SmoothField
 from unifg.residuals import Residual, residual
 from unifg.typing import Array
 
@@ -46,22 +46,22 @@ radius: (M,) or (n, M); give the sum of the disc's and the robot's radii for hul
 
 
 class _Wall:
-    def __init__(self, distance_map: DistanceMap) -> None:
-        self.distance_map = distance_map
+    def __init__(self, field: SmoothField) -> None:
+        self.field = field
 
     def __call__(self, x: Array) -> Array:
-        return self.distance_map.distance(x[:, :2])[:, None]
+        return self.field.distance(x[:, :2])[:, None]
 
     def jacobian(self, x: Array) -> list[Array]:
-        _, gradient = self.distance_map.distance_and_gradient(x[:, :2])
+        _, gradient = self.field.distance_and_gradient(x[:, :2])
         block = np.zeros((len(x), 1, 3))
         block[:, :, :2] = _in_body(x, gradient[:, None, :])
         return [block]
 
 
-def wall_distance(distance_map: DistanceMap) -> Residual:
-    """``wall_distance(map)(x)``: signed distance of each SE(2) position to the nearest wall, (n, 1) [m]."""
-    function = _Wall(distance_map)
+def wall_distance(field: SmoothField) -> Residual:
+    """``wall_distance(field)(x)``: signed distance of each SE(2) position to the nearest wall, (n, 1) [m]."""
+    function = _Wall(field)
     return residual(function, function.jacobian, "wall distance")
 
 

@@ -1,7 +1,7 @@
 """The command ``unifg``: run a scenario, watch its progress, keep its results.
 
-Exit status: 0 if every goal was reached without a collision, 1 if not, 2 for arguments that cannot be served, 130 after an
-interrupt (what was driven until then is written all the same).
+Exit status: 0 if every goal was reached without a collision, 1 if not, 2 for arguments that cannot be
+served, 130 after an interrupt (what was driven until then is written all the same).
 
 Commands and scenarios are tables: to add one, write a function that describes its arguments and one that runs it.
 """
@@ -84,14 +84,16 @@ def _parser() -> argparse.ArgumentParser:
     run = commands.add_parser("run", help="run a scenario", description="Run a scenario.", allow_abbrev=False)
     scenarios = run.add_subparsers(title="scenarios", required=True, metavar="SCENARIO")
     for name, scenario in SCENARIOS.items():
-        one = scenarios.add_parser(
-            name, help=scenario.summary, description=scenario.summary, allow_abbrev=False
-        )
+        one = scenarios.add_parser(name, help=scenario.summary, description=scenario.summary, allow_abbrev=False)
         scenario.arguments(one)
         one.add_argument("--solver", choices=SOLVERS, default="sqp", help="backend (default: %(default)s)")
         one.add_argument("--seed", type=_count, default=0, metavar="S", help="of everything random (default: 0)")
         one.add_argument(
-            "--out", type=Path, default=Path("out"), metavar="DIR", help="folder for results (default: %(default)s)"
+            "--out",
+            type=Path,
+            default=Path("out"),
+            metavar="DIR",
+            help="folder for results (default: %(default)s)",
         )
         one.set_defaults(command=_run, scenario=name)
     return parser
@@ -201,10 +203,16 @@ def _map_file(text: str) -> Path:
 
 def _navigation_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--map", type=_map_file, metavar="F.yaml", help="ROS map (default: the building that ships with unifg)"
+        "--map",
+        type=_map_file,
+        metavar="F.yaml",
+        help="ROS map (default: the building that ships with unifg)",
     )
     parser.add_argument(
-        "--start", type=_pose, metavar="X,Y,TH", help="start pose [m, m, rad]; has a default only for the shipped map"
+        "--start",
+        type=_pose,
+        metavar="X,Y,TH",
+        help="start pose [m, m, rad]; has a default only for the shipped map",
     )
     parser.add_argument(
         "--goal",
@@ -216,7 +224,11 @@ def _navigation_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--coupling", choices=COUPLINGS, default=COUPLINGS[0], help="of estimation and control")
     parser.add_argument(
-        "--obstacles", type=_count, default=3, metavar="K", help="obstacles that are not on the map (default: 3)"
+        "--obstacles",
+        type=_count,
+        default=3,
+        metavar="K",
+        help="obstacles that are not on the map (default: 3)",
     )
 
 

@@ -13,12 +13,14 @@ import numpy as np
 import unifg as fg
 from unifg.models import obstacles, unicycle
 from unifg.models.distance_map import DistanceMap
+from unifg.models.smooth_field import SmoothField
 from unifg.scenarios.perception import Tracks, nearest
 from unifg.solvers import SQP, AugmentedLagrangian
-from unifg.typing import Array
+from unifg.typing import Array, BoolArray
 
 FAR_AWAY = 1e3  # [m]; where an unused disc waits
 LEFT_BEHIND = 0.6  # [m] between the ends of plan and reference
+BRAKING = 6  # ticks to come to rest when no new plan is found
 PATIENCE = 5  # ticks of being left behind before the plan starts over from the reference
 
 
@@ -38,7 +40,8 @@ class ControllerSettings:
         robot_radius: [m].
         wall_clearance: least distance of the hull to walls [m].
         disc_clearance: least distance of the hull to tracked discs [m].
-        mover_allowance: added to the radius of discs that move: they may turn round [m].
+        mover_allowance: added to the clearance from discs that move [m].
+        approach: share of the gap to a moving disc that one step may close.
         margin: distance of the hull below which the soft costs begin [m].
         margin_sigma: [m].
         discs: tracked discs considered at once.
@@ -58,7 +61,8 @@ class ControllerSettings:
     robot_radius: float = 0.17
     wall_clearance: float = 0.03
     disc_clearance: float = 0.06
-    mover_allowance: float = 0.12
+    mover_allowance: float = 0.1
+    approach: float = 0.12
     margin: float = 0.2
     margin_sigma: float = 0.1
     discs: int = 3
@@ -74,9 +78,9 @@ def backend(name: str, tolerance: float) -> fg.Solver:
         ScenarioError: for an unknown name.
     """
     if name == "sqp":
-        return SQP(tolerance=tolerance, max_iterations=20)
+        return SQP(tolerance=tolerance, max_iterations=15)
     if name == "alm":
-        return AugmentedLagrangian(tolerance=tolerance, max_iterations=60)
+        return AugmentedLagrangian(tolerance=tolerance, max_iterations=40)
     raise fg.ScenarioError(f"unknown solver '{name}': choose alm or sqp")
 
 
@@ -89,7 +93,7 @@ class Plan:
         states: (N + 1, 3) predicted poses [m, m, rad].
         status: status of the solve.
         iterations: of the backend.
-        bound_violation: of the solver's controls, before any clipping.
+        bound_violation: of the plan that is driven, as the solver returned it, before any clipping.
         emergency: whether the stored plan is being driven instead.
         worst: largest violated constraint of the solve, for the record.
     """
@@ -128,7 +132,8 @@ class Controller:
         graph.minimize(fg.prior, u, self._cruise, sigma=s.control_sigma, name="effort")
         graph.minimize(fg.prior, u[0], self._last, sigma=s.rate_sigma, name="first change")
         graph.minimize(unicycle.rate, u[:-1], u[1:], sigma=s.rate_sigma, name="change")
-        walls = obstacles.wall_distance(distance_map)
+        self._field = SmoothField(distance_map)
+        walls = obstacles.wall_distance(self._field)
         wall_margin = obstacles.shortfall(walls, s.robot_radius + s.margin)
         disc_margin = obstacles.shortfall(obstacles.disc_clearance, s.robot_radius + s.margin)
         graph.minimize(wall_margin, x[1:], sigma=s.margin_sigma, name="wall margin")
@@ -139,13 +144,13 @@ class Controller:
         graph.constrain(
             obstacles.disc_clearance, x[1:], self._centres, self._radii, lower=self._disc_limit, name="discs"
         )
-        self._distance_map = distance_map
         self._run = backend(solver, s.tolerance).prepare(graph)
         self._guess: fg.Guess | None = None
         self._applied = np.zeros(2)
         self._stored = np.zeros((n, 2))
         self._age = n
         self._lagging = 0
+        self._failed = False
 
     def plan(self, pose: Array, reference: Array, tracks: Tracks) -> Plan:
         """Decide the next control.
@@ -157,23 +162,23 @@ class Controller:
         """
         s = self.settings
         data = self._data(pose, reference, tracks)
-        guess = self._guess or self._along(pose, reference)
+        guess = self._guess or (self._staying(pose) if self._failed else self._along(pose, reference))
         solution = self._run.solve(guess, data=data)
         controls = solution[self._u]
-        bound_violation = float(np.maximum(np.abs(controls) - s.limits, 0.0).max())
         worst = "" if solution.worst is None else solution.worst[0]
         if solution.violation <= s.feasible:
             self._stored, self._age = controls, 0
-            emergency = False
+            emergency = self._failed = False
             states = solution[self._x]
             self._guess = None if self._left_behind(states, reference) else solution.shifted(self._x, self._u)
         else:
             self._age += 1
             self._guess = None
-            emergency = True
+            emergency = self._failed = True
             states = unicycle.rollout(pose, self._braking(), s.dt)
+        beyond = float(np.maximum(np.abs(self._stored) - s.limits, 0.0).max())
         self._applied = np.clip(controls[0], *_box(s)) if not emergency else self._braking()[0]
-        return Plan(self._applied, states, solution.status, solution.iterations, bound_violation, emergency, worst)
+        return Plan(self._applied, states, solution.status, solution.iterations, beyond, emergency, worst)
 
     def forget(self) -> None:
         """Drop the warm start, as when a new goal makes it misleading."""
@@ -189,13 +194,17 @@ class Controller:
         return True
 
     def _braking(self) -> Array:
-        """What remains of the stored plan, slowed to rest by its end; the path keeps its shape."""
-        n = self.settings.horizon
-        remaining = self._stored[min(self._age, n) :]
-        fade = 1.0 - (np.arange(self._age, n) + 1.0) / n if len(remaining) else np.zeros(0)
-        controls = np.zeros((n, 2))
-        controls[: len(remaining)] = remaining * fade[:, None]
+        """The stored plan slowed to rest; the path keeps its shape, and the robot rests well before its end."""
+        controls = np.zeros((self.settings.horizon, 2))
+        stages = np.arange(self._age, self.settings.horizon)
+        fade = np.maximum(1.0 - stages / BRAKING, 0.0)
+        controls[: len(stages)] = self._stored[stages] * fade[:, None]
         return controls
+
+    def _staying(self, pose: Array) -> fg.Guess:
+        """Guess rest, which is feasible: from there a solver that failed finds the near side of what stopped it."""
+        n = self.settings.horizon
+        return fg.Guess({self._x: np.tile(pose, (n + 1, 1)), self._u: np.zeros((n, 2))})
 
     def _along(self, pose: Array, reference: Array) -> fg.Guess:
         """Guess the reference itself: it leads around whatever the route leads around."""
@@ -214,17 +223,12 @@ class Controller:
         s = self.settings
         n, m = s.horizon, s.discs
         stages = s.dt * np.arange(1, n + 1)
-        centres, radii = np.full((n, m, 2), FAR_AWAY), np.zeros(m)
+        centres, radii, moving = np.full((n, m, 2), FAR_AWAY), np.zeros(m), np.zeros(m, dtype=bool)
         chosen = nearest(tracks, pose, m)
         k = len(chosen)
         centres[:, :k] = chosen.centre + stages[:, None, None] * chosen.velocity
-        moving = np.hypot(*chosen.velocity.T) > 0.0
-        radii[:k] = chosen.radius + np.where(moving, s.mover_allowance, 0.0)
-        regained = s.relaxation * np.arange(1, n + 1)
-        wall_now = float(self._distance_map.distance(pose[None, :2])[0])
-        disc_now = np.hypot(*(pose[:2] - centres[0]).T) - radii
-        wall_limit = np.minimum(s.robot_radius + s.wall_clearance, wall_now - s.relaxation + regained)
-        disc_limit = np.minimum(s.robot_radius + s.disc_clearance, disc_now[None, :] - s.relaxation + regained[:, None])
+        moving[:k] = np.hypot(*chosen.velocity.T) > 0.0
+        radii[:k] = chosen.radius
         cruise = np.zeros((n, 2))
         cruise[:, 0] = self._cruising(reference)
         return {
@@ -233,11 +237,33 @@ class Controller:
             self._end: reference[-1],
             self._cruise: cruise,
             self._last: self._applied,
-            self._wall_limit: wall_limit[:, None],
-            self._disc_limit: disc_limit,
+            self._wall_limit: self._wall_limits(pose),
+            self._disc_limit: self._disc_limits(pose, centres, radii, moving),
             self._centres: centres,
             self._radii: radii,
         }
+
+
+    def _wall_limits(self, pose: Array) -> Array:
+        """(N, 1) least distances to walls; a robot found nearer need not move away at once, but may not near."""
+        s = self.settings
+        now = float(self._field.distance(pose[None, :2])[0])
+        regained = s.relaxation * np.arange(s.horizon)
+        return np.minimum(s.robot_radius + s.wall_clearance, now + regained)[:, None]
+
+    def _disc_limits(self, pose: Array, centres: Array, radii: Array, moving: BoolArray) -> Array:
+        """(N, M) least distances to discs, as far as a robot at rest could keep them.
+
+        A mover is not approached by more than a share of the gap each step, as a control barrier function
+        demands, for it may turn round. Resting is always feasible: movers wait for a robot at rest.
+        """
+        s = self.settings
+        stages = np.arange(1, s.horizon + 1)[:, None]
+        at_rest = np.hypot(*np.moveaxis(pose[:2] - centres, 2, 0)) - radii
+        least = s.robot_radius + s.disc_clearance + np.where(moving, s.mover_allowance, 0.0)
+        spare = np.maximum(at_rest[0] - least, 0.0) * np.where(moving, 1.0, 0.0)
+        wanted = least + spare * (1.0 - s.approach) ** stages
+        return np.minimum(wanted, at_rest + s.relaxation * (stages - 1))
 
 
 def _box(settings: ControllerSettings) -> tuple[Array, Array]:

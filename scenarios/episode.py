@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from unifg.files.ros_map import OccupancyMap
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -48,7 +50,8 @@ class EpisodeLog:
         localisation_iterations: (T,).
         plan_iterations: (T,).
         status: T status words of the plan, ``"converged"`` when all is well.
-        bound_violation: (T,) worst violation of a control bound by the solver's output, before any clipping.
+        bound_violation: (T,) worst violation of a control bound by the plan that is driven, as the solver returned
+            it, before any clipping.
         clearance: (T,) distance from the robot's hull to the nearest thing [m].
         collisions: distinct contact events of the episode.
         goal_index: (T,) goal being approached.
@@ -113,7 +116,8 @@ class EpisodeLog:
         if self.obstacle_moving is not None:
             return self.obstacle_moving
         if self.ticks == 0:
-            return self.obstacles[:, :, 0].any(axis=0)
-        travel = abs(self.obstacles[:, :, :2] - self.obstacles[:1, :, :2]).max(axis=(0, 2), initial=0.0)
-        moved: BoolArray = travel > 1e-6
+            return np.zeros(self.obstacles.shape[1], dtype=bool)
+        places = self.obstacles[:, :, :2]
+        travel = np.abs(places - places[:1]).max(axis=(0, 2), initial=0.0)
+        moved: BoolArray = np.asarray(travel > 1e-6)
         return moved

@@ -59,9 +59,10 @@ class Iterations(TypedDict):
 class EpisodeMetrics(TypedDict):
     """What `episode_metrics` returns; the key says the unit.
 
-    ``path_length_m`` is the way the robot really drove, ``planned_length_m`` that of the planned path; ``solver_failures``
-    counts ticks whose solve was rejected, so that the stored plan was driven (``emergency_ticks``, the same ticks), and
-    ``plan_status`` counts the status words of all ticks. ``odometry_error_m`` is the error of dead reckoning.
+    ``path_length_m`` is the way the robot really drove, ``planned_length_m`` that of the planned path;
+    ``solver_failures`` counts ticks whose solve was rejected, so that the stored plan was driven
+    (``emergency_ticks``, the same ticks), and ``plan_status`` counts the status words of all ticks.
+    ``odometry_error_m`` is the error of dead reckoning.
     """
 
     scenario: str
@@ -113,7 +114,7 @@ def episode_metrics(log: EpisodeLog) -> EpisodeMetrics:
     """
     if log.ticks == 0:
         raise ScenarioError("the episode has no tick: there is nothing to measure")
-    duration = log.ticks * log.dt
+    duration = round(log.ticks * log.dt, 9)
     length = path_length(log.true_pose)
     position, heading = pose_errors(log.estimate, log.true_pose)
     odometry_position, odometry_heading = pose_errors(log.dead_reckoning, log.true_pose)

@@ -1,13 +1,13 @@
 """An episode as one picture: where it went on the map, and how well it went over time.
 
-Each function draws into the axes it is given, or into new ones, and returns them. Figures are made without matplotlib's global
-state (no ``pyplot``), so drawing works in threads and on machines without a screen.
+Each function draws into the axes it is given, or into new ones, and returns them. Figures are made without
+matplotlib's global state (no ``pyplot``), so drawing works in threads and on machines without a screen.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from unifg.errors import ScenarioError
 from unifg.scenarios.episode import EpisodeLog
 from unifg.scenarios.metrics import EpisodeMetrics, episode_metrics, pose_errors
 from unifg.scenarios.palette import css
+from unifg.scenarios.shapes import known_corners
 from unifg.typing import Array
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ __all__ = [
     "write_overview",
 ]
 
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],  # ships with matplotlib: the same picture everywhere
     "font.size": 9.0,
@@ -92,8 +93,9 @@ def overview(log: EpisodeLog) -> Figure:
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(15.0, 9.4), layout="constrained")
         FigureCanvasAgg(figure)
-        left, right = figure.subfigures(1, 2, width_ratios=(1.75, 1.0))
-        plot_map(log, ax=left.subplots())
+        left, right = figure.subfigures(1, 2, width_ratios=(1.75, 1.0), squeeze=False)[0]
+        place = plot_map(log, ax=left.subplots(), legend=False)
+        left.legend(*place.get_legend_handles_labels(), loc="outside lower center", ncols=4)
         panels = right.subplots(5, 1, sharex=True)
         plot_localisation(log, ax=panels[0])
         plot_controls(log, ax=(panels[1], panels[2]))
@@ -105,12 +107,13 @@ def overview(log: EpisodeLog) -> Figure:
     return figure
 
 
-def plot_map(log: EpisodeLog, ax: Axes | None = None) -> Axes:
+def plot_map(log: EpisodeLog, ax: Axes | None = None, *, legend: bool = True) -> Axes:
     """The map seen from above with all paths, obstacles, start and goals.
 
     Args:
         log: the episode.
         ax: axes to draw into; None for new ones.
+        legend: False leaves out the legend below the axes.
     """
     from matplotlib.colors import ListedColormap
     from matplotlib.transforms import Affine2D
@@ -142,19 +145,16 @@ def plot_map(log: EpisodeLog, ax: Axes | None = None) -> Axes:
         ax.plot(*stored[:, :2].T, "x", color="#000000", ms=5, mew=1.2, label=_STORED, zorder=7)
     _poses(log, ax)
 
-    seen = np.argwhere(occupancy.occupied | occupancy.free)
-    low, high = seen.min(axis=0), seen.max(axis=0) + 1
-    box = np.array([[low[1], low[0]], [high[1], low[0]], [high[1], high[0]], [low[1], high[0]]], dtype=np.float64)
-    everything = np.concatenate([occupancy.grid_to_world(box), log.true_pose[:, :2], log.goals[:, :2]])
+    everything = np.concatenate([known_corners(occupancy), log.true_pose[:, :2], log.goals[:, :2]])
     margin = 0.02 * float(np.ptp(everything, axis=0).max())
     ax.set_xlim(everything[:, 0].min() - margin, everything[:, 0].max() + margin)
     ax.set_ylim(everything[:, 1].min() - margin, everything[:, 1].max() + margin)
     ax.set_aspect("equal")
-    ax.set_anchor("N")
     ax.set_xlabel("x [m]")
     ax.set_ylabel("y [m]")
     ax.set_title("Where it went")
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=4)
+    if legend:
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=4)
     return ax
 
 
@@ -179,7 +179,10 @@ def plot_localisation(log: EpisodeLog, ax: Axes | None = None) -> Axes:
 def plot_controls(log: EpisodeLog, ax: tuple[Axes, Axes] | None = None) -> tuple[Axes, Axes]:
     """Forward and turning speed over time against their limits, in two axes."""
     first, second = (_axes(None), _axes(None)) if ax is None else ax
-    names = (("v [m/s]", "Forward speed and its limits"), ("$\\omega$ [rad/s]", "Turning speed and its limits"))
+    names = (
+        ("v [m/s]", "Forward speed and its limits"),
+        ("$\\omega$ [rad/s]", "Turning speed and its limits"),
+    )
     for axes, column, limit, (label, title) in zip((first, second), (0, 1), log.control_limits, names, strict=True):
         for bound in (-limit, limit):
             axes.axhline(bound, color=_LIMIT, lw=1.0, ls="--")
@@ -206,7 +209,7 @@ def plot_clearance(log: EpisodeLog, ax: Axes | None = None) -> Axes:
     top = 1.15 * float(finite.max()) if finite.size else 1.0
     ax.set_ylim(min(0.0, 1.1 * float(log.clearance[lowest])) - 0.03 * top, top)
     ax.set_ylabel("clearance [m]")
-    ax.set_title(f"Distance from hull to nearest thing, at least {log.clearance[lowest]:.2f} m")
+    ax.set_title(f"Distance from hull to nearest thing, at least {max(0.0, log.clearance[lowest]):.2f} m")
     return _finish(log, ax)
 
 
@@ -220,7 +223,7 @@ def plot_solve_times(log: EpisodeLog, ax: Axes | None = None) -> Axes:
         ax.axhline(value, color=_LIMIT, lw=0.9, ls="--")
     ax.set_ylim(0.0, 1.25 * float(np.max(log.solve_ms)) + 1e-9)
     ax.set_ylabel("solve [ms]")
-    ax.set_title(f"Time to localise and plan: median {p50:.1f} ms, 99 % within {p99:.0f} ms")
+    ax.set_title(f"Solve time: median {p50:.1f} ms, 99 % within {p99:.0f} ms")
     ax.legend(loc="upper left", ncols=2, markerscale=3, borderpad=0.0)
     return _finish(log, ax)
 
@@ -238,8 +241,9 @@ def _finish(log: EpisodeLog, ax: Axes) -> Axes:
     ax.set_axisbelow(True)
     ax.grid(True)
     ax.set_xlim(log.time[0], log.time[-1] + log.dt)
-    for time in log.time[log.emergency]:
-        ax.axvspan(time, time + log.dt, color="#000000", alpha=0.25, lw=0)
+    steps = np.diff(np.concatenate([[0], log.emergency.astype(np.int8), [0]]))
+    for begin, end in zip(np.flatnonzero(steps == 1), np.flatnonzero(steps == -1), strict=True):
+        ax.axvspan(log.time[begin], log.time[end - 1] + log.dt, color="#000000", alpha=0.12, lw=0)
     return ax
 
 
@@ -268,7 +272,7 @@ def _obstacles(log: EpisodeLog, ax: Axes) -> None:
 
 
 def _apart(places: Array) -> Array:
-    """Of places over time, the last one and earlier ones at least 1.5 radii from those kept after them, oldest first."""
+    """The last place and earlier ones at least 1.5 radii from all later ones kept, oldest first."""
     kept = [places[-1]]
     for place in places[-2::-1]:
         if np.linalg.norm(np.array(kept)[:, :2] - place[:2], axis=1).min() >= 1.5 * place[2]:
@@ -280,7 +284,7 @@ def _poses(log: EpisodeLog, ax: Axes) -> None:
     """Start, goals and the robot where the episode ended, with short strokes for their headings."""
     from matplotlib.patches import Circle
 
-    stroke = 0.03 * float(np.ptp(log.occupancy.bounds, axis=0).max())
+    stroke = 0.03 * float(np.ptp(known_corners(log.occupancy), axis=0).max())
     named = [("start", log.start, "o", css("start"))]
     for index, goal in enumerate(log.goals):
         name = "goal" if len(log.goals) == 1 else f"goal {index + 1}"
@@ -292,11 +296,12 @@ def _poses(log: EpisodeLog, ax: Axes) -> None:
         ax.plot(*ends, color="#1d2430", lw=1.4, zorder=8)
         ax.plot(x, y, marker, color=colour, ms=15 if marker == "*" else 8, mec="#1d2430", mew=0.8, zorder=9)
         ax.annotate(
-            name, (x, y), xytext=(0, -9), textcoords="offset points", ha="center", va="top", fontsize=9, fontweight="bold",
+            name, (x, y), xytext=(0, -9), textcoords="offset points", ha="center", va="top", fontsize=9,
+            fontweight="bold",
             bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8}, zorder=10,
         )  # fmt: skip
     x, y, _ = log.true_pose[-1].tolist()
-    ax.add_patch(Circle((x, y), log.robot_radius, facecolor=css("robot"), edgecolor="white", lw=0.5, zorder=10))
+    ax.add_patch(Circle((x, y), log.robot_radius, facecolor=css("robot"), edgecolor="white", lw=0.5, zorder=7))
 
 
 def _title(log: EpisodeLog, metrics: EpisodeMetrics) -> str:

@@ -1,14 +1,16 @@
 """A window for meshcat that records instead of showing, so that a scene becomes a file without a server.
 
-``meshcat.Visualizer(window=Recorder())`` sends its commands here; `Recorder.packed` gives them back as the bytes the browser
-side understands. Two things are mended on the way: numpy scalars, which meshcat cannot pack, become Python numbers, and the
-random identifiers of meshcat's objects become a running count, so that the same scene is the same bytes.
+``meshcat.Visualizer(window=Recorder())`` sends its commands here; `Recorder.packed` gives them back as the
+bytes the browser side understands. Two things are mended on the way: numpy scalars, which meshcat cannot
+pack, become Python numbers, and the random identifiers of meshcat's objects become a running count, so that
+the same scene is the same bytes.
 """
 
 from __future__ import annotations
 
 import base64
 import re
+import warnings
 from importlib import resources
 from typing import Protocol
 
@@ -16,7 +18,7 @@ import numpy as np
 
 from unifg.errors import ScenarioError
 
-__all__ = ["Recorder", "viewer_script"]
+__all__ = ["Recorder", "load_meshcat", "viewer_script"]
 
 _UUID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
@@ -74,8 +76,19 @@ def viewer_script() -> str:
     Raises:
         ScenarioError: meshcat is not installed.
     """
+    load_meshcat()
+    return resources.files("meshcat").joinpath("viewer", "dist", "main.min.js").read_text(encoding="utf-8")
+
+
+def load_meshcat() -> None:
+    """Import meshcat, an optional dependency, with its warnings about its own imports kept quiet.
+
+    Raises:
+        ScenarioError: meshcat is not installed.
+    """
     try:
-        files = resources.files("meshcat")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)
+            import meshcat  # noqa: F401
     except ModuleNotFoundError as error:
         raise ScenarioError("a scene needs meshcat: pip install 'unifg[scenarios]'") from error
-    return files.joinpath("viewer", "dist", "main.min.js").read_text(encoding="utf-8")

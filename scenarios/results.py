@@ -45,7 +45,10 @@ def summary(log: EpisodeLog) -> str:
         ("solver, coupling, seed", f"{metrics['solver']}, {metrics['coupling']}, {metrics['seed']}"),
         ("goals reached", f"{metrics['goals_reached']} of {metrics['goals']}{stopped}"),
         ("collisions", f"{metrics['collisions']}"),
-        ("driven", f"{metrics['path_length_m']:.2f} m in {metrics['duration_s']:.1f} s, {metrics['steps']} ticks"),
+        (
+            "driven",
+            f"{metrics['path_length_m']:.2f} m in {metrics['duration_s']:.1f} s, {metrics['steps']} ticks",
+        ),
         ("planned path", f"{metrics['planned_length_m']:.2f} m"),
         ("smallest clearance", f"{metrics['min_clearance_m']:.3f} m"),
         ("localisation error", _spread(metrics["localisation_error_m"], "m")),

@@ -1,8 +1,8 @@
 """An episode as one HTML file: the building, the robot and what it saw, estimated and planned, played back offline.
 
-The file carries its viewer (meshcat) and needs neither a server nor a network. The same log gives the same bytes, provided
-that the same version of meshcat wrote them. What changes shape from frame to frame (scan, horizon, detections) is one object per
-frame that is shown in turn; what only moves is animated.
+The file carries its viewer (meshcat) and needs neither a server nor a network. The same log gives the same
+bytes, provided that the same version of meshcat wrote them. What changes shape from frame to frame (scan,
+horizon, detections) is one object per frame that is shown in turn; what only moves is animated.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from unifg.errors import ScenarioError
 from unifg.scenarios import shapes
 from unifg.scenarios.episode import EpisodeLog
 from unifg.scenarios.palette import COLOURS
-from unifg.scenarios.recorder import Recorder, viewer_script
+from unifg.scenarios.recorder import Recorder, load_meshcat, viewer_script
 from unifg.scenarios.scene_page import scene_page
 from unifg.typing import Array, IntArray
 
@@ -83,11 +83,10 @@ def record_scene(log: EpisodeLog) -> Recorder:
     """
     if log.ticks == 0:
         raise ScenarioError("the episode has no tick: there is nothing to show")
-    try:
-        from meshcat.animation import Animation
-        from meshcat.visualizer import Visualizer
-    except ModuleNotFoundError as error:
-        raise ScenarioError("a scene needs meshcat: pip install 'unifg[scenarios]'") from error
+    load_meshcat()
+    from meshcat.animation import Animation
+    from meshcat.visualizer import Visualizer
+
     recorder = Recorder()
     scene = _Scene(log, Visualizer(window=recorder), Animation(default_framerate=1.0 / log.dt))
     scene.draw()
@@ -101,7 +100,7 @@ class _Scene:
         self.log, self.viewer, self.animation = log, viewer, animation
         self.ticks = frame_ticks(log)
         self.last = int(self.ticks[-1])
-        extent = float(np.ptp(log.occupancy.bounds, axis=0).max())
+        extent = float(np.ptp(shapes.known_corners(log.occupancy), axis=0).max())
         self.stroke = float(np.clip(0.004 * extent, 0.03, 0.14))  # width of ribbons [m]
         self.pin = float(np.clip(0.035 * extent, 0.3, 1.4))  # height of pins and flags [m]
 
@@ -163,7 +162,11 @@ class _Scene:
         self._cylinder("odometry/body", _BODY, radius, COLOURS["odometry"], opacity=0.55)
         marker = shapes.wedge(1.2 * radius, _BODY + 0.02)
         self._mesh("odometry/heading", marker, COLOURS["odometry"], flat=True, opacity=0.8)
-        for path, poses in (("robot", log.true_pose), ("estimate", log.estimate), ("odometry", log.dead_reckoning)):
+        for path, poses in (
+            ("robot", log.true_pose),
+            ("estimate", log.estimate),
+            ("odometry", log.dead_reckoning),
+        ):
             self._move(path, poses)
 
     def _obstacles(self) -> None:
@@ -198,7 +201,12 @@ class _Scene:
                 self._points(f"{path}/scan", np.column_stack([hits, np.full(len(hits), _WALL + 0.02)]))
             horizon = log.horizon[tick][nodes]
             if len(horizon) > 1 and np.isfinite(horizon).all():
-                self._mesh(f"{path}/horizon", shapes.ribbon(horizon, self.stroke, 0.06), COLOURS["horizon"], flat=True)
+                self._mesh(
+                    f"{path}/horizon",
+                    shapes.ribbon(horizon, self.stroke, 0.06),
+                    COLOURS["horizon"],
+                    flat=True,
+                )
             rings = [
                 shapes.ring(x[:2], float(x[2]) + 0.03, 0.5 * self.stroke, _WALL + 0.01, corners=10)
                 for x in log.detected[tick]

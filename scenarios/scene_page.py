@@ -1,7 +1,7 @@
 """The HTML page around a recorded scene: title, legend, time slider, labels and camera.
 
-The page forbids itself every connection (Content-Security-Policy), so a scene cannot depend on a network by mistake. For
-pictures of a chosen moment, append ``#t=12.5`` (paused there) or ``#t=12.5&follow`` to its address.
+The page forbids itself every connection (Content-Security-Policy), so a scene cannot depend on a network by
+mistake. For pictures of a chosen moment, append ``#t=12.5`` (paused there) or ``#t=12.5&follow`` to its address.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from unifg.scenarios.episode import EpisodeLog
 from unifg.scenarios.metrics import EpisodeMetrics, episode_metrics, pose_errors
 from unifg.scenarios.palette import css
+from unifg.scenarios.shapes import known_corners
 from unifg.typing import IntArray
 
 __all__ = ["scene_page"]
@@ -78,7 +79,7 @@ def _facts(metrics: EpisodeMetrics) -> str:
         ("solver", f"{metrics['solver']} ({metrics['coupling']})"),
         ("seed", str(metrics["seed"])),
         ("driven", f"{metrics['path_length_m']:.1f} m in {metrics['duration_s']:.1f} s"),
-        ("closest approach", f"{metrics['min_clearance_m']:.2f} m"),
+        ("closest approach", f"{max(0.0, metrics['min_clearance_m']):.2f} m"),
         ("localisation error", f"{100 * metrics['localisation_error_m']['mean']:.1f} cm on average"),
         ("odometry error", f"{metrics['odometry_error_m']['max']:.2f} m at worst"),
     )
@@ -101,10 +102,6 @@ def _data(log: EpisodeLog, ticks: IntArray) -> dict[str, object]:
     """What the script of the page needs: times, a line of numbers per frame, labels, and what the camera must see."""
     error, _ = pose_errors(log.estimate, log.true_pose)
     duration = float(log.dt * ticks[-1])
-    seen = log.occupancy.free | log.occupancy.occupied
-    rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
-    box = np.array([[columns[0], rows[0]], [columns[-1] + 1, rows[-1] + 1]], dtype=np.float64)
-    corners = log.occupancy.grid_to_world(np.array([[box[i, 0], box[j, 1]] for i in (0, 1) for j in (0, 1)]))
     labels = [{"text": "start", "at": log.start[:2].round(3).tolist()}]
     for index, goal in enumerate(log.goals):
         text = "goal" if len(log.goals) == 1 else f"goal {index + 1}"
@@ -123,7 +120,7 @@ def _data(log: EpisodeLog, ticks: IntArray) -> dict[str, object]:
         "goals": len(log.goals),
         "goal": (log.goal_index[ticks] + 1).tolist(),
         "emergency": log.emergency[ticks].astype(int).tolist(),
-        "corners": corners.round(3).tolist(),
+        "corners": known_corners(log.occupancy).round(3).tolist(),
         "labels": labels,
         **{name: values.tolist() for name, values in rounded.items()},
     }
@@ -133,27 +130,36 @@ _PAGE = """<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval'; \
-style-src 'unsafe-inline'; img-src data: blob:; worker-src blob:">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; \
+script-src 'unsafe-inline' 'unsafe-eval'; style-src 'unsafe-inline'; img-src data: blob:; worker-src blob:">
 <meta name="viewport" content="width=device-width">
 <title>@@TITLE@@</title>
 <style>
-body { margin: 0; overflow: hidden; background: #eceef0; color: #1d2430; font: 13px/1.4 system-ui, "DejaVu Sans", sans-serif; }
+body { margin: 0; overflow: hidden; background: #eceef0; color: #1d2430;
+  font: 13px/1.4 system-ui, "DejaVu Sans", sans-serif; }
 #pane { width: 100vw; height: 100vh; overflow: hidden; }
 #panel { position: absolute; left: 12px; top: 12px; width: 252px; padding: 12px 14px; border-radius: 8px;
-  background: rgba(255, 255, 255, .92); box-shadow: 0 1px 6px rgba(0, 0, 0, .2); max-height: calc(100vh - 110px); overflow: auto; }
+  background: rgba(255, 255, 255, .92); box-shadow: 0 1px 6px rgba(0, 0, 0, .2);
+  max-height: calc(100vh - 110px); overflow: auto; }
 h1 { font-size: 15px; margin: 0 0 4px; }
 #outcome { font-weight: 600; margin: 0 0 8px; } .good { color: #00703c; } .bad { color: #b3261e; }
-dl { display: grid; grid-template-columns: auto 1fr; gap: 1px 10px; margin: 0 0 8px; } dt { color: #5b6472; } dd { margin: 0; }
+dl { display: grid; grid-template-columns: auto 1fr; gap: 1px 10px; margin: 0 0 8px; }
+dt { color: #5b6472; } dd { margin: 0; }
 summary { cursor: pointer; font-weight: 600; } ul { list-style: none; margin: 6px 0 0; padding: 0; }
-li { display: flex; gap: 9px; align-items: center; margin: 4px 0; line-height: 1.25; } li i { flex: 0 0 18px; box-sizing: border-box; }
-.disc, .ghost, .ring { height: 18px; border-radius: 50%; } .disc, .block { background: var(--c); } .block { height: 12px; }
-.ghost { background: color-mix(in srgb, var(--c) 40%, white); border: 1px solid var(--c); } .ring { border: 2px solid var(--c); }
+li { display: flex; gap: 9px; align-items: center; margin: 4px 0; line-height: 1.25; }
+li i { flex: 0 0 18px; box-sizing: border-box; }
+.disc, .ghost, .ring { height: 18px; border-radius: 50%; }
+.disc, .block { background: var(--c); } .block { height: 12px; }
+.ghost { background: color-mix(in srgb, var(--c) 40%, white); border: 1px solid var(--c); }
+.ring { border: 2px solid var(--c); }
 .line { height: 4px; background: var(--c); } .dots { height: 4px; border-bottom: 4px dotted var(--c); }
 .flag { height: 16px; background: var(--c); clip-path: polygon(0 0, 100% 35%, 12% 70%, 12% 100%, 0 100%); }
-#bar { position: absolute; left: 12px; right: 12px; bottom: 12px; padding: 8px 14px; border-radius: 8px; display: flex; gap: 12px;
-  align-items: center; background: rgba(255, 255, 255, .92); box-shadow: 0 1px 6px rgba(0, 0, 0, .2); flex-wrap: wrap; }
-#bar input { flex: 1 1 200px; accent-color: #0a56a8; } #bar button { font: inherit; min-width: 76px; padding: 3px 8px; }
+#bar { position: absolute; left: 12px; right: 12px; bottom: 12px; padding: 8px 14px; border-radius: 8px;
+  display: flex; gap: 12px;
+  align-items: center; background: rgba(255, 255, 255, .92);
+  box-shadow: 0 1px 6px rgba(0, 0, 0, .2); flex-wrap: wrap; }
+#bar input { flex: 1 1 200px; accent-color: #0a56a8; }
+#bar button { font: inherit; min-width: 76px; padding: 3px 8px; }
 #readout { font-variant-numeric: tabular-nums; white-space: pre; } #readout b { color: #b3261e; }
 .label { position: absolute; left: 0; top: 0; padding: 0 5px; border-radius: 4px; background: rgba(255, 255, 255, .82);
   font-weight: 600; font-size: 12px; pointer-events: none; white-space: nowrap; }
@@ -167,13 +173,15 @@ li { display: flex; gap: 9px; align-items: center; margin: 4px 0; line-height: 1
 <h1>@@TITLE@@</h1>
 <p id="outcome" class="@@OUTCOME_CLASS@@">@@OUTCOME@@</p>
 <dl>@@FACTS@@</dl>
-<details open><summary>What you see</summary><ul>@@LEGEND@@</ul></details>
+<details open>
+<summary>What you see</summary><ul>@@LEGEND@@</ul></details>
 </div>
 <div id="bar">
 <button id="play">Pause</button>
 <input id="slider" type="range" min="0" step="0.01" value="0" aria-label="time">
 <span id="readout"></span>
-<select id="speed" aria-label="speed"><option>1</option><option>2</option><option>4</option><option>8</option></select>
+<select id="speed" aria-label="speed"><option>1</option>
+<option>2</option><option>4</option><option>8</option></select>
 <button id="follow">Follow robot</button>
 </div>
 <script>
@@ -287,7 +295,7 @@ function frameAt(time) {
 }
 function update() {
   requestAnimationFrame(update);
-  if (animator.playing) { slider.value = animator.time; }
+  slider.value = animator.time;
   playButton.textContent = animator.playing ? "Pause" : "Play";
   const time = Number(slider.value), k = frameAt(time);
   const pad = (x, digits, width) => x.toFixed(digits).padStart(width, "\\u2007");
@@ -302,11 +310,14 @@ function update() {
     viewer.camera.position.add(step);
     viewer.set_dirty();
   }
+  const pixels = (p) => [(p.x + 1) / 2 * window.innerWidth, (1 - p.y) / 2 * window.innerHeight];
+  const [robotX, robotY] = pixels(robotPlace().project(viewer.camera));
   for (const label of labels) {
     const place = label.place().project(viewer.camera);
-    const x = (place.x + 1) / 2 * window.innerWidth, y = (1 - place.y) / 2 * window.innerHeight;
+    const [x, y] = pixels(place);
+    const covered = label.minor && Math.abs(x - robotX) < 75 && Math.abs(y - robotY) < 20;
     label.element.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px) translate(-50%, 9px)`;
-    label.element.style.display = Math.abs(place.z) < 1 ? "" : "none";
+    label.element.style.display = Math.abs(place.z) < 1 && !covered ? "" : "none";
   }
 }
 arrange();

@@ -1,6 +1,6 @@
-"""Meshes for scenes: an occupancy grid extruded into walls, and flat ribbons where a browser would draw hair-thin lines.
+"""Meshes for scenes: a map extruded into walls, and flat ribbons where a browser draws hair-thin lines.
 
-A mesh is a pair (vertices (n, 3) [m], faces (m, 3)). Quads share no vertices, so that shading keeps edges sharp.
+A mesh is a pair (vertices (n, 3) [m], faces (m, 3)). Walls share no vertices, so that shading keeps edges sharp.
 """
 
 from __future__ import annotations
@@ -10,9 +10,11 @@ import numpy as np
 from unifg.files.ros_map import OccupancyMap
 from unifg.typing import Array, BoolArray, IntArray
 
-__all__ = ["Mesh", "cover", "extrude", "flat", "merge", "ribbon", "ring", "wedge"]
+__all__ = ["Mesh", "cover", "extrude", "flat", "known_corners", "merge", "ribbon", "ring", "wedge"]
 
 Mesh = tuple[Array, IntArray]
+
+_WALLS_AROUND = 0.5  # [m]; thickness of outer walls that is still shown
 
 
 def cover(mask: BoolArray) -> IntArray:
@@ -38,6 +40,26 @@ def cover(mask: BoolArray) -> IntArray:
         finished += [(low, row, *run) for run, low in growing.items() if run not in still]
         growing = still
     return np.array(finished, dtype=np.intp).reshape(-1, 4)
+
+
+def known_corners(occupancy: OccupancyMap) -> Array:
+    """Corners (4, 2) [m] of the part of a map worth looking at, counter-clockwise.
+
+    It holds the free cells and the walls around them: maps made by robots often have stray marks far outside.
+    """
+    free, known = np.argwhere(occupancy.free), np.argwhere(occupancy.occupied | occupancy.free)
+    if not len(free):
+        return occupancy.bounds
+    margin = round(_WALLS_AROUND / occupancy.resolution)
+    low_row, low_column = np.maximum(free.min(axis=0) - margin, known.min(axis=0))
+    high_row, high_column = np.minimum(free.max(axis=0) + margin, known.max(axis=0)) + 1
+    corners = [
+        [low_column, low_row],
+        [high_column, low_row],
+        [high_column, high_row],
+        [low_column, high_row],
+    ]
+    return occupancy.grid_to_world(np.array(corners, dtype=np.float64))
 
 
 def flat(occupancy: OccupancyMap, mask: BoolArray, z: float) -> Mesh:
@@ -92,8 +114,7 @@ def ribbon(points: Array, width: float, z: float) -> Mesh:
     norm = np.linalg.norm(tangent, axis=1, keepdims=True)
     across = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1) / np.maximum(norm, 1e-9) * (width / 2.0)
     sides = np.stack([places - across, places + across], axis=1).reshape(-1, 2)
-    first = 2 * np.arange(len(places) - 1)[:, None]
-    faces = np.concatenate([first + [0, 2, 1], first + [1, 2, 3]])
+    faces = _repeat([[0, 2, 1], [1, 2, 3]], 2, len(places) - 1)
     return np.column_stack([sides, np.full(len(sides), z)]), faces
 
 
@@ -102,8 +123,7 @@ def ring(centre: Array, radius: float, width: float, z: float, corners: int = 16
     angles = np.linspace(0.0, 2.0 * np.pi, corners + 1)
     circle = np.column_stack([np.cos(angles), np.sin(angles)])
     vertices = np.stack([centre + radius * circle, centre + (radius + width) * circle], axis=1).reshape(-1, 2)
-    first = 2 * np.arange(corners)[:, None]
-    faces = np.concatenate([first + [0, 1, 2], first + [1, 3, 2]])
+    faces = _repeat([[0, 1, 2], [1, 3, 2]], 2, corners)
     return np.column_stack([vertices, np.full(len(vertices), z)]), faces
 
 
@@ -121,7 +141,7 @@ def merge(meshes: list[Mesh]) -> Mesh:
 
 
 def _edges(solid: BoolArray, forward: bool) -> IntArray:
-    """Runs of solid cells whose neighbour in the next (forward) or previous row is not: (n, 2, 2) ends (column, row)."""
+    """Edges (n, 2, 2), ends as (column, row), of solid runs that border the next or the previous row."""
     beyond = np.zeros_like(solid)
     if forward:
         beyond[:-1] = solid[1:]
@@ -138,5 +158,10 @@ def _edges(solid: BoolArray, forward: bool) -> IntArray:
 
 def _quads(corners: Array) -> Mesh:
     """Quadrilaterals (n, 4, 3) as two triangles each."""
-    first = 4 * np.arange(len(corners))[:, None]
-    return corners.reshape(-1, 3), np.concatenate([first + [0, 1, 2], first + [0, 2, 3]])
+    return corners.reshape(-1, 3), _repeat([[0, 1, 2], [0, 2, 3]], 4, len(corners))
+
+
+def _repeat(faces: list[list[int]], stride: int, count: int) -> IntArray:
+    """The same faces ``count`` times, each time ``stride`` vertices on."""
+    begin = stride * np.arange(count, dtype=np.intp)[:, None, None]
+    return (begin + np.array(faces, dtype=np.intp)).reshape(-1, 3)

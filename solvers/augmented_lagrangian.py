@@ -84,7 +84,7 @@ class AugmentedLagrangian(Solver):
                 primal.curvature(lin, multipliers, penalty), primal.gradient(lin, multipliers, penalty)
             )
             if step is None:
-                return Status.NOT_FINITE
+                return Status.SINGULAR
             after = run.program.linearize(run.program.retract(lin.values, step))
             updated = primal.next_multipliers(after.constraints, multipliers, penalty)
             run.accept(after, updated, norm(step), 1.0, penalty=rho)

@@ -46,7 +46,7 @@ class GaussNewton(Solver):
             gradient = workspace.gradient(lin, none, none)
             step = workspace.direction(workspace.curvature(lin, none, none), gradient)
             if step is None:
-                return Status.NOT_FINITE
+                return Status.SINGULAR
             slope = float(gradient @ step)
             length = 1.0
             values, evaluation = workspace.trial(lin, step)

@@ -2,7 +2,8 @@
 
 OSQP accepts wrong sizes, crossed limits and NaN without raising and fills x with numbers near 1e9 when a problem
 is infeasible, so nothing it returns is used before :func:`unifg.solvers.qp.qp_error` has measured it. The step
-size rho is adapted at fixed iterations, never by the clock: equal inputs give equal answers.
+size rho is adapted at fixed iterations, never by the clock: equal inputs give equal answers. Polishing is left
+off without equalities: it would print to the terminal whenever no limit is active.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class OsqpRoute:
                 eps_abs=accuracy,
                 eps_rel=0.0,
                 max_iter=self.max_iterations,
-                polishing=True,
+                polishing=bool((qp.lower == qp.upper).any()),
                 adaptive_rho_interval=50,
                 check_termination=25,
             )

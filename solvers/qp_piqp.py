@@ -1,8 +1,8 @@
 """PIQP, called directly: a proximal interior point with a workspace per structure.
 
 Takes 7-20 iterations where OSQP takes hundreds once obstacles are active, and says so when a problem is
-infeasible. Equalities, inequalities and the pattern of both are fixed at setup; when data turn an inequality into
-an equality the workspace is rebuilt.
+infeasible. :class:`PiqpRoute` solves the subproblem, :class:`ElasticRoute` its relaxation for linearised constraints
+that contradict each other.
 """
 
 from __future__ import annotations
@@ -17,10 +17,23 @@ from unifg.typing import Array, BoolArray, IntArray
 
 INFINITY = 1e30  # PIQP treats larger limits as absent
 TIGHTEST = 1e-9
+LOOSEST = 1e-7
+SLACK_CURVATURE = 1e-8
+
+
+def new_solver() -> piqp.SparseSolver:
+    """A PIQP workspace with the settings both routes share."""
+    solver = piqp.SparseSolver()
+    solver.settings.eps_rel = 0.0
+    solver.settings.eps_duality_gap_rel = 0.0
+    solver.settings.max_iter = 60
+    return solver
 
 
 class PiqpRoute:
-    """A persistent PIQP workspace.
+    """The subproblem itself; equalities are eliminated from the inequalities' pattern.
+
+    When data turn an inequality into an equality the workspace is rebuilt.
 
     Attributes:
         name: "piqp".
@@ -41,7 +54,7 @@ class PiqpRoute:
         if fresh:
             self._split(equal)
         assert self._solver is not None
-        self._solver.settings.eps_abs = float(np.clip(0.1 * accuracy, TIGHTEST, 1e-6))
+        self._solver.settings.eps_abs = float(np.clip(0.01 * accuracy, TIGHTEST, LOOSEST))
         entries = self.program.constraints.compress(qp.jacobian)
         self._hessian.data[:] = qp.hessian
         self._equalities.data[:] = entries[self._equality_entries]
@@ -76,10 +89,7 @@ class PiqpRoute:
         self._equal = equal.copy()
         self._equality_entries, self._equalities = self._part(equal)
         self._inequality_entries, self._inequalities = self._part(~equal)
-        self._solver = piqp.SparseSolver()
-        self._solver.settings.eps_rel = 0.0
-        self._solver.settings.eps_duality_gap_rel = 0.0
-        self._solver.settings.max_iter = 100
+        self._solver = new_solver()
 
     def _part(self, rows: BoolArray) -> tuple[IntArray, sp.csc_matrix]:
         """Positions of the entries of chosen rows, and the matrix they make."""
@@ -93,3 +103,65 @@ class PiqpRoute:
             shape=(int(rows.sum()), self.program.size),
         )
         return chosen, matrix
+
+
+class ElasticRoute:
+    """The subproblem with constraints, but not bounds on unknowns, violated at a price per unit.
+
+    With a price above the multipliers its step is that of the subproblem wherever that one is feasible;
+    elsewhere it violates the linearised rows least.
+    """
+
+    def __init__(self, program: Program) -> None:
+        """Lay out d, and two slacks for every row that may be violated."""
+        self.program = program
+        n, constraints = program.size, program.constraints
+        rows = np.flatnonzero(~program.bound_rows)
+        m = len(rows)
+        hessian = program.hessian
+        diagonal = np.arange(n, n + 2 * m)
+        self._hessian = sp.csc_matrix(
+            (
+                np.concatenate([np.zeros(hessian.nnz), np.full(2 * m, SLACK_CURVATURE)]),
+                np.concatenate([hessian.indices, diagonal]),
+                np.concatenate([hessian.indptr, hessian.nnz + 1 + np.arange(2 * m)]),
+            ),
+            shape=(n + 2 * m, n + 2 * m),
+        )
+        self._rows = sp.csc_matrix(
+            (
+                np.concatenate([np.zeros(constraints.nnz), np.ones(m), -np.ones(m)]),
+                np.concatenate([constraints.indices, rows, rows]),
+                np.concatenate([constraints.indptr, constraints.nnz + 1 + np.arange(2 * m)]),
+            ),
+            shape=(constraints.count, n + 2 * m),
+        )
+        self._slacks = 2 * m
+        self._solver: piqp.SparseSolver | None = None
+
+    def solve(self, qp: QP, price: float) -> QPAnswer:
+        """Solve; the error reported is zero when PIQP converged, infinite otherwise."""
+        program, n = self.program, self.program.size
+        self._hessian.data[: program.hessian.nnz] = qp.hessian
+        self._rows.data[: program.constraints.nnz] = program.constraints.compress(qp.jacobian)
+        numbers = {
+            "P": self._hessian,
+            "c": np.concatenate([qp.gradient, np.full(self._slacks, price)]),
+            "G": self._rows,
+            "h_l": np.maximum(qp.lower, -INFINITY),
+            "h_u": np.minimum(qp.upper, INFINITY),
+            "x_l": np.concatenate([np.full(n, -INFINITY), np.zeros(self._slacks)]),
+            "x_u": np.full(n + self._slacks, INFINITY),
+        }
+        if self._solver is None:
+            self._solver = new_solver()
+            self._solver.settings.eps_abs = LOOSEST
+            self._solver.setup(**numbers)
+        else:
+            self._solver.update(**numbers)
+        status = self._solver.solve()
+        result = self._solver.result
+        step = np.array(result.x)[:n]
+        dual = np.asarray(result.z_u) - np.asarray(result.z_l)
+        solved = status == piqp.PIQP_SOLVED and np.isfinite(step).all() and np.isfinite(dual).all()
+        return QPAnswer(step, dual, "elastic", int(result.info.iter), 0.0 if solved else np.inf)

@@ -1,4 +1,4 @@
-"""Any solver that qpsolvers knows, by name; and the elastic subproblem for infeasible linearisations."""
+"""Any solver that qpsolvers knows, by name."""
 
 from __future__ import annotations
 
@@ -53,30 +53,6 @@ class QpsolversRoute:
             return QPAnswer(np.zeros(self.program.size), multipliers, self.name, 0, np.inf)
         step, dual, iterations = answer
         return QPAnswer(step, dual, self.name, iterations, qp_error(qp, step, dual))
-
-    def solve_elastic(self, qp: QP, price: float) -> QPAnswer:
-        """Allow constraints (not bounds on unknowns) to be violated at ``price`` per unit.
-
-        With prices above the multipliers the step is that of the QP wherever the QP is feasible. The error
-        reported is that of the elastic problem's own stationarity; the step may violate the linearised rows.
-        """
-        program = self.program
-        n, rows = program.size, np.flatnonzero(~program.bound_rows)
-        m = len(rows)
-        hessian = sp.block_diag([self._full(qp), 1e-8 * sp.eye(2 * m)], format="csc")
-        gradient = np.concatenate([qp.gradient, np.full(2 * m, price)])
-        selector = sp.csr_matrix((np.ones(m), (rows, np.arange(m))), shape=(program.constraints.count, m))
-        jacobian = program.constraints.matrix(qp.jacobian).tocsr()
-        nonnegative = sp.hstack([sp.csr_matrix((2 * m, n)), sp.eye(2 * m)])
-        stacked = sp.vstack([sp.hstack([jacobian, selector, -selector]), nonnegative], format="csr")
-        lower = np.concatenate([qp.lower, np.zeros(2 * m)])
-        upper = np.concatenate([qp.upper, np.full(2 * m, np.inf)])
-        answer = self._solve(hessian, gradient, stacked, lower, upper)
-        if answer is None:
-            return QPAnswer(np.zeros(n), np.zeros(program.constraints.count), "elastic", 0, np.inf)
-        step, dual, iterations = answer[0][:n], answer[1][: program.constraints.count], answer[2]
-        finite = np.isfinite(step).all() and np.isfinite(dual).all()
-        return QPAnswer(step, dual, f"elastic {self.name}", iterations, 0.0 if finite else np.inf)
 
     def _full(self, qp: QP) -> sp.csc_matrix:
         upper = self.program.hessian.matrix(qp.hessian)

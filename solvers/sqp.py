@@ -19,7 +19,7 @@ from unifg.solver import Run, Solver
 from unifg.solvers.damping import norm
 from unifg.solvers.qp import QP, QPAnswer, Route, subproblem
 from unifg.solvers.qp_osqp import OsqpRoute
-from unifg.solvers.qp_piqp import PiqpRoute
+from unifg.solvers.qp_piqp import ElasticRoute, PiqpRoute
 from unifg.solvers.qp_qpsolvers import QpsolversRoute
 from unifg.status import Status
 from unifg.typing import Array
@@ -29,6 +29,7 @@ SHORTEST = 1e-6
 ROUNDING = 1e-13
 GOOD_ENOUGH = 1e-5  # QP error that is always accepted from the fallback
 USABLE = 1e-3  # QP error below which a step may still be tried
+FAILURES = 4  # damped attempts at one step before giving up
 MISSES = 2  # in a row within one solve, after which the first route is no longer asked
 SMALLEST_DAMPING = 1e-9  # keeps H positive definite without showing in the step
 
@@ -39,8 +40,8 @@ class SQP(Solver):
 
     Attributes:
         qp: "osqp" (called directly, warm-started) or any name qpsolvers knows.
-        fallback: qpsolvers name that repeats a QP which missed its accuracy and solves the elastic ones;
-            None leaves inaccurate answers as they are.
+        fallback: "piqp" (called directly) or any name qpsolvers knows: repeats a QP which missed its accuracy.
+            None leaves inaccurate answers as they are, and infeasible subproblems unsolved.
         qp_iterations: limit for OSQP before the fallback takes over.
         second_order_correction: try to repair a full step that the merit function rejects.
         full_steps: take every step in full, as the paper does; no merit function.
@@ -65,25 +66,24 @@ class SQP(Solver):
         workspace.start()
         merit = Merit(run.program, run.multipliers)
         damping = SMALLEST_DAMPING
+        failures = 0
         while run.status is None:
-            lin = run.lin
             accuracy = self._accuracy(run)
-            qp = subproblem(run.program, lin, damping)
+            qp = subproblem(run.program, run.lin, damping)
             answer = workspace.solve(qp, run.multipliers, accuracy)
-            if not np.isfinite(answer.error):
-                if damping > 1e6:
-                    return Status.STALLED
-                damping = max(10.0 * damping, 1e-4)
-                continue
             if answer.route.startswith("elastic") and run.infeasible_stationary():
                 return Status.LOCALLY_INFEASIBLE
-            merit.raise_prices(answer)
-            taken = self._search(run, workspace, merit, qp, answer, accuracy)
+            taken = None
+            if np.isfinite(answer.error):
+                merit.raise_prices(answer)
+                taken = self._search(run, workspace, merit, qp, answer, accuracy)
             if taken is None:
-                if damping > 1e6:
+                failures += 1
+                if failures == FAILURES:
                     return Status.STALLED
-                damping = max(10.0 * damping, 1e-4)
+                damping = max(100.0 * damping, 1e-4)
                 continue
+            failures = 0
             after, multipliers, length, corrected = taken
             run.accept(
                 after,
@@ -106,7 +106,7 @@ class SQP(Solver):
     def _next_damping(self, damping: float, length: float) -> float:
         if length < 0.1:
             return max(4.0 * damping, 1e-3)
-        return max(0.25 * damping, SMALLEST_DAMPING) if length == 1.0 else damping
+        return max(0.1 * damping, SMALLEST_DAMPING) if length == 1.0 else damping
 
     def _search(
         self, run: Run, workspace: Subproblems, merit: Merit, qp: QP, answer: QPAnswer, accuracy: float
@@ -117,7 +117,8 @@ class SQP(Solver):
             return program.linearize(values), answer.multipliers, 1.0, False
         here = merit.value(lin)
         slope = merit.slope(qp, answer.step, lin)
-        slack = ROUNDING * max(1.0, abs(here))
+        # The QP meets its rows to its own accuracy only; below a tenth of the tolerance the merit is noise.
+        slack = ROUNDING * max(1.0, abs(here)) + 0.1 * self.tolerance * merit.price
         if slope > slack:
             return None
         trial = program.evaluate(values, lin.weights)
@@ -146,6 +147,11 @@ class Merit:
         """Start with the prices the multipliers suggest."""
         self.program = program
         self.prices = np.abs(multipliers)
+
+    @property
+    def price(self) -> float:
+        """The highest price, at least one."""
+        return float(self.prices.max(initial=1.0))
 
     def raise_prices(self, answer: QPAnswer) -> None:
         """Keep every price above its multiplier."""
@@ -183,7 +189,7 @@ class Subproblems:
         self.fallback = None if options.fallback is None else _route(program, options.fallback, 0)
         first = options.fallback if unconstrained and options.fallback is not None else options.qp
         self.first = _route(program, first, options.qp_iterations)
-        self.elastic = None if options.fallback is None else QpsolversRoute(program, options.fallback)
+        self.elastic = None if options.fallback is None else ElasticRoute(program)
         self._misses = 0
 
     def start(self) -> None:
@@ -209,7 +215,7 @@ class Subproblems:
         best = min(answers, key=lambda answer: answer.error)
         if best.error <= USABLE:
             return best
-        return self.elastic.solve_elastic(qp, max(10.0 * float(np.abs(multipliers).max(initial=0.0)), 1e3))
+        return self.elastic.solve(qp, max(10.0 * float(np.abs(multipliers).max(initial=0.0)), 1e3))
 
     def correct(
         self, qp: QP, answer: QPAnswer, trial: Evaluation, lin: Linearization, accuracy: float

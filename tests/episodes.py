@@ -26,7 +26,7 @@ def room(width: float = 8.0, height: float = 6.0, yaw: float = 0.0) -> Occupancy
 def episode(ticks: int = 40, obstacles: int = 2, *, map_yaw: float = 0.0, seed: int = 3) -> EpisodeLog:
     """An arc from (0, 0) at 0.5 m/s with a known drift of dead reckoning and a constant error of the estimate."""
     rng = np.random.default_rng(seed)
-    time = DT * np.arange(ticks)
+    time = DT * np.arange(ticks, dtype=np.float64)
     sweep = 1.2 * max(ticks * DT, 1.0)
     phase = 0.5 * time / sweep * 2.4
     truth = np.column_stack([2.4 * np.sin(phase), 2.4 * (1.0 - np.cos(phase)), phase])

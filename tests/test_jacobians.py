@@ -11,7 +11,9 @@ import pytest
 import unifg as fg
 import unifg.models
 from unifg.differentiation import jacobian
-from unifg.models import obstacles, unicycle
+from unifg.models import lidar, obstacles, unicycle
+from unifg.models.distance_map import DistanceMap
+from unifg.models.smooth_field import SmoothField
 from unifg.residuals import Residual
 from unifg.typing import Array
 
@@ -41,6 +43,12 @@ CASES: dict[str, tuple[Residual, list[Array], list[fg.Manifold], list[object]]] 
         obstacles.disc_clearance, [poses()], [fg.SE2], [RNG.normal(size=(4, 2)), np.full(4, 0.3)],
     ),
 }  # fmt: skip
+GRID = DistanceMap(np.add.outer(np.sin(np.arange(30.0)), np.cos(0.7 * np.arange(40.0))), 0.25, (-5.0, -4.0, 0.3))
+INSIDE = np.concatenate([RNG.uniform(-1.5, 1.5, (COUNT, 2)), poses()[:, 2:]], axis=1)
+WALLS = obstacles.wall_distance(SmoothField(GRID))
+CASES["lidar.endpoint"] = (lidar.endpoint(GRID), [INSIDE], [fg.SE2], [RNG.uniform(-1.0, 1.0, (COUNT, 2))])
+CASES["obstacles.wall_distance"] = (WALLS, [INSIDE], [fg.SE2], [])
+CASES["obstacles.shortfall"] = (obstacles.shortfall(WALLS, 0.3), [INSIDE], [fg.SE2], [])
 for group in (fg.Rn(3), fg.SO2, fg.SE2, fg.Product(pose=fg.SE2, v=fg.Rn(2))):
     x, y, z = (group.random(RNG, (COUNT,)) for _ in range(3))
     CASES[f"prior on {group.name}"] = (fg.prior.on(group), [x], [group], [y])
@@ -56,7 +64,9 @@ def shipped() -> set[str]:
         for name, value in vars(loaded).items():
             if isinstance(value, Residual) and value.jacobian is not None and not name.startswith("_"):
                 names.add(f"{module.name}.{name}")
-    return names
+            if callable(value) and getattr(value, "__annotations__", {}).get("return") == "Residual":
+                names.add(f"{module.name}.{name}")  # a function that makes residuals
+    return names - {f"{module}.residual" for module in ("lidar", "obstacles", "unicycle")}
 
 
 def test_every_shipped_residual_has_a_case() -> None:

@@ -106,6 +106,8 @@ class CompiledTerm:
             blocks = jacobian(lambda *moved: np.asarray(self._call(list(moved))), points, self.manifolds)
         else:
             blocks = [np.asarray(block, dtype=np.float64) for block in self._jacobian(*self._fill(points))]
+            if len(blocks) > len(self.dims) and len(blocks) > max(self._places):
+                blocks = [blocks[place] for place in self._places]  # some of its arguments are constants here
             wanted = [(self.count, self.size, dim) for dim in self.dims]
             if [block.shape for block in blocks] != wanted:
                 raise GraphError(

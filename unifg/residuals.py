@@ -37,8 +37,9 @@ def residual(function: Function, jacobian: JacobianFunction | None = None, name:
 
     Args:
         function: batched residual, ``(n, ...) -> (n, m)``.
-        jacobian: returns one (n, m, d_k) array for each variable argument, right perturbation.
-            ``graph.check`` compares it with numerical differentiation.
+        jacobian: returns one (n, m, d_k) array for each argument that may be a variable, in order and right
+            perturbation. Blocks of arguments that a term gives as constants are dropped. ``graph.check``
+            compares the rest with numerical differentiation.
         name: defaults to the function's own name.
     """
     return Residual(function, jacobian, name or getattr(function, "__name__", "residual"))

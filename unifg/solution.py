@@ -14,7 +14,7 @@ from unifg.kkt import Optimality
 from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.status import Status
-from unifg.typing import Array, IntArray
+from unifg.typing import Array, BoolArray, IntArray
 from unifg.variables import Family, Selection, Variable, as_selection
 
 
@@ -154,7 +154,7 @@ class Solution:
         selection = as_selection(variable)
         self._require(selection)
         program = self._program
-        active = self._equality | (np.abs(self._multipliers) > 0.0)
+        active = self._equality | self._held()
         return covariance(program, self._lin, program.columns.of(selection).ravel(), active)
 
     def report(self) -> str:
@@ -176,6 +176,13 @@ class Solution:
     def __repr__(self) -> str:
         """The report."""
         return f"<Solution {self.report()}>"
+
+    def _held(self) -> BoolArray:
+        """Inequalities that are active: the multiplier outweighs the distance to its limit."""
+        limit = np.where(self._multipliers > 0.0, self._upper, self._lower)
+        distance = np.where(np.isfinite(limit), np.abs(self._lin.constraints - limit), np.inf)
+        held: BoolArray = np.abs(self._multipliers) > distance
+        return held
 
     def _require(self, selection: Selection) -> None:
         if selection.family not in self._lin.values:

@@ -18,6 +18,10 @@ class Status(Enum):
         "The point is stationary for the violation of the constraints: no nearby point violates them less."
     )
     UNBOUNDED = "The objective fell below every reasonable value: it is probably unbounded below."
+    SINGULAR = (
+        "The linear system is singular: the costs do not determine every unknown; run graph.check(guess), add priors, "
+        "or use a damped backend."
+    )
     NOT_FINITE = "A residual, Jacobian or linear system was not finite where the backend needed it."
     INTERRUPTED = "The callback or the user ended the solve."
 

@@ -15,9 +15,9 @@ import matplotlib
 import numpy as np
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-from matplotlib.axes import Axes  # noqa: E402
-from matplotlib.patches import Circle, Rectangle  # noqa: E402
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle, Rectangle
 
 HERE = Path(__file__).resolve().parent
 CHECKOUT = HERE.parent.parent
@@ -31,6 +31,7 @@ from unifg.scenarios.navigation import NavigationSettings, run_navigation  # noq
 from unifg.scenarios.palette import css  # noqa: E402
 from unifg.typing import Array  # noqa: E402
 
+Point = tuple[float, float]
 COST, HARD, GIVEN = "#ffffff", "#222222", "#d9d9d9"
 
 
@@ -62,7 +63,7 @@ def worked_problem() -> Any:
     ax.plot(*poses[now:, :2].T, "o-", color=css("horizon"), ms=3.0, lw=1.5, label="planned future")
     arrow(ax, poses[now], css("robot"), 0.22)
     ax.plot(*poses[now, :2], "o", color=css("robot"), ms=9)
-    ax.annotate("now", poses[now, :2], (0, -16), textcoords="offset points", ha="center", color=css("robot"))
+    ax.annotate("now", place(poses[now]), (0, -16), textcoords="offset points", ha="center", color=css("robot"))
     ax.plot(3.0, 1.2, "*", color=css("goal"), ms=17, mec="#4d4d4d")
     ax.annotate("goal", (3.0, 1.2), (10, -4), textcoords="offset points")
     ax.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", xlim=(-0.2, 3.4), ylim=(-0.15, 1.4))
@@ -84,10 +85,10 @@ def graphs() -> Any:
 
 def localisation_graph(ax: Axes) -> None:
     """One pose, one prior, many beams."""
-    pose = np.array([0.0, 0.0])
+    pose = (0.0, 0.0)
     factor(ax, [pose], (-1.35, 0.0), "odometry", COST, (0, 14))
     for angle in np.linspace(-75.0, 75.0, 7):
-        at = 1.3 * np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
+        at = (1.3 * float(np.cos(np.radians(angle))), 1.3 * float(np.sin(np.radians(angle))))
         factor(ax, [pose], at, "", COST)
     ax.annotate("lidar:\none for each\nof 360 beams", (1.5, 0.0), va="center", fontsize=9)
     variable(ax, pose, "$x$", css("estimate"))
@@ -96,28 +97,28 @@ def localisation_graph(ax: Axes) -> None:
 
 def control_graph(ax: Axes) -> None:
     """A chain of poses and controls."""
-    stages = [np.array([2.4 * k, 0.0]) for k in range(4)]
+    stages = [(2.4 * k, 0.0) for k in range(4)]
     names = ["$x_0$", "$x_1$", "$x_2$", "$x_{30}$"]
     for k in range(3):
-        middle = stages[k] + [1.2, 0.0]
-        control = middle + [0.0, -1.25]
+        middle = beside(stages[k], 1.2, 0.0)
+        control = beside(middle, 0.0, -1.25)
         if k < 2:
             factor(ax, [stages[k], stages[k + 1], control], middle, "dynamics", HARD, (0, 9))
-            factor(ax, [control], control + [0.0, -0.8], "effort" if k == 0 else "", COST, (0, -16))
-            factor(ax, [control], control + [-0.6, -0.55], "limits" if k == 0 else "", HARD, (-22, -14))
+            factor(ax, [control], beside(control, 0.0, -0.8), "effort" if k == 0 else "", COST, (0, -16))
+            factor(ax, [control], beside(control, -0.6, -0.55), "limits" if k == 0 else "", HARD, (-22, -14))
             variable(ax, control, f"$u_{k}$", css("robot"))
         else:
             ax.annotate("...", middle, ha="center", va="center", fontsize=20)
             ax.annotate("...", control, ha="center", va="center", fontsize=20)
-    first, second = np.array([1.2, -1.25]), np.array([3.6, -1.25])
-    factor(ax, [first, second], 0.5 * (first + second), "change", COST, (0, 9))
-    factor(ax, [first], first + [-1.35, 0.0], "first change", COST, (0, 9))
+    first, second = (1.2, -1.25), (3.6, -1.25)
+    factor(ax, [first, second], (2.4, -1.25), "change", COST, (0, 9))
+    factor(ax, [first], beside(first, -1.35, 0.0), "first change", COST, (0, 9))
     for k, stage in enumerate(stages[1:]):
         label = k == 0
         end = k == 2
-        factor(ax, [stage], stage + [-0.7, 1.0], "end of path" if end else "path" if label else "", COST, (-6, 10))
-        factor(ax, [stage], stage + [0.0, 1.2], "margins" if label else "", COST, (0, 10))
-        factor(ax, [stage], stage + [0.7, 1.0], "walls, discs" if label else "", HARD, (14, 10))
+        factor(ax, [stage], beside(stage, -0.7, 1.0), "end of path" if end else "path" if label else "", COST, (-6, 10))
+        factor(ax, [stage], beside(stage, 0.0, 1.2), "margins" if label else "", COST, (0, 10))
+        factor(ax, [stage], beside(stage, 0.7, 1.0), "walls, discs" if label else "", HARD, (14, 10))
     for stage, name in zip(stages, names, strict=True):
         variable(ax, stage, name, GIVEN if name == "$x_0$" else css("horizon"), dark=name == "$x_0$")
     ax.annotate("fixed to the\nestimate", stages[0], (0, 28), textcoords="offset points", ha="center", fontsize=9)
@@ -128,15 +129,18 @@ def control_graph(ax: Axes) -> None:
     frame(ax, "What should I do?", (-1.0, 8.6), (-2.6, 1.9))
 
 
-def variable(ax: Axes, at: Array, name: str, colour: str, *, dark: bool = False) -> None:
+def beside(point: Point, right: float, up: float) -> Point:
+    """A point moved."""
+    return point[0] + right, point[1] + up
+
+
+def variable(ax: Axes, at: Point, name: str, colour: str, *, dark: bool = False) -> None:
     """A circle with a name."""
     ax.add_patch(Circle((at[0], at[1]), 0.32, fc=colour, ec=HARD, lw=1.0, zorder=3))
     ax.annotate(name, at, ha="center", va="center", color="black" if dark else "white", fontsize=12, zorder=4)
 
 
-def factor(
-    ax: Axes, ends: list[Array], at: Any, name: str, colour: str, offset: tuple[float, float] = (0.0, 12.0)
-) -> None:
+def factor(ax: Axes, ends: list[Point], at: Point, name: str, colour: str, offset: Point = (0.0, 12.0)) -> None:
     """A square joined to its variables."""
     for end in ends:
         ax.plot([at[0], end[0]], [at[1], end[1]], color="#666666", lw=1.2, zorder=1)
@@ -160,34 +164,43 @@ def overview() -> Any:
     log = run_navigation(NavigationSettings(obstacles=3, seed=0))
     if not log.succeeded:
         raise SystemExit("the demonstration did not reach its goals: no picture of that")
-    index = 2  # the obstacle to be shown from near: it moves
+    index = int(np.flatnonzero(~log.moving())[-1])  # shown from near; a standing disc needs no prediction
     gap = np.hypot(*(log.true_pose[:, :2] - log.obstacles[:, index, :2]).T) - log.obstacles[:, index, 2]
-    tick = int(np.argmin(np.where(gap > 1.0, gap, np.inf)[: int(gap.argmin())]))
+    tick = int(np.argmin(np.where(gap > 0.9, gap, np.inf)[: int(gap.argmin())]))
     figure, (whole, near) = plt.subplots(1, 2, figsize=(13.0, 5.9), gridspec_kw={"width_ratios": [1.32, 1.0]})
-    view = (*log.true_pose[tick, :2] + [0.7, -0.45], 2.5)
+    x, y = log.true_pose[tick, :2] + 0.5 * (log.horizon[tick][-1] - log.horizon[tick][0])[:2]
+    view = (float(x), float(y), 2.4)
     whole_way(whole, log, view)
     one_moment(near, log, tick, view)
-    figure.subplots_adjust(wspace=0.04)
+    labelled = [axes.get_legend_handles_labels() for axes in (whole, near)]
+    handles, labels = (first + second for first, second in zip(*labelled, strict=True))
+    figure.subplots_adjust(wspace=0.03, bottom=0.1)
+    figure.legend(handles, labels, loc="lower center", ncol=4, frameon=False, fontsize=10)
     return figure
 
 
 def whole_way(ax: Axes, log: EpisodeLog, view: tuple[float, float, float]) -> None:
     """Map, planned path, the way driven, dead reckoning."""
     walls(ax, log)
-    ax.plot(*log.dead_reckoning[:, :2].T, color=css("odometry"), lw=1.4, ls="--", label="what the wheels alone would say")
+    ax.plot(
+        *log.dead_reckoning[:, :2].T,
+        color=css("odometry"),
+        lw=1.4,
+        ls="--",
+        label="where the wheels alone would put it",
+    )
     ax.plot(*log.path[:, :2].T, color=css("plan"), lw=1.0, ls=":", label="planned path")
     ax.plot(*log.true_pose[:, :2].T, color=css("trail"), lw=2.4, label="driven")
     discs(ax, log, log.ticks - 1)
     ax.plot([], [], "o", color=css("fixed"), label="not on the map, standing")
     ax.plot([], [], "o", color=css("moving"), label="not on the map, moving")
     ax.plot(*log.start[:2], "o", color=css("robot"), ms=9)
-    ax.annotate("start", log.start[:2], (0, 11), textcoords="offset points", ha="center")
+    ax.annotate("start", place(log.start), (0, 11), textcoords="offset points", ha="center")
     for number, goal in enumerate(log.goals, 1):
         ax.plot(*goal[:2], "*", color=css("goal"), ms=18, mec="#4d4d4d")
-        ax.annotate(f"goal {number}", goal[:2], (12, -4), textcoords="offset points")
+        ax.annotate(f"goal {number}", place(goal), (0, -20), textcoords="offset points", ha="center")
     x, y, half = view
     ax.add_patch(Rectangle((x - half, y - half), 2 * half, 2 * half, fill=False, ec=css("scan"), lw=1.6, zorder=6))
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), ncol=3, frameon=False, fontsize=9)
     ax.set(aspect="equal", xlim=limits(log, 0), ylim=limits(log, 1))
     ax.set_title(f"{log.ticks * log.dt:.0f} seconds through a building", fontsize=12)
     ax.axis("off")
@@ -198,22 +211,23 @@ def one_moment(ax: Axes, log: EpisodeLog, tick: int, view: tuple[float, float, f
     walls(ax, log)
     x, y, half = view
     pose, estimate = log.true_pose[tick], log.estimate[tick]
-    ranges, angles = log.scan[tick], log.scan_angles
-    seen = np.isfinite(ranges)
-    ends = in_world(estimate[None], np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=1)[seen])
+    seen = np.isfinite(log.scan[tick])
+    ranges, angles = log.scan[tick][seen], log.scan_angles[seen]
+    ends = in_world(estimate[None], np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=1))
     for end in ends[::3]:
         ax.plot([estimate[0], end[0]], [estimate[1], end[1]], color=css("scan"), lw=0.4, alpha=0.25, zorder=2)
     ax.plot(*log.path[:, :2].T, color=css("plan"), lw=1.2, ls=":", zorder=3)
     discs(ax, log, tick)
-    ax.plot(*ends.T, ".", color=css("scan"), ms=4.5, zorder=5, label="lidar, carried into the map by the estimate")
+    ax.plot(*ends.T, ".", color=css("scan"), ms=4.5, zorder=5, label="lidar end-points, placed by the estimate")
     for cx, cy, radius in log.detected[tick]:
         ax.add_patch(Circle((cx, cy), radius, fill=False, ec=css("detected"), lw=1.6, ls="--", zorder=6))
     ax.plot(*log.true_pose[: tick + 1, :2].T, color=css("trail"), lw=2.4, zorder=3)
-    ax.plot(*log.horizon[tick][:, :2].T, "o-", color=css("horizon"), ms=3.2, lw=1.4, zorder=5, label="plan for the next 3 s")
+    ax.plot(
+        *log.horizon[tick][:, :2].T, "o-", color=css("horizon"), ms=3.2, lw=1.4, zorder=5, label="plan for the next 3 s"
+    )
     ax.add_patch(Circle((pose[0], pose[1]), log.robot_radius, color=css("robot"), zorder=6))
     arrow(ax, pose, "white", 0.13)
     ax.plot([], [], "--", color=css("detected"), label="disc the robot has found")
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), ncol=2, frameon=False, fontsize=9)
     ax.set(aspect="equal", xlim=(x - half, x + half), ylim=(y - half, y + half), xticks=[], yticks=[])
     for spine in ax.spines.values():
         spine.set(color=css("scan"), linewidth=1.6)
@@ -229,7 +243,10 @@ def walls(ax: Axes, log: EpisodeLog) -> None:
         picture[cells] = [int(css(name)[k : k + 2], 16) / 255.0 for k in (1, 3, 5)]
     corner = occupancy.grid_to_world(np.array([[0.0, 0.0], [float(width), float(height)]]))
     ax.imshow(
-        picture, origin="lower", extent=(corner[0, 0], corner[1, 0], corner[0, 1], corner[1, 1]), interpolation="nearest"
+        picture,
+        origin="lower",
+        extent=(corner[0, 0], corner[1, 0], corner[0, 1], corner[1, 1]),
+        interpolation="nearest",
     )
 
 
@@ -244,6 +261,11 @@ def limits(log: EpisodeLog, axis: int) -> tuple[float, float]:
     cells = np.argwhere(log.occupancy.occupied)[:, ::-1]
     corners = log.occupancy.grid_to_world(np.stack([cells.min(axis=0), cells.max(axis=0) + 1]).astype(np.float64))
     return float(corners[0, axis] - 0.3), float(corners[1, axis] + 0.3)
+
+
+def place(pose: Array) -> Point:
+    """Position of a pose."""
+    return float(pose[0]), float(pose[1])
 
 
 def arrow(ax: Axes, pose: Array, colour: str, length: float) -> None:

@@ -1,7 +1,7 @@
 """Trajectories in the TUM format: one line ``t tx ty tz qx qy qz qw`` per pose, read by evo and most SLAM tools.
 
-Exactly eight fields separated by single blanks, no trailing blank, the quaternion with its scalar LAST (xyzw). Planar poses are
-lifted to z = 0 and a rotation about z. Format: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats.
+Exactly eight fields separated by single blanks, no trailing blank, the quaternion with its scalar LAST
+(xyzw). Planar poses are lifted to z = 0 and a rotation about z. Format: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats.
 """
 
 from __future__ import annotations
@@ -83,7 +83,8 @@ def read_tum(path: str | Path) -> Trajectory:
         The trajectory, in the order of the file.
 
     Raises:
-        FileFormatError: the file is missing or a line is not eight finite numbers with a usable quaternion; names the line.
+        FileFormatError: the file is missing, or a line (named in the message) is not eight finite numbers
+            with a usable quaternion.
     """
     path = Path(path)
     try:
@@ -106,9 +107,7 @@ def _parse(place: str, line: str) -> list[float]:
     words = line.split()
     if len(words) != len(_FIELDS):
         hint = "; fields are separated by blanks, not commas" if "," in line else ""
-        raise FileFormatError(
-            f"{place}: {len(words)} fields, expected {len(_FIELDS)} ({' '.join(_FIELDS)}){hint}"
-        )
+        raise FileFormatError(f"{place}: {len(words)} fields, expected {len(_FIELDS)} ({' '.join(_FIELDS)}){hint}")
     values = []
     for name, word in zip(_FIELDS, words, strict=True):
         try:

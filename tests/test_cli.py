@@ -1,0 +1,259 @@
+"""The command line: arguments, exit status, files, without driving a real episode."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import types
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from episodes import episode, room
+from unifg import __version__
+from unifg.errors import ScenarioError
+from unifg.files.ros_map import save_map
+from unifg.files.tum import read_tum
+from unifg.scenarios import cli
+from unifg.scenarios.episode import EpisodeLog
+
+FILES = ("scene.html", "overview.png", "metrics.json", "trajectory.tum", "estimate.tum")
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass
+class Settings:
+    """Stands in for the scenario's settings."""
+
+    map: Path | None
+    start: tuple[float, float, float] | None
+    goals: tuple[tuple[float, float, float], ...] | None
+    solver: str
+    coupling: str
+    obstacles: int
+    seed: int
+
+
+class FakeNavigation:
+    """Stands in for the scenario: notes the settings, reports progress, gives a made-up episode."""
+
+    def __init__(self) -> None:
+        self.settings: list[Settings] = []
+        self.log = episode(ticks=5)
+
+    def run(self, settings: Settings, progress: Progress) -> EpisodeLog:
+        self.settings.append(settings)
+        progress(0.5, "halfway")
+        progress(1.0, "done")
+        return self.log
+
+
+@pytest.fixture
+def navigation(monkeypatch: pytest.MonkeyPatch) -> FakeNavigation:
+    fake = FakeNavigation()
+    module = types.ModuleType("unifg.scenarios.navigation")
+    module.NavigationSettings = Settings  # type: ignore[attr-defined]
+    module.run_navigation = fake.run  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "unifg.scenarios.navigation", module)
+    import unifg.scenarios
+
+    monkeypatch.setattr(unifg.scenarios, "navigation", module, raising=False)
+    return fake
+
+
+@pytest.fixture
+def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spare tests that look at settings alone the drawing of pictures."""
+    monkeypatch.setattr(cli, "write_results", lambda folder, log: [])
+
+
+def run(tmp_path: Path, *words: str) -> int:
+    return cli.main(["run", "navigation", *words, "--out", str(tmp_path / "out")])
+
+
+def test_writes_every_file_and_names_it(
+    navigation: FakeNavigation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(tmp_path) == 0
+    said = capsys.readouterr()
+    for name in FILES:
+        file = tmp_path / "out" / name
+        assert file.stat().st_size > 0
+        assert str(file) in said.out.splitlines()
+    for words in ("goals reached", "1 of 1", "collisions", "localisation error", "median"):
+        assert words in said.out
+    assert "100%" in said.err and "100%" not in said.out  # the bar stays out of pipes
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["steps"] == 5
+    truth, estimate = (read_tum(tmp_path / "out" / name).planar() for name in FILES[3:])
+    np.testing.assert_allclose(truth, navigation.log.true_pose, atol=1e-8)
+    np.testing.assert_allclose(estimate, navigation.log.estimate, atol=1e-8)
+
+
+@pytest.mark.usefixtures("no_files")
+def test_defaults_leave_the_scenario_its_own(navigation: FakeNavigation, tmp_path: Path) -> None:
+    run(tmp_path)
+    (settings,) = navigation.settings
+    assert (settings.map, settings.start, settings.goals) == (None, None, None)
+    assert (settings.coupling, settings.seed) == ("sequential", 0)
+
+
+@pytest.mark.usefixtures("no_files")
+def test_arguments_arrive(navigation: FakeNavigation, tmp_path: Path) -> None:
+    save_map(tmp_path / "m.yaml", room())
+    words = ["--map", str(tmp_path / "m.yaml"), "--start=0,0,0", "--goal=1,2,0.5", "--goal", "2,1e0,-3"]
+    words += ["--solver", "alm", "--coupling", "sequential", "--obstacles", "4", "--seed", "17"]
+    assert run(tmp_path, *words) == 0
+    expected = Settings(
+        tmp_path / "m.yaml", (0.0, 0.0, 0.0), ((1.0, 2.0, 0.5), (2.0, 1.0, -3.0)), "alm", "sequential", 4, 17
+    )
+    assert navigation.settings == [expected]
+
+
+@pytest.mark.usefixtures("no_files")
+@pytest.mark.parametrize("value", ["-2,-0.5,0", "-.5,1,0", "-2e0,3,-1"])
+def test_values_that_begin_with_a_minus(navigation: FakeNavigation, tmp_path: Path, value: str) -> None:
+    pose = tuple(float(word) for word in value.split(","))
+    for form in (["--start", value, "--goal", value], [f"--start={value}", f"--goal={value}"]):
+        assert run(tmp_path, *form) == 0
+        assert navigation.settings[-1].start == pose
+        assert navigation.settings[-1].goals == (pose,)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--start", "1,2"], r"argument --start: '1,2' is not a pose: expected three numbers"),
+        (["--start", "-1,2"], r"argument --start: '-1,2' is not a pose"),
+        (["--goal", "1,2,3,4"], r"argument --goal: '1,2,3,4' is not a pose"),
+        (["--goal", "1,two,3"], r"'1,two,3' is not a pose"),
+        (["--goal", "1,nan,3"], r"every number must be finite"),
+        (["--start", "--goal", "1,2,3"], r"argument --start: expected one argument"),
+        (["--solver", "ipopt"], r"invalid choice: 'ipopt' \(choose from '?alm'?, '?sqp'?\)"),
+        (["--coupling", "magic"], r"choose from '?sequential'?"),
+        (["--obstacles", "-1"], r"argument --obstacles"),
+        (["--obstacles", "many"], r"'many' is not a whole number"),
+        (["--seed", "1.5"], r"'1\.5' is not a whole number"),
+        (["--map", "nowhere.yaml"], r"nowhere\.yaml: no such file"),
+        (["--sol", "alm"], r"unrecognized arguments: --sol"),
+    ],
+)
+def test_bad_arguments_exit_2(
+    navigation: FakeNavigation, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    assert run(tmp_path, *words) == 2
+    assert re.search(message, capsys.readouterr().err)
+    assert navigation.settings == []
+
+
+@pytest.mark.parametrize("words", [[], ["run"], ["run", "swimming"], ["fly"]])
+def test_unknown_commands_exit_2(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(words) == 2
+    assert "usage: unifg" in capsys.readouterr().err
+
+
+def test_help_and_version_exit_0(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"unifg {__version__}\n"
+    assert cli.main(["run", "navigation", "--help"]) == 0
+    said = capsys.readouterr().out
+    for option in ("--map", "--start", "--goal", "--solver", "--coupling", "--obstacles", "--seed", "--out"):
+        assert option in said
+
+
+def test_scenario_error_is_a_message_not_a_traceback(
+    navigation: FakeNavigation, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(settings: Settings, progress: Progress) -> EpisodeLog:
+        raise ScenarioError("goal 1 stands in a wall")
+
+    monkeypatch.setattr(sys.modules["unifg.scenarios.navigation"], "run_navigation", refuse)
+    assert run(tmp_path) == 2
+    said = capsys.readouterr()
+    assert said.err.splitlines()[-1] == "unifg: error: goal 1 stands in a wall"
+    assert "Traceback" not in said.err and said.out == ""
+
+
+def test_broken_map_is_a_message(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "m.yaml").write_text("image: gone.pgm\nresolution: 0.1\norigin: [0, 0, 0]\n")
+    # The real scenario, which must not get further than the map.
+    assert run(tmp_path, "--map", str(tmp_path / "m.yaml"), "--start=0,0,0", "--goal=1,0,0") == 2
+    assert "gone.pgm" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_out_that_is_a_file_is_refused_before_the_run(
+    navigation: FakeNavigation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "out").write_text("in the way")
+    assert run(tmp_path) == 2
+    assert "cannot make this folder" in capsys.readouterr().err
+    assert navigation.settings == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "status"),
+    [({"collisions": 1}, 1), ({"reached": [False]}, 1), ({"interrupted": True}, 130)],
+)
+def test_exit_status_tells_the_outcome(
+    navigation: FakeNavigation, tmp_path: Path, changes: dict[str, object], status: int
+) -> None:
+    navigation.log = replace(navigation.log, **changes)  # type: ignore[arg-type]
+    assert run(tmp_path) == status
+    assert all((tmp_path / "out" / name).exists() for name in FILES)
+
+
+def test_interrupt_before_the_first_tick(
+    navigation: FakeNavigation, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(settings: Settings, progress: Progress) -> EpisodeLog:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys.modules["unifg.scenarios.navigation"], "run_navigation", stop)
+    assert run(tmp_path) == 130
+    assert "before there was anything to write" in capsys.readouterr().err
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals work otherwise on Windows")
+def test_first_interrupt_waits_for_the_end_of_the_tick(
+    navigation: FakeNavigation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    finished: list[int] = []
+
+    def loop(settings: Settings, progress: Progress) -> EpisodeLog:
+        try:
+            for tick in range(10):
+                if tick == 3:
+                    os.kill(os.getpid(), signal.SIGINT)
+                finished.append(tick)  # reached although the interrupt came first
+                progress(tick / 10, "driving")
+        except KeyboardInterrupt:
+            return replace(navigation.log, interrupted=True)
+        return navigation.log
+
+    monkeypatch.setattr(sys.modules["unifg.scenarios.navigation"], "run_navigation", loop)
+    assert run(tmp_path) == 130
+    assert finished == [0, 1, 2, 3]
+    assert (tmp_path / "out" / "scene.html").exists()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_as_a_module_without_loading_the_scenario() -> None:
+    code = (
+        "import sys; from unifg.scenarios import cli; status = cli.main(['run', 'navigation', '--help']);"
+        "assert 'pymunk' not in sys.modules and 'meshcat' not in sys.modules; sys.exit(status)"
+    )
+    root = Path(__file__).parent.parent
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(root)}
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("usage: unifg run navigation")

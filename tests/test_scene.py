@@ -1,0 +1,311 @@
+"""Scenes and plots: what is in the files, read back without a browser."""
+
+import base64
+import hashlib
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from episodes import HORIZON, episode, room
+from unifg.errors import ScenarioError
+from unifg.scenarios.episode import EpisodeLog
+from unifg.scenarios.plots import (
+    overview,
+    plot_clearance,
+    plot_controls,
+    plot_localisation,
+    plot_map,
+    plot_solve_times,
+    write_overview,
+)
+from unifg.scenarios.recorder import Recorder, viewer_script
+from unifg.scenarios.scene import frame_ticks, record_scene, scan_points, scene_html, write_scene
+from unifg.scenarios.shapes import cover, extrude, flat, known_corners, ribbon
+
+umsgpack = pytest.importorskip("umsgpack")
+
+Commands = list[dict[str, Any]]
+
+
+@pytest.fixture(scope="module")
+def log() -> EpisodeLog:
+    return episode(ticks=12, obstacles=4)
+
+
+@pytest.fixture(scope="module")
+def page(log: EpisodeLog) -> str:
+    return scene_html(log)
+
+
+def _commands(page: str) -> Commands:
+    found = re.search(r"^const COMMANDS = (\[.*?\]);$", page, re.DOTALL | re.MULTILINE)
+    assert found
+    return [umsgpack.unpackb(base64.b64decode(text)) for text in json.loads(found.group(1))]
+
+
+def _tracks(commands: Commands) -> dict[str, dict[str, list[tuple[int, Any]]]]:
+    """Path to property to keys (frame, value)."""
+    tracks: dict[str, dict[str, list[tuple[int, Any]]]] = {}
+    for animation in commands[-1]["animations"]:
+        for track in animation["clip"]["tracks"]:
+            keys = [(key["time"], key["value"]) for key in track["keys"]]
+            tracks.setdefault(animation["path"], {})[track["name"]] = keys
+    return tracks
+
+
+def _strip_viewer(page: str) -> str:
+    script = viewer_script()
+    assert page.count(script) == 1
+    return page.replace(script, "")
+
+
+def test_page_loads_nothing_from_outside(page: str) -> None:
+    around = _strip_viewer(page)
+    assert re.findall(r"(?:https?:)?//[\w.-]+\.\w+", re.sub(r'"[A-Za-z0-9+/=\s]{40,}"', "", around)) == []
+    for word in (" src=", "href=", "@import", "url(", "fetch(", "import(", "WebSocket", ".connect("):
+        assert word not in around
+    # The viewer itself names one address, the XHTML namespace, which no browser opens.
+    assert set(re.findall(r"https?://[^\"'`\s)]+", viewer_script())) == {"http://www.w3.org/1999/xhtml"}
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)
+    assert policy and "default-src 'none'" in policy.group(1)
+    assert "http" not in policy.group(1) and "connect-src" not in policy.group(1)
+
+
+def test_page_has_no_placeholder_left_and_says_what_it_shows(page: str, log: EpisodeLog) -> None:
+    around = _strip_viewer(page)
+    assert "@@" not in around
+    text = re.sub(r"<[^>]+>", " ", around)
+    for words in ("navigation on room", "1 of 1 goals reached, no collision", "alm (sequential)", "lidar hits"):
+        assert words in text
+    failed = scene_html(replace(log, collisions=2, reached=[False]))
+    assert "0 of 1 goals reached, 2 collisions" in failed and 'class="bad"' in failed
+
+
+def test_names_from_outside_cannot_become_markup(log: EpisodeLog) -> None:
+    named = replace(log.occupancy, name="</script><b>x")
+    page = _strip_viewer(scene_html(replace(log, occupancy=named)))
+    assert "</script><b>" not in page and "&lt;/script&gt;&lt;b&gt;x" in page
+
+
+def test_same_log_same_bytes_in_two_processes(page: str, tmp_path: Path, log: EpisodeLog) -> None:
+    assert write_scene(tmp_path / "scene.html", log).read_bytes() == page.encode()
+    code = (
+        "import hashlib; from episodes import episode; from unifg.scenarios.scene import scene_html;"
+        "print(hashlib.sha256(scene_html(episode(ticks=12, obstacles=4)).encode()).hexdigest())"
+    )
+    here = Path(__file__).parent
+    printed = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={"PYTHONPATH": f"{here}:{here.parent}", "PYTHONHASHSEED": "7"},
+    ).stdout.strip()
+    assert printed == hashlib.sha256(page.encode()).hexdigest()
+
+
+def test_animation_comes_last_and_moves_things_that_exist(page: str) -> None:
+    commands = _commands(page)
+    kinds = [command["type"] for command in commands]
+    assert kinds.count("set_animation") == 1 and kinds[-1] == "set_animation"
+    assert commands[-1]["options"]["play"] is True
+    objects = [command["path"] for command in commands if command["type"] == "set_object"]
+    for path in _tracks(commands):
+        assert any(name == path or name.startswith(path + "/") for name in objects), path
+
+
+def test_every_frame_is_packed_and_shown_in_turn(page: str, log: EpisodeLog) -> None:
+    commands = _commands(page)
+    objects = {command["path"]: command["object"] for command in commands if command["type"] == "set_object"}
+    tracks = _tracks(commands)
+    last = log.ticks - 1
+    for tick in range(log.ticks):
+        path = f"/meshcat/frames/{tick}"
+        assert f"{path}/scan" in objects and f"{path}/horizon" in objects
+        assert (f"{path}/detected" in objects) == (len(log.detected[tick]) > 0)
+        keys = dict(tracks[path][".visible"])
+        assert min(keys) == 0  # otherwise the viewer holds the first key backwards
+        assert max(keys) == last  # otherwise this track would end before the others
+        for moment in range(log.ticks):
+            shown = keys[max(time for time in keys if time <= moment)]
+            assert shown is (moment == tick)
+
+
+def test_all_tracks_start_at_zero_and_end_together(page: str, log: EpisodeLog) -> None:
+    for path, properties in _tracks(_commands(page)).items():
+        for name, keys in properties.items():
+            frames = [frame for frame, _ in keys]
+            assert frames[0] == 0 and frames[-1] == log.ticks - 1, (path, name)
+            assert frames == sorted(set(frames))
+
+
+def test_robot_ghost_and_movers_follow_the_log(page: str, log: EpisodeLog) -> None:
+    tracks = _tracks(_commands(page))
+    for name, poses in (("robot", log.true_pose), ("estimate", log.estimate), ("odometry", log.dead_reckoning)):
+        track = tracks[f"/meshcat/{name}"]
+        places = np.array([value for _, value in track[".position"]])
+        turns = np.array([value for _, value in track[".quaternion"]])
+        np.testing.assert_allclose(places[:, :2], poses[:, :2])
+        np.testing.assert_allclose(2 * np.arctan2(turns[:, 2], turns[:, 3]), poses[:, 2], atol=1e-12)
+    assert log.moving().tolist() == [True, False, False, True]
+    moved = {path for path in tracks if "/obstacles/" in path}
+    assert moved == {"/meshcat/obstacles/0", "/meshcat/obstacles/3"}
+
+
+def test_objects_are_packed_as_the_viewer_wants_them(page: str) -> None:
+    for command in _commands(page):
+        if command["type"] != "set_object":
+            continue
+        (geometry,) = command["object"]["geometries"]
+        (material,) = command["object"]["materials"]
+        drawn = command["object"]["object"]
+        assert (drawn["geometry"], drawn["material"]) == (geometry["uuid"], material["uuid"])
+        if geometry["type"] == "BufferGeometry":
+            position = geometry["data"]["attributes"]["position"]
+            values = np.frombuffer(position["array"].data, dtype=np.float32)
+            assert position["itemSize"] == 3 and np.isfinite(values).all() and values.size > 0
+
+
+def test_horizon_ends_where_the_plan_ends(page: str, log: EpisodeLog) -> None:
+    for command in _commands(page):
+        if command.get("path") == "/meshcat/frames/5/horizon":
+            data = command["object"]["geometries"][0]["data"]["attributes"]["position"]["array"].data
+            sides = np.frombuffer(data, dtype=np.float32).reshape(-1, 2, 3)
+            assert len(sides) == HORIZON + 1
+            np.testing.assert_allclose(sides.mean(axis=1)[[0, -1], :2], log.horizon[5, [0, -1], :2], atol=1e-6)
+            return
+    pytest.fail("no horizon at tick 5")
+
+
+def test_scan_points_skip_dropouts_and_misses(log: EpisodeLog) -> None:
+    beams = np.arange(len(log.scan_angles))
+    points = scan_points(log, 4, beams)
+    assert len(points) == len(beams) - 2
+    ranges = np.linalg.norm(points - log.true_pose[4, :2], axis=1)
+    np.testing.assert_allclose(ranges, log.scan[4, 2:])
+    first = log.true_pose[4, 2] + log.scan_angles[2]
+    np.testing.assert_allclose(
+        points[0], log.true_pose[4, :2] + log.scan[4, 2] * np.array([np.cos(first), np.sin(first)])
+    )
+
+
+def test_long_episodes_are_thinned_and_small() -> None:
+    log = episode(ticks=1001)
+    ticks = frame_ticks(log)
+    assert ticks[:3].tolist() == [0, 3, 6] and ticks[-1] == 1000 and len(ticks) <= 501
+    log.scan, log.scan_angles = np.full((1001, 360), 2.0), np.linspace(-np.pi, np.pi, 360)
+    log.horizon = np.repeat(log.horizon[:, -1:], 31, axis=1) + np.linspace(0.0, 1.0, 31)[:, None]
+    assert len(scene_html(log)) < 6e6
+    assert frame_ticks(episode(ticks=500)).tolist() == list(range(500))
+
+
+def test_odd_episodes_are_drawn_too(log: EpisodeLog) -> None:
+    single = episode(ticks=1, obstacles=0)
+    assert _commands(scene_html(single))[-1]["type"] == "set_animation"
+    overview(single)
+    lost = replace(log, horizon=np.full_like(log.horizon, np.nan), scan=np.full_like(log.scan, np.nan))
+    paths = {command.get("path") for command in _commands(scene_html(lost))}
+    assert "/meshcat/frames/0/horizon" not in paths and "/meshcat/frames/0/scan" not in paths
+    with pytest.raises(ScenarioError, match="no tick"):
+        record_scene(replace(log, time=log.time[:0]))
+
+
+def test_recorder_makes_numpy_and_identifiers_plain() -> None:
+    class Command:
+        def lower(self) -> dict[str, object]:
+            name = "01234567-89ab-cdef-0123-456789abcdef"
+            return {"type": "x", "a": np.float32(1.5), "b": [np.bool_(True), name], "c": np.arange(2), "d": (name,)}
+
+    recorder = Recorder()
+    recorder.send(Command())
+    expected = {"type": "x", "a": 1.5, "b": [True, "000000"], "c": [0, 1], "d": ["000000"]}
+    assert recorder.commands == [expected]
+    assert umsgpack.unpackb(recorder.packed()[0]) == expected
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7])
+def test_walls_cover_the_map_and_enclose_it(yaw: float) -> None:
+    occupancy = room(yaw=yaw)
+    occupied = occupancy.occupied
+    painted = np.zeros(occupied.shape, dtype=int)
+    for low, high, left, right in cover(occupied).tolist():
+        painted[low:high, left:right] += 1
+    np.testing.assert_array_equal(painted, occupied.astype(int))  # each cell once, nothing else
+
+    vertices, faces = extrude(occupancy, 0.6)
+    triangles = vertices[faces]
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]) / 2.0
+    top = np.abs(normals[:, 2]) > 1e-12
+    area = occupancy.resolution**2
+    assert normals[top, 2].sum() == pytest.approx(occupied.sum() * area)
+    padded = np.pad(occupied, 1).astype(int)
+    edges = np.abs(np.diff(padded, axis=0)).sum() + np.abs(np.diff(padded, axis=1)).sum()
+    assert np.linalg.norm(normals[~top], axis=1).sum() == pytest.approx(edges * occupancy.resolution * 0.6)
+    floor, _ = flat(occupancy, occupied, 0.0)
+    np.testing.assert_allclose(np.abs(np.ptp(floor, axis=0)[2]), 0.0)
+    np.testing.assert_allclose(known_corners(occupancy), occupancy.bounds)
+
+
+def test_stray_marks_outside_the_rooms_do_not_shrink_the_picture() -> None:
+    free, occupied = np.zeros((60, 90), dtype=bool), np.zeros((60, 90), dtype=bool)
+    free[20:30, 30:50] = True
+    occupied[0, 0] = occupied[-1, -1] = True
+    stray = replace(room(), free=free, occupied=occupied)
+    low, high = known_corners(stray)[[0, 2]]
+    np.testing.assert_allclose([low, high], [[30 - 5 - 10, 20 - 5 - 10], [50 + 5 - 10, 30 + 5 - 10]] * np.array(0.1))
+    blank = replace(stray, free=np.zeros_like(free))
+    np.testing.assert_allclose(known_corners(blank), blank.bounds)
+
+
+def test_ribbon_keeps_its_width_also_where_points_coincide() -> None:
+    line = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
+    vertices, faces = ribbon(line, 0.2, 0.5)
+    assert np.isfinite(vertices).all() and len(faces) == 6
+    np.testing.assert_allclose(np.ptp(vertices, axis=0), [2.0, 0.2, 0.0])
+
+
+def test_overview_is_a_picture_and_deterministic(log: EpisodeLog, tmp_path: Path) -> None:
+    from matplotlib.image import imread
+
+    first = write_overview(tmp_path / "a.png", log, dpi=60).read_bytes()
+    second = write_overview(tmp_path / "b.png", log, dpi=60).read_bytes()
+    assert first == second
+    pixels = imread(tmp_path / "a.png")
+    assert pixels.shape[:2] == (564, 900) and pixels[..., :3].std() > 0.05
+
+
+def test_overview_names_everything(log: EpisodeLog) -> None:
+    figure = overview(log)
+    axes = [ax for part in figure.subfigs for ax in part.axes]
+    assert len(axes) == 6
+    for ax in axes:
+        assert "[" in ax.get_ylabel() and ax.get_title(loc="left")
+    legend = {text.get_text() for part in figure.subfigs for box in part.legends for text in box.get_texts()}
+    assert {"planned path", "true path", "estimate (lidar)", "wheel odometry alone", "unforeseen obstacle"} <= legend
+    title = figure.get_suptitle()
+    assert "1 of 1 goals reached" in title and "alm" in title and "seed 3" in title
+
+
+def test_plots_draw_into_the_axes_they_get_without_global_state(log: EpisodeLog) -> None:
+    from matplotlib.figure import Figure
+
+    before = "matplotlib.pyplot" in sys.modules
+    for plot in (plot_map, plot_localisation, plot_clearance, plot_solve_times):
+        ax = Figure().subplots()
+        assert plot(log, ax=ax) is ax
+        assert plot(log) is not ax
+    pair = tuple(Figure().subplots(2, 1))
+    assert plot_controls(log, ax=pair) == pair
+    assert ("matplotlib.pyplot" in sys.modules) == before
+
+
+def test_plotted_error_is_the_error(log: EpisodeLog) -> None:
+    line = plot_localisation(log).get_lines()[0]
+    np.testing.assert_allclose(np.asarray(line.get_ydata()), 5.0)  # [cm]
