@@ -3,7 +3,7 @@
 #   make demo     drive a robot through the shipped building, write out/demo/scene.html
 #   make test     run the tests
 #   make lint     check style (ruff) and types (mypy)
-#   make bench    run the timing scripts in benchmarks/
+#   make bench    measure everything again and rewrite the tables in docs/ (long)
 #   make fences   run the shell commands shown in README.md and docs/
 #   make clean    remove everything made here
 #
@@ -41,10 +41,8 @@ types: $(VENV)/ready-dev
 	$(BIN)/mypy
 
 bench: $(VENV)/ready-bench
-	@found=no; for script in benchmarks/bench_*.py; do \
-		test -f "$$script" || continue; found=yes; \
-		echo "$(BIN)/python $$script"; $(ONE_THREAD) $(BIN)/python "$$script" || exit 1; \
-	done; test $$found = yes || echo "benchmarks/ holds no bench_*.py"
+	$(BIN)/python -m benchmarks.reference_problems
+	$(BIN)/python -m benchmarks.navigation
 
 fences: $(VENV)/ready
 	$(BIN)/python docs/check_shell_fences.py

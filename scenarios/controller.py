@@ -37,6 +37,7 @@ class ControllerSettings:
         terminal_sigma: the same at the end of the horizon.
         control_sigma: (v, omega) deviation from the reference control [m/s, rad/s].
         rate_sigma: (v, omega) change between samples [m/s, rad/s].
+        control_weight: factor on all costs of the controller; matters where they meet those of the estimate.
         robot_radius: [m].
         wall_clearance: least distance of the hull to walls [m].
         disc_clearance: least distance of the hull to tracked discs [m].
@@ -45,8 +46,8 @@ class ControllerSettings:
         margin: distance of the hull below which the soft costs begin [m].
         margin_sigma: [m].
         discs: tracked discs considered at once.
-        relaxation: how fast the robot must regain a clearance it finds violated [m per step].
         tolerance: of the KKT test.
+        step_tolerance: norm of a step over the whole horizon below which iterating on is of no use to the robot.
         feasible: largest violation of a plan that may be driven.
     """
 
@@ -58,6 +59,7 @@ class ControllerSettings:
     terminal_sigma: tuple[float, float, float] = (0.1, 0.1, 0.2)
     control_sigma: tuple[float, float] = (1.0, 2.0)
     rate_sigma: tuple[float, float] = (0.5, 1.0)
+    control_weight: float = 1.0
     robot_radius: float = 0.17
     wall_clearance: float = 0.03
     disc_clearance: float = 0.06
@@ -66,21 +68,24 @@ class ControllerSettings:
     margin: float = 0.2
     margin_sigma: float = 0.1
     discs: int = 3
-    relaxation: float = 0.005
     tolerance: float = 1e-4
+    step_tolerance: float = 3e-3
     feasible: float = 5e-4
 
 
-def backend(name: str, tolerance: float) -> fg.Solver:
+def backend(name: str, settings: ControllerSettings) -> fg.Solver:
     """The backend of a control loop by its short name.
 
     Raises:
         ScenarioError: for an unknown name.
     """
+    tolerance, step, violation = settings.tolerance, settings.step_tolerance, 0.5 * settings.feasible
     if name == "sqp":
-        return SQP(tolerance=tolerance, max_iterations=15)
+        return SQP(tolerance=tolerance, step_tolerance=step, violation_tolerance=violation, max_iterations=15)
     if name == "alm":
-        return AugmentedLagrangian(tolerance=tolerance, max_iterations=40)
+        return AugmentedLagrangian(
+            tolerance=tolerance, step_tolerance=step, violation_tolerance=violation, max_iterations=40
+        )
     raise fg.ScenarioError(f"unknown solver '{name}': choose alm or sqp")
 
 
@@ -115,9 +120,13 @@ class Controller:
         self.settings = s = settings
         n, m = s.horizon, s.discs
         graph = fg.Graph()
+
+        def weighted(sigma: tuple[float, ...]) -> Array:
+            scaled: Array = np.array(sigma) / np.sqrt(s.control_weight)
+            return scaled
+
         self._x = x = graph.variables("pose", fg.SE2, n + 1)
         self._u = u = graph.variables("control", fg.Rn(2), n)
-        self._start = graph.data("start", np.zeros(3))
         self._reference = graph.data("reference", np.zeros((n - 1, 3)), each=True)
         self._end = graph.data("end of reference", np.zeros(3))
         self._cruise = graph.data("reference control", np.zeros((n, 2)), each=True)
@@ -126,25 +135,27 @@ class Controller:
         self._disc_limit = graph.data("disc clearance", np.zeros((n, m)), each=True)
         self._centres = graph.data("disc centres", np.full((n, m, 2), FAR_AWAY), each=True)
         self._radii = graph.data("disc radii", np.zeros(m))
-        graph.fix(x[0], self._start)
-        graph.minimize(unicycle.tracking, x[1:-1], self._reference, sigma=s.pose_sigma, name="path")
-        graph.minimize(unicycle.tracking, x[-1], self._end, sigma=s.terminal_sigma, name="end of path")
-        graph.minimize(fg.prior, u, self._cruise, sigma=s.control_sigma, name="effort")
-        graph.minimize(fg.prior, u[0], self._last, sigma=s.rate_sigma, name="first change")
-        graph.minimize(unicycle.rate, u[:-1], u[1:], sigma=s.rate_sigma, name="change")
+        self._anchor(graph, x)
+        graph.minimize(unicycle.tracking, x[1:-1], self._reference, sigma=weighted(s.pose_sigma), name="path")
+        graph.minimize(unicycle.tracking, x[-1], self._end, sigma=weighted(s.terminal_sigma), name="end of path")
+        graph.minimize(fg.prior, u, self._cruise, sigma=weighted(s.control_sigma), name="effort")
+        graph.minimize(fg.prior, u[0], self._last, sigma=weighted(s.rate_sigma), name="first change")
+        graph.minimize(unicycle.rate, u[:-1], u[1:], sigma=weighted(s.rate_sigma), name="change")
         self._field = SmoothField(distance_map)
         walls = obstacles.wall_distance(self._field)
         wall_margin = obstacles.shortfall(walls, s.robot_radius + s.margin)
         disc_margin = obstacles.shortfall(obstacles.disc_clearance, s.robot_radius + s.margin)
-        graph.minimize(wall_margin, x[1:], sigma=s.margin_sigma, name="wall margin")
-        graph.minimize(disc_margin, x[1:], self._centres, self._radii, sigma=s.margin_sigma, name="disc margin")
+        graph.minimize(wall_margin, x[1:], sigma=weighted((s.margin_sigma,))[0], name="wall margin")
+        graph.minimize(
+            disc_margin, x[1:], self._centres, self._radii, sigma=weighted((s.margin_sigma,))[0], name="disc margin"
+        )
         graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], s.dt, lower=0.0, upper=0.0, name="dynamics")
         graph.bound(u, lower=[-limit for limit in s.limits], upper=s.limits, name="limits")
         graph.constrain(walls, x[1:], lower=self._wall_limit, name="walls")
         graph.constrain(
             obstacles.disc_clearance, x[1:], self._centres, self._radii, lower=self._disc_limit, name="discs"
         )
-        self._run = backend(solver, s.tolerance).prepare(graph)
+        self._run = backend(solver, s).prepare(graph)
         self._guess: fg.Guess | None = None
         self._applied = np.zeros(2)
         self._stored = np.zeros((n, 2))
@@ -160,10 +171,22 @@ class Controller:
             reference: (N + 1, 3) poses along the path, the first beside the robot.
             tracks: discs the robot has seen.
         """
-        s = self.settings
         data = self._data(pose, reference, tracks)
         guess = self._guess or (self._staying(pose) if self._failed else self._along(pose, reference))
-        solution = self._run.solve(guess, data=data)
+        return self._judge(self._run.solve(guess, data=data), pose, reference)
+
+    def _anchor(self, graph: fg.Graph, x: fg.Family) -> None:
+        """Tie the horizon to the estimate: here it is given, and its first pose fixed."""
+        self._start = graph.data("start", np.zeros(3))
+        graph.fix(x[0], self._start)
+
+    def _anchored(self, pose: Array) -> dict[fg.Data, Array]:
+        """Data of what :meth:`_anchor` stated."""
+        return {self._start: pose}
+
+    def _judge(self, solution: fg.Solution, pose: Array, reference: Array) -> Plan:
+        """Drive a plan that keeps the constraints; brake along the last one otherwise."""
+        s = self.settings
         controls = solution[self._u]
         worst = "" if solution.worst is None else solution.worst[0]
         if solution.violation <= s.feasible:
@@ -232,7 +255,7 @@ class Controller:
         cruise = np.zeros((n, 2))
         cruise[:, 0] = self._cruising(reference)
         return {
-            self._start: pose,
+            **self._anchored(pose),
             self._reference: reference[1:-1],
             self._end: reference[-1],
             self._cruise: cruise,
@@ -243,13 +266,11 @@ class Controller:
             self._radii: radii,
         }
 
-
     def _wall_limits(self, pose: Array) -> Array:
-        """(N, 1) least distances to walls; a robot found nearer need not move away at once, but may not near."""
+        """(N, 1) least distances to walls; a robot found nearer may not come nearer still."""
         s = self.settings
-        now = float(self._field.distance(pose[None, :2])[0])
-        regained = s.relaxation * np.arange(s.horizon)
-        return np.minimum(s.robot_radius + s.wall_clearance, now + regained)[:, None]
+        now = self._field.distance(pose[None, :2])
+        return np.full((s.horizon, 1), min(s.robot_radius + s.wall_clearance, float(now[0])))
 
     def _disc_limits(self, pose: Array, centres: Array, radii: Array, moving: BoolArray) -> Array:
         """(N, M) least distances to discs, as far as a robot at rest could keep them.
@@ -261,11 +282,11 @@ class Controller:
         stages = np.arange(1, s.horizon + 1)[:, None]
         at_rest = np.hypot(*np.moveaxis(pose[:2] - centres, 2, 0)) - radii
         least = s.robot_radius + s.disc_clearance + np.where(moving, s.mover_allowance, 0.0)
-        spare = np.maximum(at_rest[0] - least, 0.0) * np.where(moving, 1.0, 0.0)
-        wanted = least + spare * (1.0 - s.approach) ** stages
-        return np.minimum(wanted, at_rest + s.relaxation * (stages - 1))
+        spare = np.where(moving, np.maximum(at_rest[0] - least, 0.0), 0.0)
+        limits: Array = np.minimum(least + spare * (1.0 - s.approach) ** stages, at_rest)
+        return limits
 
 
 def _box(settings: ControllerSettings) -> tuple[Array, Array]:
-    limits = np.array(settings.limits)
+    limits: Array = np.array(settings.limits)
     return -limits, limits

@@ -19,11 +19,11 @@ from unifg.files.ros_map import OccupancyMap, load_map
 from unifg.models.distance_map import DistanceMap
 from unifg.models.unicycle import step
 from unifg.scenarios.building import DEMO_GOALS, DEMO_START, building_map
-from unifg.scenarios.controller import Controller, ControllerSettings
+from unifg.scenarios.controller import ControllerSettings
 from unifg.scenarios.episode import EpisodeLog
-from unifg.scenarios.localiser import Localiser
 from unifg.scenarios.path import path_length
 from unifg.scenarios.perception import Tracker
+from unifg.scenarios.pilot import make_pilot
 from unifg.scenarios.recording import Recording
 from unifg.scenarios.route import Route
 from unifg.scenarios.unforeseen import place_obstacles
@@ -49,7 +49,7 @@ class NavigationSettings:
         start: true start pose [m, m, rad]; None for the demonstration's.
         goals: poses to be reached in order; None for the demonstration's.
         solver: "alm" or "sqp".
-        coupling: "sequential": estimation first, then control conditioned on it.
+        coupling: "sequential": estimation first, then control conditioned on it; "joint": one graph for both.
         obstacles: number of unforeseen obstacles.
         seed: of everything random.
         controller: weights and limits.
@@ -83,8 +83,6 @@ class Episode:
 
     def __init__(self, settings: NavigationSettings) -> None:
         """Load the map, plan the legs, place the obstacles, wake the robot."""
-        if settings.coupling != "sequential":
-            raise ScenarioError(f"unknown coupling '{settings.coupling}': choose sequential")
         self.settings = settings
         control = settings.controller
         self.occupancy = building_map() if settings.map is None else load_map(settings.map)
@@ -114,9 +112,10 @@ class Episode:
         self.world = World(self.occupancy, self.start, discs, sensors, robot_radius=control.robot_radius)
         sigma = np.array(INITIAL_SIGMA)
         believed = self.start + sigma * belief.standard_normal(3)
-        self.localiser = Localiser(self.distance_map, believed, sigma, self.world.lidar.beams)
         self.tracker = Tracker(self.distance_map)
-        self.controller = Controller(self.distance_map, settings.solver, control)
+        self.pilot = make_pilot(
+            settings.coupling, self.distance_map, settings.solver, control, believed, sigma, self.world.lidar.beams
+        )
 
     def run(self, progress: Progress) -> EpisodeLog:
         """Tick until the last goal is reached or time is up."""
@@ -124,7 +123,7 @@ class Episode:
         length = path_length(self.path)
         limit = int((length / SLOWEST + 60.0) / dt)
         recording = Recording(self.world, len(self.goals))
-        dead_reckoning = self.localiser.pose
+        dead_reckoning = self.pilot.pose
         goal, driven, interrupted = 0, 0.0, False
         try:
             for tick in range(limit):
@@ -133,15 +132,15 @@ class Episode:
                     dead_reckoning = step(dead_reckoning[None], odometry[None], dt)[0]
                     driven += abs(odometry[0]) * dt
                 else:
-                    odometry = np.zeros(2)
-                control = self._tick(tick, goal, odometry, dead_reckoning, recording)
+                    odometry = None
+                control = self._tick(goal, odometry, dead_reckoning, recording)
                 if self._arrived(goal):
                     recording.reached[goal] = self._confirmed(goal)
                     goal += 1
                     if goal == len(self.goals):
                         break
-                    self.legs[goal] = self._route(self.localiser.pose, self.goals[goal])
-                    self.controller.forget()
+                    self.legs[goal] = self._route(self.pilot.pose, self.goals[goal])
+                    self.pilot.forget()
                 self.world.step(float(control[0]), float(control[1]), dt)
                 progress(min(driven / length, 0.99), f"goal {goal + 1}/{len(self.goals)}")
         except KeyboardInterrupt:
@@ -149,26 +148,24 @@ class Episode:
         progress(1.0, "done")
         return recording.log(self, interrupted)
 
-    def _tick(self, tick: int, goal: int, odometry: Array, dead_reckoning: Array, recording: Recording) -> Array:
+    def _tick(self, goal: int, odometry: Array | None, dead_reckoning: Array, recording: Recording) -> Array:
         """Estimate and plan; the measured time is what a robot would spend."""
         control = self.settings.controller
         scan = self.world.scan()
         begin = time.perf_counter()
-        if tick:
-            self.localiser.predict(odometry, control.dt)
-        self.localiser.correct(scan)
+        self.pilot.estimate(scan, odometry, control.dt)
         estimated = time.perf_counter()
-        pose = self.localiser.pose
+        pose = self.pilot.pose
         tracks = self.tracker.update(scan, pose, control.dt)
         perceived = time.perf_counter()
         route = self.legs[goal]
         route.repair(pose, tracks)
         repaired = time.perf_counter()
         reference = route.reference(pose, control.speed * control.dt, control.horizon + 1)
-        plan = self.controller.plan(pose, reference, tracks)
+        plan = self.pilot.plan(reference, tracks)
         planned = time.perf_counter()
         recording.add(
-            goal, self.localiser, dead_reckoning, scan, tracks, plan,
+            goal, self.pilot, dead_reckoning, scan, tracks, plan,
             localise_ms=1e3 * (estimated - begin),
             perceive_ms=1e3 * (perceived - estimated),
             route_ms=1e3 * (repaired - perceived),
@@ -180,7 +177,7 @@ class Episode:
         return Route(self.occupancy, self.distance_map, begin, end, self.settings.controller.robot_radius)
 
     def _arrived(self, goal: int) -> bool:
-        return _near(self.localiser.pose, self.goals[goal], REACHED_DISTANCE, REACHED_HEADING)
+        return _near(self.pilot.pose, self.goals[goal], REACHED_DISTANCE, REACHED_HEADING)
 
     def _confirmed(self, goal: int) -> bool:
         """Whether the robot truly is where it believes to have arrived."""

@@ -59,9 +59,7 @@ class _Clearance:
         columns = np.arange(max(0, int(column - reach)), min(width, math.ceil(column + reach) + 1))
         if rows.size and columns.size:
             part = np.ix_(rows, columns)
-            away = (
-                np.hypot(rows[:, None] - row, columns[None, :] - column) * self.occupancy.resolution - radius
-            )
+            away = np.hypot(rows[:, None] - row, columns[None, :] - column) * self.occupancy.resolution - radius
             self.grid[part] = np.minimum(self.grid[part], away)
 
     def at(self, points: Array) -> Array:
@@ -157,9 +155,7 @@ def plan(
     clearance = _Clearance(occupancy, distance_map, extra_discs)
     for name, pose in (("start", start_pose), ("goal", goal_pose)):
         _check_standing(clearance, name, pose, robot_radius)
-    preferred = (
-        robot_radius + _COMFORT if clearance_preferred is None else max(clearance_preferred, robot_radius)
-    )
+    preferred = robot_radius + _COMFORT if clearance_preferred is None else max(clearance_preferred, robot_radius)
 
     steps = math.ceil((preferred - robot_radius) / _LEVEL_STEP - 1e-9)
     for level in np.linspace(preferred, robot_radius, max(2, steps + 1)):
@@ -241,9 +237,7 @@ _Route = tuple[BoolArray, tuple[int, int], tuple[int, int]]
 def _connected(clearance: _Clearance, start: Array, goal: Array, level: float, least: float) -> _Route | None:
     """The open cells that join start and goal and the two cells at which these join them, or None."""
     cells = clearance.open_cells(level)
-    labels, _ = ndimage.label(
-        cells
-    )  # joined along edges: every joined square of cells can also be crossed diagonally
+    labels, _ = ndimage.label(cells)  # joined along edges: every joined square of cells can also be crossed diagonally
     first = clearance.attach(start, cells, least)
     if first is None:
         return None
@@ -329,9 +323,7 @@ def _shorten(clearance: _Clearance, points: Array, level: float, robot_radius: f
     return points[kept]
 
 
-def _smooth(
-    clearance: _Clearance, points: Array, level: float, preferred: float, robot_radius: float
-) -> Array:
+def _smooth(clearance: _Clearance, points: Array, level: float, preferred: float, robot_radius: float) -> Array:
     """Diffuse the corners away; no point moves nearer to a wall unless it keeps the preferred clearance."""
     points = points.copy()
     distance, gradient = clearance.with_gradient(points)

@@ -11,9 +11,9 @@ from unifg.typing import Array
 
 if TYPE_CHECKING:
     from unifg.scenarios.controller import Plan
-    from unifg.scenarios.localiser import Localiser
     from unifg.scenarios.navigation import Episode
     from unifg.scenarios.perception import Tracks
+    from unifg.scenarios.pilot import Pilot
     from unifg.scenarios.world import Scan, World
 
 
@@ -34,7 +34,7 @@ class Recording:
     def add(
         self,
         goal: int,
-        localiser: Localiser,
+        pilot: Pilot,
         dead_reckoning: Array,
         scan: Scan,
         tracks: Tracks,
@@ -47,14 +47,14 @@ class Recording:
         row: dict[str, object] = {
             "time": world.time,
             "true_pose": world.pose,
-            "estimate": localiser.pose,
+            "estimate": pilot.pose,
             "dead_reckoning": dead_reckoning,
             "control": plan.control,
             "horizon": plan.states,
             "scan": scan.ranges,
             "obstacles": world.obstacle_states()[:, :3],
             "detected": np.column_stack([tracks.centre, tracks.radius]),
-            "localisation_iterations": localiser.iterations,
+            "localisation_iterations": pilot.iterations,
             "plan_iterations": plan.iterations,
             "status": plan.status.name.lower(),
             "bound_violation": plan.bound_violation,

@@ -79,10 +79,7 @@ class _Site:
     def passable(self, discs: Array) -> bool:
         """Whether the start is still joined to every goal around discs (K, 3) x, y, radius [m]."""
         clearance = self.rules.way_clearance
-        return all(
-            path_exists(self.occupancy, self.distance_map, self.start, g, clearance, discs)
-            for g in self.goals
-        )
+        return all(path_exists(self.occupancy, self.distance_map, self.start, g, clearance, discs) for g in self.goals)
 
 
 def place_obstacles(
@@ -147,16 +144,10 @@ def place_obstacles(
     )
 
 
-def _draw_until_good(
-    site: _Site, placed: list[Obstacle], moves: bool, rng: np.random.Generator
-) -> Obstacle | None:
+def _draw_until_good(site: _Site, placed: list[Obstacle], moves: bool, rng: np.random.Generator) -> Obstacle | None:
     for _ in range(_DRAWS):
         obstacle = _draw(site, moves, rng)
-        if (
-            obstacle is not None
-            and _keeps_distance(site, placed, obstacle)
-            and _leaves_way(site, [*placed, obstacle])
-        ):
+        if obstacle is not None and _keeps_distance(site, placed, obstacle) and _leaves_way(site, [*placed, obstacle]):
             return obstacle
     return None
 
@@ -166,9 +157,7 @@ def _draw(site: _Site, moves: bool, rng: np.random.Generator) -> Obstacle | None
     rules = site.rules
     # The same number of draws for every candidate, whatever becomes of it.
     radius, offset, where = rng.uniform([rules.radius[0], -1.0, 0.0], [rules.radius[1], 1.0, 1.0])
-    across, slant, length, sense = rng.uniform(
-        [0.0, -0.35, rules.sweep[0], -1.0], [1.0, 0.35, rules.sweep[1], 1.0]
-    )
+    across, slant, length, sense = rng.uniform([0.0, -0.35, rules.sweep[0], -1.0], [1.0, 0.35, rules.sweep[1], 1.0])
     point = site.path[min(int(where * len(site.path)), len(site.path) - 1)]
     normal = np.array([-np.sin(point[2]), np.cos(point[2])])
     centre = point[:2] + offset * rules.path_distance * normal
@@ -224,9 +213,7 @@ def _leaves_way(site: _Site, obstacles: list[Obstacle]) -> bool:
     fixed += [disc for mover in far for disc in at(mover, everywhere)]
     moments = [*itertools.product((0.0, 1.0), repeat=len(joint)), *((f,) * len(joint) for f in _FRACTIONS)]
     return all(
-        site.passable(
-            np.array([*fixed, *(at(m, np.array([f]))[0] for m, f in zip(joint, moment, strict=True))])
-        )
+        site.passable(np.array([*fixed, *(at(m, np.array([f]))[0] for m, f in zip(joint, moment, strict=True))]))
         for moment in moments
     )
 

@@ -304,9 +304,7 @@ class World:
         lidar = self.lidar
         x, y = self._robot.position
         bearing = self._robot.angle + self._angles
-        tips = np.stack(
-            [x + lidar.range_max * np.cos(bearing), y + lidar.range_max * np.sin(bearing)], axis=1
-        )
+        tips = np.stack([x + lidar.range_max * np.cos(bearing), y + lidar.range_max * np.sin(bearing)], axis=1)
         query, origin = self._space.segment_query_first, (x, y)
         hits = [query(origin, (tip[0], tip[1]), 0.0, _OTHERS) for tip in tips.tolist()]
         fraction = np.array([math.inf if hit is None else hit.alpha for hit in hits])

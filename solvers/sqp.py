@@ -44,6 +44,8 @@ class SQP(Solver):
             None leaves inaccurate answers as they are, and infeasible subproblems unsolved.
         qp_iterations: limit for OSQP before the fallback takes over.
         second_order_correction: try to repair a full step that the merit function rejects.
+        step_tolerance, violation_tolerance: stop rule on the norm of the step and the largest violation, for
+            control loops. A positive step_tolerance switches it on; it does not grant CONVERGED.
         full_steps: take every step in full, as the paper does; no merit function.
     """
 
@@ -51,6 +53,8 @@ class SQP(Solver):
     fallback: str | None = "piqp"
     qp_iterations: int = 200
     second_order_correction: bool = True
+    step_tolerance: float = 0.0
+    violation_tolerance: float = 1e-4
     full_steps: bool = False
 
     def workspace(self, program: Program) -> Subproblems:
@@ -95,6 +99,9 @@ class SQP(Solver):
                 damping=damping,
                 **({"correction": 1} if corrected else {}),
             )
+            if run.status is None and length * norm(answer.step) < self.step_tolerance:
+                if run.optimality.violation < self.violation_tolerance:
+                    return Status.STOP_RULE
             damping = self._next_damping(damping, length)
         return None
 

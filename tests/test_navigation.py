@@ -170,7 +170,7 @@ def test_failed_solves_brake_to_rest_along_the_stored_plan(
 ) -> None:
     episode = Episode(replace(CORNER, solver=solver, seed=3))
     horizon = episode.settings.controller.horizon
-    monkeypatch.setattr(episode.controller, "_run", Failing(episode.controller._run, good))
+    monkeypatch.setattr(episode.pilot.controller, "_run", Failing(episode.pilot.controller._run, good))
     log = drive(episode, good + horizon + 10)
     assert np.array_equal(log.emergency, np.arange(log.ticks) >= good)
     assert set(log.status[good:]) == {"locally_infeasible"}
@@ -193,7 +193,7 @@ def test_failed_solves_brake_to_rest_along_the_stored_plan(
 
 def test_one_failed_solve_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     episode = Episode(replace(CORRIDOR, seed=3))
-    run = episode.controller._run
+    run = episode.pilot.controller._run
     calls = 0
 
     class Once:
@@ -203,7 +203,7 @@ def test_one_failed_solve_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
             solution = run.solve(guess, **options)
             return Garbage(solution) if calls == 20 else solution
 
-    monkeypatch.setattr(episode.controller, "_run", Once())
+    monkeypatch.setattr(episode.pilot.controller, "_run", Once())
     log = episode.run(lambda done, text: None)
     assert log.succeeded
     assert log.emergency.sum() == 1
@@ -211,7 +211,7 @@ def test_one_failed_solve_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_failure_on_the_first_tick_stands_still(monkeypatch: pytest.MonkeyPatch) -> None:
     episode = Episode(CORRIDOR)
-    monkeypatch.setattr(episode.controller, "_run", Failing(episode.controller._run, 0))
+    monkeypatch.setattr(episode.pilot.controller, "_run", Failing(episode.pilot.controller._run, 0))
     log = drive(episode, 5)
     assert log.emergency.all()
     assert np.all(log.control == 0.0)

@@ -71,6 +71,15 @@ def gradient_and_hessian(
     return gradient, hessian
 
 
+def convexified(blocks: Array) -> Array:
+    """Hessian blocks of scalar costs with negative curvature removed: a Gauss-Newton step must descend."""
+    if not np.isfinite(blocks).all():
+        return blocks
+    eigenvalues, vectors = np.linalg.eigh(blocks)
+    result: Array = (vectors * np.maximum(eigenvalues, 0.0)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    return result
+
+
 def _directions(count: int, dim: int, step: float) -> list[Array]:
     """One (count, dim) array per tangent direction, scaled by ``step``."""
     scaled = step * np.eye(dim)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from unifg.typing import Array
+from unifg.variables import Family
+
 
 @dataclass(frozen=True)
 class Iteration:
@@ -18,6 +21,7 @@ class Iteration:
         seconds: since the solve began.
         terms: residual norm of every term (for constraints, of the violation).
         details: what the backend adds: damping, penalty, QP route and iterations, ...
+        values: copies of the values of every family, None unless the solver has ``keep_values``.
     """
 
     number: int
@@ -30,6 +34,7 @@ class Iteration:
     seconds: float
     terms: dict[str, float]
     details: dict[str, float | int | str] = field(default_factory=dict)
+    values: dict[Family, Array] | None = field(default=None, repr=False, compare=False)
 
 
 HEADER = (

@@ -6,19 +6,20 @@ costs; rows of constraints read ``lower <= g <= upper``. Columns are tangent coo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from unifg.columns import Columns
 from unifg.compiled import CompiledTerm, Values
+from unifg.differentiation import convexified
 from unifg.errors import GraphError
 from unifg.linear import Factorization
 from unifg.linearization import Evaluation, HeldWeights, Linearization
 from unifg.sparse import Gram, Rows, Symmetric, scatter, upper_pairs
 from unifg.terms import Constraint, Cost, ScalarCost
-from unifg.typing import Array, ArrayLike, IntArray
+from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 from unifg.variables import Data, Family
 
 if TYPE_CHECKING:
@@ -239,7 +240,7 @@ class Program:
                 norms[term.name] = float(np.abs(value).sum())
                 slope, curvature = term.scalar_derivatives(values)
                 gradient += scatter(columns.ravel(), slope.ravel(), self.columns.width)
-                hessians.append(_convex(curvature)[self._scalar_keep[term.name]])
+                hessians.append(convexified(curvature)[self._scalar_keep[term.name]])
         return Linearization(
             values,
             cost,
@@ -295,6 +296,20 @@ class Program:
             if rows.start <= row < rows.stop:
                 return term.name, (row - rows.start) // term.size
         raise IndexError(row)
+
+    def cost_rows(self, names: Sequence[str]) -> BoolArray:
+        """(C,) whether each cost row belongs to one of the named terms.
+
+        Raises:
+            GraphError: when no least-squares cost has such a name.
+        """
+        chosen = np.zeros(self.costs.count, dtype=bool)
+        slices = {term.name: rows for term, rows in zip(self.cost_terms, self._cost_slices, strict=True)}
+        for name in names:
+            if name not in slices:
+                raise GraphError(f"no cost is called '{name}' (there are: {', '.join(slices) or 'none'})", term=name)
+            chosen[slices[name]] = True
+        return chosen
 
     # ---------------------------------------------------------------- compilation
 
@@ -382,12 +397,3 @@ def _summed(slots: list[IntArray], parts: list[Array], size: int) -> Array:
         if len(place):
             total += scatter(place, numbers, size)
     return total
-
-
-def _convex(blocks: Array) -> Array:
-    """Hessian blocks of scalar costs with negative curvature removed: a Gauss-Newton step must descend."""
-    if not np.isfinite(blocks).all():
-        return blocks
-    eigenvalues, vectors = np.linalg.eigh(blocks)
-    result: Array = (vectors * np.maximum(eigenvalues, 0.0)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-    return result

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +12,7 @@ from unifg.errors import GraphError
 from unifg.history import HEADER, Iteration, line
 from unifg.kkt import Optimality
 from unifg.linearization import Linearization
+from unifg.marginal import information, marginal_prior
 from unifg.program import Program
 from unifg.status import Status
 from unifg.typing import Array, BoolArray, IntArray
@@ -156,6 +157,18 @@ class Solution:
         program = self._program
         active = self._equality | self._held()
         return covariance(program, self._lin, program.columns.of(selection).ravel(), active)
+
+    def information(self, terms: Sequence[str], *variables: Variable) -> Array:
+        """Information matrix (d, d) of the named costs over the selected variables; see :mod:`unifg.marginal`."""
+        columns = np.concatenate([self._program.columns.of(as_selection(v)).ravel() for v in variables])
+        return information(self._program, self._lin, terms, columns)[0]
+
+    def marginal_prior(self, terms: Sequence[str], remove: Variable, keep: Variable) -> tuple[Array, Array]:
+        """Reference and information of a prior that replaces variables leaving a window.
+
+        Only the named costs that touch ``remove`` are marginalised, at this solution's linearisation point.
+        """
+        return marginal_prior(self._program, self._lin, terms, remove, keep)
 
     def report(self) -> str:
         """The status sentence with the numbers behind it."""

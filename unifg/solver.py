@@ -40,12 +40,14 @@ class Solver(ABC):
         max_iterations: iterations (linear systems or subproblems solved) before giving up.
         time_limit: seconds before giving up, checked once an iteration.
         verbose: log one line per iteration at level INFO to the logger ``unifg``.
+        keep_values: keep the values of every iterate in the history, for pictures of a solve.
     """
 
     tolerance: float = 1e-6
     max_iterations: int = 100
     time_limit: float = np.inf
     verbose: bool = False
+    keep_values: bool = False
 
     def __post_init__(self) -> None:
         """Refuse options no solve could honour."""
@@ -165,6 +167,7 @@ class Run:
             self.seconds,
             lin.norms,
             dict(details),
+            {family: array.copy() for family, array in lin.values.items()} if self._solver.keep_values else None,
         )
         self.history.append(row)
         if self._solver.verbose:

@@ -1,0 +1,359 @@
+"""Two manoeuvres nobody programmed: reversing out of a wrong heading, and deflecting around a disc.
+
+Each is one control graph solved once, cold, from a guess that the robot cannot drive (Bazzana et al. 2022, section
+VII-B and Fig. 7). In ``behind`` the path to follow leaves behind the robot's back; in ``obstacle`` it leads straight
+through a disc that nobody had foreseen. Every iterate is kept for the picture.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypedDict
+
+import numpy as np
+
+import unifg as fg
+from unifg.models import obstacles, unicycle
+from unifg.solvers import SQP, AugmentedLagrangian
+from unifg.typing import Array
+
+__all__ = [
+    "CASES",
+    "Case",
+    "CaseMetrics",
+    "Manoeuvre",
+    "ManoeuvreSettings",
+    "case_metrics",
+    "run_manoeuvre",
+    "state_problem",
+    "table",
+    "write_metrics",
+]
+
+AT_REST = 1e-3  # [m/s] and [rad/s]; smaller controls have no sign worth counting
+ROUNDING = 1e-6  # by which a limit may seem exceeded
+SUBSTEPS = 10  # looks at the way between two nodes
+
+Progress = Callable[[fg.Iteration], bool | None]
+
+
+@dataclass(frozen=True)
+class ManoeuvreSettings:
+    """Numbers shared by the manoeuvres. Weights multiply half the square of an error.
+
+    Attributes:
+        horizon: steps N.
+        dt: sampling time Ts [s].
+        limits: greatest |v| [m/s] and |omega| [rad/s].
+        robot_radius: [m].
+        clearance: least distance of the hull to discs at the nodes [m]; between nodes the hull may come nearer by
+            the sagitta of one step, 3 mm at most here.
+        path: weights of the deviation (x, y, theta) at each node [1/m^2, 1/m^2, 1/rad^2].
+        end: the same at the last node.
+        effort: weights of the deviation of (v, omega) from the reference control [s^2/m^2, s^2/rad^2].
+        change: weights of the change of (v, omega) from one sample to the next.
+        tolerance: of the KKT test.
+        max_iterations: of the backend.
+    """
+
+    horizon: int = 50
+    dt: float = 0.1
+    limits: tuple[float, float] = (1.0, 1.0)
+    robot_radius: float = 0.17
+    clearance: float = 0.03
+    path: tuple[float, float, float] = (10.0, 10.0, 1.0)
+    end: tuple[float, float, float] = (50.0, 50.0, 5.0)
+    effort: tuple[float, float] = (0.1, 0.1)
+    change: tuple[float, float] = (2.0, 2.0)
+    tolerance: float = 1e-6
+    max_iterations: int = 300
+
+
+@dataclass(frozen=True)
+class Case:
+    """What makes one manoeuvre hard.
+
+    Attributes:
+        name: on the command line and in file names.
+        title: what is asked of the robot.
+        start: pose of the robot [m, m, rad].
+        heading: direction in which the straight path leaves the origin [rad].
+        speed: along the path [m/s].
+        discs: x, y, radius of each disc [m].
+    """
+
+    name: str
+    title: str
+    start: tuple[float, float, float]
+    heading: float
+    speed: float
+    discs: tuple[tuple[float, float, float], ...] = ()
+
+    def reference(self, settings: ManoeuvreSettings) -> Array:
+        """(N + 1, 3) poses along the path, a step's travel apart [m, m, rad]."""
+        way = self.speed * settings.dt * np.arange(settings.horizon + 1)
+        heading = np.full_like(way, self.heading)
+        return np.column_stack([way * np.cos(self.heading), way * np.sin(self.heading), heading])
+
+
+CASES = {
+    "behind": Case(
+        "behind", "the path leads away behind the robot's back", start=(0.0, 0.0, 0.3), heading=np.pi, speed=0.5
+    ),
+    "obstacle": Case(
+        "obstacle",
+        "the path leads straight through an unforeseen disc",
+        start=(0.0, 0.0, 0.0),
+        heading=0.0,
+        speed=0.7,
+        discs=((1.75, -0.05, 0.35),),
+    ),
+}
+"""The manoeuvres by name."""
+
+
+def state_problem(case: Case, settings: ManoeuvreSettings) -> tuple[fg.Graph, fg.Family, fg.Family, fg.Guess]:
+    """The control graph of a case.
+
+    Returns:
+        The graph, its poses, its controls, and the cold guess: the reference itself after the true start.
+    """
+    s = settings
+    reference = case.reference(s)
+    cruise = np.array([case.speed, 0.0])
+    graph = fg.Graph()
+    x = graph.variables("pose", fg.SE2, s.horizon + 1)
+    u = graph.variables("control", fg.Rn(2), s.horizon)
+    graph.fix(x[0], case.start)
+    graph.minimize(unicycle.tracking, x[:-1], reference[:-1], information=np.diag(s.path), name="path")
+    graph.minimize(unicycle.tracking, x[-1], reference[-1], information=np.diag(s.end), name="end of path")
+    graph.minimize(fg.prior, u, cruise, information=np.diag(s.effort), name="effort")
+    graph.minimize(unicycle.rate, u[:-1], u[1:], information=np.diag(s.change), name="change")
+    graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], s.dt, lower=0.0, upper=0.0, name="dynamics")
+    graph.bound(u, lower=[-limit for limit in s.limits], upper=s.limits, name="limits")
+    if case.discs:
+        discs = np.array(case.discs)
+        kept = s.robot_radius + s.clearance
+        graph.constrain(obstacles.disc_clearance, x[1:], discs[:, :2], discs[:, 2], lower=kept, name="discs")
+    states = reference.copy()
+    states[0] = case.start
+    return graph, x, u, fg.Guess({x: states, u: np.tile(cruise, (s.horizon, 1))})
+
+
+@dataclass(frozen=True)
+class Manoeuvre:
+    """One solved case.
+
+    Attributes:
+        case: what was asked.
+        settings: the numbers.
+        solver: "alm" or "sqp".
+        solution: with its history.
+        states: (N + 1, 3) poses of the solution [m, m, rad].
+        controls: (N, 2) controls of the solution [m/s, rad/s].
+        iterates: (iterations + 1, N + 1, 3) poses of every iterate, the guess first.
+    """
+
+    case: Case
+    settings: ManoeuvreSettings
+    solver: str
+    solution: fg.Solution
+    states: Array
+    controls: Array
+    iterates: Array
+
+    @property
+    def time(self) -> Array:
+        """(N + 1,) time of each node [s]."""
+        return self.settings.dt * np.arange(self.settings.horizon + 1)
+
+    @property
+    def cusps(self) -> list[int]:
+        """Nodes at which the robot passes from driving backward to driving forward, or the other way."""
+        return _reversals(self.controls[:, 0])
+
+    @property
+    def inflections(self) -> list[int]:
+        """Nodes at which the turning speed changes sign."""
+        return _reversals(self.controls[:, 1])
+
+    @property
+    def clearance(self) -> Array:
+        """(N + 1,) distance of the hull to the nearest disc at each node [m]; infinite without discs."""
+        return self._clearance(self.states)
+
+    @property
+    def clearance_between(self) -> float:
+        """Least distance of the hull to the discs on the whole way, also between nodes [m]."""
+        parts = np.arange(SUBSTEPS) / SUBSTEPS * self.settings.dt
+        way = [unicycle.step(self.states[:-1], self.controls, part) for part in parts]
+        return float(self._clearance(np.concatenate([*way, self.states[-1:]])).min())
+
+    @property
+    def within_limits(self) -> bool:
+        """Whether speeds and clearance keep their limits at every node."""
+        s = self.settings
+        slow = bool((np.abs(self.controls) <= np.array(s.limits) + ROUNDING).all())
+        return slow and bool((self.clearance[1:] >= s.clearance - ROUNDING).all())
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the solver converged and every limit is kept."""
+        return self.solution.converged and self.within_limits
+
+    def _clearance(self, states: Array) -> Array:
+        if not self.case.discs:
+            return np.full(len(states), np.inf)
+        discs = np.array(self.case.discs)
+        gaps = np.linalg.norm(states[:, None, :2] - discs[None, :, :2], axis=2) - discs[:, 2]
+        nearest: Array = gaps.min(axis=1) - self.settings.robot_radius
+        return nearest
+
+
+def run_manoeuvre(
+    case: Case, solver: str = "sqp", settings: ManoeuvreSettings | None = None, progress: Progress | None = None
+) -> Manoeuvre:
+    """Solve one case from its cold guess.
+
+    Args:
+        case: one of `CASES`, or another.
+        solver: "alm" or "sqp".
+        settings: None for the defaults.
+        progress: called with every row of the history; returning True ends the solve.
+
+    Raises:
+        ScenarioError: for an unknown solver.
+    """
+    settings = settings or ManoeuvreSettings()
+    backend: fg.Solver
+    if solver == "alm":
+        backend = AugmentedLagrangian(
+            tolerance=settings.tolerance, max_iterations=settings.max_iterations, keep_values=True
+        )
+    elif solver == "sqp":
+        backend = SQP(tolerance=settings.tolerance, max_iterations=settings.max_iterations, keep_values=True)
+    else:
+        raise fg.ScenarioError(f"unknown solver '{solver}': choose alm or sqp")
+    graph, x, u, guess = state_problem(case, settings)
+    solution = backend.solve(graph, guess, callback=progress)
+    iterates = np.stack([row.values[x] for row in solution.history if row.values is not None])
+    return Manoeuvre(case, settings, solver, solution, solution[x], solution[u], iterates)
+
+
+class CaseMetrics(TypedDict):
+    """Numbers of one manoeuvre; only ``solve_ms`` depends on the clock."""
+
+    status: str
+    converged: bool
+    within_limits: bool
+    cost: float
+    iterations: int
+    stationarity: float
+    violation: float
+    complementarity: float
+    cusps: int
+    cusp_times_s: list[float]
+    inflection_times_s: list[float]
+    max_speed_m_s: float
+    max_turn_rate_rad_s: float
+    min_clearance_m: float | None
+    min_clearance_between_nodes_m: float | None
+    end_error_m: float
+    end_error_rad: float
+    solve_ms: float
+
+
+def case_metrics(manoeuvre: Manoeuvre) -> CaseMetrics:
+    """The numbers of one manoeuvre; clearances are None without discs."""
+    m, solution = manoeuvre, manoeuvre.solution
+    speed, turning = np.abs(m.controls).max(axis=0).tolist()
+    end = m.states[-1] - m.case.reference(m.settings)[-1]
+    blocked = bool(m.case.discs)
+    return {
+        "status": solution.status.name.lower(),
+        "converged": solution.converged,
+        "within_limits": m.within_limits,
+        "cost": float(solution.cost),
+        "iterations": solution.iterations,
+        "stationarity": float(solution.stationarity),
+        "violation": float(solution.violation),
+        "complementarity": float(solution.complementarity),
+        "cusps": len(m.cusps),
+        "cusp_times_s": _rounded(m.time[m.cusps]),
+        "inflection_times_s": _rounded(m.time[m.inflections]),
+        "max_speed_m_s": speed,
+        "max_turn_rate_rad_s": turning,
+        "min_clearance_m": float(m.clearance.min()) if blocked else None,
+        "min_clearance_between_nodes_m": m.clearance_between if blocked else None,
+        "end_error_m": float(np.hypot(end[0], end[1])),
+        "end_error_rad": float(abs(fg.wrap_angle(end[2]))),
+        "solve_ms": 1e3 * solution.seconds,
+    }
+
+
+def write_metrics(path: Path, manoeuvres: Sequence[Manoeuvre]) -> Path:
+    """Write the numbers of all cases as JSON and return the path."""
+    content = {
+        "scenario": "manoeuvres",
+        "solver": manoeuvres[0].solver,
+        "cases": {m.case.name: case_metrics(m) for m in manoeuvres},
+    }
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8", newline="\n")
+    return path
+
+
+def table(manoeuvres: Sequence[Manoeuvre]) -> str:
+    """The outcome for people, one column per case."""
+    found = [case_metrics(m) for m in manoeuvres]
+    rows = [
+        ("case", [m.case.name for m in manoeuvres]),
+        ("solver", [m.solver for m in manoeuvres]),
+        ("status", [n["status"].replace("_", " ") for n in found]),
+        ("iterations", [f"{n['iterations']} in {n['solve_ms']:.0f} ms" for n in found]),
+        ("cost", [f"{n['cost']:.5f}" for n in found]),
+        ("stationarity, violation", [f"{n['stationarity']:.1e}, {n['violation']:.1e}" for n in found]),
+        ("cusps (v changes sign)", [_at(n["cusp_times_s"]) for n in found]),
+        ("omega changes sign", [_at(n["inflection_times_s"]) for n in found]),
+        ("greatest |v|", [f"{n['max_speed_m_s']:.6f} of {m.settings.limits[0]:g} m/s" for m, n in _pairs(manoeuvres)]),
+        (
+            "greatest |omega|",
+            [f"{n['max_turn_rate_rad_s']:.6f} of {m.settings.limits[1]:g} rad/s" for m, n in _pairs(manoeuvres)],
+        ),
+        ("least clearance of hull", [_metres(n["min_clearance_m"]) for n in found]),
+        ("  also between nodes", [_metres(n["min_clearance_between_nodes_m"]) for n in found]),
+        ("end of path missed by", [f"{n['end_error_m']:.3f} m, {n['end_error_rad']:.3f} rad" for n in found]),
+        ("all limits kept", ["yes" if n["within_limits"] else "NO" for n in found]),
+    ]
+    first = max(len(name) for name, _ in rows)
+    widths = [max(len(cells[k]) for _, cells in rows) for k in range(len(manoeuvres))]
+    lines = (
+        f"{name:<{first}}  " + "  ".join(f"{cell:<{width}}" for cell, width in zip(cells, widths, strict=True))
+        for name, cells in rows
+    )
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _pairs(manoeuvres: Sequence[Manoeuvre]) -> list[tuple[Manoeuvre, CaseMetrics]]:
+    return [(m, case_metrics(m)) for m in manoeuvres]
+
+
+def _reversals(values: Array) -> list[int]:
+    """Indices of the first samples of a new sign; those too small to have one count for neither."""
+    signed = np.flatnonzero(np.abs(values) > AT_REST)
+    changes = np.flatnonzero(np.diff(np.sign(values[signed])) != 0.0)
+    return [int(k) for k in signed[changes + 1]]
+
+
+def _rounded(times: Array) -> list[float]:
+    return [round(float(time), 9) for time in times]
+
+
+def _at(times: list[float]) -> str:
+    return f"{len(times)}, at " + ", ".join(f"{t:.1f}" for t in times) + " s" if times else "0"
+
+
+def _metres(value: float | None) -> str:
+    return "no discs" if value is None else f"{value:.4f} m"
