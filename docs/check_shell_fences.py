@@ -149,9 +149,7 @@ def check_page(page: Path, seconds: float) -> tuple[int, int, list[str]]:
 def main() -> int:
     """Check the pages named on the command line, or all of them; return 0 when every fence passed."""
     parser = argparse.ArgumentParser(description="Run the shell commands shown in the documentation.")
-    parser.add_argument(
-        "pages", nargs="*", type=Path, help="pages to check (default: README.md and docs/*.md)"
-    )
+    parser.add_argument("pages", nargs="*", type=Path, help="pages to check (default: README.md and docs/*.md)")
     parser.add_argument("--seconds", type=float, default=300.0, help="time limit of one fence [s]")
     options = parser.parse_args()
     run, skipped, failures = 0, 0, list[str]()

@@ -1,7 +1,8 @@
 """The command ``unifg``: run a scenario, watch its progress, keep its results.
 
-Exit status: 0 if every goal was reached without a collision, 1 if not, 2 for arguments that cannot be
-served, 130 after an interrupt (what was driven until then is written all the same).
+Exit status: 0 if the robot did what it was asked (every goal reached without a collision, every solve converged within
+its limits), 1 if not, 2 for arguments that cannot be served, 130 after an interrupt (what was done until then is
+written all the same).
 
 Commands and scenarios are tables: to add one, write a function that describes its arguments and one that runs it.
 """
@@ -17,20 +18,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
 
 from unifg import __version__
 from unifg.errors import UnifgError
+from unifg.history import Iteration
 from unifg.scenarios.results import summary, write_results
 
-if TYPE_CHECKING:
-    from unifg.scenarios.episode import EpisodeLog
-
-__all__ = ["SCENARIOS", "SOLVERS", "Scenario", "main"]
+__all__ = ["SCENARIOS", "SOLVERS", "Outcome", "Scenario", "main"]
 
 SUCCEEDED, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
 SOLVERS = ("alm", "sqp")
 COUPLINGS = ("sequential",)
+MANOEUVRES = ("behind", "obstacle")
 
 Pose = tuple[float, float, float]
 Progress = Callable[[float, str], None]
@@ -40,18 +39,37 @@ _NEGATIVE = re.compile(r"-[\d.]")
 
 
 @dataclass(frozen=True)
+class Outcome:
+    """How a run ended.
+
+    Attributes:
+        succeeded: whether the robot did what it was asked.
+        interrupted: whether the user stopped it.
+        summary: table for people.
+        write: writes the results into an existing folder and returns the files.
+    """
+
+    succeeded: bool
+    interrupted: bool
+    summary: str
+    write: Callable[[Path], list[Path]]
+
+
+@dataclass(frozen=True)
 class Scenario:
     """One entry of `SCENARIOS`.
 
     Attributes:
         summary: one line for the help.
         arguments: adds the scenario's arguments to its parser.
-        run: runs one episode.
+        run: runs it; raises KeyboardInterrupt when stopped before there is anything to write.
+        random: whether a seed makes a difference.
     """
 
     summary: str
     arguments: Callable[[argparse.ArgumentParser], None]
-    run: Callable[[argparse.Namespace, Progress], EpisodeLog]
+    run: Callable[[argparse.Namespace, Progress], Outcome]
+    random: bool = True
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -87,7 +105,8 @@ def _parser() -> argparse.ArgumentParser:
         one = scenarios.add_parser(name, help=scenario.summary, description=scenario.summary, allow_abbrev=False)
         scenario.arguments(one)
         one.add_argument("--solver", choices=SOLVERS, default="sqp", help="backend (default: %(default)s)")
-        one.add_argument("--seed", type=_count, default=0, metavar="S", help="of everything random (default: 0)")
+        if scenario.random:
+            one.add_argument("--seed", type=_count, default=0, metavar="S", help="of everything random (default: 0)")
         one.add_argument(
             "--out",
             type=Path,
@@ -107,21 +126,18 @@ def _run(chosen: argparse.Namespace) -> int:
     except OSError as error:
         return _refuse(f"--out {folder}: cannot make this folder ({error.strerror})")
     with _progress_bar(chosen.scenario) as progress:
-        log = SCENARIOS[chosen.scenario].run(chosen, progress)
-    if log.ticks == 0:
-        print("unifg: interrupted before there was anything to write", file=sys.stderr)
-        return INTERRUPTED
+        outcome = SCENARIOS[chosen.scenario].run(chosen, progress)
     try:
-        files = write_results(folder, log)
+        files = outcome.write(folder)
     except OSError as error:
         return _refuse(f"--out {folder}: cannot write the results ({error})")
-    print(summary(log))
+    print(outcome.summary)
     print()
     for file in files:
         print(file)
-    if log.interrupted:
+    if outcome.interrupted:
         return INTERRUPTED
-    return SUCCEEDED if log.succeeded else FAILED
+    return SUCCEEDED if outcome.succeeded else FAILED
 
 
 @contextmanager
@@ -232,7 +248,7 @@ def _navigation_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _run_navigation(chosen: argparse.Namespace, progress: Progress) -> EpisodeLog:
+def _run_navigation(chosen: argparse.Namespace, progress: Progress) -> Outcome:
     from unifg.scenarios import navigation  # imports solvers and the physics engine: not for --help
 
     settings = navigation.NavigationSettings(
@@ -244,7 +260,42 @@ def _run_navigation(chosen: argparse.Namespace, progress: Progress) -> EpisodeLo
         obstacles=chosen.obstacles,
         seed=chosen.seed,
     )
-    return navigation.run_navigation(settings, progress=progress)
+    log = navigation.run_navigation(settings, progress=progress)
+    if log.ticks == 0:
+        raise KeyboardInterrupt
+    return Outcome(log.succeeded, log.interrupted, summary(log), lambda folder: write_results(folder, log))
+
+
+def _manoeuvres_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--case", choices=(*MANOEUVRES, "both"), default="both", help="which manoeuvre (default: %(default)s)"
+    )
+
+
+def _run_manoeuvres(chosen: argparse.Namespace, progress: Progress) -> Outcome:
+    from unifg.scenarios import manoeuvre_plots, manoeuvres
+    from unifg.status import Status
+
+    names = MANOEUVRES if chosen.case == "both" else (chosen.case,)
+    solved: list[manoeuvres.Manoeuvre] = []
+    interrupted = False
+    for number, name in enumerate(names):
+
+        def tell(row: Iteration, name: str = name, number: int = number) -> None:
+            share = 1.0 - 0.9**row.number  # nobody knows how many iterations there will be
+            progress((number + share) / len(names), f"{name}: iteration {row.number}, cost {row.cost:.5g}")
+
+        solved.append(manoeuvres.run_manoeuvre(manoeuvres.CASES[name], chosen.solver, progress=tell))
+        interrupted = solved[-1].solution.status is Status.INTERRUPTED
+        if interrupted:
+            break
+    progress(1.0, "solved")
+
+    def write(folder: Path) -> list[Path]:
+        numbers = manoeuvres.write_metrics(folder / "metrics.json", solved)
+        return [*(manoeuvre_plots.write_picture(folder / f"{m.case.name}.png", m) for m in solved), numbers]
+
+    return Outcome(all(m.succeeded for m in solved), interrupted, manoeuvres.table(solved), write)
 
 
 SCENARIOS = {
@@ -252,6 +303,12 @@ SCENARIOS = {
         "A robot localises itself by lidar and drives through a building under MPC.",
         _navigation_arguments,
         _run_navigation,
+    ),
+    "manoeuvres": Scenario(
+        "Two control graphs solved once: backing out of a wrong heading, and deflecting around an unforeseen disc.",
+        _manoeuvres_arguments,
+        _run_manoeuvres,
+        random=False,
     ),
 }
 """Everything ``unifg run`` can run."""

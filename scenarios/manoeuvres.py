@@ -307,37 +307,34 @@ def write_metrics(path: Path, manoeuvres: Sequence[Manoeuvre]) -> Path:
 
 def table(manoeuvres: Sequence[Manoeuvre]) -> str:
     """The outcome for people, one column per case."""
-    found = [case_metrics(m) for m in manoeuvres]
-    rows = [
-        ("case", [m.case.name for m in manoeuvres]),
-        ("solver", [m.solver for m in manoeuvres]),
-        ("status", [n["status"].replace("_", " ") for n in found]),
-        ("iterations", [f"{n['iterations']} in {n['solve_ms']:.0f} ms" for n in found]),
-        ("cost", [f"{n['cost']:.5f}" for n in found]),
-        ("stationarity, violation", [f"{n['stationarity']:.1e}, {n['violation']:.1e}" for n in found]),
-        ("cusps (v changes sign)", [_at(n["cusp_times_s"]) for n in found]),
-        ("omega changes sign", [_at(n["inflection_times_s"]) for n in found]),
-        ("greatest |v|", [f"{n['max_speed_m_s']:.6f} of {m.settings.limits[0]:g} m/s" for m, n in _pairs(manoeuvres)]),
-        (
-            "greatest |omega|",
-            [f"{n['max_turn_rate_rad_s']:.6f} of {m.settings.limits[1]:g} rad/s" for m, n in _pairs(manoeuvres)],
-        ),
-        ("least clearance of hull", [_metres(n["min_clearance_m"]) for n in found]),
-        ("  also between nodes", [_metres(n["min_clearance_between_nodes_m"]) for n in found]),
-        ("end of path missed by", [f"{n['end_error_m']:.3f} m, {n['end_error_rad']:.3f} rad" for n in found]),
-        ("all limits kept", ["yes" if n["within_limits"] else "NO" for n in found]),
-    ]
-    first = max(len(name) for name, _ in rows)
-    widths = [max(len(cells[k]) for _, cells in rows) for k in range(len(manoeuvres))]
+    columns = [_column(m) for m in manoeuvres]
+    first = max(map(len, columns[0]))
+    widths = [max(map(len, column.values())) for column in columns]
     lines = (
-        f"{name:<{first}}  " + "  ".join(f"{cell:<{width}}" for cell, width in zip(cells, widths, strict=True))
-        for name, cells in rows
+        "  ".join([f"{name:<{first}}", *(f"{c[name]:<{width}}" for c, width in zip(columns, widths, strict=True))])
+        for name in columns[0]
     )
     return "\n".join(line.rstrip() for line in lines)
 
 
-def _pairs(manoeuvres: Sequence[Manoeuvre]) -> list[tuple[Manoeuvre, CaseMetrics]]:
-    return [(m, case_metrics(m)) for m in manoeuvres]
+def _column(manoeuvre: Manoeuvre) -> dict[str, str]:
+    numbers, limits = case_metrics(manoeuvre), manoeuvre.settings.limits
+    return {
+        "case": manoeuvre.case.name,
+        "solver": manoeuvre.solver,
+        "status": numbers["status"].replace("_", " "),
+        "iterations": f"{numbers['iterations']} in {numbers['solve_ms']:.0f} ms",
+        "cost": f"{numbers['cost']:.5f}",
+        "stationarity, violation": f"{numbers['stationarity']:.1e}, {numbers['violation']:.1e}",
+        "cusps (v changes sign)": _at(numbers["cusp_times_s"]),
+        "omega changes sign": _at(numbers["inflection_times_s"]),
+        "greatest |v|": f"{numbers['max_speed_m_s']:.6f} of {limits[0]:g} m/s",
+        "greatest |omega|": f"{numbers['max_turn_rate_rad_s']:.6f} of {limits[1]:g} rad/s",
+        "least clearance of hull": _metres(numbers["min_clearance_m"]),
+        "  also between nodes": _metres(numbers["min_clearance_between_nodes_m"]),
+        "end of path missed by": f"{numbers['end_error_m']:.3f} m, {numbers['end_error_rad']:.3f} rad",
+        "all limits kept": "yes" if numbers["within_limits"] else "NO",
+    }
 
 
 def _reversals(values: Array) -> list[int]:

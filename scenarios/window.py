@@ -63,7 +63,7 @@ class Window:
         self.length = length
         self.slots: list[Slot] = []
         self.now = self._slot(np.asarray(pose, dtype=np.float64), beams)
-        self.arrival: tuple[Array, Array] = (self.now.pose, np.linalg.inv(covariance))
+        self.arrival: tuple[Array, Array] = (self.now.pose, inverse(covariance))
         self._noise = odometry.OdometryNoise()
 
     def look(self, scan: Scan) -> None:
@@ -75,7 +75,7 @@ class Window:
         """Push the present into the past and predict the next pose by the wheels' velocities ``u`` (2,)."""
         here = np.zeros(3)
         self.now.step = unicycle.step(here[None], u[None], dt)[0]
-        self.now.information = np.linalg.inv(self._noise.covariance(u, dt))
+        self.now.information = inverse(self._noise.covariance(u, dt))
         self.slots.append(self.now)
         self.now = self._slot(fg.SE2.compose(self.now.pose, self.now.step), len(self.now.beams))
         if len(self.slots) > self.length:
@@ -181,5 +181,9 @@ class WindowTerms:
     def covariance(self, solution: fg.Solution) -> Array:
         """(3, 3) covariance of the present pose from the past's terms alone, whatever else the graph wishes."""
         matrix = solution.information((*PAST_TERMS, *NOW_TERMS), self.past, self.present)
-        covariance: Array = np.linalg.inv(matrix)[-3:, -3:]
-        return covariance
+        return inverse(matrix)[-3:, -3:]
+
+
+def inverse(matrix: Array) -> Array:
+    """Inverse of a covariance or information matrix."""
+    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)

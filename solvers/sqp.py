@@ -27,10 +27,14 @@ from unifg.typing import Array
 ARMIJO = 1e-4
 SHORTEST = 1e-6
 ROUNDING = 1e-13
+NOISE = 1e-8
 GOOD_ENOUGH = 1e-5  # QP error that is always accepted from the fallback
 USABLE = 1e-3  # QP error below which a step may still be tried
 FAILURES = 4  # damped attempts at one step before giving up
 MISSES = 2  # in a row within one solve, after which the first route is no longer asked
+FIRST_DAMPING = 1e-3
+DAMPING_GROWTH = 10.0
+DAMPING_DECAY = 0.9  # faster forgetting cycles between overshooting and damped steps
 SMALLEST_DAMPING = 1e-9  # keeps H positive definite without showing in the step
 
 
@@ -39,6 +43,7 @@ class SQP(Solver):
     """Equalities, inequalities and general costs by quadratic subproblems with a Gauss-Newton Hessian.
 
     Attributes:
+        max_iterations: subproblems before giving up.
         qp: "osqp" (called directly, warm-started) or any name qpsolvers knows.
         fallback: "piqp" (called directly) or any name qpsolvers knows: repeats a QP which missed its accuracy.
             None leaves inaccurate answers as they are, and infeasible subproblems unsolved.
@@ -49,6 +54,7 @@ class SQP(Solver):
         full_steps: take every step in full, as the paper does; no merit function.
     """
 
+    max_iterations: int = 200
     qp: str = "osqp"
     fallback: str | None = "piqp"
     qp_iterations: int = 200
@@ -111,9 +117,10 @@ class SQP(Solver):
         return float(np.clip(1e-3 * size, 0.1 * self.tolerance, 1e-4))
 
     def _next_damping(self, damping: float, length: float) -> float:
-        if length < 0.1:
-            return max(4.0 * damping, 1e-3)
-        return max(0.1 * damping, SMALLEST_DAMPING) if length == 1.0 else damping
+        """A shortened step means curvature that H does not know: damp, and forget it slowly."""
+        if length < 1.0:
+            return max(DAMPING_GROWTH * damping, FIRST_DAMPING)
+        return max(DAMPING_DECAY * damping, SMALLEST_DAMPING)
 
     def _search(
         self, run: Run, workspace: Subproblems, merit: Merit, qp: QP, answer: QPAnswer, accuracy: float
@@ -124,8 +131,8 @@ class SQP(Solver):
             return program.linearize(values), answer.multipliers, 1.0, False
         here = merit.value(lin)
         slope = merit.slope(qp, answer.step, lin)
-        # The QP meets its rows to its own accuracy only; below a tenth of the tolerance the merit is noise.
-        slack = ROUNDING * max(1.0, abs(here)) + 0.1 * self.tolerance * merit.price
+        # The QP meets its rows to its own accuracy only; what that costs in merit is noise.
+        slack = ROUNDING * max(1.0, abs(here)) + NOISE * merit.price
         if slope > slack:
             return None
         trial = program.evaluate(values, lin.weights)

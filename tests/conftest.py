@@ -10,9 +10,7 @@ from hypothesis import HealthCheck, settings
 CHECKOUT = Path(__file__).resolve().parent.parent
 
 # Same examples on every machine and in every run: a red test stays red until the code changes.
-settings.register_profile(
-    "unifg", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
-)
+settings.register_profile("unifg", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 # For hunting by hand: HYPOTHESIS_PROFILE=explore draws new examples each time, and more of them.
 settings.register_profile("explore", deadline=None, max_examples=1000)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "unifg"))

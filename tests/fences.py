@@ -66,9 +66,7 @@ def fences(path: Path) -> Iterator[Fence]:
         skip = _SKIP.match(lines[number - 1]) if number else None
         body = [text[min(indent, len(text) - len(text.lstrip())) :] for text in lines[start:end]]
         info = opening["info"].split()
-        yield Fence(
-            path, start + 1, info[0].lower() if info else "", "\n".join(body) + "\n", skip and skip["reason"]
-        )
+        yield Fence(path, start + 1, info[0].lower() if info else "", "\n".join(body) + "\n", skip and skip["reason"])
         number = end + 1
 
 

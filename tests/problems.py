@@ -38,6 +38,12 @@ class Problem:
     duals: dict[str, list[list[float]]] = field(default_factory=dict)
 
 
+def line(count: int = 4) -> tuple[fg.Graph, fg.Family]:
+    """An empty graph over ``count`` points of the plane."""
+    graph = fg.Graph()
+    return graph, graph.variables("x", fg.Rn(2), count)
+
+
 def ecg2o_residual(x: Array) -> Array:
     """Residuals of ecg2o's second case study."""
     return np.stack([x[:, 0] + np.exp(-x[:, 1]), x[:, 0] ** 2 + 2.0 * x[:, 1] + 1.0], axis=1)

@@ -23,9 +23,7 @@ _HTML = re.compile(r"\b(?:src|href)=\"(?P<target>[^\"]+)\"")
 
 def run_page(blocks: list[Fence], monkeypatch: pytest.MonkeyPatch) -> None:
     """Execute blocks in order in one namespace; fail with the file and line of the block that raised."""
-    module = ModuleType(
-        "__main__"
-    )  # so that dataclasses, and `if __name__ == "__main__"`, work as in a script
+    module = ModuleType("__main__")  # so that dataclasses, and `if __name__ == "__main__"`, work as in a script
     monkeypatch.setitem(sys.modules, "__main__", module)
     for block in blocks:
         # Blank lines in front make every traceback show the line of the page itself.
@@ -33,9 +31,7 @@ def run_page(blocks: list[Fence], monkeypatch: pytest.MonkeyPatch) -> None:
         try:
             exec(compile(source, str(block.path), "exec"), module.__dict__)
         except Exception as error:
-            where = [
-                f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(block.path)
-            ]
+            where = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(block.path)]
             line = error.lineno if isinstance(error, SyntaxError) else where[-1] if where else block.line
             trace = "".join(traceback.format_exception(error))
             pytest.fail(
@@ -118,9 +114,7 @@ def broken_links(page: Path) -> list[str]:
     return broken
 
 
-@pytest.mark.parametrize(
-    "page", [*PAGES, *[p for p in [CHECKOUT / "CHANGELOG.md"] if p.is_file()]], ids=relative
-)
+@pytest.mark.parametrize("page", [*PAGES, *[p for p in [CHECKOUT / "CHANGELOG.md"] if p.is_file()]], ids=relative)
 def test_links_lead_somewhere(page: Path) -> None:
     assert broken_links(page) == []
 
@@ -206,9 +200,7 @@ def test_blocks_share_a_namespace(scratch: Path, monkeypatch: pytest.MonkeyPatch
         ("value = 1\nvalue value", r"page\.md:5: SyntaxError"),
     ],
 )
-def test_failures_name_the_line(
-    code: str, message: str, scratch: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failures_name_the_line(code: str, message: str, scratch: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = _page(scratch, f"# A title\n\n```python\n{code}\n```\n")
     with pytest.raises(pytest.fail.Exception, match=message):
         run_page(list(fences(page)), monkeypatch)

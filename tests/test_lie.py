@@ -211,9 +211,7 @@ def phi(generator: Array) -> Array:
     return exponentials(block)[..., :size, size:]
 
 
-def test_jacobians_are_integrals_of_the_adjoint(
-    case: Case, batch: Batch, regime: str, rng: Generator
-) -> None:
+def test_jacobians_are_integrals_of_the_adjoint(case: Case, batch: Batch, regime: str, rng: Generator) -> None:
     group = case.group
     d = tangents(case, regime, batch, rng)
     assert_close(group.right_jacobian(d), phi(-group.ad(d)))

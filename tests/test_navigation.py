@@ -262,9 +262,7 @@ def hall(width: float = 2.0) -> tuple[OccupancyMap, DistanceMap]:
 
 def disc(x: float, y: float, radius: float, velocity: tuple[float, float] = (0.0, 0.0)) -> Tracks:
     """One tracked disc."""
-    return Tracks(
-        np.array([[x, y]]), np.array([velocity]), np.array([radius]), np.array([0]), np.array([0.0])
-    )
+    return Tracks(np.array([[x, y]]), np.array([velocity]), np.array([radius]), np.array([0]), np.array([0.0]))
 
 
 def through_the_hall() -> tuple[Route, Array]:
@@ -324,9 +322,7 @@ def building() -> tuple[OccupancyMap, DistanceMap]:
 SIGMA = np.array([0.1, 0.1, 0.05])
 
 
-@pytest.mark.parametrize(
-    "place", [(3.0, 25.2, 0.0), (21.0, 9.6, -2.0), (10.8, 17.0, 1.0), (36.0, 18.0, 3.0)], ids=str
-)
+@pytest.mark.parametrize("place", [(3.0, 25.2, 0.0), (21.0, 9.6, -2.0), (10.8, 17.0, 1.0), (36.0, 18.0, 3.0)], ids=str)
 @pytest.mark.parametrize("off", [(0.1, 0.0, 0.05), (-0.07, 0.07, -0.05), (0.0, -0.1, 0.05)], ids=str)
 def test_localiser_converges(place: tuple[float, float, float], off: tuple[float, float, float]) -> None:
     occupancy, field = building()

@@ -27,9 +27,7 @@ def hall(width: float = 10.0, height: float = 8.0, pillar: bool = False) -> Occu
     occupied[:, [0, -1]] = True
     if pillar:
         occupied[75:85, 95:105] = True
-    return OccupancyMap(
-        occupied=occupied, free=~occupied, resolution=0.05, origin=(0.0, 0.0, 0.0), name="hall"
-    )
+    return OccupancyMap(occupied=occupied, free=~occupied, resolution=0.05, origin=(0.0, 0.0, 0.0), name="hall")
 
 
 def field(occupancy: OccupancyMap) -> DistanceMap:
@@ -51,9 +49,7 @@ def watch(world: World, tracker: Tracker, ticks: int, noise: Array, rng: np.rand
     return tracks
 
 
-def follow(
-    world: World, path: Array, tracker: Tracker, noise: Array, rng: np.random.Generator
-) -> list[Tracks]:
+def follow(world: World, path: Array, tracker: Tracker, noise: Array, rng: np.random.Generator) -> list[Tracks]:
     """Drive along a path by pure pursuit of the true pose, tracking from a disturbed one."""
     seen: list[Tracks] = []
     reached = 0
@@ -62,9 +58,7 @@ def follow(
         reached += int(np.argmin(np.linalg.norm(path[reached : reached + 40, :2] - pose[:2], axis=1)))
         aim = path[min(reached + 10, len(path) - 1), :2] - pose[:2]
         bearing = math.remainder(math.atan2(aim[1], aim[0]) - pose[2], 2.0 * math.pi)
-        world.step(
-            0.8 * math.cos(bearing) if abs(bearing) < 1.0 else 0.0, float(np.clip(2.5 * bearing, -1.0, 1.0))
-        )
+        world.step(0.8 * math.cos(bearing) if abs(bearing) < 1.0 else 0.0, float(np.clip(2.5 * bearing, -1.0, 1.0)))
         seen.append(tracker.update(world.scan(), world.pose + noise * rng.standard_normal(3), DT))
     return seen
 
@@ -79,9 +73,7 @@ def test_one_scan_places_a_disc(distance: float, radius: float) -> None:
     for seed in range(20):
         bearing = 0.3 * seed
         centre = np.array([5.0 + distance * math.cos(bearing), 4.0 + distance * math.sin(bearing)])
-        world = World(
-            occupancy, (5.0, 4.0, 0.1 * seed), [Obstacle(centre, radius)], np.random.default_rng(seed)
-        )
+        world = World(occupancy, (5.0, 4.0, 0.1 * seed), [Obstacle(centre, radius)], np.random.default_rng(seed))
         discs = finder.find(world.scan(), world.pose)
         assert len(discs.radius) == 1
         errors.append(np.linalg.norm(discs.centre[0] - centre))
@@ -120,9 +112,7 @@ def test_two_hits_confirm() -> None:
 def test_mapped_things_are_not_obstacles() -> None:
     """Walls and a pillar on the map give no tracks; the pillar missing from the map does."""
     world = World(hall(pillar=True), (3.0, 4.0, 0.0), rng=np.random.default_rng(0))
-    assert (
-        len(watch(world, Tracker(field(hall(pillar=True))), 30, np.zeros(3), np.random.default_rng(0))) == 0
-    )
+    assert len(watch(world, Tracker(field(hall(pillar=True))), 30, np.zeros(3), np.random.default_rng(0))) == 0
     found = watch(world, Tracker(field(hall())), 5, np.zeros(3), np.random.default_rng(0))
     assert len(found) >= 1
     assert np.linalg.norm(found.centre - (5.0, 4.0), axis=1).min() < 0.25
@@ -132,9 +122,7 @@ def test_wide_things_become_several_discs() -> None:
     """An unmapped wall of two metres is covered by discs along its whole face."""
     occupied = hall().occupied.copy()
     occupied[60:100, 100:104] = True
-    solid = OccupancyMap(
-        occupied=occupied, free=~occupied, resolution=0.05, origin=(0.0, 0.0, 0.0), name="hall"
-    )
+    solid = OccupancyMap(occupied=occupied, free=~occupied, resolution=0.05, origin=(0.0, 0.0, 0.0), name="hall")
     world = World(solid, (3.0, 4.0, 0.0), rng=np.random.default_rng(0))
     tracks = watch(world, Tracker(field(hall())), 5, np.zeros(3), np.random.default_rng(0))
     face = np.stack([np.full(41, 5.0), np.linspace(3.0, 5.0, 41)], axis=1)

@@ -68,9 +68,7 @@ def test_a_gap_narrower_than_the_robot_is_no_way() -> None:
     occupancy = room(6)
     field = field_of(occupancy)
     assert not path_exists(occupancy, field, (1, 1), (5, 1), RADIUS)
-    with pytest.raises(
-        ScenarioError, match=r"no way from \(1\.00, 1\.00\) to \(5\.00, 1\.00\).*choose another goal"
-    ):
+    with pytest.raises(ScenarioError, match=r"no way from \(1\.00, 1\.00\) to \(5\.00, 1\.00\).*choose another goal"):
         plan(occupancy, field, (1, 1, 0), (5, 1, 0), robot_radius=RADIUS)
 
 
@@ -157,9 +155,7 @@ def test_a_distance_map_of_another_map_is_refused() -> None:
 @pytest.mark.parametrize("apart", [0.0, 0.01, 0.3])
 def test_a_goal_at_hand_still_gives_two_poses(apart: float) -> None:
     occupancy = room()
-    path = plan(
-        occupancy, field_of(occupancy), (1.012, 1.033, 0), (1.012 + apart, 1.033, 2.0), robot_radius=RADIUS
-    )
+    path = plan(occupancy, field_of(occupancy), (1.012, 1.033, 0), (1.012 + apart, 1.033, 2.0), robot_radius=RADIUS)
     assert len(path) >= 2
     assert np.allclose(path[-1], (1.012 + apart, 1.033, 2.0))
     assert path_length(path) < apart + 0.05

@@ -13,8 +13,7 @@ from unifg.files.ros_map import OccupancyMap, load_map, save_map
 from unifg.typing import Array
 
 HEADER = (
-    "image: m.pgm\nresolution: 0.1\norigin: [1.0, 2.0, 0.0]\nnegate: 0\n"
-    "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    "image: m.pgm\nresolution: 0.1\norigin: [1.0, 2.0, 0.0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
 )
 
 

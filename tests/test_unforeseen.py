@@ -33,9 +33,7 @@ def floor(door: float = 1.4) -> OccupancyMap:
     for column, middle in ((120, 100), (260, 60)):
         occupied[:, column : column + 3] = True
         occupied[middle - half : middle + half, column : column + 3] = False
-    return OccupancyMap(
-        occupied=occupied, free=~occupied, resolution=0.05, origin=(0.0, 0.0, 0.0), name="floor"
-    )
+    return OccupancyMap(occupied=occupied, free=~occupied, resolution=0.05, origin=(0.0, 0.0, 0.0), name="floor")
 
 
 @functools.lru_cache(maxsize=4)
@@ -77,9 +75,7 @@ def joined(occupancy: OccupancyMap, start: Array, goals: Array, discs: list[Arra
     return bool(found[0] > 0 and (found == found[0]).all())
 
 
-def check(
-    occupancy: OccupancyMap, path: Array, start: Array, goals: Array, obstacles: list[Obstacle]
-) -> None:
+def check(occupancy: OccupancyMap, path: Array, start: Array, goals: Array, obstacles: list[Obstacle]) -> None:
     """Every promise of the placement, judged by other means than those that made it."""
     rules = PlacementRules()
     distance_map = field(occupancy)
@@ -134,8 +130,7 @@ def test_same_seed_same_obstacles() -> None:
     occupancy = floor()
     path = route(occupancy, START, GOALS)
     first, again, other = (
-        place_obstacles(occupancy, field(occupancy), path, 3, np.random.default_rng(seed))
-        for seed in (5, 5, 6)
+        place_obstacles(occupancy, field(occupancy), path, 3, np.random.default_rng(seed)) for seed in (5, 5, 6)
     )
     np.testing.assert_array_equal([o.centre for o in first], [o.centre for o in again])
     assert np.abs(first[0].centre - other[0].centre).max() > 0.01

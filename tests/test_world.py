@@ -19,9 +19,7 @@ QUIET = LidarModel(sigma=0.0, dropout=0.0)
 EXACT = OdometryModel(scale_sigma=0.0, noise_sigma=0.0)
 
 
-def room(
-    width: float = 6.0, height: float = 4.0, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> OccupancyMap:
+def room(width: float = 6.0, height: float = 4.0, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> OccupancyMap:
     """A room with walls one cell thick; its inside begins one cell (0.05 m) from the origin."""
     rows, columns = round(height / 0.05), round(width / 0.05)
     occupied = np.zeros((rows, columns), dtype=bool)
@@ -123,9 +121,7 @@ def test_clearance_to_walls_and_in_the_open() -> None:
     """Distance of the hull to a wall's face; infinite where there is nothing."""
     assert quiet_world((0.55, 2.0, 1.0)).clearance() == pytest.approx(0.5 - 0.17, abs=1e-6)
     nothing = np.zeros((10, 10), dtype=bool)
-    empty = OccupancyMap(
-        occupied=nothing, free=~nothing, resolution=0.05, origin=(0.0, 0.0, 0.0), name="empty"
-    )
+    empty = OccupancyMap(occupied=nothing, free=~nothing, resolution=0.05, origin=(0.0, 0.0, 0.0), name="empty")
     assert World(empty, (0.0, 0.0, 0.0)).clearance() == math.inf
 
 
@@ -144,9 +140,7 @@ def test_mover_keeps_its_pace_on_its_segment() -> None:
 @pytest.mark.parametrize("turning", [0.0, 0.6])
 def test_mover_waits_for_a_robot_at_rest(turning: float) -> None:
     """It stops 0.1 m before a resting robot, in its way or beside it, and goes on when the robot has left."""
-    world = quiet_world(
-        (3.0, 2.1, math.pi / 2), Obstacle(np.array([4.5, 2.0]), 0.2, np.array([1.5, 2.0]), 0.3)
-    )
+    world = quiet_world((3.0, 2.1, math.pi / 2), Obstacle(np.array([4.5, 2.0]), 0.2, np.array([1.5, 2.0]), 0.3))
     gaps = []
     for _ in range(80):
         world.step(0.0, turning)
@@ -184,9 +178,7 @@ def test_lidar_measures_the_room(yaw: float) -> None:
 
 def test_lidar_noise_dropouts_and_range() -> None:
     """Spread 0.02 m, one beam in a hundred lost, +inf beyond 12 m, obstacles seen, the robot itself not."""
-    world = World(
-        room(30.0, 4.0), (2.0, 2.0, 0.0), [Obstacle(np.array([4.0, 2.0]), 0.2)], np.random.default_rng(3)
-    )
+    world = World(room(30.0, 4.0), (2.0, 2.0, 0.0), [Obstacle(np.array([4.0, 2.0]), 0.2)], np.random.default_rng(3))
     true = World(room(30.0, 4.0), (2.0, 2.0, 0.0), [Obstacle(np.array([4.0, 2.0]), 0.2)], lidar=QUIET).scan()
     scans = np.array([world.scan().ranges for _ in range(60)])
     seen = np.isfinite(scans)

@@ -192,18 +192,12 @@ def _read_header(path: Path) -> dict[str, Any]:
     except FileNotFoundError as error:
         raise FileFormatError(f"{path}: no such file; give the YAML file of a ROS map") from error
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise FileFormatError(
-            f"{path}: not readable as YAML ({error}); give the YAML file, not the image"
-        ) from error
+        raise FileFormatError(f"{path}: not readable as YAML ({error}); give the YAML file, not the image") from error
     if not isinstance(header, dict):
-        raise FileFormatError(
-            f"{path}: expected lines 'key: value' (image, resolution, ...), found {header!r}"
-        )
+        raise FileFormatError(f"{path}: expected lines 'key: value' (image, resolution, ...), found {header!r}")
     for key in ("image", "resolution", "origin"):
         if key not in header:
-            raise FileFormatError(
-                f"{path}: the key {key!r} is missing; a map needs image, resolution, origin"
-            )
+            raise FileFormatError(f"{path}: the key {key!r} is missing; a map needs image, resolution, origin")
     return header
 
 
@@ -244,9 +238,7 @@ def _read_image(path: Path, image: Path) -> tuple[Array, BoolArray]:
         with Image.open(image) as picture:
             kind = picture.mode
             if kind not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
-                raise FileFormatError(
-                    f"{image} (named in {path}): pixel kind {kind!r}; save as 8-bit grey or RGB"
-                )
+                raise FileFormatError(f"{image} (named in {path}): pixel kind {kind!r}; save as 8-bit grey or RGB")
             pixels = np.asarray(picture.convert("RGBA"), dtype=np.uint8)
     except FileNotFoundError as error:
         raise FileFormatError(f"{path}: the image {image} does not exist; put it beside the YAML") from error

@@ -100,9 +100,7 @@ class Product:
         for name, array in arrays.items():
             needed = self.components[name].manifold.storage
             if array.ndim == 0 or array.shape[-1] != needed:
-                raise UnifgError(
-                    f"component '{name}' of {self.name} stores {needed} numbers; got shape {array.shape}"
-                )
+                raise UnifgError(f"component '{name}' of {self.name} stores {needed} numbers; got shape {array.shape}")
         batch = np.broadcast_shapes(*(array.shape[:-1] for array in arrays.values()))
         result = np.empty((*batch, self.storage))
         for name, array in arrays.items():

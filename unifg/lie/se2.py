@@ -211,9 +211,7 @@ def _angle_minus_sine(theta: Array) -> Array:
     """Return (theta - sin theta) / theta^2, by series where the difference cancels."""
     small = np.abs(theta) < SERIES_BELOW
     t = theta * theta
-    series = theta * (
-        1 / 6 - t * (1 / 120 - t * (1 / 5040 - t * (1 / 362880 - t * (1 / 39916800 - t / 6227020800))))
-    )
+    series = theta * (1 / 6 - t * (1 / 120 - t * (1 / 5040 - t * (1 / 362880 - t * (1 / 39916800 - t / 6227020800)))))
     safe = np.where(small, 1.0, theta)
     result: Array = np.where(small, series, (safe - np.sin(safe)) / (safe * safe))
     return result

@@ -1,0 +1,201 @@
+"""Bad input is refused before the first iteration, and ``graph.check`` finds what a solve would stumble over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from problems import line, short_drive
+from unifg.models import unicycle
+from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton
+from unifg.typing import Array
+
+Breaks = Callable[[fg.Graph, fg.Family], object]
+
+REFUSALS: list[tuple[str, Breaks, str]] = [
+    ("family name twice", lambda g, x: g.variables("x", fg.Rn(1), 1), "exists already"),
+    ("no members", lambda g, x: g.variables("y", fg.Rn(1), 0), "at least one"),
+    ("no variable", lambda g, x: g.minimize(fg.prior, np.zeros(2), [0.0, 0.0]), "no variable"),
+    ("lengths", lambda g, x: g.minimize(fg.difference, x[:2], x[:3]), "unclear.*has 2.*has 3"),
+    (
+        "sigma and information",
+        lambda g, x: g.minimize(fg.prior, x, [0, 0], sigma=1.0, information=np.eye(2)),
+        "not both",
+    ),
+    ("lower above upper", lambda g, x: g.bound(x, lower=[0.0, 2.0], upper=1.0), "lower exceeds upper"),
+    ("nan limit", lambda g, x: g.bound(x, upper=np.nan), "NaN"),
+    ("fixed twice", lambda g, x: (g.fix(x[0], [0.0, 0.0]), g.fix(x[:2], [0.0, 0.0])), r"x\[0\] is fixed"),
+    ("fix shape", lambda g, x: g.fix(x[0], [0.0, 0.0, 0.0]), "shape"),
+    ("fix nan", lambda g, x: g.fix(x[1], [0.0, np.nan]), r"x\[1\]"),
+    ("out of range", lambda g, x: x[7], "family 'x' has 4"),
+    (
+        "name taken",
+        lambda g, x: (g.bound(x, upper=1, name="a"), g.bound(x, lower=0, name="a")),
+        "'a' is taken",
+    ),
+    ("other graph", lambda g, x: g.minimize(fg.prior, line()[1], [0.0, 0.0]), "another graph"),
+    ("data nan", lambda g, x: g.data("z", [np.nan]), "NaN"),
+    (
+        "residual shape",
+        lambda g, x: (g.minimize(lambda p: p[:, 0], x), g.compile()),
+        r"returned shape \(4,\)",
+    ),
+    (
+        "sigma shape",
+        lambda g, x: (g.minimize(fg.prior, x, [0, 0], sigma=np.ones(3)), g.compile()),
+        "sigma has shape",
+    ),
+    (
+        "negative sigma",
+        lambda g, x: (g.minimize(fg.prior, x, [0, 0], sigma=-1.0), g.compile()),
+        "must be positive",
+    ),
+    (
+        "indefinite information",
+        lambda g, x: (g.minimize(fg.prior, x, [0, 0], information=np.diag([1.0, -1.0])), g.compile()),
+        "negative eigenvalue",
+    ),
+    (
+        "untouched",
+        lambda g, x: (g.minimize(fg.prior, x[:2], [0.0, 0.0]), g.compile()),
+        r"x\[2\] is in no cost",
+    ),
+    ("bound on a group", lambda g, x: g.bound(g.variables("p", fg.SE2, 1), upper=1.0), "not Rn"),
+]
+
+
+@pytest.mark.parametrize(("breaks", "message"), [r[1:] for r in REFUSALS], ids=[r[0] for r in REFUSALS])
+def test_bad_statement_is_refused(breaks: Breaks, message: str) -> None:
+    graph, x = line()
+    with pytest.raises(fg.GraphError, match=message):
+        breaks(graph, x)
+
+
+GUESSES: list[tuple[str, Callable[[fg.Family], dict[fg.Family, Array]], str]] = [
+    ("missing", lambda x: {}, "no values for family 'x'"),
+    ("shape", lambda x: {x: np.zeros((3, 2))}, r"shape \(3, 2\), expected \(4, 2\)"),
+    ("nan", lambda x: {x: np.array([[0, 0], [0, 0], [np.nan, 0], [0, 0.0]])}, r"x\[2\]"),
+    ("stranger", lambda x: {x: np.zeros((4, 2)), line()[1]: np.zeros((4, 2))}, "no family of this graph"),
+]
+
+
+@pytest.mark.parametrize(("guess", "message"), [g[1:] for g in GUESSES], ids=[g[0] for g in GUESSES])
+@pytest.mark.parametrize("solver", [GaussNewton(), SQP(), AugmentedLagrangian()], ids=["gn", "sqp", "alm"])
+def test_bad_guess_is_refused(
+    solver: fg.Solver, guess: Callable[[fg.Family], dict[fg.Family, Array]], message: str
+) -> None:
+    graph, x = line()
+    graph.minimize(fg.prior, x, [0.0, 0.0])
+    with pytest.raises(fg.GraphError, match=message) as caught:
+        solver.solve(graph, guess(x))
+    assert caught.value.family in ("x", None)
+
+
+def test_bad_data_and_duals_are_refused() -> None:
+    graph, x = line()
+    target = graph.data("target", [0.0, 0.0])
+    low = graph.data("low", -1.0)
+    graph.minimize(fg.prior, x, target)
+    graph.bound(x, lower=low, upper=1.0, name="box")
+    run = SQP().prepare(graph)
+    guess = {x: np.zeros((4, 2))}
+    with pytest.raises(fg.GraphError, match=r"data 'target' has shape \(3,\)"):
+        run.solve(guess, data={target: [0.0, 0.0, 0.0]})
+    with pytest.raises(fg.GraphError, match="data 'target' contains NaN"):
+        run.solve(guess, data={target: [0.0, np.nan]})
+    with pytest.raises(fg.GraphError, match="'box': lower exceeds upper in factor 0"):
+        run.solve(guess, data={low: 2.0})
+    with pytest.raises(fg.GraphError, match="does not belong"):
+        run.solve(guess, data={fg.Graph().data("t", [0.0]): [1.0]})
+    with pytest.raises(fg.GraphError, match="which is no constraint"):
+        run.solve(guess, duals={"bax": np.zeros((4, 2))})
+    with pytest.raises(fg.GraphError, match="multipliers of 'box' have shape"):
+        run.solve(guess, duals={"box": np.zeros(4)})
+    assert run.solve(guess).converged, "a refused solve leaves the prepared solver usable"
+
+
+def test_not_finite_at_the_guess_names_the_factor() -> None:
+    graph, x = line()
+    graph.minimize(fg.prior, x, [1.0, 1.0])
+    graph.minimize(lambda p: np.log(p), x, name="logarithm")
+    guess = np.ones((4, 2))
+    guess[2, 1] = -1.0
+    with pytest.raises(fg.GraphError, match=r"'logarithm'.*factor 2.*x\[2\]") as caught:
+        GaussNewton().solve(graph, {x: guess})
+    assert (caught.value.term, caught.value.family, caught.value.index) == ("logarithm", "x", 2)
+
+
+def test_unknown_dual_and_solution_of_another_family() -> None:
+    graph, guess = short_drive()
+    solution = SQP().solve(graph, guess)
+    with pytest.raises(fg.GraphError, match="no constraint, bound or fix is called 'limit'"):
+        solution.dual("limit")
+    with pytest.raises(fg.GraphError, match="not part of this solution"):
+        solution[line()[1]]
+
+
+def test_check_true_raises_with_the_solution() -> None:
+    graph, guess = short_drive()
+    with pytest.raises(fg.NotConverged) as caught:
+        SQP(max_iterations=1).solve(graph, guess, check=True)
+    assert caught.value.solution.status is fg.Status.ITERATION_LIMIT
+
+
+# ------------------------------------------------------------------ graph.check
+
+
+def test_check_finds_nothing_in_a_sound_graph() -> None:
+    graph, guess = short_drive()
+    report = graph.check(guess)
+    assert report, str(report)
+
+
+def test_check_finds_a_wrong_jacobian() -> None:
+    graph = fg.Graph()
+    x, u = graph.variables("x", fg.SE2, 3), graph.variables("u", fg.Rn(2), 2)
+
+    def jacobian(*arguments: Array) -> list[Array]:
+        assert unicycle.dynamics.jacobian is not None
+        blocks = list(unicycle.dynamics.jacobian(*arguments))
+        blocks[1] = -blocks[1]
+        return blocks
+
+    wrong = fg.residual(unicycle.dynamics.function, jacobian, "dynamics")
+    graph.fix(x[0], [0.0, 0.0, 0.0])
+    graph.minimize(fg.prior, u, [0.5, 0.1])
+    graph.constrain(wrong, x[:-1], u, x[1:], 0.1, lower=0.0, upper=0.0)
+    report = graph.check({x: np.zeros((3, 3)), u: np.full((2, 2), 0.3)})
+    assert [(f.kind, f.term, f.family) for f in report.findings] == [("wrong Jacobian", "dynamics", "u")]
+
+
+def test_check_finds_what_nothing_determines() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE2, 4)
+    graph.minimize(fg.between, x[:-1], x[1:], [1.0, 0.0, 0.0])
+    report = graph.check({x: np.zeros((4, 3))})
+    assert {f.kind for f in report.findings} == {"undetermined"}
+    assert {(f.family, f.index) for f in report.findings} == {("x", k) for k in range(4)}
+    graph, y = line(3)
+    graph.minimize(fg.prior, y[:2], [0.0, 0.0])
+    graph.minimize(lambda p: p[:, :1], y[2])
+    found = graph.check({y: np.zeros((3, 2))}).findings
+    assert [(f.kind, f.family, f.index) for f in found] == [("undetermined", "x", 2)]
+
+
+def test_check_finds_dependent_constraints_and_bad_residuals() -> None:
+    graph, x = line(2)
+    graph.minimize(fg.prior, x, [0.0, 0.0])
+    graph.constrain(lambda p: p[:, :1], x[0], lower=1.0, upper=1.0, name="once")
+    graph.constrain(lambda p: 2.0 * p[:, :1], x[0], lower=2.0, upper=2.0, name="twice")
+    found = graph.check({x: np.zeros((2, 2))}).findings
+    assert {(f.kind, f.term) for f in found} == {
+        ("dependent constraints", "once"),
+        ("dependent constraints", "twice"),
+    }
+    graph.minimize(lambda p: 1.0 / p[:, :1], x, name="inverse")
+    with np.errstate(all="ignore"):
+        found = graph.check({x: np.array([[1.0, 1.0], [0.0, 1.0]])}).findings
+    assert [(f.kind, f.term, f.index) for f in found] == [("not finite", "inverse", 1)]
