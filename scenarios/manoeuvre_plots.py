@@ -36,14 +36,15 @@ _STYLE: dict[Any, Any] = {
 }
 _INK, _LIMIT = "#1d2430", "#6b7280"
 _FIRST, _LAST = css("horizon"), css("robot")
-_PINK, _WHITENED = np.array([0.84, 0.0, 0.42]), np.array([1.0, 0.90, 0.95])
-_INFLECTION = "#000000"
+_PINK, _WHITENED = np.array([0.84, 0.0, 0.42]), np.array([1.0, 0.86, 0.93])
+_CUSP = css("fixed")
 _REACH = 0.8  # [m]; how far from a disc the shading goes
 _EVERY = 5  # nodes between two drawn robots
+_STRAY = 0.6  # [m]; how far around the first and the last iterate the others are shown
 _FLOOR = 1e-10  # smaller violations are drawn here
 
 
-def write_picture(path: Path, manoeuvre: Manoeuvre, *, dpi: int = 110) -> Path:
+def write_picture(path: Path, manoeuvre: Manoeuvre, *, dpi: int = 105) -> Path:
     """Write the picture of a manoeuvre as a PNG and return its path."""
     # No software version and no date in the file: the same manoeuvre gives the same picture.
     picture(manoeuvre).savefig(path, dpi=dpi, format="png", metadata={"Software": None})
@@ -60,9 +61,9 @@ def picture(manoeuvre: Manoeuvre) -> Figure:
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(11.0, 8.0), layout="constrained")
         FigureCanvasAgg(figure)
-        above, below = figure.subfigures(2, 1, height_ratios=(1.75, 1.0), squeeze=False)[:, 0]
+        above, key, below = figure.subfigures(3, 1, height_ratios=(1.75, 0.28, 1.0), squeeze=False)[:, 0]
         place = plot_iterates(m, above.subplots())
-        above.legend(*place.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        key.legend(*place.get_legend_handles_labels(), loc="center", ncols=3)
         speed, turning, convergence = below.subplots(1, 3)
         plot_control(m, 0, speed)
         plot_control(m, 1, turning)
@@ -73,11 +74,10 @@ def picture(manoeuvre: Manoeuvre) -> Figure:
 
 def plot_iterates(manoeuvre: Manoeuvre, ax: Axes) -> Axes:
     """Every iterate from the guess to the optimum, the robot along the optimum, and what stands in the way."""
-    from matplotlib.patches import Circle
+    from matplotlib.patches import Circle, Polygon
 
     m = manoeuvre
-    everything = np.concatenate([m.iterates[0, :, :2], m.states[:, :2], *_corners(m)])
-    low, high = everything.min(axis=0) - 0.35, everything.max(axis=0) + 0.35
+    low, high = _extent(m)
     _discs(m, ax, low, high)
 
     colours = shades(len(m.iterates))
@@ -93,11 +93,13 @@ def plot_iterates(manoeuvre: Manoeuvre, ax: Axes) -> Axes:
     radius = m.settings.robot_radius
     for k in range(0, len(m.states), _EVERY):
         x, y, heading = m.states[k].tolist()
-        label = f"robot every {_EVERY * m.settings.dt:g} s; the stroke is its front" if k == 0 else None
         ax.add_patch(Circle((x, y), radius, fc=_LAST, ec=_LAST, alpha=0.13, lw=0, zorder=4))
         ax.add_patch(Circle((x, y), radius, fill=False, ec=_LAST, alpha=0.5, lw=0.7, zorder=4))
-        nose = [x, x + radius * np.cos(heading)], [y, y + radius * np.sin(heading)]
-        ax.plot(*nose, color=_INK, lw=1.6, zorder=7, label=label)
+        nose = radius * np.array([[0.95, 0.0], [0.4, 0.24], [0.4, -0.24]])
+        turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+        ax.add_patch(Polygon(nose @ turn.T + [x, y], fc="white", ec=_INK, lw=1.0, zorder=7))
+    name = f"front of the robot, every {_EVERY * m.settings.dt:g} s"
+    ax.plot([], [], ">", color="white", mec=_INK, ms=8, label=name)
     _marks(m, ax)
 
     ax.set_xlim(low[0], high[0])
@@ -118,18 +120,20 @@ def plot_control(manoeuvre: Manoeuvre, column: int, ax: Axes) -> Axes:
     held = np.append(m.controls[:, column], m.controls[-1, column])
     ax.step(m.time, held, where="post", color=_LAST, lw=1.8)
     for k in m.cusps:
-        ax.axvline(m.time[k], color=css("scan"), lw=1.3, ls="--")
+        ax.axvline(m.time[k], color=_CUSP, lw=1.8, ls="--")
         ax.annotate(
-            f"cusp, {m.time[k]:.1f} s", (m.time[k], -1.0 * limit), xytext=(4, 4), textcoords="offset points",
-            color=css("scan"), fontsize=8.5, fontweight="bold",
+            f"cusp, {m.time[k]:.1f} s", (m.time[k], -limit), xytext=(5, 5), textcoords="offset points",
+            fontsize=8.5, fontweight="bold",
         )  # fmt: skip
     for k in m.inflections:
-        ax.axvline(m.time[k], color=_INFLECTION, lw=0.9, ls=":")
+        ax.axvline(m.time[k], color=_INK, lw=1.0, ls=":")
     ax.set_ylim(-1.3 * limit, 1.3 * limit)
     ax.set_xlim(0.0, m.time[-1])
     ax.set_xlabel("time [s]")
     ax.set_ylabel(("v [m/s]", "$\\omega$ [rad/s]")[column])
-    ax.set_title(("Forward speed", "Turning speed")[column] + f", grey: beyond the limit of {limit:g}")
+    ax.set_title(("Forward speed v", "Turning speed $\\omega$")[column])
+    for place in (1.15 * limit, -1.15 * limit):
+        ax.text(0.98 * m.time[-1], place, "not allowed", ha="right", va="center", fontsize=8, color="#4b5563")
     ax.set_axisbelow(True)
     ax.grid(True)
     return ax
@@ -140,7 +144,8 @@ def plot_convergence(manoeuvre: Manoeuvre, ax: Axes) -> Axes:
     history = manoeuvre.solution.history
     number = [row.number for row in history]
     violation = np.maximum([row.violation for row in history], _FLOOR)
-    stationarity = np.maximum([row.stationarity for row in history], _FLOOR)
+    # A guess that is the reference itself costs nothing: without multipliers it is stationary by accident.
+    stationarity = [row.stationarity if row.stationarity > _FLOOR else np.nan for row in history]
     ax.plot(number, stationarity, color=_LIMIT, lw=1.0, ls=":", label="stationarity")
     ax.plot(number, violation, color=_INK, lw=0.8, zorder=2, label="largest violation")
     ax.scatter(number, violation, c=shades(len(history)), s=34, ec=_INK, lw=0.6, zorder=3)
@@ -160,15 +165,21 @@ def shades(count: int) -> Array:
     """(count, 3) colours of the iterates: green, then pink that whitens, then blue."""
     from matplotlib.colors import to_rgb
 
-    share = np.linspace(0.0, 1.0, max(count - 2, 1))[:, None]
+    share = np.sqrt(np.linspace(0.0, 1.0, max(count - 2, 1)))[:, None]  # the first ones differ most
     between = (1.0 - share) * _PINK + share * _WHITENED
     return np.concatenate([[to_rgb(_FIRST)], between[: max(count - 2, 0)], [to_rgb(_LAST)]])[:count]
 
 
-def _corners(manoeuvre: Manoeuvre) -> list[Array]:
-    """Extreme points of each disc."""
+def _extent(manoeuvre: Manoeuvre) -> tuple[Array, Array]:
+    """Lower left and upper right corner of the picture; iterates that stray far are cut."""
+    m = manoeuvre
     corners = np.array([[-1.0, -1.0], [1.0, 1.0]])
-    return [np.array([x, y]) + radius * corners for x, y, radius in manoeuvre.case.discs]
+    discs = [np.array([x, y]) + radius * corners for x, y, radius in m.case.discs]
+    shown = np.concatenate([m.iterates[0, :, :2], m.states[:, :2], *discs])
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    strays = np.clip(m.iterates[:, :, :2].reshape(-1, 2), low - _STRAY, high + _STRAY)
+    robot = m.settings.robot_radius
+    return np.minimum(low - robot, strays.min(axis=0)) - 0.1, np.maximum(high + robot, strays.max(axis=0)) + 0.1
 
 
 def _discs(manoeuvre: Manoeuvre, ax: Axes, low: Array, high: Array) -> None:
@@ -181,19 +192,18 @@ def _discs(manoeuvre: Manoeuvre, ax: Axes, low: Array, high: Array) -> None:
         return
     discs = np.array(m.case.discs)
     kept = m.settings.robot_radius + m.settings.clearance
-    x, y = np.linspace(low[0], high[0], 480), np.linspace(low[1], high[1], 240)
+    x, y = np.linspace(low[0], high[0], 240), np.linspace(low[1], high[1], 120)
     offset = np.stack(np.meshgrid(x, y), axis=2)[:, :, None, :] - discs[:, :2]
     distance = (np.linalg.norm(offset, axis=3) - discs[:, 2]).min(axis=2) - kept
-    ax.imshow(
-        distance, extent=(low[0], high[0], low[1], high[1]), origin="lower", vmin=0.0, vmax=_REACH,
-        cmap=LinearSegmentedColormap.from_list("near", ["#b9c2cf", "#ffffff"]), interpolation="bilinear", zorder=0,
-    )  # fmt: skip
+    shading = LinearSegmentedColormap.from_list("near", ["#b9c2cf", "#ffffff"])
+    ax.contourf(x, y, np.clip(distance, 0.0, _REACH), levels=np.linspace(0.0, _REACH, 9), cmap=shading, zorder=0)
     for index, (cx, cy, radius) in enumerate(discs.tolist()):
         first = index == 0
         disc = Circle((cx, cy), radius, fc=css("fixed"), ec="none", zorder=1)
         ring = Circle((cx, cy), radius + kept, fill=False, ec=_INK, lw=1.1, ls=(0, (2, 2)), zorder=2)
-        disc.set_label("unforeseen disc; darker ground is nearer" if first else None)
+        disc.set_label("unforeseen disc (ground: nearer is darker)" if first else None)
         ring.set_label("the robot's centre stays outside" if first else None)
+        ax.text(cx, cy - 0.5 * radius, "unforeseen\ndisc", ha="center", va="center", fontweight="bold", zorder=6)
         ax.add_patch(disc)
         ax.add_patch(ring)
 
@@ -204,17 +214,17 @@ def _marks(manoeuvre: Manoeuvre, ax: Axes) -> None:
     start, goal = m.states[0], m.case.reference(m.settings)[-1]
     ax.plot(*start[:2], "o", color=css("start"), ms=8, mec="white", mew=0.8, zorder=9)
     ax.plot(*goal[:2], "*", color=css("goal"), ms=17, mec=_INK, mew=0.8, zorder=9)
-    _word(ax, start, "start", (0, 24))
-    _word(ax, goal, "goal", (0, 24))
+    _word(ax, start, "start", (0, 30))
+    _word(ax, goal, "goal", (0, 30))
     for k in m.cusps:
         name = "cusp: v passes through 0" if k == m.cusps[0] else None
-        ax.plot(*m.states[k, :2], "D", color=css("scan"), ms=9, mec="white", mew=1.0, zorder=10, label=name)
+        ax.plot(*m.states[k, :2], "D", color=_CUSP, ms=9, mec=_INK, mew=1.0, zorder=10, label=name)
         forward = m.controls[k, 0] > 0.0
         ways = ("backward", "forward") if forward else ("forward", "backward")
-        _word(ax, m.states[k], f"cusp at {m.time[k]:.1f} s:\n{ways[0]} till here, {ways[1]} from here", (0, -30))
+        _word(ax, m.states[k], f"cusp at {m.time[k]:.1f} s:\n{ways[0]} till here,\n{ways[1]} from here", (105, -14))
     for k in m.inflections:
         name = "inflection: $\\omega$ changes sign" if k == m.inflections[0] else None
-        ax.plot(*m.states[k, :2], "s", color=_INFLECTION, ms=6, mec="white", mew=1.0, zorder=8, label=name)
+        ax.plot(*m.states[k, :2], "s", color=_INK, ms=6, mec="white", mew=1.0, zorder=8, label=name)
 
 
 def _word(ax: Axes, at: Array, text: str, offset: tuple[int, int]) -> None:
@@ -228,7 +238,8 @@ def _word(ax: Axes, at: Array, text: str, offset: tuple[int, int]) -> None:
 def _title(manoeuvre: Manoeuvre) -> str:
     m = manoeuvre
     ended = "optimum" if m.solution.converged else m.solution.status.name.lower().replace("_", " ")
+    limits = "all limits kept" if m.within_limits else "a LIMIT BROKEN"
     return (
         f"{m.case.name}: {m.case.title}\n"
-        f"{ended} after {m.solution.iterations} iterations of {m.solver}, cost {m.solution.cost:.4g}"
+        f"{ended} after {m.solution.iterations} iterations of {m.solver}, cost {m.solution.cost:.4g}, {limits}"
     )

@@ -168,7 +168,8 @@ class Manoeuvre:
     @property
     def time(self) -> Array:
         """(N + 1,) time of each node [s]."""
-        return self.settings.dt * np.arange(self.settings.horizon + 1)
+        time: Array = self.settings.dt * np.arange(self.settings.horizon + 1)
+        return time
 
     @property
     def cusps(self) -> list[int]:

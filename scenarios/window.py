@@ -50,6 +50,7 @@ class Window:
         slots: at most ``length`` past poses.
         now: the present pose and its scan.
         arrival: (3,) reference and (3, 3) information about the oldest pose.
+        departure: what ``arrival`` becomes when the oldest pose leaves.
     """
 
     def __init__(self, length: int, pose: Array, covariance: Array, beams: int) -> None:
@@ -64,6 +65,7 @@ class Window:
         self.slots: list[Slot] = []
         self.now = self._slot(np.asarray(pose, dtype=np.float64), beams)
         self.arrival: tuple[Array, Array] = (self.now.pose, inverse(covariance))
+        self.departure = self.arrival
         self._noise = odometry.OdometryNoise()
 
     def look(self, scan: Scan) -> None:
@@ -80,6 +82,7 @@ class Window:
         self.now = self._slot(fg.SE2.compose(self.now.pose, self.now.step), len(self.now.beams))
         if len(self.slots) > self.length:
             self.slots.pop(0)
+            self.arrival = self.departure
 
     @property
     def full(self) -> bool:
@@ -176,7 +179,7 @@ class WindowTerms:
         window.now.pose = solution[self.present][0]
         if window.full:
             mean, weight = solution.marginal_prior(PAST_TERMS, self.past[0], self.past[1])
-            window.arrival = mean[0], weight
+            window.departure = mean[0], weight
 
     def covariance(self, solution: fg.Solution) -> Array:
         """(3, 3) covariance of the present pose from the past's terms alone, whatever else the graph wishes."""

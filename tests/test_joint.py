@@ -1,0 +1,168 @@
+"""Windows, marginal priors, and the graph that localises and drives at once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.building import building_map
+from unifg.scenarios.controller import ControllerSettings
+from unifg.scenarios.joint import JointController
+from unifg.scenarios.metrics import episode_metrics
+from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigation
+from unifg.scenarios.pilot import JointPilot
+from unifg.scenarios.window import NOW_TERMS, PAST_TERMS, Window
+from unifg.solvers import GaussNewton
+from unifg.typing import Array
+
+HERE, THERE = (13.9, 20.0, -1.6), (15.0, 14.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def field() -> DistanceMap:
+    occupancy = building_map()
+    return DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+
+
+def chain(count: int, rng: np.random.Generator) -> tuple[fg.Graph, fg.Family, Array]:
+    """A linear chain: prior on the first, noisy steps, a fix on position now and then."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), count)
+    graph.minimize(fg.prior, x[0], [0.3, -0.2], sigma=0.5, name="prior")
+    steps = rng.normal(size=(count - 1, 2))
+    graph.minimize(lambda a, b, z: b - a - z, x[:-1], x[1:], steps, sigma=[0.1, 0.2], name="step")
+    fixes = rng.normal(size=(count, 2))
+    graph.minimize(fg.prior, x, fixes, sigma=0.7, name="gps")
+    return graph, x, steps
+
+
+def test_marginal_prior_of_a_linear_chain_is_exact(rng: np.random.Generator) -> None:
+    """Eliminating the first state and adding its prior to the second leaves the others where they were."""
+    graph, x, steps = chain(5, rng)
+    whole = GaussNewton().solve(graph, {x: np.zeros((5, 2))}, check=True)
+    mean, information = whole.marginal_prior(["prior", "step", "gps"], x[0], x[1])
+    rest = fg.Graph()
+    y = rest.variables("y", fg.Rn(2), 4)
+    gps = graph.terms[2].arguments[1]
+    rest.minimize(fg.prior, y[0], mean, information=information)
+    rest.minimize(lambda a, b, z: b - a - z, y[:-1], y[1:], steps[1:], sigma=[0.1, 0.2])
+    rest.minimize(fg.prior, y, gps[1:], sigma=0.7)
+    short = GaussNewton().solve(rest, {y: np.zeros((4, 2))}, check=True)
+    np.testing.assert_allclose(short[y], whole[x][1:], atol=1e-9)
+    np.testing.assert_allclose(short.covariance(y), whole.covariance(x)[2:, 2:], rtol=1e-8, atol=1e-12)
+
+
+def test_marginal_prior_refuses_what_it_cannot_do(rng: np.random.Generator) -> None:
+    graph, x, _ = chain(4, rng)
+    solution = GaussNewton().solve(graph, {x: np.zeros((4, 2))})
+    with pytest.raises(fg.GraphError, match=r"also depend on x\[2\]"):
+        solution.marginal_prior(["step", "gps"], x[1], x[0])
+    with pytest.raises(fg.GraphError, match="no cost is called 'steps'"):
+        solution.marginal_prior(["steps"], x[0], x[1])
+
+
+def test_a_window_needs_two_poses() -> None:
+    with pytest.raises(fg.ScenarioError, match="at least two"):
+        Window(1, np.zeros(3), np.eye(3), 360)
+
+
+def settled(field: DistanceMap, weight: float, ticks: int = 12) -> tuple[Episode, JointController]:
+    """A joint episode after some ticks."""
+    settings = NavigationSettings(
+        start=HERE, goals=(THERE,), coupling="joint", seed=3, controller=replace(ControllerSettings(), control_weight=weight)
+    )
+    episode = Episode(settings)
+    seen = 0
+
+    def stop(done: float, text: str) -> None:
+        nonlocal seen
+        seen += 1
+        if seen == ticks:
+            raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(episode, "_arrived", lambda goal: False)
+        episode.run(stop)
+    assert isinstance(episode.pilot, JointPilot)
+    controller = episode.pilot.controller
+    assert isinstance(controller, JointController)
+    return episode, controller
+
+
+def test_the_past_ignores_a_weightless_future(field: DistanceMap) -> None:
+    """With a tiny control weight the joint estimate is that of the window alone."""
+    episode, controller = settled(field, 1e-6)
+    joint = controller.window.now.pose.copy()
+    controller._estimate_alone()
+    alone = controller.window.now.pose
+    assert np.hypot(*(joint - alone)[:2]) < 1e-3
+    assert np.hypot(*(joint - episode.world.pose)[:2]) < 0.15  # one step of motion after the last tick
+
+
+def test_a_heavy_future_pulls_the_estimate() -> None:
+    """The bias the documentation warns of: it exists, and it grows with the control weight."""
+    errors = []
+    for weight in (1e-3, 30.0):
+        settings = NavigationSettings(
+            start=HERE, goals=(THERE,), coupling="joint", seed=3,
+            controller=replace(ControllerSettings(), control_weight=weight),
+        )  # fmt: skip
+        errors.append(episode_metrics(run_navigation(settings))["localisation_error_m"]["mean"])
+    assert errors[1] > 1.2 * errors[0]
+
+
+def test_window_keeps_its_length_and_its_prior_is_of_the_past_alone(field: DistanceMap) -> None:
+    _, controller = settled(field, 1.0)
+    window = controller.window
+    assert len(window.slots) == window.length
+    reference, information = window.departure
+    assert np.linalg.eigvalsh(information).min() > 0.0
+    oldest = window.slots[1].pose  # the prior is about the pose that is oldest after the next move
+    assert np.hypot(*(reference - oldest)[:2]) < 0.05
+
+
+def test_covariance_counts_the_past_alone(field: DistanceMap) -> None:
+    """Raising the control weight does not make the robot more certain of where it is."""
+    _, controller = settled(field, 1.0)
+    terms = controller._smoother
+    guess = {terms.past: terms.poses(controller.window), terms.present.family: controller.window.now.pose[None]}
+    solution = controller._smooth.solve(guess, data=terms.data(controller.window))
+    mine = terms.covariance(solution)
+    np.testing.assert_allclose(mine, solution.covariance(terms.present), rtol=1e-5)
+    everything = solution.information((*PAST_TERMS, *NOW_TERMS), terms.past, terms.present)
+    assert everything.shape == (3 * controller.window.length + 3,) * 2
+
+
+@pytest.mark.parametrize("solver", ["sqp", "alm"])
+def test_joint_episode_reaches_its_goal(solver: str) -> None:
+    settings = NavigationSettings(start=HERE, goals=(THERE,), coupling="joint", solver=solver, obstacles=1, seed=1)
+    metrics = episode_metrics(run_navigation(settings))
+    assert metrics["reached"]
+    assert metrics["collisions"] == 0
+    assert metrics["localisation_error_m"]["mean"] < 0.05
+    assert metrics["max_bound_violation"] < 1e-3
+
+
+def test_same_seed_same_joint_drive() -> None:
+    def drive() -> Array:
+        seen = 0
+
+        def stop(done: float, text: str) -> None:
+            nonlocal seen
+            seen += 1
+            if seen == 25:
+                raise KeyboardInterrupt
+
+        settings = NavigationSettings(start=HERE, goals=(THERE,), coupling="joint", obstacles=1, seed=5)
+        return Episode(settings).run(stop).true_pose
+
+    np.testing.assert_array_equal(drive(), drive())
+
+
+def test_unknown_coupling_is_refused() -> None:
+    with pytest.raises(fg.ScenarioError, match="choose sequential or joint"):
+        Episode(NavigationSettings(start=HERE, goals=(THERE,), coupling="both"))
