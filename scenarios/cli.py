@@ -28,7 +28,7 @@ __all__ = ["SCENARIOS", "SOLVERS", "Outcome", "Scenario", "main"]
 
 SUCCEEDED, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
 SOLVERS = ("alm", "sqp")
-COUPLINGS = ("sequential",)
+COUPLINGS = ("sequential", "joint")
 MANOEUVRES = ("behind", "obstacle")
 
 Pose = tuple[float, float, float]
@@ -210,6 +210,16 @@ def _count(text: str) -> int:
     return int(text)
 
 
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
+    return value
+
+
 def _map_file(text: str) -> Path:
     path = Path(text)
     if not path.is_file():
@@ -240,6 +250,13 @@ def _navigation_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--coupling", choices=COUPLINGS, default=COUPLINGS[0], help="of estimation and control")
     parser.add_argument(
+        "--control-weight",
+        type=_positive,
+        default=1.0,
+        metavar="W",
+        help="factor on the costs of control, which pull on the estimate in the joint graph (default: 1)",
+    )
+    parser.add_argument(
         "--obstacles",
         type=_count,
         default=3,
@@ -251,6 +268,8 @@ def _navigation_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_navigation(chosen: argparse.Namespace, progress: Progress) -> Outcome:
     from unifg.scenarios import navigation  # imports solvers and the physics engine: not for --help
 
+    from unifg.scenarios.controller import ControllerSettings
+
     settings = navigation.NavigationSettings(
         map=chosen.map,
         start=chosen.start,
@@ -259,6 +278,7 @@ def _run_navigation(chosen: argparse.Namespace, progress: Progress) -> Outcome:
         coupling=chosen.coupling,
         obstacles=chosen.obstacles,
         seed=chosen.seed,
+        controller=ControllerSettings(control_weight=chosen.control_weight),
     )
     log = navigation.run_navigation(settings, progress=progress)
     if log.ticks == 0:

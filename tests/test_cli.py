@@ -8,7 +8,7 @@ import subprocess
 import sys
 import types
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ from unifg.errors import ScenarioError
 from unifg.files.ros_map import save_map
 from unifg.files.tum import read_tum
 from unifg.scenarios import cli
+from unifg.scenarios.controller import ControllerSettings
 from unifg.scenarios.episode import EpisodeLog
 
 FILES = ("scene.html", "overview.png", "metrics.json", "trajectory.tum", "estimate.tum")
@@ -38,6 +39,7 @@ class Settings:
     coupling: str
     obstacles: int
     seed: int
+    controller: ControllerSettings = field(default_factory=ControllerSettings)
 
 
 class FakeNavigation:
@@ -257,3 +259,17 @@ def test_as_a_module_without_loading_the_scenario() -> None:
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("usage: unifg run navigation")
+
+
+def test_control_weight_reaches_the_controller(navigation: FakeNavigation, no_files: None, tmp_path: Path) -> None:
+    assert (
+        cli.main(["run", "navigation", "--coupling", "joint", "--control-weight", "0.1", "--out", str(tmp_path)]) == 0
+    )
+    assert navigation.settings[0].coupling == "joint"
+    assert navigation.settings[0].controller.control_weight == 0.1
+
+
+@pytest.mark.parametrize("weight", ["0", "-1", "nan", "much"])
+def test_control_weight_must_be_positive(weight: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["run", "navigation", f"--control-weight={weight}"]) == 2
+    assert "positive" in capsys.readouterr().err

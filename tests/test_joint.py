@@ -73,7 +73,11 @@ def test_a_window_needs_two_poses() -> None:
 def settled(field: DistanceMap, weight: float, ticks: int = 12) -> tuple[Episode, JointController]:
     """A joint episode after some ticks."""
     settings = NavigationSettings(
-        start=HERE, goals=(THERE,), coupling="joint", seed=3, controller=replace(ControllerSettings(), control_weight=weight)
+        start=HERE,
+        goals=(THERE,),
+        coupling="joint",
+        seed=3,
+        controller=replace(ControllerSettings(), control_weight=weight),
     )
     episode = Episode(settings)
     seen = 0

@@ -230,7 +230,7 @@ def test_failure_on_the_first_tick_stands_still(monkeypatch: pytest.MonkeyPatch)
         ({"goals": ((np.nan, 10.0, 0.0),)}, "goal"),
         ({"goals": ()}, "goal"),
         ({"solver": "newton"}, "alm or sqp"),
-        ({"coupling": "joint"}, "sequential"),
+        ({"coupling": "telepathic"}, "sequential"),
     ],
 )
 def test_impossible_episodes_are_refused(change: dict[str, Any], message: str) -> None:
