@@ -94,18 +94,20 @@ class CompiledTerm:
         """(n, m) residuals, zero where inactive, not whitened; (n,) for a scalar cost."""
         return self._masked(self._checked(self._call([gather(values) for gather in self.gathers])))
 
-    def jacobians(self, values: Values, numerical: bool = False) -> list[Array]:
+    def jacobians(self, values: Values, numerical: bool = False, search: bool = False) -> list[Array]:
         """One (n, m, d_k) array per variable argument, zero where inactive.
 
         Args:
             values: where to differentiate.
             numerical: differentiate numerically even when a Jacobian is attached.
+            search: prefer the residual's search Jacobian, which is not a derivative.
         """
+        attached = self.term.residual.search if search and self.term.residual.search else self._jacobian
         points = [gather(values) for gather in self.gathers]
-        if self._jacobian is None or numerical:
+        if attached is None or numerical:
             blocks = jacobian(lambda *moved: np.asarray(self._call(list(moved))), points, self.manifolds)
         else:
-            blocks = [np.asarray(block, dtype=np.float64) for block in self._jacobian(*self._fill(points))]
+            blocks = [np.asarray(block, dtype=np.float64) for block in attached(*self._fill(points))]
             if len(blocks) > len(self.dims) and len(blocks) > max(self._places):
                 blocks = [blocks[place] for place in self._places]  # some of its arguments are constants here
             wanted = [(self.count, self.size, dim) for dim in self.dims]

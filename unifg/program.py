@@ -191,8 +191,8 @@ class Program:
             constraints = [term.residual(values).ravel() for term in self.constraint_terms]
         return Evaluation(cost, _stacked(constraints))
 
-    def linearize(self, values: Values) -> Linearization:
-        """Everything a backend needs at ``values``; one batched call per term."""
+    def linearize(self, values: Values, search: bool = False) -> Linearization:
+        """Everything a backend needs at ``values``; with ``search``, by search Jacobians where a residual has one."""
         residual = np.empty(self.costs.count)
         jacobian = np.empty(len(self.costs.rows))
         constraints = np.empty(self.constraints.count)
@@ -204,7 +204,7 @@ class Program:
             for term, rows in zip(self.cost_terms, self._cost_slices, strict=True):
                 assert isinstance(term.term, Cost)
                 whitened = term.whiten(term.residual(values))
-                blocks = [term.whiten_jacobian(block) for block in term.jacobians(values)]
+                blocks = [term.whiten_jacobian(block) for block in term.jacobians(values, search=search)]
                 loss = term.term.robust
                 squared_sum = float(np.vdot(whitened, whitened))
                 norms[term.name] = squared_sum**0.5
@@ -229,7 +229,7 @@ class Program:
                     constraint_jacobian[at : at + value.size] = 1.0
                     at += value.size
                 else:
-                    at = _write(constraint_jacobian, at, term.jacobians(values))
+                    at = _write(constraint_jacobian, at, term.jacobians(values, search=search))
                 beyond = np.maximum(value - term.upper, term.lower - value)
                 norms[term.name] = float(np.linalg.norm(np.maximum(beyond, 0.0)))
             gradient = self.costs.transposed_times(jacobian, residual)

@@ -21,18 +21,26 @@ class Residual:
         jacobian: maps the same arguments to one (n, m, d_k) array per *variable* argument, in order,
             each the derivative along the right perturbation ``X Exp(d)``.
         name: shown in tables and messages.
+        search: like ``jacobian``, but not a derivative: a direction to look in during the first
+            ``Solver.search_iterations`` iterations. Answers are never judged by it.
     """
 
     function: Function
     jacobian: JacobianFunction | None = None
     name: str = ""
+    search: JacobianFunction | None = None
 
     def __call__(self, *arguments: Any) -> Array:
         """Evaluate the residual."""
         return self.function(*arguments)
 
 
-def residual(function: Function, jacobian: JacobianFunction | None = None, name: str = "") -> Residual:
+def residual(
+    function: Function,
+    jacobian: JacobianFunction | None = None,
+    name: str = "",
+    search: JacobianFunction | None = None,
+) -> Residual:
     """Attach a Jacobian and a name to a plain function.
 
     Args:
@@ -41,8 +49,11 @@ def residual(function: Function, jacobian: JacobianFunction | None = None, name:
             perturbation. Blocks of arguments that a term gives as constants are dropped. ``graph.check``
             compares the rest with numerical differentiation.
         name: defaults to the function's own name.
+        search: same shapes as ``jacobian``; stands in for it in the steps of the first
+            ``Solver.search_iterations`` iterations (none by default), for fields that are the gradient of no cost.
+            Costs, KKT numbers and all later steps use the true derivatives; ``graph.check`` does not look at it.
     """
-    return Residual(function, jacobian, name or getattr(function, "__name__", "residual"))
+    return Residual(function, jacobian, name or getattr(function, "__name__", "residual"), search)
 
 
 def as_residual(function: Function | Residual) -> Residual:

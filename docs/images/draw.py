@@ -38,7 +38,7 @@ COST, HARD, GIVEN = "#ffffff", "#222222", "#d9d9d9"
 def main() -> None:
     """Draw all pictures, or those named on the command line."""
     plt.rcParams.update({"font.size": 10, "font.family": "DejaVu Sans", "savefig.dpi": 130})
-    pictures = {"worked-problem": worked_problem, "graphs": graphs, "overview": overview}
+    pictures = {"worked-problem": worked_problem, "graphs": graphs, "joint": joint, "overview": overview}
     for name in sys.argv[1:] or pictures:
         pictures[name]().savefig(HERE / f"{name}.png", bbox_inches="tight", facecolor="white")
 
@@ -127,6 +127,50 @@ def control_graph(ax: Axes) -> None:
     ax.plot([], [], "o", ms=12, mfc=GIVEN, mec=HARD, label="given")
     ax.legend(loc="lower right", frameon=False, fontsize=9)
     frame(ax, "What should I do?", (-1.0, 8.6), (-2.6, 1.9))
+
+
+# ---------------------------------------------------------------- the joint graph
+
+
+def joint() -> Any:
+    """Past and future around one present."""
+    figure, ax = plt.subplots(figsize=(12.5, 4.2))
+    places = [(2.1 * k, 0.0) for k in range(-3, 4)]
+    names = ["$x_{-4}$", "...", "$x_{-1}$", "$x_0$", "$x_1$", "...", "$x_{30}$"]
+    factor(ax, [places[0]], beside(places[0], -1.2, 0.0), "prior: what left\nthe window", COST, (0, 26))
+    for k in (0, 1, 2):
+        middle = beside(places[k], 1.05, 0.0)
+        factor(ax, [places[k], places[k + 1]], middle, "odometry" if k == 2 else "", COST, (0, 12))
+    for k in (0, 2, 3):
+        for right in (-0.45, 0.0, 0.45):
+            factor(ax, [places[k]], beside(places[k], right, 1.05), "lidar" if right == 0.0 else "", COST, (0, 14))
+    for k in (3, 4, 5):
+        middle = beside(places[k], 1.05, 0.0)
+        control = beside(middle, 0.0, -1.15)
+        if k == 4:
+            ax.annotate("...", control, ha="center", va="center", fontsize=20)
+            ax.plot([places[k][0], places[k + 1][0]], [0.0, 0.0], color="#666666", lw=1.2, zorder=1)
+            continue
+        factor(ax, [places[k], places[k + 1], control], middle, "dynamics" if k == 3 else "", HARD, (0, 12))
+        factor(ax, [control], beside(control, -0.55, -0.5), "limits" if k == 3 else "", HARD, (-22, -8))
+        factor(ax, [control], beside(control, 0.55, -0.5), "effort, change" if k == 3 else "", COST, (0, -14))
+        variable(ax, control, "$u_0$" if k == 3 else "$u_{29}$", css("horizon"))
+    for k in (4, 6):
+        factor(ax, [places[k]], beside(places[k], -0.35, 1.0), "path, margins" if k == 4 else "", COST, (-14, 12))
+        factor(ax, [places[k]], beside(places[k], 0.35, 1.0), "walls, discs" if k == 4 else "", HARD, (22, 12))
+    for k, (place_, name) in enumerate(zip(places, names, strict=True)):
+        if name == "...":
+            ax.annotate(name, place_, ha="center", va="center", fontsize=20, bbox={"fc": "white", "ec": "none", "pad": 6})
+        else:
+            variable(ax, place_, name, css("robot") if k < 3 else css("estimate") if k == 3 else css("horizon"))
+    ax.annotate("past", beside(places[1], 0.0, -1.0), ha="center", color=css("robot"), fontsize=14)
+    ax.annotate("present", beside(places[3], -0.2, -1.0), ha="center", color=css("estimate"), fontsize=14)
+    ax.annotate("future", beside(places[5], 0.0, -2.2), ha="center", color=css("horizon"), fontsize=14)
+    ax.plot([], [], "s", ms=9, mfc=COST, mec=HARD, label="cost")
+    ax.plot([], [], "s", ms=9, mfc=HARD, mec=HARD, label="hard constraint")
+    ax.legend(loc="lower left", frameon=False, fontsize=9)
+    frame(ax, "Where am I, and what should I do?", (-8.4, 7.2), (-2.4, 2.0))
+    return figure
 
 
 def beside(point: Point, right: float, up: float) -> Point:
