@@ -85,9 +85,7 @@ def _times(matrices: Array, vectors: Array) -> Array:
     return np.einsum("nij,nj->ni", matrices, vectors)
 
 
-def trapezoid(
-    group: LieGroup, field: Field, form: Form = "full", jacobian: FieldJacobian | None = None
-) -> Residual:
+def trapezoid(group: LieGroup, field: Field, form: Form = "full", jacobian: FieldJacobian | None = None) -> Residual:
     """``trapezoid(group, F)(x, u, x_next, h)``: defect of one implicit step, (n, dim).
 
     Use it with ``constrain(..., lower=0, upper=0)`` or, soft, with ``minimize``.

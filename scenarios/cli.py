@@ -267,7 +267,6 @@ def _navigation_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run_navigation(chosen: argparse.Namespace, progress: Progress) -> Outcome:
     from unifg.scenarios import navigation  # imports solvers and the physics engine: not for --help
-
     from unifg.scenarios.controller import ControllerSettings
 
     settings = navigation.NavigationSettings(

@@ -168,8 +168,7 @@ class Manoeuvre:
     @property
     def time(self) -> Array:
         """(N + 1,) time of each node [s]."""
-        time: Array = self.settings.dt * np.arange(self.settings.horizon + 1)
-        return time
+        return self.settings.dt * np.arange(self.settings.horizon + 1, dtype=np.float64)
 
     @property
     def cusps(self) -> list[int]:

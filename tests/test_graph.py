@@ -10,7 +10,7 @@ import pytest
 import unifg as fg
 from judge import judge
 from problems import line, short_drive
-from unifg.models import obstacles
+from unifg.models import obstacles, unicycle
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, LevenbergMarquardt
 
 
@@ -203,3 +203,25 @@ def test_history_has_each_term_and_timing() -> None:
     assert all(a.seconds <= b.seconds for a, b in zip(solution.history, solution.history[1:], strict=False))
     assert solution.history[-1].terms["dynamics"] < 1e-6
     assert str(solution.iterations) in solution.report()
+
+
+def test_attached_jacobian_serves_where_an_argument_is_constant() -> None:
+    """Measured controls in place of unknown ones: the unicycle as an odometry factor."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE2, 4)
+    measured = np.array([[0.5, 0.1], [0.4, -0.2], [0.6, 0.0]])
+    graph.fix(x[0], [0.0, 0.0, 0.2])
+    graph.minimize(unicycle.dynamics, x[:-1], measured, x[1:], 0.5, sigma=0.1)
+    guess = {x: np.zeros((4, 3))}
+    assert graph.check(guess)
+    solution = GaussNewton().solve(graph, guess, check=True)
+    np.testing.assert_allclose(solution[x], unicycle.rollout(np.array([0.0, 0.0, 0.2]), measured, 0.5), atol=1e-8)
+
+
+def test_covariance_does_not_depend_on_the_backend() -> None:
+    """Interior points leave small multipliers on inactive rows: those rows do not remove variance."""
+    graph, guess = short_drive()
+    x = graph.families["x"]
+    first = SQP(qp="piqp").solve(graph, guess, check=True).covariance(x[6])
+    second = AugmentedLagrangian().solve(graph, guess, check=True).covariance(x[6])
+    np.testing.assert_allclose(first, second, rtol=1e-3, atol=1e-9)

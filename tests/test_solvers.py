@@ -175,3 +175,11 @@ def test_missing_qp_solver_is_named() -> None:
     graph, guess = short_drive()
     with pytest.raises(fg.BackendError, match="not installed"):
         SQP(qp="no-such-solver").solve(graph, guess)
+
+
+def test_backends_are_silent(capfd: pytest.CaptureFixture[str]) -> None:
+    """Not even the compiled libraries below may write to the terminal."""
+    for problem in PROBLEMS:
+        graph, guess = problem.build()
+        SQP().solve(graph, guess)
+    assert capfd.readouterr() == ("", "")

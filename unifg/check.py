@@ -139,22 +139,28 @@ def _undetermined(program: Program, values: Values) -> list[Finding]:
         if factorization.pivots().min() > PIVOT_TOLERANCE:
             return []
         loose = np.flatnonzero(np.abs(_null_direction(factorization, program.size)) > 0.1)
-    result, seen = [], set()
+    members: dict[str, list[int]] = {}
     for column in loose.tolist():
         family, member = program.columns.name(int(program.columns.free[column]))
-        if (family, member) not in seen:
-            seen.add((family, member))
-            result.append(
-                Finding(
-                    "undetermined",
-                    f"{family}[{member}] can move at the guess without any cost or constraint noticing to first order; "
-                    "add a prior or fix it",
-                    None,
-                    family,
-                    member,
-                )
-            )
-    return result
+        if member not in members.setdefault(family, []):
+            members[family].append(member)
+    return [
+        Finding(
+            "undetermined",
+            f"{_listed(family, found)} can move at the guess without any cost or constraint noticing to first order; "
+            "add a prior or fix something",
+            None,
+            family,
+            found[0],
+        )
+        for family, found in members.items()
+    ]
+
+
+def _listed(family: str, members: list[int]) -> str:
+    """A few members by name, and how many there are."""
+    names = ", ".join(f"{family}[{member}]" for member in members[:3])
+    return names if len(members) <= 3 else f"{names}, ... ({len(members)} members)"
 
 
 def _null_direction(factorization: Factorization, size: int) -> Array:

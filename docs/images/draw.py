@@ -160,7 +160,9 @@ def joint() -> Any:
         factor(ax, [places[k]], beside(places[k], 0.35, 1.0), "walls, discs" if k == 4 else "", HARD, (22, 12))
     for k, (place_, name) in enumerate(zip(places, names, strict=True)):
         if name == "...":
-            ax.annotate(name, place_, ha="center", va="center", fontsize=20, bbox={"fc": "white", "ec": "none", "pad": 6})
+            ax.annotate(
+                name, place_, ha="center", va="center", fontsize=20, bbox={"fc": "white", "ec": "none", "pad": 6}
+            )
         else:
             variable(ax, place_, name, css("robot") if k < 3 else css("estimate") if k == 3 else css("horizon"))
     ax.annotate("past", beside(places[1], 0.0, -1.0), ha="center", color=css("robot"), fontsize=14)
