@@ -19,6 +19,7 @@ from unifg.solvers import SQP, AugmentedLagrangian
 from unifg.typing import Array, BoolArray
 
 FAR_AWAY = 1e3  # [m]; where an unused disc waits
+YIELD_SPEED = 0.05  # [m/s] towards the robot
 LEFT_BEHIND = 0.6  # [m] between the ends of plan and reference
 BRAKING = 6  # ticks to come to rest when no new plan is found
 PATIENCE = 5  # ticks of being left behind before the plan starts over from the reference
@@ -41,8 +42,11 @@ class ControllerSettings:
         robot_radius: [m].
         wall_clearance: least distance of the hull to walls [m].
         disc_clearance: least distance of the hull to tracked discs [m].
-        mover_allowance: added to the clearance from discs that move [m].
-        approach: share of the gap to a moving disc that one step may close.
+        mover_speed: fastest walk of a mover [m/s].
+        mover_allowance: most that is added to the clearance from discs that have ever moved [m].
+        approach: share of the gap to such a disc that one step may close.
+        courtesy: gap at which movers wait for a robot at rest [m].
+        yield_distance: gap to a mover that closes in at which the robot rests [m].
         margin: distance of the hull below which the soft costs begin [m].
         margin_sigma: [m].
         discs: tracked discs considered at once.
@@ -63,8 +67,11 @@ class ControllerSettings:
     robot_radius: float = 0.17
     wall_clearance: float = 0.03
     disc_clearance: float = 0.06
-    mover_allowance: float = 0.1
+    mover_speed: float = 0.3
+    mover_allowance: float = 0.15
     approach: float = 0.12
+    courtesy: float = 0.1
+    yield_distance: float = 0.3
     margin: float = 0.2
     margin_sigma: float = 0.1
     discs: int = 3
@@ -81,10 +88,10 @@ def backend(name: str, settings: ControllerSettings) -> fg.Solver:
     """
     tolerance, step, violation = settings.tolerance, settings.step_tolerance, 0.5 * settings.feasible
     if name == "sqp":
-        return SQP(tolerance=tolerance, step_tolerance=step, violation_tolerance=violation, max_iterations=15)
+        return SQP(tolerance=tolerance, step_tolerance=step, violation_tolerance=violation, max_iterations=10)
     if name == "alm":
         return AugmentedLagrangian(
-            tolerance=tolerance, step_tolerance=step, violation_tolerance=violation, max_iterations=40
+            tolerance=tolerance, step_tolerance=step, violation_tolerance=violation, max_iterations=18
         )
     raise fg.ScenarioError(f"unknown solver '{name}': choose alm or sqp")
 
@@ -173,7 +180,7 @@ class Controller:
         """
         data = self._data(pose, reference, tracks)
         guess = self._guess or (self._staying(pose) if self._failed else self._along(pose, reference))
-        return self._judge(self._run.solve(guess, data=data), pose, reference)
+        return self._judge(self._run.solve(guess, data=data), pose, reference, tracks)
 
     def _anchor(self, graph: fg.Graph, x: fg.Family) -> None:
         """Tie the horizon to the estimate: here it is given, and its first pose fixed."""
@@ -184,8 +191,8 @@ class Controller:
         """Data of what :meth:`_anchor` stated."""
         return {self._start: pose}
 
-    def _judge(self, solution: fg.Solution, pose: Array, reference: Array) -> Plan:
-        """Drive a plan that keeps the constraints; brake along the last one otherwise."""
+    def _judge(self, solution: fg.Solution, pose: Array, reference: Array, tracks: Tracks) -> Plan:
+        """Drive a plan that keeps the constraints; brake along the last one otherwise; rest where a mover nears."""
         s = self.settings
         controls = solution[self._u]
         worst = "" if solution.worst is None else solution.worst[0]
@@ -200,12 +207,14 @@ class Controller:
             emergency = self._failed = True
             states = unicycle.rollout(pose, self._braking(), s.dt)
         beyond = float(np.maximum(np.abs(self._stored) - s.limits, 0.0).max())
-        self._applied = np.clip(controls[0], *_box(s)) if not emergency else self._braking()[0]
+        control = np.clip(controls[0], *_box(s)) if not emergency else self._braking()[0]
+        self._applied = np.zeros(2) if self._yields(pose, tracks) else control
         return Plan(self._applied, states, solution.status, solution.iterations, beyond, emergency, worst)
 
     def forget(self) -> None:
-        """Drop the warm start, as when a new goal makes it misleading."""
+        """Drop the warm start, as when a new route makes it misleading."""
         self._guess = None
+        self._failed = False
 
     def _left_behind(self, states: Array, reference: Array) -> bool:
         """Whether plans have ended far from the reference for so long that they must be caught in a dead end."""
@@ -221,7 +230,10 @@ class Controller:
         controls = np.zeros((self.settings.horizon, 2))
         stages = np.arange(self._age, self.settings.horizon)
         fade = np.maximum(1.0 - stages / BRAKING, 0.0)
-        controls[: len(stages)] = self._stored[stages] * fade[:, None]
+        stored = self._stored[stages] * fade[:, None]
+        fastest = np.abs(stored[:, 0]).max(initial=0.0)
+        slower = min(1.0, abs(float(self._applied[0])) / fastest) if fastest > 0.0 else 1.0
+        controls[: len(stages)] = slower * stored
         return controls
 
     def _staying(self, pose: Array) -> fg.Guess:
@@ -245,13 +257,10 @@ class Controller:
     def _data(self, pose: Array, reference: Array, tracks: Tracks) -> dict[fg.Data, Array]:
         s = self.settings
         n, m = s.horizon, s.discs
-        stages = s.dt * np.arange(1, n + 1)
-        centres, radii, moving = np.full((n, m, 2), FAR_AWAY), np.zeros(m), np.zeros(m, dtype=bool)
+        centres, radii, movers = np.full((n, m, 2), FAR_AWAY), np.zeros(m), np.zeros(m, dtype=bool)
         chosen = nearest(tracks, pose, m)
         k = len(chosen)
-        centres[:, :k] = chosen.centre + stages[:, None, None] * chosen.velocity
-        moving[:k] = np.hypot(*chosen.velocity.T) > 0.0
-        radii[:k] = chosen.radius
+        centres[:, :k], radii[:k], movers[:k] = self._predicted(pose, chosen), chosen.radius, chosen.mover
         cruise = np.zeros((n, 2))
         cruise[:, 0] = self._cruising(reference)
         return {
@@ -261,7 +270,7 @@ class Controller:
             self._cruise: cruise,
             self._last: self._applied,
             self._wall_limit: self._wall_limits(pose),
-            self._disc_limit: self._disc_limits(pose, centres, radii, moving),
+            self._disc_limit: self._disc_limits(pose, centres, radii, movers),
             self._centres: centres,
             self._radii: radii,
         }
@@ -272,19 +281,47 @@ class Controller:
         now = self._field.distance(pose[None, :2])
         return np.full((s.horizon, 1), min(s.robot_radius + s.wall_clearance, float(now[0])))
 
-    def _disc_limits(self, pose: Array, centres: Array, radii: Array, moving: BoolArray) -> Array:
-        """(N, M) least distances to discs, as far as a robot at rest could keep them.
+    def _predicted(self, pose: Array, tracks: Tracks) -> Array:
+        """(N, k, 2) centres along the horizon.
 
-        A mover is not approached by more than a share of the gap each step, as a control barrier function
-        demands, for it may turn round. Resting is always feasible: movers wait for a robot at rest.
+        A mover goes straight on, but not into a robot at rest, for which it waits; and it is not trusted to go
+        away, for it may turn round.
+        """
+        s = self.settings
+        stages = s.dt * np.arange(1, s.horizon + 1)
+        towards = pose[:2] - tracks.centre
+        towards /= np.maximum(np.hypot(*towards.T), 1e-9)[:, None]
+        leaving = np.minimum(np.einsum("ij,ij->i", tracks.velocity, towards), 0.0)
+        velocity = tracks.velocity - leaving[:, None] * towards
+        centres: Array = tracks.centre + stages[:, None, None] * velocity
+        gap = np.hypot(*np.moveaxis(centres - pose[:2], 2, 0)) - tracks.radius - s.robot_radius
+        blocked = np.maximum.accumulate(gap < s.courtesy, axis=0)
+        last = np.maximum((~blocked).sum(axis=0) - 1, 0)  # the stage before the mover has to wait
+        return np.where(blocked[:, :, None], centres[last, np.arange(len(tracks))], centres)
+
+    def _disc_limits(self, pose: Array, centres: Array, radii: Array, movers: BoolArray) -> Array:
+        """(N, M) least distances to discs, as far as a robot at rest keeps them: resting is always feasible.
+
+        A disc that has ever moved is kept off by what it can travel in the meantime, up to a limit, and is not
+        approached by more than a share of the gap each step, as a control barrier function demands.
         """
         s = self.settings
         stages = np.arange(1, s.horizon + 1)[:, None]
         at_rest = np.hypot(*np.moveaxis(pose[:2] - centres, 2, 0)) - radii
-        least = s.robot_radius + s.disc_clearance + np.where(moving, s.mover_allowance, 0.0)
-        spare = np.where(moving, np.maximum(at_rest[0] - least, 0.0), 0.0)
+        allowance = np.minimum(s.mover_speed * s.dt * stages, s.mover_allowance)
+        least = s.robot_radius + s.disc_clearance + np.where(movers, allowance, 0.0)
+        spare = np.where(movers, np.maximum(at_rest[0] - least, 0.0), 0.0)
         limits: Array = np.minimum(least + spare * (1.0 - s.approach) ** stages, at_rest)
         return limits
+
+    def _yields(self, pose: Array, tracks: Tracks) -> bool:
+        """Whether a mover is so near and closing in that resting, which it respects, is the only safe answer."""
+        s = self.settings
+        offset = pose[:2] - tracks.centre
+        distance = np.hypot(*offset.T)
+        closing = np.einsum("ij,ij->i", offset, tracks.velocity) / np.maximum(distance, 1e-9)
+        near = distance - tracks.radius - s.robot_radius < s.yield_distance
+        return bool((tracks.mover & near & (closing > YIELD_SPEED)).any())
 
 
 def _box(settings: ControllerSettings) -> tuple[Array, Array]:

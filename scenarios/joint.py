@@ -47,7 +47,7 @@ class JointController(Controller):
         values = {**guess.values, self._terms.past: self._terms.poses(self.window)}
         values[self._x] = np.concatenate([pose[None], guess.values[self._x][1:]])
         solution = self._run.solve(fg.Guess(values, guess.multipliers), data=data)
-        plan = self._judge(solution, pose, reference)
+        plan = self._judge(solution, pose, reference, tracks)
         if plan.emergency:
             self._estimate_alone()
         else:

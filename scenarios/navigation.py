@@ -159,7 +159,8 @@ class Episode:
         tracks = self.tracker.update(scan, pose, control.dt)
         perceived = time.perf_counter()
         route = self.legs[goal]
-        route.repair(pose, tracks)
+        if route.repair(pose, tracks):
+            self.pilot.forget()
         repaired = time.perf_counter()
         reference = route.reference(pose, control.speed * control.dt, control.horizon + 1)
         plan = self.pilot.plan(reference, tracks)

@@ -23,6 +23,7 @@ __all__ = ["Tracker", "Tracks", "nearest"]
 _GATE = 0.4  # [m]; a disc farther than this from where a track is expected is another disc
 _SPEED_FLOOR = 0.1  # [m/s]; slower counts as standing still
 _ACCELERATION = 0.3  # [m/s^2]; standard deviation of a mover's acceleration
+_SURPRISE = 6.0  # squared innovation, in variances, that only a change of motion explains
 _FIRST_SPEED = 0.2  # [m/s]; standard deviation of the velocity of a new track, per axis
 _DRIFT = 0.03  # [m/sqrt(s)]; how fast the memory of a standing disc fades
 _CLEAR_LIMIT = 3  # scans in a row that see through a remembered disc before it is dropped
@@ -40,6 +41,7 @@ class Tracks:
         radius: (m,) [m].
         identity: (m,) number of the track, kept for its lifetime.
         unseen: (m,) time since the track was last seen [s].
+        mover: (m,) whether it has ever moved; what stands now may go on.
     """
 
     centre: Array
@@ -47,6 +49,7 @@ class Tracks:
     radius: Array
     identity: IntArray
     unseen: Array
+    mover: BoolArray
 
     def __len__(self) -> int:
         """Number of tracks."""
@@ -60,6 +63,7 @@ class Tracks:
             self.radius[index],
             self.identity[index],
             self.unseen[index],
+            self.mover[index],
         )
 
 
@@ -111,6 +115,7 @@ class Tracker:
         self._unseen = np.zeros(0)
         self._clear = np.zeros(0, dtype=np.intp)
         self._moving = np.zeros(0, dtype=bool)
+        self._has_moved = np.zeros(0, dtype=bool)
 
     def update(self, scan: Scan, pose: ArrayLike, dt: float) -> Tracks:
         """Take in one scan.
@@ -147,6 +152,7 @@ class Tracker:
             radius=self._radius[confirmed],
             identity=self._identity[confirmed],
             unseen=self._unseen[confirmed],
+            mover=self._has_moved[confirmed],
         )
 
     def _predict(self, dt: float) -> None:
@@ -178,7 +184,7 @@ class Tracker:
         covariance = self._covariance[track]
         innovation = seen - self._mean[track, 0]
         # A mover that turns round surprises the filter: let its velocity go rather than lag behind.
-        surprise = np.sum(innovation**2, axis=1) / (covariance[:, 0, 0] + variance) > 12.0
+        surprise = np.sum(innovation**2, axis=1) / (covariance[:, 0, 0] + variance) > _SURPRISE
         covariance[surprise, 1, 1] += _FIRST_SPEED**2
         covariance[surprise, 0, 0] += 0.05**2
         gain = covariance[:, :, 0] / (covariance[:, 0, 0] + variance)[:, None]
@@ -206,6 +212,7 @@ class Tracker:
         begins = (speed > _SPEED_FLOOR) & (speed > 3.0 * spread) & (self._hits[track] >= 4)
         moving = np.where(self._moving[track], speed > _SPEED_FLOOR, begins)
         self._moving[track] = moving
+        self._has_moved[track] |= moving
         moved = track[moving]
         self._anchor[moved] = self._mean[moved, 0]
         self._anchor_variance[moved] = variance[moving]
@@ -261,13 +268,15 @@ class Tracker:
         self._unseen = np.concatenate([self._unseen, np.zeros(count)])
         self._clear = np.concatenate([self._clear, np.zeros(count, dtype=np.intp)])
         self._moving = np.concatenate([self._moving, np.zeros(count, dtype=bool)])
+        self._has_moved = np.concatenate([self._has_moved, np.zeros(count, dtype=bool)])
 
     def _keep(self, keep: BoolArray) -> None:
         self._mean, self._covariance = self._mean[keep], self._covariance[keep]
         self._anchor, self._anchor_variance = self._anchor[keep], self._anchor_variance[keep]
         self._radius, self._radius_information = self._radius[keep], self._radius_information[keep]
         self._identity, self._hits = self._identity[keep], self._hits[keep]
-        self._unseen, self._clear, self._moving = self._unseen[keep], self._clear[keep], self._moving[keep]
+        self._unseen, self._clear = self._unseen[keep], self._clear[keep]
+        self._moving, self._has_moved = self._moving[keep], self._has_moved[keep]
 
 
 def _centre_variance(distance: Array) -> Array:

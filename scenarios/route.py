@@ -17,6 +17,11 @@ REJOIN = 2.0  # [m] beyond the disc where the detour meets the path again
 WINDOW = 3.0  # [m] of map kept around the detour's ends
 STANDING = 0.15  # [m/s]; faster discs are left to the controller, which predicts them
 GAP = 0.10  # [m] between hull and disc that a path must leave
+WIDE = 0.25  # [m] added to discs when the robot is stuck
+STUCK_TICKS = 25
+STUCK_DISTANCE = 0.1  # [m]
+NEAR_GOAL = 0.5  # [m] of path left, where turning on the spot is normal
+STANDING_GAP = 0.01  # [m] a planned path needs around its start
 PATIENCE = 5  # ticks between two repairs
 
 
@@ -46,6 +51,7 @@ class Route:
         self._radius = robot_radius
         self.repairs = 0
         self._rest = 0
+        self._trail: list[Array] = []
         self._follow(plan(occupancy, distance_map, start, goal, robot_radius=robot_radius))
 
     def _follow(self, path: Array) -> None:
@@ -59,12 +65,17 @@ class Route:
         return poses
 
     def repair(self, pose: Array, tracks: Tracks) -> bool:
-        """Plan a detour if a standing disc blocks the path ahead; whether the path changed."""
+        """Plan a detour if a standing disc blocks the path ahead, or the robot is stuck; whether the path changed."""
         self._rest = max(self._rest - 1, 0)
-        standing = tracks.at(np.hypot(*tracks.velocity.T) < STANDING)
-        if self._rest or not len(standing):
+        self._trail = [*self._trail[-STUCK_TICKS + 1 :], pose[:2].copy()]
+        if self._rest or not len(tracks):
             return False
         arc = SPACING * np.arange(len(self.path))
+        if self._stuck(float(arc[-1])):
+            self._trail = []
+            # Wide around everything, whatever it does just now: the near side has been tried.
+            return self._detour(pose, min(self._reached + 2.0 * REJOIN, float(arc[-1])), tracks, WIDE)
+        standing = tracks.at(np.hypot(*tracks.velocity.T) < STANDING)
         ahead = (arc >= self._reached) & (arc <= self._reached + LOOK_AHEAD)
         offsets = self.path[ahead, None, :2] - standing.centre
         room = np.hypot(offsets[..., 0], offsets[..., 1]) - standing.radius
@@ -73,13 +84,21 @@ class Route:
             return False
         self._rest = PATIENCE
         last = float(arc[ahead][np.flatnonzero(blocked)[-1]])
-        return self._detour(pose, min(last + REJOIN, float(arc[-1])), standing)
+        return self._detour(pose, min(last + REJOIN, float(arc[-1])), standing, 0.5 * GAP)
 
-    def _detour(self, pose: Array, rejoin: float, standing: Tracks) -> bool:
+    def _stuck(self, end: float) -> bool:
+        """Whether the robot has hardly moved for a while though the goal is not near."""
+        if len(self._trail) < STUCK_TICKS or end - self._reached < NEAR_GOAL:
+            return False
+        return bool(np.ptp(np.array(self._trail), axis=0).max() < STUCK_DISTANCE)
+
+    def _detour(self, pose: Array, rejoin: float, tracks: Tracks, allowance: float) -> bool:
         index = min(round(rejoin / SPACING), len(self.path) - 1)
         target = self.path[index]
         corners = np.stack([pose[:2], target[:2], *self.path[self._index() : index + 1, :2]])
-        discs = np.column_stack([standing.centre, standing.radius + 0.5 * GAP])
+        # A disc the robot nearly touches is taken as small as leaves it free to go.
+        reach = np.hypot(*(tracks.centre - pose[:2]).T) - self._radius - STANDING_GAP
+        discs = np.column_stack([tracks.centre, np.clip(reach, 0.0, tracks.radius + allowance)])
         occupancy, distance_map = self._window(corners)
         try:
             detour = plan(occupancy, distance_map, pose, target, robot_radius=self._radius, extra_discs=discs)

@@ -262,7 +262,9 @@ def hall(width: float = 2.0) -> tuple[OccupancyMap, DistanceMap]:
 
 def disc(x: float, y: float, radius: float, velocity: tuple[float, float] = (0.0, 0.0)) -> Tracks:
     """One tracked disc."""
-    return Tracks(np.array([[x, y]]), np.array([velocity]), np.array([radius]), np.array([0]), np.array([0.0]))
+    return Tracks(
+        np.array([[x, y]]), np.array([velocity]), np.array([radius]), np.array([0]), np.array([0.0]), np.array([False])
+    )
 
 
 def through_the_hall() -> tuple[Route, Array]:
