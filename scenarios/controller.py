@@ -19,6 +19,7 @@ from unifg.solvers import SQP, AugmentedLagrangian
 from unifg.typing import Array, BoolArray
 
 FAR_AWAY = 1e3  # [m]; where an unused disc waits
+COLD_PATIENCE = 3  # a tick without a warm start may iterate longer
 YIELD_SPEED = 0.05  # [m/s] towards the robot
 LEFT_BEHIND = 0.6  # [m] between the ends of plan and reference
 BRAKING = 6  # ticks to come to rest when no new plan is found
@@ -44,6 +45,7 @@ class ControllerSettings:
         disc_clearance: least distance of the hull to tracked discs [m].
         mover_speed: fastest walk of a mover [m/s].
         mover_allowance: most that is added to the clearance from discs that have ever moved [m].
+        mover_margin: added to the soft margin around such discs [m].
         approach: share of the gap to such a disc that one step may close.
         courtesy: gap at which movers wait for a robot at rest [m].
         yield_distance: gap to a mover that closes in at which the robot rests [m].
@@ -69,6 +71,7 @@ class ControllerSettings:
     disc_clearance: float = 0.06
     mover_speed: float = 0.3
     mover_allowance: float = 0.15
+    mover_margin: float = 0.3
     approach: float = 0.12
     courtesy: float = 0.1
     yield_distance: float = 0.3
@@ -80,18 +83,25 @@ class ControllerSettings:
     feasible: float = 5e-4
 
 
-def backend(name: str, settings: ControllerSettings) -> fg.Solver:
+def backend(name: str, settings: ControllerSettings, patience: int = 1) -> fg.Solver:
     """The backend of a control loop by its short name.
+
+    Args:
+        name: "alm" or "sqp".
+        settings: tolerances.
+        patience: factor on the iterations of a warm-started tick.
 
     Raises:
         ScenarioError: for an unknown name.
     """
     tolerance, step, violation = settings.tolerance, settings.step_tolerance, 0.5 * settings.feasible
     if name == "sqp":
-        return SQP(tolerance=tolerance, step_tolerance=step, violation_tolerance=violation, max_iterations=10)
+        return SQP(
+            tolerance=tolerance, step_tolerance=step, violation_tolerance=violation, max_iterations=10 * patience
+        )
     if name == "alm":
         return AugmentedLagrangian(
-            tolerance=tolerance, step_tolerance=step, violation_tolerance=violation, max_iterations=18
+            tolerance=tolerance, step_tolerance=step, violation_tolerance=violation, max_iterations=18 * patience
         )
     raise fg.ScenarioError(f"unknown solver '{name}': choose alm or sqp")
 
@@ -142,6 +152,7 @@ class Controller:
         self._disc_limit = graph.data("disc clearance", np.zeros((n, m)), each=True)
         self._centres = graph.data("disc centres", np.full((n, m, 2), FAR_AWAY), each=True)
         self._radii = graph.data("disc radii", np.zeros(m))
+        self._shy_radii = graph.data("disc radii for the margin", np.zeros(m))
         self._anchor(graph, x)
         graph.minimize(unicycle.tracking, x[1:-1], self._reference, sigma=weighted(s.pose_sigma), name="path")
         graph.minimize(unicycle.tracking, x[-1], self._end, sigma=weighted(s.terminal_sigma), name="end of path")
@@ -154,7 +165,7 @@ class Controller:
         disc_margin = obstacles.shortfall(obstacles.disc_clearance, s.robot_radius + s.margin)
         graph.minimize(wall_margin, x[1:], sigma=weighted((s.margin_sigma,))[0], name="wall margin")
         graph.minimize(
-            disc_margin, x[1:], self._centres, self._radii, sigma=weighted((s.margin_sigma,))[0], name="disc margin"
+            disc_margin, x[1:], self._centres, self._shy_radii, sigma=weighted((s.margin_sigma,))[0], name="disc margin"
         )
         graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], s.dt, lower=0.0, upper=0.0, name="dynamics")
         graph.bound(u, lower=[-limit for limit in s.limits], upper=s.limits, name="limits")
@@ -163,6 +174,7 @@ class Controller:
             obstacles.disc_clearance, x[1:], self._centres, self._radii, lower=self._disc_limit, name="discs"
         )
         self._run = backend(solver, s).prepare(graph)
+        self._cold = backend(solver, s, COLD_PATIENCE).prepare(graph)
         self._guess: fg.Guess | None = None
         self._applied = np.zeros(2)
         self._stored = np.zeros((n, 2))
@@ -179,8 +191,14 @@ class Controller:
             tracks: discs the robot has seen.
         """
         data = self._data(pose, reference, tracks)
-        guess = self._guess or (self._staying(pose) if self._failed else self._along(pose, reference))
-        return self._judge(self._run.solve(guess, data=data), pose, reference, tracks)
+        run, guess = self._beginning(pose, reference)
+        return self._judge(run.solve(guess, data=data), pose, reference, tracks)
+
+    def _beginning(self, pose: Array, reference: Array) -> tuple[fg.Prepared, fg.Guess]:
+        """The shifted solution; without one, rest after a failure, and the reference otherwise."""
+        if self._guess is not None:
+            return self._run, self._guess
+        return (self._run, self._staying(pose)) if self._failed else (self._cold, self._along(pose, reference))
 
     def _anchor(self, graph: fg.Graph, x: fg.Family) -> None:
         """Tie the horizon to the estimate: here it is given, and its first pose fixed."""
@@ -273,6 +291,7 @@ class Controller:
             self._disc_limit: self._disc_limits(pose, centres, radii, movers),
             self._centres: centres,
             self._radii: radii,
+            self._shy_radii: radii + np.where(movers, s.mover_margin, 0.0),
         }
 
     def _wall_limits(self, pose: Array) -> Array:

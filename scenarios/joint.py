@@ -43,10 +43,10 @@ class JointController(Controller):
     def plan(self, pose: Array, reference: Array, tracks: Tracks) -> Plan:
         """Estimate and decide in one solve; ``pose`` is the prediction from odometry."""
         data = self._data(pose, reference, tracks)
-        guess = self._guess or (self._staying(pose) if self._failed else self._along(pose, reference))
+        run, guess = self._beginning(pose, reference)
         values = {**guess.values, self._terms.past: self._terms.poses(self.window)}
         values[self._x] = np.concatenate([pose[None], guess.values[self._x][1:]])
-        solution = self._run.solve(fg.Guess(values, guess.multipliers), data=data)
+        solution = run.solve(fg.Guess(values, guess.multipliers), data=data)
         plan = self._judge(solution, pose, reference, tracks)
         if plan.emergency:
             self._estimate_alone()

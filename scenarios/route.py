@@ -65,17 +65,24 @@ class Route:
         return poses
 
     def repair(self, pose: Array, tracks: Tracks) -> bool:
-        """Plan a detour if a standing disc blocks the path ahead, or the robot is stuck; whether the path changed."""
+        """Plan a detour if a standing disc blocks the path ahead, or the robot is stuck.
+
+        Returns:
+            Whether the controller should start over from the path: it changed, or the robot is stuck on it.
+        """
         self._rest = max(self._rest - 1, 0)
         self._trail = [*self._trail[-STUCK_TICKS + 1 :], pose[:2].copy()]
-        if self._rest or not len(tracks):
+        if self._rest:
             return False
         arc = SPACING * np.arange(len(self.path))
         if self._stuck(float(arc[-1])):
             self._trail = []
-            # Wide around everything, whatever it does just now: the near side has been tried.
-            return self._detour(pose, min(self._reached + 2.0 * REJOIN, float(arc[-1])), tracks, WIDE)
+            if len(tracks):  # wide around everything, whatever it does just now: the near side has been tried
+                self._detour(pose, min(self._reached + 2.0 * REJOIN, float(arc[-1])), tracks, WIDE)
+            return True
         standing = tracks.at(np.hypot(*tracks.velocity.T) < STANDING)
+        if not len(standing):
+            return False
         ahead = (arc >= self._reached) & (arc <= self._reached + LOOK_AHEAD)
         offsets = self.path[ahead, None, :2] - standing.centre
         room = np.hypot(offsets[..., 0], offsets[..., 1]) - standing.radius

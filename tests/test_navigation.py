@@ -163,6 +163,12 @@ class Garbage:
         return np.full_like(self.solution[variable], 99.0)
 
 
+def replace_solver(monkeypatch: pytest.MonkeyPatch, episode: Episode, double: object) -> None:
+    """Put a double in place of the warm-started solver and of the one for cold starts."""
+    for name in ("_run", "_cold"):
+        monkeypatch.setattr(episode.pilot.controller, name, double)
+
+
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("good", [12, 30], ids=["straight", "in the turn"])
 def test_failed_solves_brake_to_rest_along_the_stored_plan(
@@ -170,7 +176,7 @@ def test_failed_solves_brake_to_rest_along_the_stored_plan(
 ) -> None:
     episode = Episode(replace(CORNER, solver=solver, seed=3))
     horizon = episode.settings.controller.horizon
-    monkeypatch.setattr(episode.pilot.controller, "_run", Failing(episode.pilot.controller._run, good))
+    replace_solver(monkeypatch, episode, Failing(episode.pilot.controller._run, good))
     log = drive(episode, good + horizon + 10)
     assert np.array_equal(log.emergency, np.arange(log.ticks) >= good)
     assert set(log.status[good:]) == {"locally_infeasible"}
@@ -203,7 +209,7 @@ def test_one_failed_solve_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
             solution = run.solve(guess, **options)
             return Garbage(solution) if calls == 20 else solution
 
-    monkeypatch.setattr(episode.pilot.controller, "_run", Once())
+    replace_solver(monkeypatch, episode, Once())
     log = episode.run(lambda done, text: None)
     assert log.succeeded
     assert log.emergency.sum() == 1
@@ -211,7 +217,7 @@ def test_one_failed_solve_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_failure_on_the_first_tick_stands_still(monkeypatch: pytest.MonkeyPatch) -> None:
     episode = Episode(CORRIDOR)
-    monkeypatch.setattr(episode.pilot.controller, "_run", Failing(episode.pilot.controller._run, 0))
+    replace_solver(monkeypatch, episode, Failing(episode.pilot.controller._run, 0))
     log = drive(episode, 5)
     assert log.emergency.all()
     assert np.all(log.control == 0.0)
