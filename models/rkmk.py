@@ -82,7 +82,8 @@ class _Trapezoid:
 
 def _times(matrices: Array, vectors: Array) -> Array:
     """(n, d) products of (n, d, d) matrices and (n, d) vectors."""
-    return np.einsum("nij,nj->ni", matrices, vectors)
+    product: Array = np.einsum("nij,nj->ni", matrices, vectors)
+    return product
 
 
 def trapezoid(group: LieGroup, field: Field, form: Form = "full", jacobian: FieldJacobian | None = None) -> Residual:

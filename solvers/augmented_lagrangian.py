@@ -15,10 +15,12 @@ from typing import Literal
 import numpy as np
 
 from unifg.errors import BackendError
+from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.solver import Run, Solver
 from unifg.solvers.damping import Damping, damped_step, norm
 from unifg.solvers.least_squares import require_squares
+from unifg.solvers.model import model_step
 from unifg.solvers.primal import Primal
 from unifg.status import Status
 from unifg.typing import Array
@@ -67,6 +69,12 @@ class AugmentedLagrangian(Solver):
     def workspace(self, program: Program) -> Primal:
         """The factorisation of the primal step."""
         return Primal(program)
+
+    def search_step(self, run: Run, workspace: Primal, lin: Linearization) -> Array | None:
+        """The primal step at the initial damping, with the penalty that suits the present iterate."""
+        penalty = np.full(len(run.multipliers), self._initial_penalty(run))
+        found = model_step(workspace, lin, run.multipliers, penalty, self.damping)
+        return None if found is None else found[0]
 
     def iterate(self, run: Run, workspace: Primal) -> Status | None:
         """Alternate primal and dual steps."""

@@ -6,12 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.solver import Run, Solver
 from unifg.solvers.damping import ROUNDING, norm
 from unifg.solvers.least_squares import require_squares, require_unconstrained
 from unifg.solvers.primal import Primal
 from unifg.status import Status
+from unifg.typing import Array
 
 ARMIJO = 1e-4
 SHORTEST = 1e-8
@@ -37,6 +39,11 @@ class GaussNewton(Solver):
     def workspace(self, program: Program) -> Primal:
         """The factorisation of the normal equations."""
         return Primal(program)
+
+    def search_step(self, run: Run, workspace: Primal, lin: Linearization) -> Array | None:
+        """The full Gauss-Newton step."""
+        none = np.zeros(0)
+        return workspace.direction(workspace.curvature(lin, none, none), workspace.gradient(lin, none, none))
 
     def iterate(self, run: Run, workspace: Primal) -> Status | None:
         """Iterate to convergence."""

@@ -6,12 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.solver import Run, Solver
 from unifg.solvers.damping import Damping, damped_step, norm
 from unifg.solvers.least_squares import require_squares, require_unconstrained
+from unifg.solvers.model import model_step
 from unifg.solvers.primal import Primal
 from unifg.status import Status
+from unifg.typing import Array
 
 
 @dataclass(kw_only=True)
@@ -34,6 +37,11 @@ class LevenbergMarquardt(Solver):
     def workspace(self, program: Program) -> Primal:
         """The factorisation of the normal equations."""
         return Primal(program)
+
+    def search_step(self, run: Run, workspace: Primal, lin: Linearization) -> Array | None:
+        """The step at the initial damping."""
+        found = model_step(workspace, lin, np.zeros(0), np.zeros(0), self.damping)
+        return None if found is None else found[0]
 
     def iterate(self, run: Run, workspace: Primal) -> Status | None:
         """Iterate to convergence."""

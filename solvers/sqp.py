@@ -67,6 +67,12 @@ class SQP(Solver):
         """QP workspaces."""
         return Subproblems(self, program)
 
+    def search_step(self, run: Run, workspace: Subproblems, lin: Linearization) -> Array | None:
+        """The full step of the subproblem."""
+        workspace.start()
+        answer = workspace.solve(subproblem(run.program, lin, SMALLEST_DAMPING), run.multipliers, self._accuracy(run))
+        return answer.step if np.isfinite(answer.error) else None
+
     def iterate(self, run: Run, workspace: Subproblems) -> Status | None:
         """Iterate to convergence."""
         # Bounds are linear: once they hold they hold along every step, and leave the line search to the rest.

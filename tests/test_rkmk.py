@@ -193,9 +193,9 @@ def test_drives_as_a_hard_constraint(form: Form) -> None:
     start = {x: np.zeros((count + 1, 3)), u: np.zeros((count, 2))}
     solution = SQP().solve(graph, start)
     assert solution.converged, solution.report()
-    moved = np.concatenate([implicit_step(form, p[None], c[None], h) for p, c in zip(solution[x], solution[u])][:count])
+    nodes = zip(solution[x][:-1], solution[u], strict=True)
+    moved = np.concatenate([implicit_step(form, pose[None], control[None], h) for pose, control in nodes])
     assert np.abs(fg.SE2.local(moved, solution[x][1:])).max() < 1e-5
-    assert graph.check(solution.values) or "dependent" not in str(graph.check(solution.values))
 
 
 def test_unknown_form_is_refused_and_residuals_pickle() -> None:

@@ -41,6 +41,8 @@ class Solver(ABC):
         time_limit: seconds before giving up, checked once an iteration.
         verbose: log one line per iteration at level INFO to the logger ``unifg``.
         keep_values: keep the values of every iterate in the history, for pictures of a solve.
+        search_iterations: the first so many steps use the search Jacobians of residuals that have one, and are taken
+            in full without a merit test. Costs and KKT numbers are the true ones throughout.
     """
 
     tolerance: float = 1e-6
@@ -48,6 +50,7 @@ class Solver(ABC):
     time_limit: float = np.inf
     verbose: bool = False
     keep_values: bool = False
+    search_iterations: int = 0
 
     def __post_init__(self) -> None:
         """Refuse options no solve could honour."""
@@ -55,6 +58,8 @@ class Solver(ABC):
             raise BackendError(f"{self.name}: tolerance must be positive, found {self.tolerance}")
         if self.max_iterations < 0:
             raise BackendError(f"{self.name}: max_iterations must not be negative, found {self.max_iterations}")
+        if self.search_iterations < 0:
+            raise BackendError(f"{self.name}: search_iterations must not be negative, found {self.search_iterations}")
 
     @property
     def name(self) -> str:
@@ -104,6 +109,10 @@ class Solver(ABC):
     @abstractmethod
     def iterate(self, run: Run, workspace: Any) -> Status | None:
         """Improve ``run`` until it has a status, or return the reason to stop."""
+
+    def search_step(self, run: Run, workspace: Any, lin: Linearization) -> Array | None:
+        """The backend's own tangent step for the model ``lin``, which is made of search Jacobians; None for no step."""
+        raise BackendError(f"{self.name} has no search_step: set search_iterations=0")
 
 
 class Run:
@@ -177,6 +186,21 @@ class Run:
         if self._callback is not None and self._callback(row) and self.status is None:
             self.status = Status.INTERRUPTED
 
+    def search(self, workspace: Any) -> None:
+        """Take the first steps along the search Jacobians; the multipliers wait, and the true numbers are recorded.
+
+        Without a merit test a step may lead out of the residuals' domain: the search ends before such a step.
+        """
+        program = self.program
+        if not any(term.term.residual.search for term in program.terms):
+            return
+        while self.status is None and len(self.history) <= self._solver.search_iterations:
+            step = self._solver.search_step(self, workspace, program.linearize(self.values, search=True))
+            reached = None if step is None else program.linearize(program.retract(self.values, step))
+            if step is None or reached is None or not reached.finite:
+                return
+            self.accept(reached, self.multipliers, float(np.linalg.norm(step)), 1.0, search=1)
+
     def infeasible_stationary(self) -> bool:
         """Whether no nearby point violates the constraints less, though they are violated."""
         return infeasible_stationary(self.program, self.lin, self.tolerance)
@@ -218,10 +242,12 @@ class Run:
         return None
 
     def _keep_best(self) -> None:
-        """Feasible iterates rank by cost, others by violation."""
-        feasible = self.optimality.violation <= self.tolerance
-        rank = (0.0, self.lin.cost) if feasible else (self.optimality.violation, self.lin.cost)
-        if self._best is None or (self.optimality.finite and rank <= self._best):
+        """Feasible iterates rank by how nearly they are stationary, others by violation."""
+        measured = self.optimality
+        feasible = measured.violation <= self.tolerance
+        error = max(measured.stationarity, measured.complementarity)
+        rank = (0.0, error) if feasible else (measured.violation, error)
+        if self._best is None or (measured.finite and rank <= self._best):
             self._best, self._best_lin, self._best_multipliers = rank, self.lin, self.multipliers
 
 
@@ -262,6 +288,7 @@ class Prepared:
             if self._workspace is None:
                 self._workspace = self.solver.workspace(program)
             try:
+                run.search(self._workspace)
                 reason = self.solver.iterate(run, self._workspace)
             except KeyboardInterrupt:
                 run.status = Status.INTERRUPTED

@@ -1,0 +1,254 @@
+"""A hundred random fields of discs: potential field, potential field with vortex, and hard clearance.
+
+    python -m benchmarks.obstacle_fields [--fields K]
+
+A unicycle shall follow a straight line that leads through 3 to 6 discs. Horizon, weights, limits and cold guess (the
+line itself, through the discs) are those of :mod:`benchmarks.reference_problems`, the dynamics are hard. Only the way
+of keeping clear of the discs differs. Discs leave gaps a robot fits through, so that every field can be passed.
+
+The fields are drawn from seeds 0 to K - 1. Weight and vortex were chosen on the twenty fields of TUNING, never on
+these. Beside the vortex stands a control: the same number of first steps in full and without a merit test, but along
+the true gradient (a vortex of weight 1e-9). Writes docs/models.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from tqdm import tqdm
+
+import unifg as fg
+from benchmarks.reference_problems import DT, EFFORT, LIMIT, STAGE, TERMINAL
+from benchmarks.report import CHECKOUT, OUT, machine, put_results, table
+from unifg.models import obstacles, unicycle
+from unifg.models.potential import Sense, potential
+from unifg.solvers import SQP, AugmentedLagrangian
+from unifg.typing import Array
+
+HORIZON = 50
+SPEED = 0.8  # of the reference [m/s]
+ROBOT = 0.17  # radius [m]
+GAP = 0.5  # least distance between the surfaces of two discs [m]; the robot is 0.34 m wide
+CONTACT = 1e-3  # a node deeper than this in a disc is a collision [m]
+NEAR_END = 0.2  # a robot that ends closer than this to the end of the line has reached it [m]
+TOLERANCE = 1e-4  # of the KKT test: the acceptance of the reference problems
+TUNING = range(1000, 1020)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One random field.
+
+    Attributes:
+        seed: what it was drawn from.
+        start: (3,) pose beside the beginning of the line [m, m, rad].
+        discs: (M, 3) x, y, radius [m].
+    """
+
+    seed: int
+    start: Array
+    discs: Array
+
+    def reference(self) -> Array:
+        """(N + 1, 3) poses along the x axis."""
+        states = np.zeros((HORIZON + 1, 3))
+        states[:, 0] = SPEED * DT * np.arange(HORIZON + 1)
+        return states
+
+    def clearance(self, states: Array) -> float:
+        """Least distance between the robot's hull and a disc over all nodes [m]; negative in collision."""
+        offset = states[:, None, :2] - self.discs[:, :2]
+        return float((np.linalg.norm(offset, axis=2) - self.discs[:, 2] - ROBOT).min())
+
+
+def scene(seed: int) -> Scene:
+    """Draw a field: the first disc stands in the way, the others anywhere around it."""
+    rng = np.random.default_rng(seed)
+    start = np.array([0.0, rng.uniform(-0.1, 0.1), rng.uniform(-0.2, 0.2)])
+    count, length = int(rng.integers(3, 7)), SPEED * DT * HORIZON
+    ends = np.array([[0.0, 0.0], [length, 0.0]])
+    while True:
+        discs = np.zeros((0, 3))
+        for _ in range(200):
+            radius = rng.uniform(0.15, 0.35)
+            height = rng.uniform(-1.0, 1.0) * (0.8 * (radius + ROBOT) if not len(discs) else 0.9)
+            disc = np.array([rng.uniform(0.8, length - 0.6), height, radius])
+            apart = np.linalg.norm(discs[:, :2] - disc[:2], axis=1) - discs[:, 2] - radius
+            aside = np.linalg.norm(ends - disc[:2], axis=1) - radius - ROBOT
+            if (apart >= GAP).all() and (aside >= 0.2).all():
+                discs = np.vstack([discs, disc])
+            if len(discs) == count:
+                return Scene(seed, start, discs)
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way of keeping clear.
+
+    Attributes:
+        name: for the tables.
+        hard: clearance as a constraint; otherwise a potential on the distance to the hull.
+        sigma: of the potential's error.
+        vortex: weight of the tangent vector.
+        sense: its sense.
+        search: iterations with it.
+    """
+
+    name: str
+    hard: bool = False
+    sigma: float = 0.2
+    vortex: float = 0.0
+    sense: Sense = "circulate"
+    search: int = 0
+
+    def graph(self, field: Scene) -> tuple[fg.Graph, fg.Guess]:
+        """The problem with this method, and its cold guess."""
+        reference, cruise = field.reference(), np.tile([SPEED, 0.0], (HORIZON, 1))
+        graph = fg.Graph()
+        x = graph.variables("pose", fg.SE2, HORIZON + 1)
+        u = graph.variables("control", fg.Rn(2), HORIZON)
+        graph.fix(x[0], field.start)
+        graph.minimize(unicycle.tracking, x[1:-1], reference[1:-1], sigma=STAGE**-0.5, name="tracking")
+        graph.minimize(unicycle.tracking, x[-1], reference[-1:], sigma=TERMINAL**-0.5, name="terminal")
+        graph.minimize(fg.prior, u, cruise, sigma=EFFORT**-0.5, name="effort")
+        graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], DT, lower=0.0, upper=0.0, name="dynamics")
+        graph.bound(u, lower=-LIMIT, upper=LIMIT, name="limits")
+        centres, radii = field.discs[:, :2], field.discs[:, 2] + ROBOT
+        if self.hard:
+            graph.constrain(obstacles.disc_clearance, x[1:], centres, radii, lower=0.0, name="discs")
+        else:
+            push = potential(obstacles.disc_clearance, vortex=self.vortex, sense=self.sense)
+            graph.minimize(push, x[1:], centres, radii, sigma=self.sigma, name="discs")
+        states = reference.copy()
+        states[0] = field.start
+        return graph, fg.Guess({x: states, u: cruise})
+
+
+METHODS = (
+    Method("hard clearance", hard=True),
+    Method("potential"),
+    Method("potential, first steps in full", vortex=1e-9, search=15),
+    Method("potential, vortex", vortex=0.3, search=15),
+    Method("potential, vortex aside", vortex=1.0, sense="aside", search=15),
+)
+
+
+def solvers(search: int) -> dict[str, fg.Solver]:
+    """Both constrained backends at the tolerance of the reference problems."""
+    return {
+        "alm": AugmentedLagrangian(tolerance=TOLERANCE, search_iterations=search),
+        "sqp": SQP(tolerance=TOLERANCE, search_iterations=search),
+    }
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one field.
+
+    Attributes:
+        solved: whether the KKT test passed.
+        free: whether no node collides.
+        reached: whether the end of the line was reached.
+        cost: of tracking and effort, without the potential.
+        iterations: of the solver.
+        milliseconds: of the solve.
+    """
+
+    solved: bool
+    free: bool
+    reached: bool
+    cost: float
+    iterations: int
+    milliseconds: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether a robot could use the answer, optimal or not."""
+        return self.free and self.reached
+
+
+def attempt(method: Method, solver: fg.Solver, field: Scene) -> Outcome:
+    """Solve one field cold."""
+    graph, guess = method.graph(field)
+    run = solver.prepare(graph)
+    begin = time.perf_counter()
+    solution = run.solve(guess)
+    elapsed = 1e3 * (time.perf_counter() - begin)
+    states = solution[graph.families["pose"]]
+    error = potential(obstacles.disc_clearance)(states[1:], field.discs[:, :2], field.discs[:, 2] + ROBOT)
+    pushed = 0.0 if method.hard else 0.5 * float((error**2).sum()) / method.sigma**2
+    return Outcome(
+        solution.converged,
+        field.clearance(states) >= -CONTACT,
+        float(np.linalg.norm(states[-1, :2] - field.reference()[-1, :2])) < NEAR_END,
+        solution.cost - pushed,
+        solution.iterations,
+        elapsed,
+    )
+
+
+Results = dict[tuple[str, str], list[Outcome]]
+
+
+def render(results: Results, fields: int) -> str:
+    """Both tables as Markdown."""
+    lines = []
+    for (name, backend), outcomes in results.items():
+        hard = results["hard clearance", backend]
+        ratios = [o.cost / h.cost for o, h in zip(outcomes, hard, strict=True) if o.passed and h.passed]
+        lines.append(
+            (
+                name, backend,
+                *(str(sum(getattr(o, what) for o in outcomes)) for what in ("solved", "free", "reached")),
+                str(sum(o.passed for o in outcomes)), str(sum(o.passed and o.solved for o in outcomes)),
+                f"{np.median(ratios):.2f}" if ratios else "-",
+                f"{np.median([o.iterations for o in outcomes]):.0f}",
+                f"{np.median([o.milliseconds for o in outcomes]):.0f}",
+            )
+        )  # fmt: skip
+    head = ("method", "solver", "solved", "free", "reached", "passed", "passed and solved", "cost", "iterations", "ms")
+    parts = [table(head, lines, text=2)]
+    moves = []
+    for (name, backend), outcomes in results.items():
+        before = results["potential", backend]
+        if name != "potential":
+            pairs = [(b.passed, o.passed) for b, o in zip(before, outcomes, strict=True)]
+            strict = [(b.passed and b.solved, o.passed and o.solved) for b, o in zip(before, outcomes, strict=True)]
+            counts = [str(group.count(kind)) for group in (pairs, strict) for kind in ((False, True), (True, False))]
+            moves.append((f"potential -> {name}", backend, *counts))
+    changes = ("change", "solver", "passed: rescued", "broken", "passed and solved: rescued", "broken")
+    parts.append(table(changes, moves, text=2))
+    parts.append(
+        f"{fields} fields, seeds 0 to {fields - 1}; tolerance {TOLERANCE:g}; `python -m benchmarks.obstacle_fields`. "
+        f"{machine('unifg', 'numpy', 'scipy', 'osqp', 'piqp')}"
+    )
+    return "\n\n".join(parts)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Solve every field by every method and write the tables; 0 only if hard clearance passes everywhere."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.obstacle_fields", description=__doc__.split("\n")[0])
+    parser.add_argument("--fields", type=int, default=100, help="number of random fields")
+    options = parser.parse_args(arguments)
+    if options.fields < 1:
+        parser.error(f"--fields must be positive, found {options.fields}")
+    results: Results = {}
+    scenes = [scene(seed) for seed in range(options.fields)]
+    for field in tqdm(scenes, unit="field"):
+        for method in METHODS:
+            for backend, solver in solvers(method.search).items():
+                results.setdefault((method.name, backend), []).append(attempt(method, solver, field))
+    text = render(results, options.fields)
+    OUT.mkdir(parents=True, exist_ok=True)
+    (OUT / "obstacle-fields.md").write_text(text + "\n", encoding="utf-8", newline="\n")
+    print(text)
+    put_results(CHECKOUT / "docs" / "models.md", "Models", text)
+    hard = (outcome for (name, _), outcomes in results.items() if name == "hard clearance" for outcome in outcomes)
+    return 0 if all(outcome.passed for outcome in hard) else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
