@@ -19,6 +19,7 @@ from unifg.solvers import SQP, AugmentedLagrangian
 from unifg.typing import Array, BoolArray
 
 FAR_AWAY = 1e3  # [m]; where an unused disc waits
+PENALTY = 3e4  # of the augmented Lagrangian; the automatic one is stiffer than a tick has time for
 COLD_PATIENCE = 3  # a tick without a warm start may iterate longer
 YIELD_SPEED = 0.05  # [m/s] towards the robot
 LEFT_BEHIND = 0.6  # [m] between the ends of plan and reference
@@ -47,6 +48,7 @@ class ControllerSettings:
         mover_allowance: most that is added to the clearance from discs that have ever moved [m].
         mover_margin: added to the soft margin around such discs [m].
         approach: share of the gap to such a disc that one step may close.
+        squeeze: how much nearer than at rest a plan may pass where the clearance is violated already [m].
         courtesy: gap at which movers wait for a robot at rest [m].
         yield_distance: gap to a mover that closes in at which the robot rests [m].
         margin: distance of the hull below which the soft costs begin [m].
@@ -73,6 +75,7 @@ class ControllerSettings:
     mover_allowance: float = 0.15
     mover_margin: float = 0.3
     approach: float = 0.12
+    squeeze: float = 0.03
     courtesy: float = 0.1
     yield_distance: float = 0.3
     margin: float = 0.2
@@ -101,7 +104,11 @@ def backend(name: str, settings: ControllerSettings, patience: int = 1) -> fg.So
         )
     if name == "alm":
         return AugmentedLagrangian(
-            tolerance=tolerance, step_tolerance=step, violation_tolerance=violation, max_iterations=18 * patience
+            penalty=PENALTY,
+            tolerance=tolerance,
+            step_tolerance=step,
+            violation_tolerance=violation,
+            max_iterations=18 * patience,
         )
     raise fg.ScenarioError(f"unknown solver '{name}': choose alm or sqp")
 
@@ -330,7 +337,9 @@ class Controller:
         allowance = np.minimum(s.mover_speed * s.dt * stages, s.mover_allowance)
         least = s.robot_radius + s.disc_clearance + np.where(movers, allowance, 0.0)
         spare = np.where(movers, np.maximum(at_rest[0] - least, 0.0), 0.0)
-        limits: Array = np.minimum(least + spare * (1.0 - s.approach) ** stages, at_rest)
+        # A little nearer is allowed, or a robot beside a disc could not even turn its nose past it.
+        kept = np.minimum(at_rest, np.maximum(at_rest - s.squeeze, s.robot_radius + s.squeeze))
+        limits: Array = np.minimum(least + spare * (1.0 - s.approach) ** stages, kept)
         return limits
 
     def _yields(self, pose: Array, tracks: Tracks) -> bool:
