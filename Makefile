@@ -42,7 +42,9 @@ types: $(VENV)/ready-dev
 
 bench: $(VENV)/ready-bench
 	$(BIN)/python -m benchmarks.reference_problems
+	$(BIN)/python -m benchmarks.obstacle_fields
 	$(BIN)/python -m benchmarks.navigation
+	$(BIN)/python -m benchmarks.coupling
 
 fences: $(VENV)/ready
 	$(BIN)/python docs/check_shell_fences.py

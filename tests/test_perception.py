@@ -213,6 +213,7 @@ def test_nearest_looks_ahead() -> None:
         radius=np.array([0.2, 0.15, 0.2, 0.25]),
         identity=np.arange(4),
         unseen=np.zeros(4),
+        mover=np.zeros(4, dtype=bool),
     )
     assert nearest(tracks, (0.0, 0.0, 1.0), 3).identity.tolist() == [0, 3, 1]
     assert nearest(tracks, (0.0, 0.0), 9, horizon=0.0).identity.tolist() == [3, 1, 2, 0]
