@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from unifg.linearization import Linearization
-from unifg.program import Program
-from unifg.solver import Run, Solver
+from unifg.solver import Run
 from unifg.solvers.damping import ROUNDING, norm
-from unifg.solvers.least_squares import require_squares, require_unconstrained
+from unifg.solvers.least_squares import LeastSquares
 from unifg.solvers.primal import Primal
 from unifg.status import Status
 from unifg.typing import Array
@@ -20,25 +19,14 @@ SHORTEST = 1e-8
 
 
 @dataclass(kw_only=True)
-class GaussNewton(Solver):
+class GaussNewton(LeastSquares):
     """Unconstrained least squares with robust losses.
 
     Attributes:
         line_search: halve the step until the cost decreases; False takes full steps, as the papers do.
-        step_tolerance: optional stop rule on the norm of the step; it does not grant CONVERGED.
     """
 
     line_search: bool = True
-    step_tolerance: float = 0.0
-
-    def require(self, program: Program) -> None:
-        """Refuse constraints and scalar costs."""
-        require_unconstrained(program, self.name)
-        require_squares(program, self.name)
-
-    def workspace(self, program: Program) -> Primal:
-        """The factorisation of the normal equations."""
-        return Primal(program)
 
     def search_step(self, run: Run, workspace: Primal, lin: Linearization) -> Array | None:
         """The full Gauss-Newton step."""

@@ -1,9 +1,33 @@
-"""What the least-squares backends refuse."""
+"""What the least-squares backends share, and what they refuse."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from unifg.errors import BackendError
 from unifg.program import Program
+from unifg.solver import Solver
+from unifg.solvers.primal import Primal
+
+
+@dataclass(kw_only=True)
+class LeastSquares(Solver):
+    """Unconstrained sums of squares with robust losses.
+
+    Attributes:
+        step_tolerance: optional stop rule on the norm of the step; it does not grant CONVERGED.
+    """
+
+    step_tolerance: float = 0.0
+
+    def require(self, program: Program) -> None:
+        """Refuse constraints and scalar costs."""
+        require_unconstrained(program, self.name)
+        require_squares(program, self.name)
+
+    def workspace(self, program: Program) -> Primal:
+        """The factorisation of the normal equations."""
+        return Primal(program)
 
 
 def require_unconstrained(program: Program, solver: str) -> None:

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from unifg.linearization import Linearization
-from unifg.program import Program
-from unifg.solver import Run, Solver
+from unifg.solver import Run
 from unifg.solvers.damping import Damping, damped_step, norm
-from unifg.solvers.least_squares import require_squares, require_unconstrained
+from unifg.solvers.least_squares import LeastSquares
 from unifg.solvers.model import model_step
 from unifg.solvers.primal import Primal
 from unifg.status import Status
@@ -18,25 +17,14 @@ from unifg.typing import Array
 
 
 @dataclass(kw_only=True)
-class LevenbergMarquardt(Solver):
+class LevenbergMarquardt(LeastSquares):
     """Unconstrained least squares with robust losses.
 
     Attributes:
         damping: initial damping, relative to the diagonal of the Hessian.
-        step_tolerance: optional stop rule on the norm of the step; it does not grant CONVERGED.
     """
 
     damping: float = 1e-4
-    step_tolerance: float = 0.0
-
-    def require(self, program: Program) -> None:
-        """Refuse constraints and scalar costs."""
-        require_unconstrained(program, self.name)
-        require_squares(program, self.name)
-
-    def workspace(self, program: Program) -> Primal:
-        """The factorisation of the normal equations."""
-        return Primal(program)
 
     def search_step(self, run: Run, workspace: Primal, lin: Linearization) -> Array | None:
         """The step at the initial damping."""
