@@ -1,10 +1,11 @@
 """The campaign behind docs/navigation.md: closed-loop drives of both backends, judged against fixed limits.
 
-    python -m benchmarks.navigation [--fresh] [--workers K] [--only CASE ...] [--report]
+    python -m benchmarks.navigation [--coupling joint] [--fresh] [--workers K] [--only CASE ...] [--report]
 
 The maps of the department and of the TurtleBot arena are looked for in ``$UNIFG_DATA`` or ``../shared/data`` beside the
 checkout; without them only the building that ships with the package is driven, and the page in docs/ is left alone.
-Every finished drive is a line of out/benchmarks/navigation.jsonl, and is not repeated until the code changes.
+Every finished drive is a line of out/benchmarks/navigation.jsonl, and is not repeated until the code changes. The joint
+coupling has a file and a page of its own, docs/joint-drives.md.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from unifg.errors import UnifgError
 from unifg.scenarios.controller import ControllerSettings
 from unifg.scenarios.metrics import episode_metrics
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
+from unifg.scenarios.pilot import COUPLINGS
 
 Setting = TypeVar("Setting")
 Result = TypeVar("Result")
@@ -104,6 +106,7 @@ class Drive:
     folder: Path | None
     code: str
     workers: int
+    coupling: str = "sequential"
 
     @property
     def key(self) -> tuple[str, str, int, str]:
@@ -114,7 +117,9 @@ class Drive:
         """The episode to run."""
         case = self.case
         path = None if case.map is None or self.folder is None else self.folder / case.map
-        return NavigationSettings(path, case.start, case.goals, self.solver, obstacles=case.obstacles, seed=self.seed)
+        return NavigationSettings(
+            path, case.start, case.goals, self.solver, self.coupling, obstacles=case.obstacles, seed=self.seed
+        )
 
 
 def drive(job: Drive) -> Row:
@@ -291,18 +296,20 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--workers", type=int, default=1, help="drives at once; times mean something for one alone")
     parser.add_argument("--only", nargs="+", choices=[case.name for case in CASES], metavar="CASE", help="some cases")
     parser.add_argument("--report", action="store_true", help="drive nothing, write the tables from what is on file")
+    parser.add_argument("--coupling", choices=COUPLINGS, default=COUPLINGS[0])
     options = parser.parse_args(arguments)
+    name = "navigation" if options.coupling == COUPLINGS[0] else f"{options.coupling}-drives"
 
     folder, code = data_folder(), code_digest()
     cases = [case for case in CASES if case.map is None or folder is not None]
     if folder is None:
         print("No maps in $UNIFG_DATA or ../shared/data: only the shipped building is driven.")
-    store = OUT / "navigation.jsonl"
+    store = OUT / f"{name}.jsonl"
     store.parent.mkdir(parents=True, exist_ok=True)
     rows = read_rows(store, code)
     chosen = [case for case in cases if options.only is None or case.name in options.only]
     jobs = [
-        Drive(case, solver, seed, folder, code, options.workers)
+        Drive(case, solver, seed, folder, code, options.workers, options.coupling)
         for case in chosen for seed in SEEDS for solver in SOLVERS
     ]  # fmt: skip
     if options.fresh:
@@ -316,12 +323,12 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
 
     text = render(rows)
-    (OUT / "navigation.md").write_text(text + "\n", encoding="utf-8", newline="\n")
+    (OUT / f"{name}.md").write_text(text + "\n", encoding="utf-8", newline="\n")
     print(text)
     if {(c.name, s, seed) for c in CASES for s in SOLVERS for seed in SEEDS} <= {_key(row)[:3] for row in rows}:
-        put_results(CHECKOUT / "docs" / "navigation.md", "Navigation: results", text)
+        put_results(CHECKOUT / "docs" / f"{name}.md", f"Drives, {options.coupling} coupling", text)
     else:
-        print("\nThe campaign is incomplete, so docs/navigation.md is left as it was.")
+        print(f"\nThe campaign is incomplete, so docs/{name}.md is left as it was.")
     return 0 if all(all(passes(row).values()) for row in rows) else 1
 
 
