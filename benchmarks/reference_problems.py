@@ -21,16 +21,16 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.util import find_spec
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 from tqdm import tqdm
 
 import unifg as fg
 from benchmarks import closed_loop
+from benchmarks.closed_loop import Formulation, Peer
 from benchmarks.report import CHECKOUT, OUT, machine, put_results, table
-from unifg.lie import wrap_angle
-from unifg.models import obstacles, unicycle
+from unifg.models import unicycle
 from unifg.solvers import SQP, AugmentedLagrangian
 from unifg.typing import Array
 
@@ -87,7 +87,12 @@ class Problem:
         instance: name.
         blocked: whether the discs are there.
         horizon: N.
+        dt: sampling time [s].
+        limit: of both controls [m/s, rad/s].
     """
+
+    dt: ClassVar[float] = DT
+    limit: ClassVar[float] = LIMIT
 
     instance: str
     blocked: bool
@@ -107,6 +112,16 @@ class Problem:
     def discs(self) -> Array:
         """(M, 3) x, y, radius [m]."""
         return np.array(DISCS[self.instance] if self.blocked else np.zeros((0, 3)), dtype=np.float64)
+
+    @property
+    def start(self) -> Array:
+        """(3,) first pose."""
+        return np.array(STARTS[self.instance])
+
+    @property
+    def weights(self) -> tuple[Array, Array]:
+        """Of the states (N + 1, 3) and of a control (2,)."""
+        return np.vstack([np.tile(STAGE, (self.horizon, 1)), TERMINAL]), EFFORT
 
     def reference(self, first: int = 0) -> tuple[Array, Array]:
         """Reference states (N + 1, 3) from step ``first`` on, headings not wrapped, and controls (N, 2)."""
@@ -144,46 +159,6 @@ class Problem:
 def problems() -> list[Problem]:
     """All sixteen."""
     return [Problem(*numbers) for numbers in itertools.product(STARTS, (False, True), HORIZONS)]
-
-
-class Formulation:
-    """The problem as a factor graph whose start and references are data.
-
-    Attributes:
-        graph: the problem.
-        x, u: poses and controls.
-        guess: the cold guess.
-    """
-
-    def __init__(self, problem: Problem) -> None:
-        """Build the graph."""
-        n = problem.horizon
-        reference, cruise = problem.reference()
-        self.problem = problem
-        self.graph = graph = fg.Graph()
-        self.x = x = graph.variables("pose", fg.SE2, n + 1)
-        self.u = u = graph.variables("control", fg.Rn(2), n)
-        self._start = graph.data("start", np.array(STARTS[problem.instance]))
-        self._stages = graph.data("stages", reference[:-1], each=True)
-        self._end = graph.data("end", reference[-1])
-        effort = graph.data("effort", cruise, each=True)
-        graph.fix(x[0], self._start)
-        graph.minimize(unicycle.tracking, x[:-1], self._stages, sigma=STAGE**-0.5, name="tracking")
-        graph.minimize(unicycle.tracking, x[-1], self._end, sigma=TERMINAL**-0.5, name="terminal")
-        graph.minimize(fg.prior, u, effort, sigma=EFFORT**-0.5, name="effort")
-        graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], DT, lower=0.0, upper=0.0, name="dynamics")
-        graph.bound(u, lower=-LIMIT, upper=LIMIT, name="limits")
-        if problem.blocked:
-            discs = problem.discs
-            graph.constrain(obstacles.disc_clearance, x[1:], discs[:, :2], discs[:, 2], lower=0.0, name="discs")
-        states, controls = problem.guess()
-        self.guess = fg.Guess({x: states, u: controls})
-
-    def data(self, pose: Array, first: int) -> dict[fg.Data, Array]:
-        """The data of closed-loop step ``first``, begun at ``pose``."""
-        reference, _ = self.problem.reference(first)
-        start = np.array([pose[0], pose[1], wrap_angle(pose[2])])
-        return {self._start: start, self._stages: reference[:-1], self._end: reference[-1]}
 
 
 @dataclass
@@ -242,89 +217,6 @@ def attempt(solver: fg.Solver, problem: Problem) -> Attempt:
         outcome.routes = dict(Counter(route for route in routes if route not in ("", "none")))
 
     return solve
-
-
-class Peer:
-    """The same problem for a solver of casadi, in the order x_0, u_0, x_1, ... from which fatrop sees the stages.
-
-    Attributes:
-        problem: what it solves.
-        answer: of the last solve, with multipliers.
-    """
-
-    def __init__(self, problem: Problem, plugin: str, **options: Any) -> None:
-        """Build and differentiate the expressions; start and reference states are parameters."""
-        import casadi as ca
-
-        n = problem.horizon
-        x, u = [ca.SX.sym("x", 3) for _ in range(n + 1)], [ca.SX.sym("u", 2) for _ in range(n)]
-        start, reference = ca.SX.sym("start", 3), ca.SX.sym("reference", 3, n + 1)
-        _, cruise = problem.reference()
-        cost: Any = 0.0
-        rows: list[Any] = []
-        equality: list[bool] = []
-        for k in range(n + 1):
-            error = x[k] - reference[:, k]
-            cost += 0.5 * ca.dot(ca.DM(STAGE if k < n else TERMINAL) * error, error)
-            if k < n:
-                deviation = u[k] - cruise[k]
-                cost += 0.5 * ca.dot(ca.DM(EFFORT) * deviation, deviation)
-                heading = x[k][2] + 0.5 * DT * u[k][1]
-                moved = ca.vertcat(DT * u[k][0] * ca.cos(heading), DT * u[k][0] * ca.sin(heading), DT * u[k][1])
-                rows.append(x[k + 1] - (x[k] + moved))
-                equality += [True] * 3
-            if k == 0:
-                rows.append(x[0] - start)
-                equality += [True] * 3
-            else:
-                # Squared distances: the plain ones have no derivative at a centre.
-                rows += [ca.sumsqr(x[k][:2] - disc[:2]) - disc[2] ** 2 for disc in problem.discs]
-                equality += [False] * len(problem.discs)
-        unknowns = ca.vertcat(*(part for pair in zip(x[:-1], u, strict=True) for part in pair), x[-1])
-        program = {"x": unknowns, "p": ca.vertcat(start, ca.vec(reference)), "f": cost, "g": ca.vertcat(*rows)}
-        chosen: dict[str, Any] = {"print_time": False, plugin: {"print_level": 0, "tol": 1e-6, **options}}
-        if plugin == "fatrop":
-            chosen |= {"structure_detection": "auto", "equality": equality}
-        else:
-            chosen[plugin]["sb"] = "yes"
-        self.problem = problem
-        self._solver: Any = ca.nlpsol("solver", plugin, program, chosen)
-        bound = np.append(np.tile([np.inf] * 3 + [LIMIT] * 2, n), [np.inf] * 3)
-        upper = np.where(equality, 0.0, np.inf)
-        self._limits = {"lbx": -bound, "ubx": bound, "lbg": 0.0, "ubg": upper}
-        self.answer: dict[str, Any] = {}
-
-    def solve(self, states: Array, controls: Array, pose: Array | None = None, first: int = 0, **duals: Any) -> float:
-        """Solve from a guess; returns the time of the call [ms]."""
-        reference, _ = self.problem.reference(first)
-        start = np.array(STARTS[self.problem.instance]) if pose is None else pose
-        unknowns = np.append(np.hstack([states[:-1], controls]).ravel(), states[-1])
-        parameters = np.append(start, reference.ravel())
-        begin = time.perf_counter()
-        self.answer = self._solver(x0=unknowns, p=parameters, **self._limits, **duals)
-        return 1e3 * (time.perf_counter() - begin)
-
-    @property
-    def status(self) -> str:
-        """In words."""
-        statistics = self._solver.stats()
-        return "converged" if statistics["success"] else str(statistics.get("return_status", "failed"))
-
-    @property
-    def iterations(self) -> int:
-        """Of the last solve."""
-        return int(self._solver.stats()["iter_count"])
-
-    @property
-    def cost(self) -> float:
-        """Of the last answer."""
-        return float(self.answer["f"])
-
-    @property
-    def trajectory(self) -> tuple[Array, Array]:
-        """States (N + 1, 3) and controls (N, 2) of the last answer."""
-        unknowns = np.append(np.asarray(self.answer["x"]).ravel(), np.zeros(2)).reshape(-1, 5)
-        return unknowns[:, :3], unknowns[:-1, 3:]
 
 
 def attempt_peer(problem: Problem, plugin: str) -> Attempt:
@@ -418,8 +310,9 @@ def render(results: dict[Problem, dict[str, Outcome]], loops: str, rounds: int) 
             lines.append(
                 (
                     problem.name, name, outcome.status, verdict(problem, outcome), stays(outcome),
-                    "-" if np.isnan(outcome.kkt) else f"{outcome.kkt:.0e}", f"{outcome.cost:.5f}", f"{problem.optima[0]:.5f}", str(outcome.iterations),
-                    f"{outcome.median:.1f}", *(_number(ratio(outcomes, name, peer)) for peer in PEERS),
+                    "-" if np.isnan(outcome.kkt) else f"{outcome.kkt:.0e}", f"{outcome.cost:.5f}",
+                    f"{problem.optima[0]:.5f}", str(outcome.iterations), f"{outcome.median:.1f}",
+                    *(_number(ratio(outcomes, name, peer)) for peer in PEERS),
                     *(counts if name.startswith("sqp") else "---"),
                 )
             )  # fmt: skip
@@ -428,10 +321,10 @@ def render(results: dict[Problem, dict[str, Outcome]], loops: str, rounds: int) 
     notes = (
         f"Median of {rounds} interleaved cold solves (one where it took more than {SLOW / 1e3:.0f} s), tolerance 1e-6 "
         f"each. KKT: largest number of our own test, scaled as in unifg.kkt. Solved: KKT below {GOOD:.0e} (peers: "
-        f"converged), and a cost within 1e-4 of a known optimum or one at which IPOPT stays, to {STAYS:.0e}, when it is "
-        "started there at tolerance 1e-9; IPOPT is asked wherever the cost is not a known one to 1e-5. Staying shows a "
-        "KKT point, not that it is a minimum. QPs: accepted iterations by the route that solved their subproblem. "
-        "Times: ours over the peer's, where the peer converged. "
+        f"converged), and a cost within 1e-4 of a known optimum or one at which IPOPT stays, to {STAYS:.0e}, when it "
+        "is started there at tolerance 1e-9; IPOPT is asked wherever the cost is not a known one to 1e-5. Staying "
+        "shows a KKT point, not that it is a minimum. QPs: accepted iterations by the route that solved their "
+        "subproblem. Times: ours over the peer's, where the peer converged. "
         f"{machine(*packages, *peer_package)}"
     )
     return "\n\n".join([_summary(results), table(head, lines, text=5), notes, loops])
@@ -470,19 +363,8 @@ def _summary(results: dict[Problem, dict[str, Outcome]]) -> str:
 
 def drive() -> str:
     """The closed loops as Markdown."""
-    loops = {}
-    for instance, blocked in itertools.product(("straight", "behind"), (False, True)):
-        problem = Problem(instance, blocked, 50)
-        drivers: dict[str, closed_loop.Driver] = {
-            "alm": closed_loop.Ours(AugmentedLagrangian(tolerance=1e-4), Formulation(problem)),
-            "sqp": closed_loop.Ours(SQP(tolerance=1e-4), Formulation(problem)),
-        }
-        if find_spec("casadi") is not None:
-            warm = {"tol": 1e-4, "mu_init": 1e-3}
-            drivers["ipopt"] = closed_loop.Warm(Peer(problem, "ipopt", **warm, **closed_loop.WARM_IPOPT))
-            drivers["fatrop"] = closed_loop.Warm(Peer(problem, "fatrop", **warm))
-        loops[problem] = closed_loop.drive(problem, np.array(STARTS[instance]), drivers)
-    return closed_loop.render(loops)
+    cases = itertools.product(("straight", "behind"), (False, True), (50,))
+    return closed_loop.render({problem: closed_loop.drive(problem) for problem in itertools.starmap(Problem, cases)})
 
 
 def main(arguments: list[str] | None = None) -> int:
