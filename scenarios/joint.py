@@ -21,6 +21,8 @@ from unifg.scenarios.window import Window, WindowTerms
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
 
+SETTLED = (fg.Status.CONVERGED, fg.Status.STOP_RULE)
+
 
 class JointController(Controller):
     """A controller whose first pose is not given but estimated in the same solve.
@@ -42,20 +44,23 @@ class JointController(Controller):
 
     def plan(self, pose: Array, reference: Array, tracks: Tracks) -> Plan:
         """Estimate and decide in one solve; ``pose`` is the prediction from odometry."""
+        if self._guess is None:  # a cold start localises first: a wrong pose would be planned around
+            self._estimate_alone()
+            pose = self.window.now.pose
         data = self._data(pose, reference, tracks)
         run, guess = self._beginning(pose, reference)
         values = {**guess.values, self._terms.past: self._terms.poses(self.window)}
         values[self._x] = np.concatenate([pose[None], guess.values[self._x][1:]])
         solution = run.solve(fg.Guess(values, guess.multipliers), data=data)
         plan = self._judge(solution, pose, reference, tracks)
-        if plan.emergency:
+        if plan.emergency or plan.status not in SETTLED:
             self._estimate_alone()
         else:
             self._terms.accept(self.window, solution)
         return plan
 
     def _estimate_alone(self) -> None:
-        """Localise by the past's terms when the joint solve found no feasible plan."""
+        """Localise by the past's terms, where the joint solve did not settle."""
         terms = self._smoother
         guess = {terms.past: terms.poses(self.window), terms.present.family: self.window.now.pose[None]}
         terms.accept(self.window, self._smooth.solve(guess, data=terms.data(self.window)))
