@@ -78,7 +78,7 @@ class SQP(Solver):
         # Bounds are linear: once they hold they hold along every step, and leave the line search to the rest.
         within = run.program.within_bounds(run.values)
         if within is not run.values and not self.full_steps:
-            run.accept(run.program.linearize(within), run.multipliers, 0.0, 0.0, qp="none: moved within bounds")
+            run.begin_at(run.program.linearize(within))
         workspace.start()
         merit = Merit(run.program, run.multipliers)
         damping = SMALLEST_DAMPING

@@ -128,6 +128,14 @@ def test_real_time_iteration_takes_one_step() -> None:
     assert solution.status is fg.Status.ITERATION_LIMIT
 
 
+def test_moving_within_bounds_spends_no_iteration() -> None:
+    graph, guess = short_drive()
+    u = graph.families["u"]
+    solution = SQP(max_iterations=1).solve(graph, {**guess, u: 3.0 * guess[u]})
+    assert solution.iterations == 1
+    assert "qp" in solution.history[1].details, "the one iteration is a subproblem"
+
+
 def test_warm_start_needs_fewer_iterations() -> None:
     graph, guess = short_drive()
     x, u = graph.families["x"], graph.families["u"]

@@ -186,6 +186,13 @@ class Run:
         if self._callback is not None and self._callback(row) and self.status is None:
             self.status = Status.INTERRUPTED
 
+    def begin_at(self, lin: Linearization) -> None:
+        """Move the start, as onto the bounds, without spending an iteration."""
+        self.lin = lin
+        self.optimality = optimality(self.program, lin, self.multipliers)
+        self._keep_best()
+        self.status = self._decide()
+
     def search(self, workspace: Any) -> None:
         """Take the first steps along the search Jacobians; the multipliers wait, and the true numbers are recorded.
 
@@ -206,7 +213,7 @@ class Run:
         return infeasible_stationary(self.program, self.lin, self.tolerance)
 
     def finish(self, reason: Status | None) -> Solution:
-        """Return the best iterate, judged by a fresh evaluation of the original problem."""
+        """Return the best iterate, judged by the KKT test of the original problem."""
         status = self.status or reason or Status.STALLED
         if status is Status.STALLED and self.infeasible_stationary():
             status = Status.LOCALLY_INFEASIBLE
