@@ -124,7 +124,6 @@ class Plan:
         iterations: of the backend.
         bound_violation: of the plan that is driven, as the solver returned it, before any clipping.
         emergency: whether the stored plan is being driven instead.
-        worst: largest violated constraint of the solve, for the record.
     """
 
     control: Array
@@ -133,7 +132,6 @@ class Plan:
     iterations: int
     bound_violation: float
     emergency: bool
-    worst: str
 
 
 class Controller:
@@ -220,7 +218,6 @@ class Controller:
         """Drive a plan that keeps the constraints; brake along the last one otherwise; rest where a mover nears."""
         s = self.settings
         controls = solution[self._u]
-        worst = "" if solution.worst is None else solution.worst[0]
         if solution.violation <= s.feasible:
             self._stored, self._age = controls, 0
             emergency = self._failed = False
@@ -234,7 +231,7 @@ class Controller:
         beyond = float(np.maximum(np.abs(self._stored) - s.limits, 0.0).max())
         control = np.clip(controls[0], *_box(s)) if not emergency else self._braking()[0]
         self._applied = np.zeros(2) if self._yields(pose, tracks) else control
-        return Plan(self._applied, states, solution.status, solution.iterations, beyond, emergency, worst)
+        return Plan(self._applied, states, solution.status, solution.iterations, beyond, emergency)
 
     def forget(self) -> None:
         """Drop the warm start, as when a new route makes it misleading."""

@@ -18,6 +18,7 @@ import numpy as np
 from unifg.errors import ScenarioError
 from unifg.lie import wrap_angle
 from unifg.scenarios.episode import EpisodeLog
+from unifg.scenarios.path import path_length
 from unifg.typing import Array, IntArray
 
 __all__ = [
@@ -26,7 +27,6 @@ __all__ = [
     "Spread",
     "Timing",
     "episode_metrics",
-    "path_length",
     "pose_errors",
     "without_timings",
     "write_metrics",
@@ -175,11 +175,6 @@ def write_metrics(path: str | Path, metrics: Mapping[str, object]) -> Path:
     text = json.dumps(_strict(dict(metrics)), indent=2, sort_keys=True, allow_nan=False)
     path.write_text(text + "\n", encoding="utf-8", newline="\n")
     return path
-
-
-def path_length(poses: Array) -> float:
-    """Length [m] of the polyline through poses (n, 2 or 3) [m]; zero for a single pose."""
-    return float(np.sum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)))
 
 
 def pose_errors(estimate: Array, truth: Array) -> tuple[Array, Array]:

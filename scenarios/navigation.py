@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from unifg.errors import ScenarioError
-from unifg.files.ros_map import OccupancyMap, load_map
+from unifg.files.ros_map import load_map
+from unifg.lie import wrap_angle
 from unifg.models.distance_map import DistanceMap
 from unifg.models.unicycle import step
 from unifg.scenarios.building import DEMO_GOALS, DEMO_START, building_map
@@ -187,7 +188,7 @@ class Episode:
 
 def _near(pose: Array, goal: Array, distance: float, heading: float) -> bool:
     error = pose - goal
-    turn = abs((error[2] + np.pi) % (2.0 * np.pi) - np.pi)
+    turn = abs(float(wrap_angle(error[2])))
     return bool(np.hypot(error[0], error[1]) < distance and turn < heading)
 
 
@@ -202,4 +203,4 @@ def _pose(given: object, default: tuple[float, float, float] | None, what: str) 
     return pose
 
 
-__all__ = ["Episode", "NavigationSettings", "OccupancyMap", "run_navigation"]
+__all__ = ["Episode", "NavigationSettings", "run_navigation"]

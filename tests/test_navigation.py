@@ -18,8 +18,9 @@ from unifg.scenarios.building import building_map
 from unifg.scenarios.episode import EpisodeLog
 from unifg.scenarios.geometry import polyline_distance
 from unifg.scenarios.localiser import Localiser
-from unifg.scenarios.metrics import episode_metrics, path_length, pose_errors
+from unifg.scenarios.metrics import episode_metrics, pose_errors
 from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigation
+from unifg.scenarios.path import path_length
 from unifg.scenarios.perception import Tracks
 from unifg.scenarios.route import GAP, Route
 from unifg.scenarios.world import Scan, World
