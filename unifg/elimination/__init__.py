@@ -1,0 +1,1 @@
+"""Elimination of variables from block-sparse symmetric systems."""
