@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.compiled import Values
+from unifg.columns import Values
 from unifg.linearization import Linearization
 from unifg.solvers.model import model_step
 from unifg.solvers.primal import Primal

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.compiled import Values
+from unifg.columns import Values
 from unifg.linearization import Evaluation, Linearization
 from unifg.program import Program
 from unifg.typing import Array, BoolArray
@@ -68,10 +68,7 @@ class Primal:
 
     def direction(self, curvature: Array, gradient: Array, added: Array | None = None) -> Array | None:
         """Solve (H + diag(added)) d = -gradient; None when the matrix cannot be factorised."""
-        if added is not None:
-            curvature = curvature.copy()
-            curvature[self.program.normal.diagonal] += added
-        if not self._solver.factor(curvature):
+        if not self._solver.factor(curvature, added):
             return None
         step = -self._solver.solve(gradient)
         return step if np.isfinite(step).all() else None

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from unifg.compiled import CompiledTerm, Values
-from unifg.linear import Factorization
+from unifg.columns import Values
+from unifg.compiled import CompiledTerm
+from unifg.elimination.factorization import Factorization
 from unifg.program import Program
 from unifg.terms import ScalarCost
 from unifg.typing import Array, ArrayLike
@@ -133,7 +134,7 @@ def _undetermined(program: Program, values: Values) -> list[Finding]:
     columns = np.repeat(np.arange(program.size), np.diff(program.normal.indptr))
     scaled = matrix.data * scale[matrix.indices] * scale[columns]
     scaled[program.normal.diagonal] += 1e-14
-    factorization = Factorization(program.normal)
+    factorization = program.normal_solver()
     loose = np.flatnonzero(diagonal <= 1e-300)
     if not len(loose) and factorization.factor(scaled):
         if factorization.pivots().min() > PIVOT_TOLERANCE:

@@ -1,20 +1,37 @@
-"""Where each variable's tangent coordinates stand, and which of them are unknown."""
+"""Where each variable is stored, where its tangent coordinates stand, and which of them are unknown."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from unifg.terms import Fix
-from unifg.typing import IntArray
+from unifg.typing import Array, IntArray
 from unifg.variables import Family, Selection
+
+
+class Values(dict[Family, Array]):
+    """(count, storage) arrays by family, all of them views of one flat array.
+
+    Attributes:
+        flat: the storage of all families in their order.
+    """
+
+    def __init__(self, columns: Columns, flat: Array) -> None:
+        """View ``flat`` by families."""
+        self.flat = flat
+        for family, start in columns.storage.items():
+            size = family.count * family.manifold.storage
+            self[family] = flat[start : start + size].reshape(family.count, family.manifold.storage)
 
 
 class Columns:
     """Numbering of the full tangent space and of the unknowns within it.
 
     Attributes:
+        storage: where each family's storage starts.
+        stored: length of the storage of all families.
         offsets: first column of each family.
         width: number of columns, fixed variables included.
         free: (size,) columns that are unknown.
@@ -26,10 +43,12 @@ class Columns:
         """Number the families in the order given, members in theirs."""
         self.families = list(families)
         self.offsets: dict[Family, int] = {}
-        self.width = 0
+        self.storage: dict[Family, int] = {}
+        self.width = self.stored = 0
         for family in families:
-            self.offsets[family] = self.width
+            self.offsets[family], self.storage[family] = self.width, self.stored
             self.width += family.count * family.manifold.dim
+            self.stored += family.count * family.manifold.storage
         is_free = np.ones(self.width, dtype=bool)
         self.fixed: dict[str, IntArray] = {}
         for fix in fixes:
@@ -50,6 +69,34 @@ class Columns:
         base = self.offsets[family] + selection.indices * family.manifold.dim
         columns: IntArray = base[:, None] + np.arange(selection.tangent.start, selection.tangent.stop)
         return columns
+
+    def starts(self, selection: Selection) -> IntArray:
+        """(n,) where the storage of each selected member, or of its selected component, starts."""
+        family = selection.family
+        first = self.storage[family] + selection.storage.start
+        starts: IntArray = first + selection.indices * family.manifold.storage
+        return starts
+
+    def values(self, parts: Mapping[Family, Array]) -> Values:
+        """One array per family as views of one flat array; values that are such already stay as they are."""
+        if isinstance(parts, Values):
+            return parts
+        flat = np.empty(self.stored)
+        values = Values(self, flat)
+        for family in self.families:
+            values[family][:] = parts[family]
+        return values
+
+    def nodes(self) -> tuple[IntArray, IntArray]:
+        """For every full column its variable, numbered over all families; and the first unknown of each variable.
+
+        Returns:
+            (width,) variables, and (V + 1,) where each variable's unknowns start.
+        """
+        sizes = np.concatenate([np.full(f.count, f.manifold.dim) for f in self.families])
+        variable = np.repeat(np.arange(len(sizes)), sizes)
+        free = np.bincount(variable[self.free], minlength=len(sizes))
+        return variable, np.concatenate([[0], np.cumsum(free)])
 
     def all_fixed(self, family: Family) -> bool:
         """Whether nothing of the family is unknown."""

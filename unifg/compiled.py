@@ -1,20 +1,49 @@
-"""One term, ready to run: gathers its variables, evaluates in one batched call, whitens, weighs."""
+"""One term with its shapes known: where its numbers stand, and how to evaluate it by itself.
+
+Solvers run all terms at once through :mod:`unifg.table`; the batched functions here serve terms without a kernel,
+checks, and messages.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
 
+from unifg.columns import Columns, Values
 from unifg.differentiation import gradient_and_hessian, jacobian
 from unifg.errors import GraphError
+from unifg.kernels import Kernel, side_by_side
 from unifg.terms import Constraint, Cost, Parameter, ScalarCost, Term
 from unifg.typing import Array, BoolArray, IntArray
-from unifg.variables import Data, Family, Selection
+from unifg.variables import Data, Selection
+from unifg.whitening import DIAGONAL, FULL, reciprocals, square_roots
 
-Values: TypeAlias = dict[Family, Array]
 Bound: TypeAlias = Mapping[Data, Array]
+
+
+@dataclass
+class Layout:
+    """Where the numbers of a term stand.
+
+    Attributes:
+        count, rows: factors and the rows of each; a bound is a factor of one row for each scalar.
+        gather: (n, slots) starts of the variables in the stored values, negative for constants.
+        sizes: storage of each slot.
+        columns: (n, D) full tangent columns.
+        kernel_width: tangent columns the kernel writes.
+        keep: those of them that are no constants here; None for all.
+    """
+
+    count: int
+    rows: int
+    gather: IntArray
+    sizes: list[int]
+    columns: IntArray
+    kernel_width: int
+    keep: list[int] | None
 
 
 class Gather:
@@ -63,7 +92,12 @@ class CompiledTerm:
         self._function = term.residual.function
         self._jacobian = term.residual.jacobian
         self.is_bound = isinstance(term, Constraint) and term.is_bound
+        self.kernel = None if isinstance(term, ScalarCost) else term.residual.kernel
+        self.search_kernel = term.residual.search_kernel
+        self.place: IntArray = np.zeros(0, dtype=np.int64)
         self.bind({})
+        if self.kernel is not None:
+            self._require_manifolds(self.kernel)
         with np.errstate(all="ignore"):
             trial = np.asarray(
                 self._call([np.tile(m.identity(), (self.count, 1)) for m in self.manifolds]), dtype=np.float64
@@ -125,68 +159,98 @@ class CompiledTerm:
         gradient, hessian = gradient_and_hessian(lambda *p: np.asarray(self._call(list(p))), points, self.manifolds)
         return self._masked(gradient), self._masked(hessian)
 
-    def whiten(self, residual: Array) -> Array:
-        """W r for every factor."""
-        if self._diagonal is not None:
-            return residual * self._diagonal
-        if self._root is not None:
-            return (self._root @ residual[:, :, None])[:, :, 0]
-        return residual
-
-    def whiten_jacobian(self, block: Array) -> Array:
-        """W J for every factor."""
-        if self._diagonal is not None:
-            return block * self._diagonal[..., None]
-        if self._root is not None:
-            whitened: Array = self._root @ block
-            return whitened
-        return block
+    def layout(self, columns: Columns, parameters: int) -> Layout:
+        """Where this term's numbers stand, when its parameters begin at ``parameters``."""
+        tangent = [columns.of(selection) for selection in self.term.selections]
+        wide = [np.broadcast_to(part, (self.count, part.shape[1])) for part in tangent]
+        joined = np.concatenate(wide, axis=1)
+        starts = [np.broadcast_to(columns.starts(s), (self.count,)) for s in self.term.selections]
+        sizes = [selection.manifold.storage for selection in self.term.selections]
+        if self.is_bound:
+            scalars = (starts[0][:, None] + np.arange(self.size)).reshape(-1, 1)
+            return Layout(self.count * self.size, 1, scalars, [1], joined.reshape(-1, 1), 1, None)
+        if self.kernel is None:
+            return Layout(self.count, self.size, np.stack(starts, axis=1), sizes, joined, joined.shape[1], None)
+        constants = parameters + self.parameter_count * (self.count if self.parameter_spread else 1)
+        gather: list[IntArray] = []
+        keep: list[int] = []
+        sizes, width = [], 0
+        for argument, expected in zip(self.term.arguments, self.kernel.arguments, strict=True):
+            if isinstance(expected, int):
+                continue
+            sizes.append(expected.storage)
+            if isinstance(argument, Selection):
+                gather.append(starts.pop(0))
+                keep += range(width, width + expected.dim)
+            else:
+                own = self._constants[len(gather)]
+                spread = expected.storage if len(own) > 1 else 0
+                gather.append(-1 - constants - spread * np.arange(self.count))
+                constants += own.size
+            width += expected.dim
+        return Layout(
+            self.count,
+            self.size,
+            np.stack(gather, axis=1),
+            sizes,
+            joined,
+            width,
+            None if len(keep) == width else keep,
+        )
 
     def _bind_parameters(self, data: Bound) -> None:
         term = self.term
-        self._diagonal: Array | None = None
-        self._root: Array | None = None
+        self.whitening = 0
+        self.whitener: Array = np.zeros(0)
         if isinstance(term, Cost):
             if term.sigma is not None:
-                self._diagonal = 1.0 / self._sigma(resolve(term.sigma, data))
+                self.whitener = reciprocals(self.name, resolve(term.sigma, data), self.count, self.size)
+                self.whitening = DIAGONAL
             if term.information is not None:
-                self._root = self._square_root(resolve(term.information, data))
+                self.whitener = square_roots(self.name, resolve(term.information, data), self.count, self.size)
+                self.whitening = FULL
+            if self.whitening and len(self.whitener) > 1:
+                self.whitening |= 1
         if isinstance(term, Constraint):
             self.lower = self._limit(resolve(term.lower, data), "lower", -np.inf)
             self.upper = self._limit(resolve(term.upper, data), "upper", np.inf)
+        self.parameters: Array = np.zeros(0)
+        self.parameter_count = self.parameter_spread = 0
+        if self.kernel is not None:
+            self._pack(self.kernel)
 
-    def _sigma(self, sigma: Array) -> Array:
-        if sigma.shape not in ((), (self.size,), (self.count, self.size)):
-            raise GraphError(
-                f"term '{self.name}': sigma has shape {sigma.shape}, expected (), ({self.size},) or {self.shape}",
-                term=self.name,
-            )
-        if not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
-            raise GraphError(f"term '{self.name}': sigma must be positive and finite", term=self.name)
-        return sigma
+    def _pack(self, kernel: Kernel) -> None:
+        """Put the kernel's parameters side by side, and after them the constants in the place of variables."""
+        points: list[Any] = [np.empty((1, m.storage)) for m in self.manifolds]
+        try:
+            variables, parameters, _ = kernel.split(self._fill(points), self.count)
+        except GraphError as error:
+            raise GraphError(f"term '{self.name}': {error}", term=self.name) from None
+        packed = side_by_side(parameters)
+        self.parameter_count = packed.shape[1]
+        self.parameter_spread = packed.shape[1] if len(packed) > 1 else 0
+        places = [k for k, expected in enumerate(kernel.arguments) if not isinstance(expected, int)]
+        given = {slot: v for slot, (k, v) in enumerate(zip(places, variables, strict=True)) if k not in self._places}
+        self._constants = given
+        self.parameters = np.concatenate([packed.ravel(), *(array.ravel() for array in given.values())])
 
-    def _square_root(self, information: Array) -> Array:
-        m = self.size
-        if information.shape not in ((m, m), (self.count, m, m)):
+    def _require_manifolds(self, kernel: Kernel) -> None:
+        if len(kernel.arguments) != len(self.term.arguments):
             raise GraphError(
-                f"term '{self.name}': information has shape {information.shape}, expected {(m, m)} or "
-                f"{(self.count, m, m)}",
+                f"term '{self.name}': {kernel.name} takes {len(kernel.arguments)} arguments, found "
+                f"{len(self.term.arguments)}: {self._shapes()}",
                 term=self.name,
             )
-        transposed = np.swapaxes(information, -1, -2)
-        if not np.isfinite(information).all() or not np.allclose(information, transposed, rtol=1e-9, atol=0.0):
-            raise GraphError(f"term '{self.name}': information must be finite and symmetric", term=self.name)
-        eigenvalues, vectors = np.linalg.eigh(information)
-        lowest = eigenvalues.min(axis=-1) / np.maximum(np.abs(eigenvalues).max(axis=-1), 1e-300)
-        if (lowest < -1e-9).any():
-            index = int(np.argmin(np.atleast_1d(lowest)))
-            raise GraphError(
-                f"term '{self.name}': information of factor {index} has a negative eigenvalue",
-                term=self.name,
-                index=index,
-            )
-        root: Array = np.sqrt(np.maximum(eigenvalues, 0.0))[..., :, None] * np.swapaxes(vectors, -1, -2)
-        return root
+        for place, selection in zip(self._places, self.term.selections, strict=True):
+            expected = kernel.arguments[place]
+            if isinstance(expected, int) or expected != selection.manifold:
+                wanted = "a parameter, not a variable" if isinstance(expected, int) else expected.name
+                raise GraphError(
+                    f"term '{self.name}': argument {place} of {kernel.name} is {wanted}; found {selection!r} on "
+                    f"{selection.manifold.name}",
+                    term=self.name,
+                    family=selection.family.name,
+                )
 
     def _limit(self, limit: Array, which: str, none: float) -> Array:
         try:

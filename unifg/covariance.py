@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.linear import Factorization
+from unifg.elimination.factorization import Factorization
 from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.sparse import Symmetric
@@ -48,9 +48,8 @@ def covariance(program: Program, lin: Linearization, columns: IntArray, active: 
     exact = pattern.matrix(data.copy())
     scale = max(float(np.abs(hessian.data).max(initial=0.0)), 1e-300)
     signs = np.where(np.arange(total) < n, 1.0, -1.0)
-    data[pattern.diagonal] += REGULARISATION * scale * signs
     factorization = Factorization(pattern)
-    if not factorization.factor(data):
+    if not factorization.factor(exact.data, REGULARISATION * scale * signs):
         raise GraphError("the covariance does not exist: the Hessian is not finite")
     symmetric = exact + exact.T
     symmetric.setdiag(exact.diagonal())
@@ -58,20 +57,10 @@ def covariance(program: Program, lin: Linearization, columns: IntArray, active: 
     for k, column in enumerate(chosen):
         right = np.zeros(total)
         right[column] = 1.0
-        result[:, k] = _refined(factorization, symmetric, right)[chosen]
+        solution = factorization.refine(exact.data, right, steps=20)
+        if np.abs(right - symmetric @ solution).max() > 1e-6:
+            raise GraphError(
+                "the covariance does not exist: some direction is not determined by the costs; run graph.check(guess)"
+            )
+        result[:, k] = solution[chosen]
     return 0.5 * (result + result.T)
-
-
-def _refined(factorization: Factorization, matrix: Array, right: Array) -> Array:
-    """Solve the unregularised system by iterative refinement."""
-    solution = factorization.solve(right)
-    for _ in range(20):
-        residual = right - matrix @ solution
-        if np.abs(residual).max() <= 1e-12:
-            return solution
-        solution = solution + factorization.solve(residual)
-    if np.abs(right - matrix @ solution).max() > 1e-6:
-        raise GraphError(
-            "the covariance does not exist: some direction is not determined by the costs; run graph.check(guess)"
-        )
-    return solution

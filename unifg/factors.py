@@ -7,13 +7,20 @@ variables they are given. Jacobians are in right perturbation, X Exp(d); equatio
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
+from functools import cache
+from types import ModuleType
+from typing import Any, cast
 
 import numpy as np
 
+from unifg.calls import local_matrix, local_vector, vector
+from unifg.jit import compiled
+from unifg.kernels import Kernel
 from unifg.lie import LieGroup, Manifold, Rn
-from unifg.residuals import Residual
+from unifg.lie.lookup import functions_of
+from unifg.residuals import Residual, residual
 from unifg.typing import Array
 
 
@@ -34,69 +41,147 @@ class ManifoldResidual:
         return self.build(manifold)
 
 
-class _OnManifold:
-    """A picklable function of values on one manifold."""
+# ---------------------------------------------------------------- groups with compiled functions
+
+
+def _relative(group: LieGroup, functions: ModuleType) -> Callable[..., None]:
+    """Write Log(p^-1 x^-1 y) and its derivatives, with p a measured element or nothing."""
+    storage, dim = group.storage, group.dim
+    between, log, adjoint = functions.between, functions.log, functions.adjoint
+    inverse_jacobian = functions.right_jacobian_inverse
+
+    @compiled
+    def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+        x, y = vector(v, 0, storage), vector(v, storage, storage)
+        seen, error = local_vector(storage), local_vector(storage)
+        between(x, y, seen)
+        if len(p):
+            between(p, seen, error)
+            log(error, r)
+        else:
+            log(seen, r)
+        if len(J):
+            after, transport = local_matrix(dim, dim), local_matrix(dim, dim)
+            inverse_jacobian(r, after)  # eq. 79
+            between(y, x, seen)
+            adjoint(seen, transport)
+            for i in range(dim):
+                for k in range(dim):
+                    total = 0.0
+                    for j in range(dim):
+                        total += after[i, j] * transport[j, k]
+                    J[i, k] = -total
+                    J[i, dim + k] = after[i, k]
+
+    return kernel
+
+
+def _deviation(group: LieGroup, functions: ModuleType) -> Callable[..., None]:
+    """Write Log(p^-1 x) and its derivative."""
+    local, inverse_jacobian = functions.local, functions.right_jacobian_inverse
+
+    @compiled
+    def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+        local(p, v, r)
+        if len(J):
+            inverse_jacobian(r, J)
+
+    return kernel
+
+
+# ---------------------------------------------------------------- vectors
+
+
+@compiled
+def _vector_deviation(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """X - p."""
+    for i in range(len(r)):
+        r[i] = v[i] - p[i]
+        if len(J):
+            for k in range(len(r)):
+                J[i, k] = 1.0 if i == k else 0.0
+
+
+@compiled
+def _vector_relative(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """Y - x - p, or y - x."""
+    dim = len(r)
+    for i in range(dim):
+        r[i] = v[dim + i] - v[i] - (p[i] if len(p) else 0.0)
+        if len(J):
+            for k in range(dim):
+                J[i, k] = -1.0 if i == k else 0.0
+                J[i, dim + k] = 1.0 if i == k else 0.0
+
+
+# ---------------------------------------------------------------- any other manifold, evaluated by NumPy
+
+
+class _Batched:
+    """A picklable function of values on one manifold, with derivatives where it is a group."""
 
     def __init__(self, manifold: Manifold) -> None:
         self.manifold = manifold
+        self.derivative = self.jacobian if isinstance(manifold, LieGroup) else None
 
-    @property
-    def group(self) -> LieGroup:
-        """The manifold, known to be a group where Jacobians are attached."""
+    def after(self, tangent: Array, count: int) -> Array:
+        """(n, d, d) inverse right Jacobians (eq. 79)."""
         assert isinstance(self.manifold, LieGroup)
-        return self.manifold
+        dim = self.manifold.dim
+        return np.broadcast_to(self.manifold.right_jacobian_inverse(tangent), (count, dim, dim))
+
+    def jacobian(self, *arguments: Array) -> list[Array]:
+        raise NotImplementedError
 
 
-class _Prior(_OnManifold):
+class _Prior(_Batched):
     def __call__(self, x: Array, reference: Array) -> Array:
         return np.atleast_2d(self.manifold.local(reference, x))
 
-    def jacobian(self, x: Array, reference: Array) -> list[Array]:
-        return [_right_inverse(self.group, self(x, reference), len(x))]
+    def jacobian(self, *arguments: Array) -> list[Array]:
+        return [self.after(self(*arguments), len(arguments[0]))]
 
 
-class _Between(_OnManifold):
-    def __call__(self, x: Array, y: Array, measured: Array) -> Array:
-        return self.group.log(self.group.between(measured, self.group.between(x, y)))
+class _Relative(_Batched):
+    def __call__(self, x: Array, y: Array, measured: Array | None = None) -> Array:
+        if measured is None:
+            return self.manifold.local(x, y)
+        assert isinstance(self.manifold, LieGroup)
+        return self.manifold.log(self.manifold.between(measured, self.manifold.between(x, y)))
 
-    def jacobian(self, x: Array, y: Array, measured: Array) -> list[Array]:
-        group = self.group
-        after = _right_inverse(group, self(x, y, measured), len(x))
-        return [-after @ group.adjoint(group.between(y, x)), after]
-
-
-class _Difference(_OnManifold):
-    def __call__(self, x: Array, y: Array) -> Array:
-        return self.manifold.local(x, y)
-
-    def jacobian(self, x: Array, y: Array) -> list[Array]:
-        group = self.group
-        after = _right_inverse(group, self(x, y), len(x))
-        return [-after @ group.adjoint(group.between(y, x)), after]
+    def jacobian(self, *arguments: Array) -> list[Array]:
+        assert isinstance(self.manifold, LieGroup)
+        after = self.after(self(*arguments), len(arguments[0]))
+        return [-after @ self.manifold.adjoint(self.manifold.between(arguments[1], arguments[0])), after]
 
 
-def _right_inverse(group: LieGroup, tangent: Array, count: int) -> Array:
-    """(n, d, d) inverse right Jacobians (eq. 79: J_log), the identity for vectors."""
-    if isinstance(group, Rn):
-        return np.broadcast_to(np.eye(group.dim), (count, group.dim, group.dim))
-    return np.broadcast_to(group.right_jacobian_inverse(tangent), (count, group.dim, group.dim))
+@cache
+def _complete(
+    manifold: Hashable, name: str, arguments: tuple[Any, ...], vectors: Callable[..., None], groups: Any, batched: Any
+) -> Residual:
+    """The kernel for vectors, for groups with compiled functions, or the batched function for all others."""
+    assert isinstance(manifold, Manifold)
+    functions = functions_of(manifold)
+    if isinstance(manifold, Rn):
+        return residual(Kernel(vectors, arguments, manifold.dim, name=name))
+    if isinstance(manifold, LieGroup) and functions is not None:
+        return residual(Kernel(groups(manifold, functions), arguments, manifold.dim, name=name))
+    function = batched(manifold)
+    return residual(function, function.derivative, name)
 
 
 def _build_prior(manifold: Manifold) -> Residual:
-    function = _Prior(manifold)
-    return Residual(function, function.jacobian if isinstance(manifold, LieGroup) else None, "prior")
+    return _complete(cast(Hashable, manifold), "prior", (manifold, 1), _vector_deviation, _deviation, _Prior)
 
 
 def _build_between(manifold: Manifold) -> Residual:
     if not isinstance(manifold, LieGroup):
         raise TypeError(f"between needs a Lie group, found {manifold.name}; use difference")
-    function = _Between(manifold)
-    return Residual(function, function.jacobian, "between")
+    return _complete(cast(Hashable, manifold), "between", (manifold, manifold, 1), _vector_relative, _relative, _Relative)
 
 
 def _build_difference(manifold: Manifold) -> Residual:
-    function = _Difference(manifold)
-    return Residual(function, function.jacobian if isinstance(manifold, LieGroup) else None, "difference")
+    return _complete(cast(Hashable, manifold), "difference", (manifold, manifold), _vector_relative, _relative, _Relative)
 
 
 prior = ManifoldResidual("prior", _build_prior)

@@ -1,15 +1,24 @@
-"""The one way functions are compiled here: Numba with a cache on disk, and floating-point liberties that keep NaN.
+"""The one way functions are compiled here: Numba, cached on disk, with floating-point liberties that keep NaN.
 
 ``fastmath`` in full may delete the checks for NaN that solvers rely on; contraction, reassociation, signed zeros
 and reciprocals are what loops need to vectorise.
+
+Numba's own cache looks at the file a function stands in and nothing else: it would go on running old code of a
+callee in another file, and never find again a function that closes over another one. Here the stamp of a function
+covers the files of everything it calls.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+import os
+from collections.abc import Callable, Iterator
+from types import FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.caching import FunctionCache
+from numba.core.dispatcher import Dispatcher
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -17,5 +26,55 @@ LIBERTIES = {"contract", "reassoc", "nsz", "arcp"}
 
 
 def compiled(function: F) -> F:
-    """Compile on the first call, from the cache where there is one; callable from other compiled functions."""
-    return cast(F, numba.njit(cache=True, error_model="numpy", fastmath=LIBERTIES)(function))
+    """Compile on the first call, from the cache where there is one; callable from other compiled functions.
+
+    The function may close over other compiled functions and numbers.
+    """
+    dispatcher = numba.njit(error_model="numpy", fastmath=LIBERTIES)(function)
+    dispatcher._cache = _Cache(function)
+    return cast(F, dispatcher)
+
+
+def is_compiled(function: object) -> bool:
+    """Whether a function runs under Numba, whoever compiled it."""
+    return isinstance(function, Dispatcher)
+
+
+class _Cache(FunctionCache):  # type: ignore[misc]
+    """A cache that asks for the stamp of the function and of everything it calls."""
+
+    def _index_key(self, signature: Any, codegen: Any) -> Any:
+        return signature, codegen.magic_tuple(), stamp(self._py_func)
+
+
+def stamp(function: Any) -> str:
+    """Digest of the source files of a function and of every compiled function it calls or closes over."""
+    digest = hashlib.sha256()
+    for part in sorted(_parts(function, set())):
+        digest.update(part.encode())
+    return digest.hexdigest()
+
+
+def _parts(function: Any, seen: set[int]) -> Iterator[str]:
+    """What identifies a function: its name, its file's date and size, the numbers it closes over, its callees."""
+    python: FunctionType = getattr(function, "py_func", function)
+    if id(python) in seen:
+        return
+    seen.add(id(python))
+    code = python.__code__
+    try:
+        status = os.stat(code.co_filename)
+        yield f"{python.__qualname__} {code.co_firstlineno} {status.st_mtime_ns} {status.st_size}"
+    except OSError:  # typed into an interpreter
+        yield f"{python.__qualname__} {code.co_code!r} {code.co_consts!r}"
+    for cell in python.__closure__ or ():
+        if is_compiled(cell.cell_contents):
+            yield from _parts(cell.cell_contents, seen)
+        else:
+            yield f"{python.__qualname__} {cell.cell_contents!r}"
+    for name in code.co_names:
+        found = python.__globals__.get(name)
+        candidates = [getattr(found, n, None) for n in code.co_names] if isinstance(found, ModuleType) else [found]
+        for callee in candidates:
+            if is_compiled(callee):
+                yield from _parts(callee, seen)

@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from unifg.compiled import Values
+from unifg.columns import Values
 from unifg.typing import Array
 
 HeldWeights: TypeAlias = dict[str, Array]
@@ -43,7 +43,7 @@ class Linearization:
         constraints: (M,) stacked g.
         constraint_jacobian: entries of A, in the order of ``Program.constraints``.
         gradient: gradient of the objective over the full tangent space.
-        scalar_hessian: entries of the Hessian blocks of scalar costs.
+        hessian: Gauss-Newton Hessian of the objective, in the order of ``Program.normal``.
         norms: each term's residual norm; for constraints the norm of the violation.
         weights: weights of reweighted losses, to be held during the line search.
     """
@@ -55,7 +55,7 @@ class Linearization:
     constraints: Array
     constraint_jacobian: Array
     gradient: Array
-    scalar_hessian: Array
+    hessian: Array
     norms: dict[str, float]
     weights: HeldWeights = field(default_factory=dict)
 

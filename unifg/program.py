@@ -7,17 +7,22 @@ costs; rows of constraints read ``lower <= g <= upper``. Columns are tangent coo
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from unifg.columns import Columns
-from unifg.compiled import CompiledTerm, Values
+from unifg import passes
+from unifg.columns import Columns, Values
+from unifg.compiled import CompiledTerm
 from unifg.differentiation import convexified
 from unifg.errors import GraphError
-from unifg.linear import Factorization
+from unifg.elimination.factorization import Factorization
 from unifg.linearization import Evaluation, HeldWeights, Linearization
-from unifg.sparse import Gram, Rows, Symmetric, scatter, upper_pairs
+from unifg.retraction import Retraction
+from unifg.rows import Rows
+from unifg.sparse import Symmetric
+from unifg.table import ENTRY, ROW, WIDTH, Table
 from unifg.terms import Constraint, Cost, ScalarCost
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 from unifg.variables import Data, Family
@@ -34,8 +39,8 @@ class Program:
         columns: numbering of the tangent coordinates.
         size: number of unknown ones.
         costs, constraints: patterns of the stacked Jacobians.
-        hessian: pattern of the Gauss-Newton Hessian of the objective.
-        normal: pattern of the same plus A'A.
+        normal: pattern of the Gauss-Newton Hessian of the objective plus A'A.
+        blocks: (size,) the variable that every unknown belongs to.
         lower, upper: (M,) limits with the present data.
         cost_terms, scalar_terms, constraint_terms: compiled terms in row order.
         slices: rows of each constraint term.
@@ -55,18 +60,30 @@ class Program:
         self.scalar_terms = [c for c in self.terms if isinstance(c.term, ScalarCost)]
         self.constraint_terms = [c for c in self.terms if isinstance(c.term, Constraint)]
         self._require_touched()
-        self.costs, self._cost_gram, self._cost_slices = self._stack(self.cost_terms)
-        self.constraints, self._constraint_gram, self.slices = self._stack(self.constraint_terms)
+        variable, starts = self.columns.nodes()
+        self.blocks = variable[self.columns.free]
+        self.normal = self._pattern(self.cost_terms + self.scalar_terms + self.constraint_terms, variable, starts)
+        stacked = self.cost_terms + self.constraint_terms
+        self._table = Table(stacked, self.columns, self.normal)
+        self._python = [term for term in stacked if term.kernel is None and not term.is_bound]
+        self.costs = Rows(self._table, self.cost_terms, True, self.size)
+        self.constraints = Rows(self._table, self.constraint_terms, False, self.size)
+        self._cost_slices = _slices(self.cost_terms)
+        self.slices = _slices(self.constraint_terms)
         self.bound_rows = np.zeros(self.constraints.count, dtype=bool)
         for term, rows in zip(self.constraint_terms, self.slices, strict=True):
             self.bound_rows[rows] = term.is_bound
-        costs, constraints = self._cost_gram.coordinates, self._constraint_gram.coordinates
-        scalars = self._scalar_blocks()
-        self.hessian = Symmetric(self.size, [costs, scalars])
-        self.normal = Symmetric(self.size, [costs, constraints, scalars])
-        self._in_hessian = [self.hessian.positions(*part) for part in (costs, scalars)]
-        self._in_normal = [self.normal.positions(*part) for part in (costs, constraints, scalars)]
+        self._scalar_blocks()
+        self._hessian: tuple[Symmetric, IntArray] | None = None
+        self._retraction = Retraction(self.columns, graph.fixes)
+        self._names = [term.name for term in stacked]
+        self._scratch = np.empty(self._table.scratch)
         self.bind({})
+
+    @property
+    def hessian(self) -> Symmetric:
+        """Pattern of the Gauss-Newton Hessian of the objective alone."""
+        return self._objective()[0]
 
     # ---------------------------------------------------------------- data and values
 
@@ -91,13 +108,13 @@ class Program:
             name, index = self.row_name(int(crossed[0]))
             raise GraphError(f"term '{name}': lower exceeds upper in factor {index}", term=name, index=index)
         self.equality = self.lower == self.upper
-        self.fixed_values = [
-            (
-                fix,
-                np.asarray(checked.get(fix.value, fix.value.value) if isinstance(fix.value, Data) else fix.value),
-            )
-            for fix in self.graph.fixes
-        ]
+        self._table.bind(self.lower, self.upper)
+        self._retraction.bind(
+            [
+                np.asarray(checked.get(fix.value, fix.value.value) if isinstance(fix.value, Data) else fix.value)
+                for fix in self.graph.fixes
+            ]
+        )
 
     def values_from(self, guess: Mapping[Family, ArrayLike]) -> Values:
         """Copy and check a guess, and give fixed variables their values.
@@ -108,7 +125,7 @@ class Program:
         for family in guess:
             if not isinstance(family, Family) or self.graph.families.get(family.name) is not family:
                 raise GraphError(f"the guess contains {family!r}, which is no family of this graph")
-        values: Values = {}
+        values = Values(self.columns, np.empty(self.columns.stored))
         for family in self.families:
             shape = (family.count, family.manifold.storage)
             if family not in guess:
@@ -117,18 +134,16 @@ class Program:
                         f"the guess has no values for family '{family.name}': give an array of shape {shape}",
                         family=family.name,
                     )
-                values[family] = np.tile(family.manifold.identity(), (family.count, 1))
+                values[family][:] = family.manifold.identity()
                 continue
-            array = np.array(guess[family], dtype=np.float64)
+            array = np.asarray(guess[family], dtype=np.float64)
             if array.shape != shape:
                 raise GraphError(
                     f"the guess for family '{family.name}' has shape {array.shape}, expected {shape}",
                     family=family.name,
                 )
-            values[family] = array
-        for fix, value in self.fixed_values:
-            selection = fix.selection
-            values[selection.family][selection.indices, selection.storage] = value
+            values[family][:] = array
+        self._retraction.fix(values)
         for family, array in values.items():
             valid = family.manifold.is_valid(array)
             if not valid.all():
@@ -142,133 +157,131 @@ class Program:
 
     def retract(self, values: Values, step: Array) -> Values:
         """Move the unknowns by a tangent step; fixed variables stay."""
-        full = np.zeros(self.columns.width)
-        full[self.columns.free] = step
-        moved: Values = {}
-        for family, array in values.items():
-            offset = self.columns.offsets[family]
-            part = full[offset : offset + family.count * family.manifold.dim]
-            moved[family] = family.manifold.retract(array, part.reshape(family.count, family.manifold.dim))
-        for fix, value in self.fixed_values:  # retract may wrap or renormalise; a fixed value stays as given
-            moved[fix.selection.family][fix.selection.indices, fix.selection.storage] = value
-        return moved
+        return self._retraction(values, step)
 
     def within_bounds(self, values: Values) -> Values:
         """The nearest values that respect every bound of an unknown; ``values`` itself when all do."""
-        moved: Values = {}
+        moved = Values(self.columns, values.flat.copy())
         for term in self.constraint_terms:
             if not term.is_bound:
                 continue
             selection = term.gathers[0].selection
-            array = moved.get(selection.family, values[selection.family]).copy()
-            part = array[selection.indices, selection.storage]
-            array[selection.indices, selection.storage] = np.clip(part, term.lower, term.upper)
-            for fix, value in self.fixed_values:
-                if fix.selection.family is selection.family:
-                    array[fix.selection.indices, fix.selection.storage] = value
-            if not np.array_equal(array, values[selection.family]):
-                moved[selection.family] = array
-        return {**values, **moved} if moved else values
+            part = moved[selection.family][selection.indices, selection.storage]
+            moved[selection.family][selection.indices, selection.storage] = np.clip(part, term.lower, term.upper)
+        self._retraction.fix(moved)
+        return values if np.array_equal(moved.flat, values.flat) else moved
 
     # ---------------------------------------------------------------- evaluation
 
-    def evaluate(self, values: Values, weights: HeldWeights | None = None) -> Evaluation:
+    def evaluate(self, values: Mapping[Family, Array], weights: HeldWeights | None = None) -> Evaluation:
         """Objective and constraints; ``weights`` are those of the linearisation whose line search this is."""
-        cost = 0.0
+        table, values = self._table, self.columns.values(values)
+        residual, constraints = np.empty(table.residuals), np.empty(table.constraints)
+        squares = np.empty(table.weights)
         with np.errstate(all="ignore"):
-            for term in self.cost_terms:
-                assert isinstance(term.term, Cost)
-                whitened = term.whiten(term.residual(values))
-                loss = term.term.robust
-                if loss is None:
-                    cost += 0.5 * float(np.vdot(whitened, whitened))
-                    continue
-                squared = np.einsum("nm,nm->n", whitened, whitened)
+            for term in self._python:
+                self._rows_of(term, residual, constraints)[:] = term.residual(values)
+            cost = passes.evaluate(table.arrays, values.flat, residual, constraints, squares, self._scratch)
+            for term, part in table.robust:
+                assert isinstance(term.term, Cost) and term.term.robust is not None
                 held = weights.get(term.name) if weights else None
-                cost += 0.5 * float((loss.value(squared) if held is None else held * squared).sum())
+                robust = term.term.robust.value(squares[part]) if held is None else held * squares[part]
+                cost += 0.5 * float(robust.sum())
             for term in self.scalar_terms:
                 cost += float(term.residual(values).sum())
-            constraints = [term.residual(values).ravel() for term in self.constraint_terms]
-        return Evaluation(cost, _stacked(constraints))
+        return Evaluation(cost, constraints)
 
-    def linearize(self, values: Values, search: bool = False) -> Linearization:
+    def linearize(self, values: Mapping[Family, Array], search: bool = False) -> Linearization:
         """Everything a backend needs at ``values``; with ``search``, by search Jacobians where a residual has one."""
-        residual = np.empty(self.costs.count)
-        jacobian = np.empty(len(self.costs.rows))
-        constraints = np.empty(self.constraints.count)
-        constraint_jacobian = np.empty(len(self.constraints.rows))
+        table, values = self._table, self.columns.values(values)
+        residual, jacobian = np.empty(table.residuals), np.empty(table.entries)
+        constraints, constraint_jacobian = np.empty(table.constraints), np.empty(table.constraint_entries)
+        squares, size = np.empty(table.weights), np.empty(len(table.arrays.fields))
+        gradient, hessian = np.zeros(self.columns.width), np.zeros(self.normal.nnz)
         norms: dict[str, float] = {}
         weights: HeldWeights = {}
-        cost, at = 0.0, 0
         with np.errstate(all="ignore"):
-            for term, rows in zip(self.cost_terms, self._cost_slices, strict=True):
-                assert isinstance(term.term, Cost)
-                whitened = term.whiten(term.residual(values))
-                blocks = [term.whiten_jacobian(block) for block in term.jacobians(values, search=search)]
-                loss = term.term.robust
-                squared_sum = float(np.vdot(whitened, whitened))
-                norms[term.name] = squared_sum**0.5
-                if loss is None:
-                    cost += 0.5 * squared_sum
-                else:
-                    squared = np.einsum("nm,nm->n", whitened, whitened)
-                    weight = loss.weight(squared)
-                    cost += 0.5 * float(loss.value(squared).sum())
-                    root = np.sqrt(weight)[:, None]
-                    whitened = whitened * root
-                    blocks = [block * root[:, :, None] for block in blocks]
-                    if loss.held:
-                        weights[term.name] = weight
-                residual[rows] = whitened.ravel()
-                at = _write(jacobian, at, blocks)
-            at = 0
-            for term, rows in zip(self.constraint_terms, self.slices, strict=True):
-                value = term.residual(values)
-                constraints[rows] = value.ravel()
-                if term.is_bound:
-                    constraint_jacobian[at : at + value.size] = 1.0
-                    at += value.size
-                else:
-                    at = _write(constraint_jacobian, at, term.jacobians(values, search=search))
-                beyond = np.maximum(value - term.upper, term.lower - value)
-                norms[term.name] = float(np.linalg.norm(np.maximum(beyond, 0.0)))
-            gradient = self.costs.transposed_times(jacobian, residual)
-            hessians = []
-            for term, columns in zip(self.scalar_terms, self._scalar_columns, strict=True):
+            for term in self._python:
+                self._rows_of(term, residual, constraints)[:] = term.residual(values)
+                self._entries_of(term, jacobian, constraint_jacobian, term.jacobians(values, search=search))
+            cost = passes.linearize(
+                table.arrays,
+                values.flat,
+                search,
+                residual,
+                jacobian,
+                constraints,
+                constraint_jacobian,
+                squares,
+                size,
+                gradient,
+                hessian,
+                self._scratch,
+            )
+            if table.robust:
+                cost += self._weigh(squares, residual, jacobian, gradient, hessian, weights)
+            for term in self.scalar_terms:
                 value = term.residual(values)
                 cost += float(value.sum())
                 norms[term.name] = float(np.abs(value).sum())
                 slope, curvature = term.scalar_derivatives(values)
-                gradient += scatter(columns.ravel(), slope.ravel(), self.columns.width)
-                hessians.append(convexified(curvature)[self._scalar_keep[term.name]])
+                columns, factor, a, b, place = self._scalars[term.name]
+                np.add.at(gradient, columns.ravel(), slope.ravel())
+                np.add.at(hessian, place, convexified(curvature)[factor, a, b])
+        norms |= zip(self._names, size.tolist(), strict=True)
         return Linearization(
-            values,
-            cost,
-            residual,
-            jacobian,
-            constraints,
-            constraint_jacobian,
-            gradient,
-            _stacked(hessians),
-            norms,
-            weights,
+            values, cost, residual, jacobian, constraints, constraint_jacobian, gradient, hessian, norms, weights
         )
+
+    def _weigh(
+        self,
+        squares: Array,
+        residual: Array,
+        jacobian: Array,
+        gradient: Array,
+        hessian: Array,
+        held: HeldWeights,
+    ) -> float:
+        """Finish what robust terms began: find weights, scale, accumulate; return their cost."""
+        table = self._table
+        weights, cost = np.empty(table.weights), 0.0
+        for term, part in table.robust:
+            assert isinstance(term.term, Cost) and term.term.robust is not None
+            loss = term.term.robust
+            weights[part] = loss.weight(squares[part])
+            cost += 0.5 * float(loss.value(squares[part]).sum())
+            if loss.held:
+                held[term.name] = weights[part]
+        passes.weigh(table.arrays, weights, residual, jacobian, gradient, hessian)
+        return cost
+
+    def _rows_of(self, term: CompiledTerm, residual: Array, constraints: Array) -> Array:
+        """(n, m) rows of a term in the stacked residuals."""
+        start = int(term.place[ROW])
+        target = residual if isinstance(term.term, Cost) else constraints
+        return target[start : start + term.count * term.size].reshape(term.count, term.size)
+
+    def _entries_of(self, term: CompiledTerm, costs: Array, constraints: Array, blocks: list[Array]) -> None:
+        """Copy (n, m, d_k) blocks side by side into the stacked Jacobian."""
+        start, width = int(term.place[ENTRY]), int(term.place[WIDTH])
+        target = costs if isinstance(term.term, Cost) else constraints
+        own = target[start : start + term.count * term.size * width].reshape(term.count, term.size, width)
+        at = 0
+        for block in blocks:
+            own[:, :, at : at + block.shape[2]] = block
+            at += block.shape[2]
 
     # ---------------------------------------------------------------- products backends need
 
     def hessian_entries(self, lin: Linearization) -> Array:
         """Gauss-Newton Hessian of the objective in the order of ``hessian``."""
-        parts = [self._cost_gram.products(lin.jacobian), lin.scalar_hessian]
-        return _summed(self._in_hessian, parts, self.hessian.nnz)
+        return lin.hessian[self._objective()[1]]
 
     def normal_entries(self, lin: Linearization, row_weights: Array) -> Array:
         """Gauss-Newton Hessian plus A' diag(row_weights) A, in the order of ``normal``."""
-        parts = [
-            self._cost_gram.products(lin.jacobian),
-            self._constraint_gram.products(lin.constraint_jacobian, row_weights),
-            lin.scalar_hessian,
-        ]
-        return _summed(self._in_normal, parts, self.normal.nnz)
+        entries = lin.hessian.copy()
+        passes.add_constraints(self._table.arrays, lin.constraint_jacobian, row_weights, entries)
+        return entries
 
     def free_gradient(self, lin: Linearization) -> Array:
         """Gradient of the objective over the unknowns."""
@@ -286,7 +299,7 @@ class Program:
 
     def normal_solver(self) -> Factorization:
         """A factorisation for matrices in the pattern ``normal``."""
-        return Factorization(self.normal)
+        return Factorization(self.normal, self.blocks)
 
     # ---------------------------------------------------------------- names
 
@@ -318,48 +331,39 @@ class Program:
         parts = [self.columns.of(selection) for selection in term.term.selections]
         return [np.broadcast_to(part, (term.count, part.shape[1])) for part in parts]
 
-    def _stack(self, terms: list[CompiledTerm]) -> tuple[Rows, Gram, list[slice]]:
-        rows, columns, blocks, slices = [], [], [], []
-        row = entry = 0
+    def _pattern(self, terms: Sequence[CompiledTerm], variable: IntArray, starts: IntArray) -> Symmetric:
+        """Every two variables of a factor share a block."""
+        first, second = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
         for term in terms:
-            n, m = term.count, term.size
-            own_rows = row + np.arange(n * m).reshape(n, m)
-            slices.append(slice(row, row + n * m))
-            row += n * m
-            arguments = self._term_columns(term)
-            if term.is_bound:  # the Jacobian is the identity: one entry a row
-                rows.append(own_rows.ravel())
-                columns.append(arguments[0].ravel())
-                blocks.append((entry + np.arange(n * m).reshape(-1, 1, 1), arguments[0].reshape(-1, 1)))
-                entry += n * m
-                continue
-            parts = []
-            for argument in arguments:
-                shape = (n, m, argument.shape[1])
-                rows.append(np.broadcast_to(own_rows[:, :, None], shape).ravel())
-                columns.append(np.broadcast_to(argument[:, None, :], shape).ravel())
-                parts.append(entry + np.arange(n * m * argument.shape[1]).reshape(shape))
-                entry += n * m * argument.shape[1]
-            blocks.append((np.concatenate(parts, axis=2), np.concatenate(arguments, axis=1)))
-        none = [np.zeros(0, dtype=np.intp)]
-        unknown = self.columns.unknown
-        stacked = Rows(row, np.concatenate(rows + none), np.concatenate(columns + none), unknown, self.size)
-        return stacked, Gram(blocks, stacked, unknown), slices
+            members = [variable[columns[:, 0]] for columns in self._term_columns(term)]
+            for k, a in enumerate(members):
+                for b in members[:k]:
+                    first.append(np.minimum(a, b))
+                    second.append(np.maximum(a, b))
+        return Symmetric.of_blocks(starts, np.concatenate(first), np.concatenate(second))
 
-    def _scalar_blocks(self) -> tuple[IntArray, IntArray]:
-        """(row, column) of the Hessian entries of scalar costs, and how to pick them from the blocks."""
-        self._scalar_columns: list[IntArray] = []
-        self._scalar_keep: dict[str, tuple[IntArray, IntArray, IntArray]] = {}
-        none = np.zeros(0, dtype=np.intp)
-        rows, columns = [none], [none]
+    def _objective(self) -> tuple[Symmetric, IntArray]:
+        """Pattern of the objective's Hessian and where its entries stand in ``normal``."""
+        if self._hessian is None:
+            if not self.constraint_terms:
+                self._hessian = self.normal, np.arange(self.normal.nnz)
+            else:
+                variable, starts = self.columns.nodes()
+                pattern = self._pattern(self.cost_terms + self.scalar_terms, variable, starts)
+                columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
+                self._hessian = pattern, self.normal.positions(pattern.indices, columns)
+        return self._hessian
+
+    def _scalar_blocks(self) -> None:
+        """Where gradient and Hessian blocks of scalar costs go."""
+        self._scalars: dict[str, tuple[IntArray, IntArray, IntArray, IntArray, IntArray]] = {}
         for term in self.scalar_terms:
             full = np.concatenate(self._term_columns(term), axis=1)
-            mapped, factor, a, b = upper_pairs(full, self.columns.unknown)
-            self._scalar_columns.append(full)
-            self._scalar_keep[term.name] = (factor, a, b)
-            rows.append(mapped[factor, a])
-            columns.append(mapped[factor, b])
-        return np.concatenate(rows), np.concatenate(columns)
+            mapped = self.columns.unknown[full]
+            keep = (mapped[:, :, None] <= mapped[:, None, :]) & (mapped[:, :, None] >= 0)
+            factor, a, b = np.nonzero(keep)
+            place = self.normal.positions(mapped[factor, a], mapped[factor, b])
+            self._scalars[term.name] = full, factor, a, b, place
 
     def _require_touched(self) -> None:
         touched = np.zeros(self.columns.width, dtype=bool)
@@ -377,23 +381,12 @@ class Program:
             )
 
 
-def _write(target: Array, at: int, blocks: list[Array]) -> int:
-    """Copy blocks into ``target`` from position ``at``; return the next position."""
-    for block in blocks:
-        target[at : at + block.size] = block.ravel()
-        at += block.size
-    return at
+def _slices(terms: Sequence[CompiledTerm]) -> list[slice]:
+    """Rows of each term in the stack."""
+    ends = np.cumsum([0] + [term.count * term.size for term in terms]).tolist()
+    return [slice(start, end) for start, end in pairwise(ends)]
 
 
 def _stacked(parts: list[Array]) -> Array:
     """One flat array, also of nothing."""
     return np.concatenate([part.ravel() for part in parts]) if parts else np.zeros(0)
-
-
-def _summed(slots: list[IntArray], parts: list[Array], size: int) -> Array:
-    """Scatter several lists of numbers into one array."""
-    total = scatter(slots[0], parts[0], size)
-    for place, numbers in zip(slots[1:], parts[1:], strict=True):
-        if len(place):
-            total += scatter(place, numbers, size)
-    return total

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from unifg.kernels import Kernel
 from unifg.typing import Array
 
 Function: TypeAlias = Callable[..., Array]
@@ -23,12 +24,16 @@ class Residual:
         name: shown in tables and messages.
         search: like ``jacobian``, but not a derivative: a direction to look in during the first
             ``Solver.search_iterations`` iterations. Answers are never judged by it.
+        kernel: ``function`` and ``jacobian`` for one factor, compiled; graphs run it in one loop with all others.
+        search_kernel: the same with ``search`` in the place of the Jacobian.
     """
 
     function: Function
     jacobian: JacobianFunction | None = None
     name: str = ""
     search: JacobianFunction | None = None
+    kernel: Kernel | None = None
+    search_kernel: Kernel | None = None
 
     def __call__(self, *arguments: Any) -> Array:
         """Evaluate the residual."""
@@ -36,15 +41,15 @@ class Residual:
 
 
 def residual(
-    function: Function,
+    function: Function | Kernel,
     jacobian: JacobianFunction | None = None,
     name: str = "",
-    search: JacobianFunction | None = None,
+    search: JacobianFunction | Kernel | None = None,
 ) -> Residual:
     """Attach a Jacobian and a name to a plain function.
 
     Args:
-        function: batched residual, ``(n, ...) -> (n, m)``.
+        function: batched residual, ``(n, ...) -> (n, m)``; or a kernel, which brings its own Jacobian and name.
         jacobian: returns one (n, m, d_k) array for each argument that may be a variable, in order and right
             perturbation. Blocks of arguments that a term gives as constants are dropped. ``graph.check``
             compares the rest with numerical differentiation.
@@ -53,9 +58,13 @@ def residual(
             ``Solver.search_iterations`` iterations (none by default), for fields that are the gradient of no cost.
             Costs, KKT numbers and all later steps use the true derivatives; ``graph.check`` does not look at it.
     """
-    return Residual(function, jacobian, name or getattr(function, "__name__", "residual"), search)
+    search_kernel = search if isinstance(search, Kernel) else None
+    looked_in = search.jacobian if isinstance(search, Kernel) else search
+    if isinstance(function, Kernel):
+        return Residual(function, function.jacobian, name or function.name, looked_in, function, search_kernel)
+    return Residual(function, jacobian, name or getattr(function, "__name__", "residual"), looked_in)
 
 
-def as_residual(function: Function | Residual) -> Residual:
-    """Wrap a plain function; leave a :class:`Residual` as it is."""
+def as_residual(function: Function | Kernel | Residual) -> Residual:
+    """Wrap a plain function or a kernel; leave a :class:`Residual` as it is."""
     return function if isinstance(function, Residual) else residual(function)

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from unifg.compiled import Values
+from unifg.columns import Values
 from unifg.errors import BackendError, GraphError, NotConverged
 from unifg.graph import Graph
 from unifg.history import HEADER, Iteration, line

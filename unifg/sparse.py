@@ -1,17 +1,14 @@
-"""Sparsity found once, numbers scattered many times.
-
-A :class:`Rows` holds where the entries of a stacked Jacobian sit; a :class:`Symmetric` is the upper triangle of
-a symmetric matrix; a :class:`Gram` turns Jacobian entries into the entries of J' D J through index arrays that
-are computed once, so that forming normal equations is a gather, a product and a scatter.
-"""
+"""The pattern of a symmetric matrix, found once and filled many times."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
 
+from unifg.jit import compiled
 from unifg.typing import Array, IntArray
 
 
@@ -34,129 +31,91 @@ class Symmetric:
         """Unite (row, column) lists with row <= column, and the diagonal."""
         diagonal = np.arange(size)
         keys = [column * size + row for row, column in entries] + [diagonal * (size + 1)]
+        unique = np.unique(np.concatenate(keys))
         self.size = size
-        self._keys = np.unique(np.concatenate(keys))
-        self.indices = self._keys % max(size, 1)
-        self.indptr = np.searchsorted(self._keys, np.arange(size + 1) * size)
-        self._column = self._keys // max(size, 1)
-        self.diagonal = self.positions(diagonal, diagonal)
+        self.indices: IntArray = unique % max(size, 1)
+        self.indptr: IntArray = np.searchsorted(unique, np.arange(size + 1) * size)
+
+    @classmethod
+    def of_blocks(cls, starts: IntArray, first: IntArray, second: IntArray) -> Symmetric:
+        """Unite dense blocks.
+
+        Args:
+            starts: (V + 1,) where the rows of each node start.
+            first: nodes of the rows of every block.
+            second: nodes of its columns, first <= second, in any order and with repetitions; the diagonal blocks are
+                always part of the pattern.
+        """
+        count = len(starts) - 1
+        own = np.arange(count)
+        keys = np.unique(np.concatenate([second * count + first, own * (count + 1)]))
+        self = cls.__new__(cls)
+        self.size = int(starts[-1])
+        lengths = np.diff(starts)
+        rows_above = np.zeros(count + 1, dtype=np.intp)  # entries in the first column of each node, without its own
+        first, second = keys % max(count, 1), keys // max(count, 1)
+        np.add.at(rows_above, second, np.where(first < second, lengths[first], 0))
+        column_of = np.repeat(own, lengths)
+        depth = np.arange(self.size) - starts[column_of] + 1
+        self.indptr = np.concatenate([[0], np.cumsum(rows_above[column_of] + depth)]).astype(np.intp)
+        self.indices = np.empty(int(self.indptr[-1]), dtype=np.intp)
+        _expand(starts, first, second, self.indptr, self.indices)
+        return self
 
     @property
     def nnz(self) -> int:
         """Number of stored entries."""
-        return len(self._keys)
+        return len(self.indices)
+
+    @cached_property
+    def diagonal(self) -> IntArray:
+        """(size,) where the diagonal is stored: last in every column."""
+        place: IntArray = self.indptr[1:] - 1
+        return place
 
     def positions(self, rows: IntArray, columns: IntArray) -> IntArray:
         """Where the given entries are stored."""
-        return np.searchsorted(self._keys, columns * self.size + rows)
+        return np.searchsorted(self._columns * self.size + self.indices, columns * self.size + rows)
 
     def times(self, data: Array, vector: Array) -> Array:
         """The symmetric matrix with upper triangle ``data`` times a vector."""
-        above = data * vector[self._column]
-        below = data * vector[self.indices]
-        below[self.diagonal] = 0.0
-        return scatter(self.indices, above, self.size) + scatter(self._column, below, self.size)
+        out = np.zeros(self.size)
+        _times(self.indptr, self.indices, data, np.ascontiguousarray(vector, dtype=np.float64), out)
+        return out
 
     def matrix(self, data: Array) -> sp.csc_matrix:
         """Upper triangle as a SciPy matrix sharing ``data``."""
         return sp.csc_matrix((data, self.indices, self.indptr), shape=(self.size, self.size))
 
-
-class Rows:
-    """Pattern of a stacked Jacobian restricted to free columns.
-
-    Attributes:
-        count: number of rows.
-        rows, columns: (E,) place of every entry in the full tangent space, in evaluation order.
-        free: (F,) entries whose variable is not fixed.
-        free_rows, free_columns: their places among the unknowns.
-    """
-
-    def __init__(self, count: int, rows: IntArray, columns: IntArray, unknown: IntArray, unknowns: int) -> None:
-        """Restrict entries to unknown columns; ``unknown`` maps full columns to unknowns or -1."""
-        self.count = count
-        self.rows = rows
-        self.columns = columns
-        self.width = len(unknown)
-        self.unknowns = unknowns
-        mapped = unknown[columns]
-        self.free = np.flatnonzero(mapped >= 0)
-        self.free_rows = rows[self.free]
-        self.free_columns = mapped[self.free]
-        self.all_free = len(self.free) == len(rows)
-        keys = self.free_columns * max(count, 1) + self.free_rows
-        unique, self._slots = np.unique(keys, return_inverse=True)
-        self.indices = unique % max(count, 1)
-        self.indptr = np.searchsorted(unique, np.arange(unknowns + 1) * max(count, 1))
-        self.nnz = len(unique)
-
-    def compress(self, flat: Array) -> Array:
-        """Entries by columns (CSC order), repeated ones summed."""
-        return scatter(self._slots, self._restrict(flat), self.nnz)
-
-    def matrix(self, flat: Array) -> sp.csc_matrix:
-        """The Jacobian over the unknowns as a SciPy matrix."""
-        return sp.csc_matrix((self.compress(flat), self.indices, self.indptr), shape=(self.count, self.unknowns))
-
-    def times(self, flat: Array, vector: Array) -> Array:
-        """J v for a vector over the unknowns."""
-        return scatter(self.free_rows, self._restrict(flat) * vector[self.free_columns], self.count)
-
-    def transposed_times(self, flat: Array, vector: Array) -> Array:
-        """J' v over the full tangent space, fixed variables included."""
-        return scatter(self.columns, flat * vector[self.rows], self.width)
-
-    def _restrict(self, flat: Array) -> Array:
-        return flat if self.all_free else flat[self.free]
+    @cached_property
+    def _columns(self) -> IntArray:
+        """(nnz,) column of every entry."""
+        return np.repeat(np.arange(self.size), np.diff(self.indptr))
 
 
-def upper_pairs(columns: IntArray, unknown: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Pairs (a, b) of columns of each factor that fall into the upper triangle over the unknowns.
+@compiled
+def _expand(starts: IntArray, first: IntArray, second: IntArray, indptr: IntArray, indices: IntArray) -> None:
+    """Write the rows of every column, for blocks sorted by second, then first."""
+    filled = np.zeros(len(indptr), dtype=np.intp)
+    for block in range(len(first)):
+        own = first[block] == second[block]
+        for column in range(starts[second[block]], starts[second[block] + 1]):
+            at = indptr[column] + filled[column]
+            last = column + 1 if own else starts[first[block] + 1]
+            for row in range(starts[first[block]], last):
+                indices[at] = row
+                at += 1
+            filled[column] = at - indptr[column]
 
-    Args:
-        columns: (n, D) full columns of each factor.
-        unknown: full column to unknown, or -1.
 
-    Returns:
-        The (n, D) unknowns, and for every pair its factor, a and b.
-    """
-    mapped = unknown[columns]
-    keep = (mapped[:, :, None] <= mapped[:, None, :]) & (mapped[:, :, None] >= 0)
-    factor, a, b = np.nonzero(keep)
-    return mapped, factor, a, b
-
-
-class Gram:
-    """Products of Jacobian entries that share a row: what the entries of J' D J are sums of.
-
-    Attributes:
-        coordinates: (row, column) of every product among the unknowns, row <= column.
-    """
-
-    def __init__(self, blocks: Sequence[tuple[IntArray, IntArray]], rows: Rows, unknown: IntArray) -> None:
-        """Enumerate the products.
-
-        Args:
-            blocks: for each term, entry numbers (n, m, D) and their full columns (n, D).
-            rows: the pattern the entries belong to.
-            unknown: full column to unknown, or -1.
-        """
-        none = np.zeros(0, dtype=np.intp)
-        first, second, row, column = [none], [none], [none], [none]
-        for entries, columns in blocks:
-            mapped, factor, a, b = upper_pairs(columns, unknown)
-            size = entries.shape[1]
-            first.append(entries[factor, :, a].ravel())
-            second.append(entries[factor, :, b].ravel())
-            row.append(np.repeat(mapped[factor, a], size))
-            column.append(np.repeat(mapped[factor, b], size))
-        self._first, self._second = np.concatenate(first), np.concatenate(second)
-        self._weight = rows.rows[self._first]
-        self.coordinates = np.concatenate(row), np.concatenate(column)
-
-    def products(self, flat: Array, weights: Array | None = None) -> Array:
-        """J[p] J[q], times the weight of their row."""
-        products: Array = flat[self._first] * flat[self._second]
-        if weights is not None:
-            products *= weights[self._weight]
-        return products
+@compiled
+def _times(indptr: IntArray, indices: IntArray, data: Array, vector: Array, out: Array) -> None:
+    """Add the product to ``out``."""
+    for column in range(len(out)):
+        total = 0.0
+        for at in range(indptr[column], indptr[column + 1]):
+            row = indices[at]
+            total += data[at] * vector[row]
+            if row != column:
+                out[row] += data[at] * vector[column]
+        out[column] += total

@@ -1,0 +1,150 @@
+"""Residuals compiled for one factor at a time: what a shipped family is, and what a user's ``@njit`` function becomes.
+
+A kernel is a compiled function ``f(v, p, table, r, J)`` of one factor:
+
+- v: (X,) storage of its variables, one after the other;
+- p: (P,) its parameters (measurements, sampling times), one after the other;
+- table: what all factors share and no solve changes, such as the cells of a map;
+- r: (m,) the residual, to be written;
+- J: (m, D) derivatives along the right perturbations of the variables, to be written unless J has no rows.
+
+One compiled loop runs the kernels of all terms of a graph; called with arrays, a kernel is a batched function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from unifg.calls import RESIDUAL, address, call_residual, matrix, vector
+from unifg.errors import GraphError
+from unifg.jit import compiled
+from unifg.lie import Manifold
+from unifg.typing import Array
+
+Rows: TypeAlias = int | Callable[..., int]
+NOTHING = np.zeros(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Kernel:
+    """A compiled residual and what it expects.
+
+    Attributes:
+        function: compiled, as described in the module's docstring.
+        arguments: in the order of the residual's arguments, the manifold of each variable and the number of axes
+            that each parameter has for one factor (0 for a number, 1 for a vector).
+        rows: m, or a function from the shapes of the parameters (for one factor) to m.
+        table: flat array that all factors share.
+        name: for messages.
+    """
+
+    function: Callable[..., None]
+    arguments: tuple[Manifold | int, ...]
+    rows: Rows
+    table: Array = field(default_factory=lambda: NOTHING)
+    name: str = "kernel"
+
+    @cached_property
+    def address(self) -> int:
+        """Of the machine code; compiles it if need be."""
+        return address(self.function, RESIDUAL)
+
+    @property
+    def manifolds(self) -> list[Manifold]:
+        """Of the variables, in order."""
+        return [argument for argument in self.arguments if not isinstance(argument, int)]
+
+    def size(self, shapes: Sequence[tuple[int, ...]]) -> int:
+        """The number of rows m, given the shape of each parameter for one factor."""
+        return self.rows if isinstance(self.rows, int) else int(self.rows(*shapes))
+
+    def split(self, arguments: Sequence[Any], count: int | None) -> tuple[list[Array], list[Array], int]:
+        """Variables and parameters as arrays with one row per factor or a single one.
+
+        Args:
+            arguments: as the residual is called.
+            count: number of factors; None to find it from the arguments.
+
+        Returns:
+            Variables (n or 1, storage), parameters (n or 1, ...), and n.
+
+        Raises:
+            GraphError: when a shape does not fit.
+        """
+        if len(arguments) != len(self.arguments):
+            raise GraphError(f"{self.name} takes {len(self.arguments)} arguments, found {len(arguments)}")
+        variables, parameters = [], []
+        for place, (expected, given) in enumerate(zip(self.arguments, arguments, strict=True)):
+            array = np.asarray(given, dtype=np.float64)
+            if isinstance(expected, int):
+                if array.ndim not in (expected, expected + 1):
+                    raise GraphError(
+                        f"{self.name}: argument {place} has shape {array.shape}, expected {expected} axes, or one more "
+                        "with a row for each factor"
+                    )
+                parameters.append(array if array.ndim == expected + 1 else array[None])
+            else:
+                array = array if array.ndim == 2 else array[None]
+                if array.ndim != 2 or array.shape[1] != expected.storage:
+                    raise GraphError(
+                        f"{self.name}: argument {place} has shape {np.shape(given)}, expected (n, {expected.storage}) "
+                        f"for {expected.name}"
+                    )
+                variables.append(array)
+        lengths = {len(array) for array in (*variables, *parameters)} - {1}
+        if count is not None and count > 1:
+            lengths.add(count)
+        if len(lengths) > 1:
+            raise GraphError(f"{self.name}: its arguments speak of {sorted(lengths)} factors")
+        return variables, parameters, lengths.pop() if lengths else 1
+
+    def __call__(self, *arguments: Any) -> Array:
+        """(n, m) residuals of batched arguments."""
+        return self._run(arguments, False)[0]
+
+    def jacobian(self, *arguments: Any) -> list[Array]:
+        """One (n, m, d_k) array per variable argument."""
+        blocks = self._run(arguments, True)[1]
+        ends = np.cumsum([manifold.dim for manifold in self.manifolds])
+        return np.split(blocks, ends[:-1], axis=2)
+
+    def _run(self, arguments: Sequence[Any], derive: bool) -> tuple[Array, Array]:
+        variables, parameters, count = self.split(arguments, None)
+        m = self.size([parameter.shape[1:] for parameter in parameters])
+        residual = np.empty((count, m))
+        jacobian = np.empty((count, m, sum(manifold.dim for manifold in self.manifolds)) if derive else (0, 0, 0))
+        _batch(self.address, side_by_side(variables, count), side_by_side(parameters), self.table, residual, jacobian)
+        return residual, jacobian
+
+
+def side_by_side(parts: Sequence[Array], count: int = 1) -> Array:
+    """(n, K) of several (n or 1, ...) arrays, n = 1 where all are shared."""
+    rows = max([len(part) for part in parts] + [count])
+    if not parts:
+        return np.zeros((1, 0))
+    flat = [np.broadcast_to(part.reshape(len(part), -1), (rows, part[0].size)) for part in parts]
+    return np.ascontiguousarray(np.concatenate(flat, axis=1))
+
+
+@compiled
+def _batch(where: int, variables: Array, parameters: Array, table: Array, residual: Array, jacobian: Array) -> None:
+    """Run one kernel over rows of its arguments."""
+    count, rows = residual.shape
+    v, p, r, J = variables.ravel(), parameters.ravel(), residual.reshape(count * rows), jacobian.ravel()
+    storage, size, width = variables.shape[1], parameters.shape[1], jacobian.shape[2]
+    shared = parameters.shape[0] == 1
+    derive = rows if len(jacobian) else 0
+    for i in range(count):
+        call_residual(
+            where,
+            vector(v, i * storage, storage),
+            vector(p, 0 if shared else i * size, size),
+            table,
+            vector(r, i * rows, rows),
+            matrix(J, i * derive * width, derive, width),
+        )

@@ -1,0 +1,56 @@
+"""From standard deviations or information matrices to the W that makes 1/2 |W r|^2 of a cost."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.typing import Array
+
+DIAGONAL, FULL = 2, 4  # kinds of W; 1 is added when every factor has its own
+
+
+def reciprocals(name: str, sigma: Array, count: int, size: int) -> Array:
+    """1 / sigma as (1, m) or (n, m).
+
+    Raises:
+        GraphError: naming the term, when sigma has another shape or is not positive.
+    """
+    if sigma.shape not in ((), (size,), (count, size)):
+        raise GraphError(
+            f"term '{name}': sigma has shape {sigma.shape}, expected (), ({size},) or {(count, size)}", term=name
+        )
+    if not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
+        raise GraphError(f"term '{name}': sigma must be positive and finite", term=name)
+    return np.array(np.broadcast_to(1.0 / sigma, (len(sigma) if sigma.ndim == 2 else 1, size)))
+
+
+def square_roots(name: str, information: Array, count: int, size: int) -> Array:
+    """Upper triangular W with W'W = information, (1, m, m) or (n, m, m); information may be singular.
+
+    Raises:
+        GraphError: naming the term and factor, when information is not symmetric positive semi-definite.
+    """
+    m = size
+    if information.shape not in ((m, m), (count, m, m)):
+        raise GraphError(
+            f"term '{name}': information has shape {information.shape}, expected {(m, m)} or {(count, m, m)}",
+            term=name,
+        )
+    stack = information.reshape(-1, m, m)
+    transposed = np.swapaxes(stack, -1, -2)
+    if not np.isfinite(stack).all() or not np.allclose(stack, transposed, rtol=1e-9, atol=0.0):
+        raise GraphError(f"term '{name}': information must be finite and symmetric", term=name)
+    try:
+        lower = np.linalg.cholesky(stack)
+    except np.linalg.LinAlgError:  # singular, or wrong
+        eigenvalues, vectors = np.linalg.eigh(stack)
+        lowest = eigenvalues.min(axis=-1) / np.maximum(np.abs(eigenvalues).max(axis=-1), 1e-300)
+        if (lowest < -1e-9).any():
+            index = int(np.argmin(lowest))
+            raise GraphError(
+                f"term '{name}': information of factor {index} has a negative eigenvalue", term=name, index=index
+            ) from None
+        roots = np.sqrt(np.maximum(eigenvalues, 0.0))[..., :, None] * np.swapaxes(vectors, -1, -2)
+        return np.asarray(np.linalg.qr(roots, mode="r"))
+    return np.ascontiguousarray(np.swapaxes(lower, -1, -2))
