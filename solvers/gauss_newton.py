@@ -44,16 +44,19 @@ class GaussNewton(LeastSquares):
                 return Status.SINGULAR
             slope = float(gradient @ step)
             length = 1.0
-            values, evaluation = workspace.trial(lin, step)
+            reached = run.program.linearize(run.program.retract(lin.values, step))
+            # Full steps are the rule: linearise at once, and only shortened steps are evaluated by themselves.
+            trial = run.program.evaluate(reached.values, lin.weights) if lin.weights else reached
             while self.line_search and not (
-                evaluation.finite
-                and evaluation.cost <= lin.cost + ARMIJO * length * slope + ROUNDING * max(1.0, lin.cost)
+                trial.finite and trial.cost <= lin.cost + ARMIJO * length * slope + ROUNDING * max(1.0, lin.cost)
             ):
                 length *= 0.5
                 if length < SHORTEST:
                     return Status.STALLED
-                values, evaluation = workspace.trial(lin, length * step)
-            run.accept(run.program.linearize(values), none, length * norm(step), length)
+                values, trial = workspace.trial(lin, length * step)
+            if length < 1.0:
+                reached = run.program.linearize(values)
+            run.accept(reached, none, length * norm(step), length)
             if run.status is None and norm(step) < self.step_tolerance:
                 return Status.STOP_RULE
         return None

@@ -10,9 +10,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.elimination.fronts import factor
+from unifg.elimination.plan import Plan
+from unifg.elimination.substitution import solve
+from unifg.jit import compiled
 from unifg.linearization import Linearization
-from unifg.solvers.primal import Primal
-from unifg.typing import Array
+from unifg.passes import add_constraints, times, transposed_times
+from unifg.solvers.phr import barrier, update
+from unifg.solvers.primal import DIAGONAL_FLOOR, Primal
+from unifg.table import Terms
+from unifg.typing import Array, BoolArray, IntArray
 
 NEWTON_STEPS = 12
 SHORTEST = 1e-3
@@ -36,41 +43,105 @@ def model_step(
         The tangent step and the decrease the model predicts; None when a system cannot be factorised.
     """
     program = primal.program
-    residual, constraints = lin.residual, lin.constraints
     step = np.zeros(program.size)
-    added: Array | None = None
-    active = primal.active(constraints, multipliers, penalty)
-    start = value = 0.5 * float(residual @ residual) + primal.barrier(constraints, multipliers, penalty)
-    for _ in range(NEWTON_STEPS):
-        after = primal.next_multipliers(constraints, multipliers, penalty)
-        gradient = program.costs.transposed_times(lin.jacobian, residual)
-        if program.constraints.count:
-            gradient += program.constraints.transposed_times(lin.constraint_jacobian, after)
-        gradient = gradient[program.columns.free]
-        curvature = program.normal_entries(lin, np.where(active, penalty, 0.0))
-        if added is None:
-            added = primal.damping_diagonal(curvature, damping)
-        gradient += added * step
-        move = primal.direction(curvature, gradient, added)
-        if move is None:
-            return None
-        residual_move = program.costs.times(lin.jacobian, move)
-        constraint_move = program.constraints.times(lin.constraint_jacobian, move)
-        slope, length = float(gradient @ move), 1.0
+    predicted = _minimize(
+        program.arrays,
+        primal.solver.plan,
+        program.columns.free,
+        program.normal.diagonal,
+        program.equality,
+        lin.residual,
+        lin.jacobian,
+        lin.constraints,
+        lin.constraint_jacobian,
+        lin.hessian,
+        multipliers,
+        penalty,
+        damping,
+        step,
+    )
+    return None if np.isnan(predicted) else (step, predicted)
+
+
+@compiled
+def _minimize(
+    terms: Terms,
+    plan: Plan,
+    free: IntArray,
+    diagonal: IntArray,
+    equality: BoolArray,
+    start_residual: Array,
+    jacobian: Array,
+    start_constraints: Array,
+    constraint_jacobian: Array,
+    hessian: Array,
+    multipliers: Array,
+    penalty: Array,
+    damping: float,
+    step: Array,
+) -> float:
+    """Newton's method on the piecewise quadratic; returns the predicted decrease, NaN when a system is singular."""
+    lower, upper = terms.lower, terms.upper
+    residual, constraints = start_residual.copy(), start_constraints.copy()
+    residual_here, constraints_here = np.empty_like(residual), np.empty_like(constraints)
+    residual_move, constraint_move = np.empty_like(residual), np.empty_like(constraints)
+    after, weights = np.empty_like(constraints), np.empty_like(constraints)
+    full, gradient, move = np.empty(len(terms.unknown)), np.empty_like(step), np.empty_like(step)
+    added, curvature, here = np.empty_like(step), np.empty_like(hessian), np.empty_like(step)
+    update(constraints, lower, upper, multipliers, penalty, after)
+    for row in range(len(weights)):
+        weights[row] = penalty[row] if equality[row] or after[row] != 0.0 else 0.0
+    value = 0.5 * float(np.dot(residual, residual)) + barrier(constraints, lower, upper, multipliers, penalty)
+    start = value
+    for newton in range(NEWTON_STEPS):
+        full[:] = 0.0
+        transposed_times(terms, True, jacobian, residual, full)
+        transposed_times(terms, False, constraint_jacobian, after, full)
+        curvature[:] = hessian
+        add_constraints(terms, constraint_jacobian, weights, curvature)
+        if newton == 0:
+            _damping(curvature, diagonal, damping, added)
+        for k in range(len(step)):
+            gradient[k] = -full[free[k]] - added[k] * step[k]
+        if not factor(plan, curvature, added):
+            return np.nan
+        solve(plan, gradient, move)
+        times(terms, True, jacobian, move, residual_move)
+        times(terms, False, constraint_jacobian, move, constraint_move)
+        slope, length = -np.dot(gradient, move), 1.0
+        if not np.isfinite(slope):
+            return np.nan
         while True:
-            here = step + length * move
-            residual_here = residual + length * residual_move
-            constraints_here = constraints + length * constraint_move
-            value_here = (
-                0.5 * float(residual_here @ residual_here)
-                + 0.5 * float(here @ (added * here))
-                + primal.barrier(constraints_here, multipliers, penalty)
-            )
+            for k in range(len(step)):
+                here[k] = step[k] + length * move[k]
+            for row in range(len(residual)):
+                residual_here[row] = residual[row] + length * residual_move[row]
+            for row in range(len(constraints)):
+                constraints_here[row] = constraints[row] + length * constraint_move[row]
+            value_here = 0.5 * float(np.dot(residual_here, residual_here))
+            value_here += barrier(constraints_here, lower, upper, multipliers, penalty)
+            for k in range(len(step)):
+                value_here += 0.5 * added[k] * here[k] * here[k]
             if value_here <= value + ARMIJO * length * slope + ROUNDING * abs(value) or length < SHORTEST:
                 break
             length *= 0.5
-        step, residual, constraints, value = here, residual_here, constraints_here, value_here
-        before, active = active, primal.active(constraints, multipliers, penalty)
-        if length == 1.0 and np.array_equal(before, active):
+        step[:], residual[:], constraints[:], value = here, residual_here, constraints_here, value_here
+        update(constraints, lower, upper, multipliers, penalty, after)
+        same = True
+        for row in range(len(weights)):
+            weight = penalty[row] if equality[row] or after[row] != 0.0 else 0.0
+            same = same and weight == weights[row]
+            weights[row] = weight
+        if length == 1.0 and same:
             break
-    return step, start - value
+    return start - value
+
+
+@compiled
+def _damping(curvature: Array, diagonal: IntArray, damping: float, added: Array) -> None:
+    """What Marquardt's damping adds to the diagonal."""
+    largest = 0.0
+    for k in range(len(added)):
+        largest = max(largest, curvature[diagonal[k]])
+    for k in range(len(added)):
+        added[k] = damping * max(curvature[diagonal[k]], DIAGONAL_FLOOR * largest + 1e-300)

@@ -15,7 +15,10 @@ import numpy as np
 from unifg.columns import Columns, Values
 from unifg.differentiation import gradient_and_hessian, jacobian
 from unifg.errors import GraphError
+from unifg.jit import is_compiled
 from unifg.kernels import Kernel, side_by_side
+from unifg.lie import Manifold
+from unifg.per_factor import per_factor
 from unifg.terms import Constraint, Cost, Parameter, ScalarCost, Term
 from unifg.typing import Array, BoolArray, IntArray
 from unifg.variables import Data, Selection
@@ -96,6 +99,9 @@ class CompiledTerm:
         self.search_kernel = term.residual.search_kernel
         self.place: IntArray = np.zeros(0, dtype=np.int64)
         self.bind({})
+        if is_compiled(self._function) and not isinstance(term, ScalarCost):
+            self.kernel = self._own_kernel()
+            self._function, self._jacobian = self.kernel, self.kernel.jacobian
         if self.kernel is not None:
             self._require_manifolds(self.kernel)
         with np.errstate(all="ignore"):
@@ -233,6 +239,21 @@ class CompiledTerm:
         given = {slot: v for slot, (k, v) in enumerate(zip(places, variables, strict=True)) if k not in self._places}
         self._constants = given
         self.parameters = np.concatenate([packed.ravel(), *(array.ravel() for array in given.values())])
+
+    def _own_kernel(self) -> Kernel:
+        """Compile the user's function of one factor for the manifolds and shapes it is used with."""
+        arguments: list[Manifold | int] = []
+        shapes = []
+        for given, argument in zip(self._arguments, self.term.arguments, strict=True):
+            if isinstance(argument, Selection):
+                arguments.append(argument.manifold)
+                continue
+            shape = np.shape(given)
+            each = argument.each if isinstance(argument, Data) else len(shape) > 1
+            shapes.append(shape[1:] if each else shape)
+            arguments.append(len(shapes[-1]))
+        own = self.term.residual
+        return per_factor(own.function, own.jacobian, own.rows, arguments, shapes, self.name)
 
     def _require_manifolds(self, kernel: Kernel) -> None:
         if len(kernel.arguments) != len(self.term.arguments):

@@ -177,11 +177,15 @@ def _build_prior(manifold: Manifold) -> Residual:
 def _build_between(manifold: Manifold) -> Residual:
     if not isinstance(manifold, LieGroup):
         raise TypeError(f"between needs a Lie group, found {manifold.name}; use difference")
-    return _complete(cast(Hashable, manifold), "between", (manifold, manifold, 1), _vector_relative, _relative, _Relative)
+    return _complete(
+        cast(Hashable, manifold), "between", (manifold, manifold, 1), _vector_relative, _relative, _Relative
+    )
 
 
 def _build_difference(manifold: Manifold) -> Residual:
-    return _complete(cast(Hashable, manifold), "difference", (manifold, manifold), _vector_relative, _relative, _Relative)
+    return _complete(
+        cast(Hashable, manifold), "difference", (manifold, manifold), _vector_relative, _relative, _Relative
+    )
 
 
 prior = ManifoldResidual("prior", _build_prior)

@@ -11,6 +11,7 @@ covers the files of everything it calls.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 from collections.abc import Callable, Iterator
 from types import FunctionType, ModuleType
@@ -21,6 +22,8 @@ from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+logger = logging.getLogger("unifg")
 
 LIBERTIES = {"contract", "reassoc", "nsz", "arcp"}
 
@@ -35,13 +38,27 @@ def compiled(function: F) -> F:
     return cast(F, dispatcher)
 
 
+def inlined(function: F) -> F:
+    """For helpers in the innermost loops: copied into the compiled functions that call them."""
+    return cast(F, numba.njit(inline="always")(function))
+
+
 def is_compiled(function: object) -> bool:
     """Whether a function runs under Numba, whoever compiled it."""
     return isinstance(function, Dispatcher)
 
 
 class _Cache(FunctionCache):  # type: ignore[misc]
-    """A cache that asks for the stamp of the function and of everything it calls."""
+    """A cache that asks for the stamp of the function and of everything it calls, and says when it has to wait."""
+
+    announced = False
+
+    def load_overload(self, signature: Any, target: Any) -> Any:
+        found = super().load_overload(signature, target)
+        if found is None and not _Cache.announced:
+            _Cache.announced = True
+            logger.warning("unifg compiles its kernels for this machine: some ten seconds, once; later runs reuse them")
+        return found
 
     def _index_key(self, signature: Any, codegen: Any) -> Any:
         return signature, codegen.magic_tuple(), stamp(self._py_func)

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from math import prod
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -53,6 +54,10 @@ class Kernel:
     def address(self) -> int:
         """Of the machine code; compiles it if need be."""
         return address(self.function, RESIDUAL)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle without the address, which means nothing to another process."""
+        return {name: value for name, value in self.__dict__.items() if name != "address"}
 
     @property
     def manifolds(self) -> list[Manifold]:
@@ -118,17 +123,21 @@ class Kernel:
         m = self.size([parameter.shape[1:] for parameter in parameters])
         residual = np.empty((count, m))
         jacobian = np.empty((count, m, sum(manifold.dim for manifold in self.manifolds)) if derive else (0, 0, 0))
-        _batch(self.address, side_by_side(variables, count), side_by_side(parameters), self.table, residual, jacobian)
+        if count:
+            packed, shared = side_by_side(variables, count), side_by_side(parameters)
+            _batch(self.address, packed, shared, self.table, residual, jacobian)
         return residual, jacobian
 
 
 def side_by_side(parts: Sequence[Array], count: int = 1) -> Array:
     """(n, K) of several (n or 1, ...) arrays, n = 1 where all are shared."""
     rows = max([len(part) for part in parts] + [count])
-    if not parts:
-        return np.zeros((1, 0))
-    flat = [np.broadcast_to(part.reshape(len(part), -1), (rows, part[0].size)) for part in parts]
-    return np.ascontiguousarray(np.concatenate(flat, axis=1))
+    sizes = [prod(part.shape[1:]) for part in parts]
+    joined, at = np.empty((rows, sum(sizes))), 0
+    for part, size in zip(parts, sizes, strict=True):
+        joined[:, at : at + size] = part.reshape(len(part), size)
+        at += size
+    return joined
 
 
 @compiled

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.calls import call_residual, matrix, vector, vector_at
-from unifg.jit import compiled
+from unifg.jit import compiled, inlined
 from unifg.table import (
     ACTIVE,
     ADDRESS,
@@ -42,48 +42,61 @@ from unifg.table import (
     WIDTH,
     Terms,
 )
-from unifg.typing import Array
+from unifg.typing import Array, IntArray
 from unifg.whitening import DIAGONAL, FULL
 
 
-@compiled
-def _gather(terms: Terms, term: Array, i: int, values: Array, out: Array) -> None:
+@inlined
+def _gather(
+    term: IntArray, i: int, gather: IntArray, sizes: IntArray, parameters: Array, values: Array, out: Array
+) -> None:
     """Copy the variables of factor i side by side; negative starts are constants among the parameters."""
     at, slots = 0, term[SLOTS]
     for slot in range(slots):
-        start, size = terms.gather[term[GATHER] + i * slots + slot], terms.sizes[term[SIZE] + slot]
+        start, size = gather[term[GATHER] + i * slots + slot], sizes[term[SIZE] + slot]
         if start >= 0:
             for k in range(size):
                 out[at + k] = values[start + k]
         else:
             for k in range(size):
-                out[at + k] = terms.parameters[k - start - 1]
+                out[at + k] = parameters[k - start - 1]
         at += size
 
 
-@compiled
-def _run(terms: Terms, term: Array, where: int, i: int, values: Array, scratch: Array, r: Array, J: Array) -> None:
+@inlined
+def _run(
+    term: IntArray,
+    where: int,
+    i: int,
+    gather: IntArray,
+    sizes: IntArray,
+    parameters: Array,
+    values: Array,
+    scratch: Array,
+    r: Array,
+    J: Array,
+) -> None:
     """Call a kernel of factor i."""
-    _gather(terms, term, i, values, scratch)
+    _gather(term, i, gather, sizes, parameters, values, scratch)
     call_residual(
         where,
         vector(scratch, 0, term[STORAGE]),
-        vector(terms.parameters, term[PARAMETER] + i * term[SPREAD], term[PARAMETERS]),
+        vector(parameters, term[PARAMETER] + i * term[SPREAD], term[PARAMETERS]),
         vector_at(term[TABLE], term[TABLE_SIZE]),
         r,
         J,
     )
 
 
-@compiled
-def _whiten(terms: Terms, term: Array, i: int, r: Array, J: Array) -> None:
+@inlined
+def _whiten(term: IntArray, i: int, whiteners: Array, r: Array, J: Array) -> None:
     """W r and W J in place; a full W is upper triangular."""
     rows, width = len(r), J.shape[1]
     kind, spread = term[WHITEN], term[WHITEN] & 1
     if kind & DIAGONAL:
         start = term[WHITENER] + i * spread * rows
         for a in range(rows):
-            w = terms.whiteners[start + a]
+            w = whiteners[start + a]
             r[a] *= w
             if len(J):
                 for d in range(width):
@@ -93,19 +106,19 @@ def _whiten(terms: Terms, term: Array, i: int, r: Array, J: Array) -> None:
         for a in range(rows):
             total = 0.0
             for b in range(a, rows):
-                total += terms.whiteners[start + a * rows + b] * r[b]
+                total += whiteners[start + a * rows + b] * r[b]
             r[a] = total
             if len(J):
-                w = terms.whiteners[start + a * rows + a]
+                w = whiteners[start + a * rows + a]
                 for d in range(width):
                     J[a, d] *= w
                 for b in range(a + 1, rows):
-                    w = terms.whiteners[start + a * rows + b]
+                    w = whiteners[start + a * rows + b]
                     for d in range(width):
                         J[a, d] += w * J[b, d]
 
 
-@compiled
+@inlined
 def _violation(value: float, lower: float, upper: float) -> float:
     """Distance outside the limits."""
     return max(value - upper, lower - value, 0.0)
@@ -114,23 +127,25 @@ def _violation(value: float, lower: float, upper: float) -> float:
 @compiled
 def evaluate(terms: Terms, values: Array, residual: Array, constraints: Array, squares: Array, scratch: Array) -> float:
     """Whitened residuals, constraints, and squared norms of robust factors; returns the cost of the others."""
+    fields, gather, sizes, parameters = terms.fields, terms.gather, terms.sizes, terms.parameters
+    whiteners, active = terms.whiteners, terms.active
     cost = 0.0
-    for t in range(len(terms.fields)):
-        term = terms.fields[t]
+    for t in range(len(fields)):
+        term = fields[t]
         m, kind = term[ROWS], term[KIND]
         target = residual if kind == COST else constraints
         for i in range(term[COUNT]):
             at = term[ROW] + i * m
             r = vector(target, at, m)
             if kind == BOUND:
-                r[0] = values[terms.gather[term[GATHER] + i]]
+                r[0] = values[gather[term[GATHER] + i]]
                 continue
-            if term[ACTIVE] >= 0 and terms.active[term[ACTIVE] + i] == 0:
+            if term[ACTIVE] >= 0 and active[term[ACTIVE] + i] == 0:
                 r[:] = 0.0
             elif term[ADDRESS] != 0:
-                _run(terms, term, term[ADDRESS], i, values, scratch, r, matrix(scratch, 0, 0, 0))
+                _run(term, term[ADDRESS], i, gather, sizes, parameters, values, scratch, r, matrix(scratch, 0, 0, 0))
             if kind == COST:
-                _whiten(terms, term, i, r, matrix(scratch, 0, 0, 0))
+                _whiten(term, i, whiteners, r, matrix(scratch, 0, 0, 0))
                 squared = 0.0
                 for a in range(m):
                     squared += r[a] * r[a]
@@ -161,9 +176,12 @@ def linearize(
     Returns the cost of the factors that are not robust. ``scratch`` holds a factor's variables, then J with all its
     columns for terms that keep only some.
     """
+    fields, gather, sizes, parameters = terms.fields, terms.gather, terms.sizes, terms.parameters
+    whiteners, active, columns, positions = terms.whiteners, terms.active, terms.columns, terms.positions
+    lower, upper = terms.lower, terms.upper
     cost = 0.0
-    for t in range(len(terms.fields)):
-        term = terms.fields[t]
+    for t in range(len(fields)):
+        term = fields[t]
         m, width, kind = term[ROWS], term[WIDTH], term[KIND]
         target = residual if kind == COST else constraints
         blocks = jacobian if kind == COST else constraint_jacobian
@@ -173,27 +191,27 @@ def linearize(
             at = term[ROW] + i * m
             r, J = vector(target, at, m), matrix(blocks, term[ENTRY] + i * m * width, m, width)
             if kind == BOUND:
-                r[0] = values[terms.gather[term[GATHER] + i]]
+                r[0] = values[gather[term[GATHER] + i]]
                 J[0, 0] = 1.0
-                total += _violation(r[0], terms.lower[at], terms.upper[at]) ** 2
+                total += _violation(r[0], lower[at], upper[at]) ** 2
                 continue
-            if term[ACTIVE] >= 0 and terms.active[term[ACTIVE] + i] == 0:
+            if term[ACTIVE] >= 0 and active[term[ACTIVE] + i] == 0:
                 r[:] = 0.0
                 J[:] = 0.0
             elif where != 0:
                 if term[KEEP] < 0:
-                    _run(terms, term, where, i, values, scratch, r, J)
+                    _run(term, where, i, gather, sizes, parameters, values, scratch, r, J)
                 else:
                     full = matrix(scratch, term[STORAGE], m, term[KERNEL_WIDTH])
-                    _run(terms, term, where, i, values, scratch, r, full)
+                    _run(term, where, i, gather, sizes, parameters, values, scratch, r, full)
                     for a in range(m):
                         for d in range(width):
-                            J[a, d] = full[a, terms.sizes[term[KEEP] + d]]
+                            J[a, d] = full[a, sizes[term[KEEP] + d]]
             if kind == CONSTRAINT:
                 for a in range(m):
-                    total += _violation(r[a], terms.lower[at + a], terms.upper[at + a]) ** 2
+                    total += _violation(r[a], lower[at + a], upper[at + a]) ** 2
                 continue
-            _whiten(terms, term, i, r, J)
+            _whiten(term, i, whiteners, r, J)
             squared = 0.0
             for a in range(m):
                 squared += r[a] * r[a]
@@ -202,16 +220,24 @@ def linearize(
                 squares[term[WEIGHT] + i] = squared
             else:
                 cost += 0.5 * squared
-                _accumulate(terms, term, i, r, J, gradient, hessian)
+                _accumulate(term, i, columns, positions, r, J, gradient, hessian)
         norms[t] = np.sqrt(total)
     return cost
 
 
 @compiled
-def weigh(terms: Terms, weights: Array, residual: Array, jacobian: Array, gradient: Array, hessian: Array) -> None:
+def weigh(
+    terms: Terms,
+    weights: Array,
+    residual: Array,
+    jacobian: Array,
+    gradient: Array,
+    hessian: Array,
+) -> None:
     """Scale robust factors by the square root of their weights and add them to gradient and Hessian."""
-    for t in range(len(terms.fields)):
-        term = terms.fields[t]
+    fields, columns, positions = terms.fields, terms.columns, terms.positions
+    for t in range(len(fields)):
+        term = fields[t]
         if term[KIND] != COST or term[WEIGHT] < 0:
             continue
         m, width = term[ROWS], term[WIDTH]
@@ -223,11 +249,20 @@ def weigh(terms: Terms, weights: Array, residual: Array, jacobian: Array, gradie
                 r[a] *= root
                 for d in range(width):
                     J[a, d] *= root
-            _accumulate(terms, term, i, r, J, gradient, hessian)
+            _accumulate(term, i, columns, positions, r, J, gradient, hessian)
 
 
-@compiled
-def _accumulate(terms: Terms, term: Array, i: int, r: Array, J: Array, gradient: Array, hessian: Array) -> None:
+@inlined
+def _accumulate(
+    term: IntArray,
+    i: int,
+    columns: IntArray,
+    positions: IntArray,
+    r: Array,
+    J: Array,
+    gradient: Array,
+    hessian: Array,
+) -> None:
     """Add J'r and the upper triangle of J'J of one factor."""
     rows, width = J.shape
     column = term[COLUMN] + i * width
@@ -236,9 +271,9 @@ def _accumulate(terms: Terms, term: Array, i: int, r: Array, J: Array, gradient:
         total = 0.0
         for a in range(rows):
             total += J[a, d] * r[a]
-        gradient[terms.columns[column + d]] += total
+        gradient[columns[column + d]] += total
         for e in range(d + 1):
-            where = terms.positions[at + e]
+            where = positions[at + e]
             if where != -1:
                 total = 0.0
                 for a in range(rows):
@@ -253,8 +288,9 @@ def _accumulate(terms: Terms, term: Array, i: int, r: Array, J: Array, gradient:
 @compiled
 def add_constraints(terms: Terms, constraint_jacobian: Array, weights: Array, hessian: Array) -> None:
     """Add the upper triangle of A' diag(weights) A."""
-    for t in range(len(terms.fields)):
-        term = terms.fields[t]
+    fields, positions = terms.fields, terms.positions
+    for t in range(len(fields)):
+        term = fields[t]
         if term[KIND] == COST:
             continue
         m, width = term[ROWS], term[WIDTH]
@@ -269,7 +305,7 @@ def add_constraints(terms: Terms, constraint_jacobian: Array, weights: Array, he
                 for d in range(width):
                     scaled = w * constraint_jacobian[entry + d]
                     for e in range(d + 1):
-                        where = terms.positions[at + e]
+                        where = positions[at + e]
                         if where >= 0:
                             hessian[where] += scaled * constraint_jacobian[entry + e]
                         elif where != -1:
@@ -280,8 +316,9 @@ def add_constraints(terms: Terms, constraint_jacobian: Array, weights: Array, he
 @compiled
 def times(terms: Terms, costs: bool, entries: Array, other: Array, out: Array) -> None:
     """J v over the unknowns, for the rows of the costs or of the constraints."""
-    for t in range(len(terms.fields)):
-        term = terms.fields[t]
+    fields, columns, unknowns = terms.fields, terms.columns, terms.unknown
+    for t in range(len(fields)):
+        term = fields[t]
         if (term[KIND] == COST) != costs:
             continue
         m, width = term[ROWS], term[WIDTH]
@@ -291,7 +328,7 @@ def times(terms: Terms, costs: bool, entries: Array, other: Array, out: Array) -
                 entry = term[ENTRY] + (i * m + a) * width
                 total = 0.0
                 for d in range(width):
-                    unknown = terms.unknown[terms.columns[column + d]]
+                    unknown = unknowns[columns[column + d]]
                     if unknown >= 0:
                         total += entries[entry + d] * other[unknown]
                 out[term[ROW] + i * m + a] = total
@@ -300,8 +337,9 @@ def times(terms: Terms, costs: bool, entries: Array, other: Array, out: Array) -
 @compiled
 def transposed_times(terms: Terms, costs: bool, entries: Array, other: Array, out: Array) -> None:
     """Add J' v to ``out`` over the full tangent space, fixed variables included."""
-    for t in range(len(terms.fields)):
-        term = terms.fields[t]
+    fields, columns = terms.fields, terms.columns
+    for t in range(len(fields)):
+        term = fields[t]
         if (term[KIND] == COST) != costs:
             continue
         m, width = term[ROWS], term[WIDTH]
@@ -312,4 +350,4 @@ def transposed_times(terms: Terms, costs: bool, entries: Array, other: Array, ou
                 if scale != 0.0:
                     entry = term[ENTRY] + (i * m + a) * width
                     for d in range(width):
-                        out[terms.columns[column + d]] += scale * entries[entry + d]
+                        out[columns[column + d]] += scale * entries[entry + d]

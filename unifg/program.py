@@ -22,7 +22,7 @@ from unifg.linearization import Evaluation, HeldWeights, Linearization
 from unifg.retraction import Retraction
 from unifg.rows import Rows
 from unifg.sparse import Symmetric
-from unifg.table import ENTRY, ROW, WIDTH, Table
+from unifg.table import ENTRY, ROW, WIDTH, Table, Terms
 from unifg.terms import Constraint, Cost, ScalarCost
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 from unifg.variables import Data, Family
@@ -79,6 +79,11 @@ class Program:
         self._names = [term.name for term in stacked]
         self._scratch = np.empty(self._table.scratch)
         self.bind({})
+
+    @property
+    def arrays(self) -> Terms:
+        """What compiled loops need to know about the terms, with the present data."""
+        return self._table.arrays
 
     @property
     def hessian(self) -> Symmetric:

@@ -103,9 +103,7 @@ class Table:
         self.scratch = 1
         self.robust: list[tuple[CompiledTerm, slice]] = []
         for row, term in zip(fields, terms, strict=True):
-            layout = term.layout(
-                columns, starts["parameters"] + term.parameter_count * (term.count if term.parameter_spread else 1)
-            )
+            layout = term.layout(columns, starts["parameters"])
             count, m, width = layout.count, layout.rows, layout.columns.shape[1]
             row[COUNT], row[ROWS], row[WIDTH] = count, m, width
             row[SLOTS], row[STORAGE], row[KERNEL_WIDTH] = len(layout.sizes), sum(layout.sizes), layout.kernel_width
@@ -126,7 +124,7 @@ class Table:
             starts["positions"] += count * (width * (width + 1) // 2)
             starts["parameters"] += term.parameters.size
             starts["whiteners"] += term.whitener.size
-            self.scratch = max(self.scratch, sum(layout.sizes) + m * layout.kernel_width)
+            self.scratch = max(self.scratch, sum(layout.sizes) + m * layout.kernel_width, width)
             row[PARAMETERS], row[SPREAD], row[WHITEN] = term.parameter_count, term.parameter_spread, term.whitening
             if term.kernel is not None:
                 row[ADDRESS] = term.kernel.address
