@@ -45,6 +45,7 @@ bench: $(VENV)/ready-bench
 	$(BIN)/python -m benchmarks.obstacle_fields
 	$(BIN)/python -m benchmarks.navigation
 	$(BIN)/python -m benchmarks.coupling
+	$(BIN)/python -m benchmarks.elimination
 
 fences: $(VENV)/ready
 	$(BIN)/python docs/check_shell_fences.py

@@ -9,11 +9,16 @@ et al. (2022), section VII.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from scipy import ndimage
 
+from unifg.jit import compiled
 from unifg.typing import Array, ArrayLike, BoolArray
+
+HEADER = 8  # numbers in front of the cells of a table
+RING = 2  # cells repeated around the grid
 
 
 class DistanceMap:
@@ -23,10 +28,12 @@ class DistanceMap:
         values: (H, W) [m], signed distance at the cell centres, row 0 at the lowest y of the map's own frame.
         resolution: side of a cell [m].
         origin: pose (x, y, yaw) [m, m, rad] in the world of the lower-left corner of cell [0, 0].
+        table: what compiled look-ups read: two rows of (., ., offset) that lead from the world to the grid, with
+            (0, 0) at the origin and 1 for a cell; W and H; and (H + 4, W + 4) values, two border cells repeated.
     """
 
     def __init__(self, values: ArrayLike, resolution: float, origin: ArrayLike) -> None:
-        """Prepare one interpolation polynomial per square of cell centres.
+        """Lay out the table.
 
         Args:
             values: (H, W) [m].
@@ -47,21 +54,12 @@ class DistanceMap:
             )
         self.origin: tuple[float, float, float] = (float(pose[0]), float(pose[1]), float(pose[2]))
 
-        # One ring of repeated border values makes the field constant across the border: a point outside finds
-        # a polynomial without slope in the outward direction, so clamping needs no masks.
-        ring = np.pad(self.values, 1, mode="edge")
-        corner, right, above, both = ring[:-1, :-1], ring[:-1, 1:], ring[1:, :-1], ring[1:, 1:]
-        # value(s, t) = k0 + k1 s + k2 t + k3 s t on the unit square; one row per square is one gather per
-        # point.
-        squares = np.stack([corner, right - corner, above - corner, both - above - (right - corner)], axis=-1)
-        self._polynomials: Array = np.ascontiguousarray(squares.reshape(-1, 4))
-        c, s = math.cos(pose[2]), math.sin(pose[2])
-        self._grid_from_world: Array = np.array([[c, -s], [s, c]]) / self.resolution
-        self._world_from_grid: Array = np.ascontiguousarray(self._grid_from_world.T)
-        self._offset: Array = 0.5 - pose[:2] @ self._grid_from_world
         height, width = self.values.shape
-        self._last: Array = np.array([width, height], dtype=np.float64)
-        self._strides: Array = np.array([1.0, width + 1.0])
+        cosine, sine = math.cos(pose[2]) / self.resolution, math.sin(pose[2]) / self.resolution
+        offset = [-cosine * pose[0] - sine * pose[1], sine * pose[0] - cosine * pose[1]]
+        header = [cosine, sine, offset[0], -sine, cosine, offset[1], width, height]
+        # Repeated border values make the field constant across the border: clamping needs no masks.
+        self.table: Array = np.concatenate([header, np.pad(self.values, RING, mode="edge").ravel()])
 
     @classmethod
     def from_occupancy(
@@ -100,8 +98,7 @@ class DistanceMap:
         Returns:
             (...,) [m].
         """
-        s, t, k = self._locate(points)
-        return np.asarray(k[..., 0] + s * k[..., 1] + t * (k[..., 2] + s * k[..., 3]))
+        return _sample(self.table, points)[0]
 
     def distance_and_gradient(self, points: Array) -> tuple[Array, Array]:
         """Interpolated signed distance and the exact derivative of the interpolant.
@@ -113,19 +110,55 @@ class DistanceMap:
             (...,) [m] and (..., 2) [-] in the world frame. On a line of cell centres, where the interpolant
             has a kink, the derivative is that of the side with larger coordinates.
         """
-        s, t, k = self._locate(points)
-        slope = k[..., 1:3] + k[..., 3:] * np.stack((t, s), axis=-1)
-        value = k[..., 0] + s * k[..., 1] + t * slope[..., 1]
-        return value, slope @ self._world_from_grid
+        return _sample(self.table, points)
 
-    def _locate(self, points: Array) -> tuple[Array, Array, Array]:
-        """Coordinates within the square of each point and its polynomial: (...,), (...,), (..., 4)."""
-        position = points @ self._grid_from_world
-        position += self._offset
-        square = np.floor(position)
-        # fmax and fmin also give NaN a harmless square; its fraction stays NaN.
-        np.fmax(square, 0.0, out=square)
-        np.fmin(square, self._last, out=square)
-        position -= square
-        index = (square @ self._strides).astype(np.intp)
-        return position[..., 0], position[..., 1], self._polynomials.take(index, axis=0)
+
+@compiled
+def cell_of(position: float, first: float, last: float) -> tuple[int, float]:
+    """Cell of a grid coordinate, from ``first`` to ``last``, and the fraction of it in [0, 1]; NaN stays NaN."""
+    cell = np.floor(position)
+    if not cell > first:
+        cell = first
+    if cell > last:
+        cell = last
+    fraction = position - cell
+    if fraction < 0.0:
+        fraction = 0.0
+    if fraction > 1.0:
+        fraction = 1.0
+    return int(cell), fraction
+
+
+@compiled
+def bilinear(table: Array, x: float, y: float) -> tuple[float, float, float]:
+    """Distance at a point in the world and its gradient there; ``table`` is that of a :class:`DistanceMap`."""
+    column, s = cell_of(table[0] * x + table[1] * y + table[2] + 0.5, 0.0, table[6])
+    row, t = cell_of(table[3] * x + table[4] * y + table[5] + 0.5, 0.0, table[7])
+    stride = int(table[6]) + 2 * RING
+    at = HEADER + (row + RING - 1) * stride + column + RING - 1
+    corner, above = table[at], table[at + stride]
+    along, along_above = table[at + 1] - corner, table[at + stride + 1] - above
+    low, high = corner + s * along, above + s * along_above
+    slope_s, slope_t = along + t * (along_above - along), high - low
+    return low + t * slope_t, table[0] * slope_s + table[3] * slope_t, table[1] * slope_s + table[4] * slope_t
+
+
+def sampler(look_up: Callable[..., tuple[float, float, float]]) -> Callable[[Array, Array], tuple[Array, Array]]:
+    """Make a look-up of one point in a table one of (..., 2) points: (...,) values and (..., 2) gradients."""
+
+    @compiled
+    def loop(table: Array, points: Array, value: Array, gradient: Array) -> None:
+        for i in range(len(points)):
+            value[i], gradient[i, 0], gradient[i, 1] = look_up(table, points[i, 0], points[i, 1])
+
+    def sample(table: Array, points: Array) -> tuple[Array, Array]:
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        shape = points.shape[:-1]
+        value, gradient = np.empty(math.prod(shape)), np.empty((math.prod(shape), 2))
+        loop(table, points.reshape(-1, 2), value, gradient)
+        return value.reshape(shape), gradient.reshape(*shape, 2)
+
+    return sample
+
+
+_sample = sampler(bilinear)

@@ -8,9 +8,14 @@ whose weights are held during one linearisation and its line search.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from unifg.models.distance_map import DistanceMap
+from unifg.jit import compiled
+from unifg.kernels import Kernel
+from unifg.lie import SE2
+from unifg.models.distance_map import DistanceMap, bilinear
 from unifg.residuals import Residual, residual
 from unifg.robust import Reweighted
 from unifg.typing import Array, BoolArray
@@ -20,22 +25,17 @@ DROP_BEYOND = 10.0  # [m] range
 NEAR_WEIGHT = 0.25
 
 
-class _Endpoint:
-    def __init__(self, distance_map: DistanceMap) -> None:
-        self.distance_map = distance_map
-
-    def __call__(self, x: Array, beams: Array) -> Array:
-        return self.distance_map.distance(in_world(x, beams))[:, None]
-
-    def jacobian(self, x: Array, beams: Array) -> list[Array]:
-        _, gradient = self.distance_map.distance_and_gradient(in_world(x, beams))
-        cosine, sine = np.cos(x[:, 2]), np.sin(x[:, 2])
-        block = np.empty((len(x), 1, 3))
-        along = cosine * gradient[:, 0] + sine * gradient[:, 1]
-        across = cosine * gradient[:, 1] - sine * gradient[:, 0]
-        block[:, 0, 0], block[:, 0, 1] = along, across
-        block[:, 0, 2] = across * beams[:, 0] - along * beams[:, 1]
-        return [block]
+@compiled
+def _endpoint(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """Distance of one end-point."""
+    cosine, sine = math.cos(v[2]), math.sin(v[2])
+    x, y = v[0] + cosine * p[0] - sine * p[1], v[1] + sine * p[0] + cosine * p[1]
+    r[0], slope_x, slope_y = bilinear(table, x, y)
+    if len(J):
+        along, across = cosine * slope_x + sine * slope_y, cosine * slope_y - sine * slope_x
+        J[0, 0] = along
+        J[0, 1] = across
+        J[0, 2] = across * p[0] - along * p[1]
 
 
 def endpoint(distance_map: DistanceMap) -> Residual:
@@ -47,17 +47,12 @@ def endpoint(distance_map: DistanceMap) -> Residual:
     Returns:
         A residual of SE(2) poses x (n, 3) and end-points (n, 2) [m] in the sensor frame.
     """
-    function = _Endpoint(distance_map)
-    return residual(function, function.jacobian, "lidar end-points")
+    return residual(Kernel(_endpoint, (SE2, (2,)), 1, distance_map.table, "lidar end-points"))
 
 
 def in_world(x: Array, points: Array) -> Array:
     """Carry (n, 2) points of the body frame into the world with (n, 3) or (1, 3) poses."""
-    cosine, sine = np.cos(x[:, 2]), np.sin(x[:, 2])
-    world = np.empty((max(len(x), len(points)), 2))
-    world[:, 0] = x[:, 0] + cosine * points[:, 0] - sine * points[:, 1]
-    world[:, 1] = x[:, 1] + sine * points[:, 0] + cosine * points[:, 1]
-    return world
+    return SE2.act(x, points)
 
 
 class _Rule:

@@ -2,42 +2,58 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
 import numpy as np
 
-from unifg.models.smooth_field import SmoothField
+from unifg.calls import vector
+from unifg.errors import GraphError
+from unifg.jit import compiled
+from unifg.kernels import Kernel
+from unifg.lie import SE2
+from unifg.models.smooth_field import SmoothField, smooth
 from unifg.residuals import Residual, residual
 from unifg.typing import Array
 
 NEAR = 1e-9  # below this distance the direction to the centre is undefined; the gradient is taken as zero
 
 
-def _offsets(x: Array, centre: Array) -> tuple[Array, Array]:
-    """(n, M, 2) vectors from the centres to the positions, and their (n, M) lengths."""
-    centres = centre[None, :, :] if centre.ndim == 2 else centre
-    offset = x[:, None, :2] - centres
-    return offset, np.sqrt(np.einsum("nmk,nmk->nm", offset, offset))
+@compiled
+def _in_body(cosine: float, sine: float, x: float, y: float, row: int, J: Array) -> None:
+    """Write the derivative along a pose of what has the gradient (x, y) in the world."""
+    J[row, 0] = cosine * x + sine * y
+    J[row, 1] = cosine * y - sine * x
+    J[row, 2] = 0.0
 
 
-def _disc_clearance(x: Array, centre: Array, radius: Array) -> Array:
-    return _offsets(x, centre)[1] - radius
+@compiled
+def _disc_clearance(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """Write |x - c| - radius for all discs; p holds M centres, then M radii."""
+    count, cosine, sine = len(r), 1.0, 0.0
+    if len(J):
+        cosine, sine = math.cos(v[2]), math.sin(v[2])
+    for k in range(count):
+        x, y = v[0] - p[2 * k], v[1] - p[2 * k + 1]
+        distance = math.sqrt(x * x + y * y)
+        r[k] = distance - p[2 * count + k]
+        if len(J):
+            scale = 1.0 / NEAR if distance < NEAR else 1.0 / distance
+            _in_body(cosine, sine, scale * x, scale * y, k, J)
 
 
-def _disc_clearance_jacobian(x: Array, centre: Array, radius: Array) -> list[Array]:
-    offset, distance = _offsets(x, centre)
-    direction = offset / np.maximum(distance, NEAR)[:, :, None]
-    block = np.zeros((*distance.shape, 3))
-    block[:, :, :2] = _in_body(x, direction)
-    return [block]
+def _discs(centre: tuple[int, ...], radius: tuple[int, ...]) -> int:
+    if centre != (*radius, 2):
+        raise GraphError(
+            f"disc clearance: centre must be (M, 2) or (n, M, 2) and radius (M,) or (n, M), found {centre} and "
+            f"{radius} for each pose"
+        )
+    return centre[0]
 
 
-def _in_body(x: Array, direction: Array) -> Array:
-    """(n, M, 2) world directions expressed in the body frames of (n, 3) poses."""
-    cosine, sine = np.cos(x[:, 2])[:, None], np.sin(x[:, 2])[:, None]
-    along, across = direction[:, :, 0], direction[:, :, 1]
-    return np.stack([cosine * along + sine * across, cosine * across - sine * along], axis=2)
-
-
-disc_clearance = residual(_disc_clearance, _disc_clearance_jacobian, "disc clearance")
+disc_clearance = residual(Kernel(_disc_clearance, (SE2, 2, 1), _discs, name="disc clearance"))
 """``disc_clearance(x, centre, radius)``: |p - c| - r [m], one column per disc, (n, M).
 
 x: (n, 3) SE(2) poses. centre: (M, 2) shared by all poses or (n, M, 2), one set for each, as for moving discs.
@@ -45,27 +61,40 @@ radius: (M,) or (n, M); give the sum of the disc's and the robot's radii for hul
 """
 
 
-class _Wall:
-    def __init__(self, field: SmoothField) -> None:
-        self.field = field
-
-    def __call__(self, x: Array) -> Array:
-        return self.field.distance(x[:, :2])[:, None]
-
-    def jacobian(self, x: Array) -> list[Array]:
-        _, gradient = self.field.distance_and_gradient(x[:, :2])
-        block = np.zeros((len(x), 1, 3))
-        block[:, :, :2] = _in_body(x, gradient[:, None, :])
-        return [block]
+@compiled
+def _wall_distance(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """Smoothed distance of a position to the nearest wall."""
+    r[0], x, y = smooth(table, v[0], v[1])
+    if len(J):
+        _in_body(math.cos(v[2]), math.sin(v[2]), x, y, 0, J)
 
 
 def wall_distance(field: SmoothField) -> Residual:
     """``wall_distance(field)(x)``: signed distance of each SE(2) position to the nearest wall, (n, 1) [m]."""
-    function = _Wall(field)
-    return residual(function, function.jacobian, "wall distance")
+    return residual(Kernel(_wall_distance, (SE2,), 1, field.table, "wall distance"))
+
+
+@cache
+def _short(distance: Callable[..., None]) -> Callable[..., None]:
+    """Write max(0, margin - distance), with the margin in front of the table of the distance."""
+
+    @compiled
+    def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+        distance(v, p, vector(table, 1, len(table) - 1), r, J)
+        for a in range(len(r)):
+            sign = -1.0 if r[a] < table[0] else 0.0
+            short = table[0] - r[a]
+            r[a] = 0.0 if short <= 0.0 else short  # NaN stays
+            if len(J):
+                for d in range(J.shape[1]):
+                    J[a, d] *= sign
+
+    return kernel
 
 
 class _Shortfall:
+    """The same for a distance without a kernel."""
+
     def __init__(self, distance: Residual, margin: float) -> None:
         self.distance = distance
         self.margin = margin
@@ -86,5 +115,9 @@ def shortfall(distance: Residual, margin: float) -> Residual:
         distance: a residual with an attached Jacobian, such as ``disc_clearance``.
         margin: distance below which the cost begins [m]; its square is continuously differentiable there.
     """
+    name = f"{distance.name} margin"
+    if distance.kernel is not None:
+        table = np.concatenate([[margin], distance.kernel.table])
+        return residual(replace(distance.kernel, function=_short(distance.kernel.function), table=table, name=name))
     function = _Shortfall(distance, margin)
-    return residual(function, function.jacobian, f"{distance.name} margin")
+    return residual(function, function.jacobian, name)

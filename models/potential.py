@@ -21,10 +21,17 @@ where it was; "aside" pushes all its poses to the side on which they are.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
 from typing import Literal, TypeAlias
 
 import numpy as np
 
+from unifg.calls import vector
+from unifg.jit import compiled
+from unifg.kernels import Kernel
 from unifg.residuals import Residual, residual
 from unifg.typing import Array
 
@@ -36,7 +43,47 @@ TINY = 1e-300
 Sense: TypeAlias = Literal["circulate", "aside"]
 
 
+@cache
+def _kernel(distance: Callable[..., None], search: bool) -> Callable[..., None]:
+    """Write g and its derivative, or what to search with; five numbers stand in front of the table of the distance."""
+
+    @compiled
+    def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+        distance(v, p, vector(table, 5, len(table) - 5), r, J)
+        scale, near, far, vortex, aside = table[0], table[1], table[2], table[3], table[4]
+        for a in range(len(r)):
+            slope = -scale / (r[a] * r[a]) if near < r[a] < far else 0.0
+            if r[a] < near:
+                r[a] = near
+            if r[a] > far:
+                r[a] = far
+            r[a] = scale * (1.0 / r[a] - 1.0 / far)
+            if len(J):
+                for d in range(J.shape[1]):
+                    J[a, d] *= slope
+                if search:
+                    # Components along and across the body: a quarter turn there is a quarter turn in the world.
+                    along, across, weight = J[a, 0], J[a, 1], vortex
+                    if aside != 0.0:
+                        # The tangential part of a push, as strong as the repulsion, across the body and away.
+                        side = -1.0 if across > 0.0 else 1.0
+                        weight = -vortex * side * along / max(math.sqrt(along * along + across * across), TINY)
+                    J[a, 0] -= weight * across
+                    J[a, 1] += weight * along
+
+    return kernel
+
+
+def _kernels(distance: Kernel, numbers: list[float], name: str) -> tuple[Kernel, Kernel]:
+    """The true kernel and the one to search with; both read one table."""
+    table = np.concatenate([numbers, distance.table])
+    true = replace(distance, function=_kernel(distance.function, False), table=table, name=name)
+    return true, replace(true, function=_kernel(distance.function, True))
+
+
 class _Potential:
+    """The same for a distance without a kernel."""
+
     def __init__(self, distance: Residual, scale: float, near: float, far: float, vortex: float, sense: Sense) -> None:
         self.distance = distance
         self.scale = scale
@@ -107,7 +154,9 @@ def potential(
         raise ValueError(
             f"potential: sense must be 'circulate', or 'aside' with a positive vortex; found {sense!r}, {vortex}"
         )
+    name = f"{distance.name} potential"
+    if distance.kernel is not None:
+        true, steered = _kernels(distance.kernel, [scale, near, far, vortex, float(sense == "aside")], name)
+        return residual(true, search=steered if vortex != 0.0 else None)
     function = _Potential(distance, scale, near, far, vortex, sense)
-    return residual(
-        function, function.jacobian, f"{distance.name} potential", function.search if vortex != 0.0 else None
-    )
+    return residual(function, function.jacobian, name, function.search if vortex != 0.0 else None)

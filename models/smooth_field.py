@@ -7,9 +7,8 @@ corners within one cell, and have a continuous gradient.
 
 from __future__ import annotations
 
-import numpy as np
-
-from unifg.models.distance_map import DistanceMap
+from unifg.jit import compiled
+from unifg.models.distance_map import HEADER, RING, DistanceMap, cell_of, sampler
 from unifg.typing import Array
 
 
@@ -18,53 +17,52 @@ class SmoothField:
 
     Attributes:
         distance_map: the grid that is smoothed.
+        table: of the map, which both share.
     """
 
     def __init__(self, distance_map: DistanceMap) -> None:
-        """Pad the grid so that the field is constant beyond its border."""
+        """Smooth a map; the field is constant beyond its border."""
         self.distance_map = distance_map
-        self._padded = np.pad(distance_map.values, 2, mode="edge")
-        self._flat = self._padded.ravel()
-        self._width = self._padded.shape[1]
-        height, width = distance_map.values.shape
-        self._last = np.array([width, height], dtype=np.float64)
-        x, y, yaw = distance_map.origin
-        cosine, sine = np.cos(yaw), np.sin(yaw)
-        self._grid_from_world = np.array([[cosine, -sine], [sine, cosine]]) / distance_map.resolution
-        self._offset = -np.array([x, y]) @ self._grid_from_world
-        self._neighbours = (np.arange(3)[:, None] * self._width + np.arange(3)).ravel()
+        self.table: Array = distance_map.table
 
     def distance_and_gradient(self, points: Array) -> tuple[Array, Array]:
         """Distance and its exact gradient.
 
         Args:
-            points: (n, 2) [m] in the world.
+            points: (..., 2) [m] in the world; NaN gives NaN.
 
         Returns:
-            (n,) [m] and (n, 2) [-] in the world frame.
+            (...,) [m] and (..., 2) [-] in the world frame.
         """
-        grid = points @ self._grid_from_world + self._offset
-        cell = np.clip(np.floor(grid), -1.0, self._last)
-        weights, slopes = _spline(np.clip(grid - cell, 0.0, 1.0))
-        index = (cell[:, 1] + 1.0) * self._width + cell[:, 0] + 1.0
-        block = self._flat[index.astype(np.intp)[:, None] + self._neighbours].reshape(-1, 3, 3)
-        along_rows = np.einsum("nij,nj->ni", block, weights[:, 0])
-        value = np.einsum("ni,ni->n", along_rows, weights[:, 1])
-        gradient = np.empty((len(points), 2))
-        gradient[:, 0] = np.einsum("nij,nj,ni->n", block, slopes[:, 0], weights[:, 1])
-        gradient[:, 1] = np.einsum("ni,ni->n", along_rows, slopes[:, 1])
-        return value, gradient @ self._grid_from_world.T
+        return _sample(self.table, points)
 
     def distance(self, points: Array) -> Array:
-        """Distance alone, (n,) [m] for points (n, 2) [m]."""
-        return self.distance_and_gradient(points)[0]
+        """Distance alone, (...,) [m] for points (..., 2) [m]."""
+        return _sample(self.table, points)[0]
 
 
-def _spline(fraction: Array) -> tuple[Array, Array]:
-    """(n, 2, 3) weights of the three nearest cells along x and y, and their derivatives."""
-    weights = np.stack(
-        [0.5 * (1.0 - fraction) ** 2, 0.75 - (fraction - 0.5) ** 2, 0.5 * fraction**2],
-        axis=2,
-    )
-    slopes = np.stack([fraction - 1.0, 1.0 - 2.0 * fraction, fraction], axis=2)
-    return weights, slopes
+@compiled
+def _spline(before: float, here: float, after: float, fraction: float) -> tuple[float, float]:
+    """Quadratic B-spline between three neighbours, and its derivative."""
+    rest, aside = 1.0 - fraction, fraction - 0.5
+    value = 0.5 * (rest * rest * before + fraction * fraction * after) + (0.75 - aside * aside) * here
+    return value, fraction * after - rest * before - 2.0 * aside * here
+
+
+@compiled
+def smooth(table: Array, x: float, y: float) -> tuple[float, float, float]:
+    """Distance at a point in the world and its gradient there; ``table`` is that of a map."""
+    column, s = cell_of(table[0] * x + table[1] * y + table[2], -1.0, table[6])
+    row, t = cell_of(table[3] * x + table[4] * y + table[5], -1.0, table[7])
+    stride = int(table[6]) + 2 * RING
+    low = HEADER + (row + RING - 1) * stride + column + RING - 1
+    middle, high = low + stride, low + 2 * stride
+    a, slope_a = _spline(table[low], table[low + 1], table[low + 2], s)
+    b, slope_b = _spline(table[middle], table[middle + 1], table[middle + 2], s)
+    c, slope_c = _spline(table[high], table[high + 1], table[high + 2], s)
+    value, slope_t = _spline(a, b, c, t)
+    slope_s = _spline(slope_a, slope_b, slope_c, t)[0]
+    return value, table[0] * slope_s + table[3] * slope_t, table[1] * slope_s + table[4] * slope_t
+
+
+_sample = sampler(smooth)

@@ -6,110 +6,133 @@ factor through ``minimize`` and as a hard constraint through ``constrain``.
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 
-from unifg.lie import SE2, wrap_angle
+from unifg.calls import vector
+from unifg.factors import difference
+from unifg.jit import compiled
+from unifg.kernels import Kernel
+from unifg.lie import SE2, Rn
+from unifg.lie.scalar.so2 import wrap
 from unifg.residuals import residual
-from unifg.typing import Array
+from unifg.typing import Array, ArrayLike
+
+state = SE2
+"""Manifold of the state."""
+
+CONTROL = Rn(2)
 
 
-def step(x: Array, u: Array, dt: float) -> Array:
+@compiled
+def advance(x: Array, u: Array, dt: float, out: Array) -> tuple[float, float]:
+    """Write the next pose of one robot (eq. 12-14); return cosine and sine of the heading at mid-step."""
+    heading, turn = x[2], dt * u[1]
+    middle = heading + 0.5 * turn
+    cosine, sine = math.cos(middle), math.sin(middle)
+    out[0] = x[0] + dt * u[0] * cosine
+    out[1] = x[1] + dt * u[0] * sine
+    out[2] = wrap(heading + turn)
+    return cosine, sine
+
+
+@compiled
+def _advance_all(x: Array, u: Array, dt: Array, out: Array) -> None:
+    """Advance row by row, in order: ``out`` may be ``x`` one row further on."""
+    for i in range(len(out)):
+        advance(x[i], u[i], dt[i], out[i])
+
+
+def step(x: Array, u: Array, dt: ArrayLike) -> Array:
     """Advance by one sample with the heading at mid-step (eq. 12-14).
 
     Args:
         x: (n, 3) poses [m, m, rad].
         u: (n, 2) controls [m/s, rad/s].
-        dt: sampling time [s].
+        dt: sampling time [s], one or (n,).
 
     Returns:
         (n, 3) next poses.
     """
-    heading = x[:, 2] + 0.5 * dt * u[:, 1]
-    return np.stack(
-        [
-            x[:, 0] + dt * u[:, 0] * np.cos(heading),
-            x[:, 1] + dt * u[:, 0] * np.sin(heading),
-            wrap_angle(x[:, 2] + dt * u[:, 1]),
-        ],
-        axis=1,
-    )
+    moved = np.empty((max(len(x), len(u)), 3))
+    _advance_all(_rows(x, moved, 3), _rows(u, moved, 2), _samples(dt, moved), moved)
+    return moved
 
 
-def rollout(start: Array, u: Array, dt: float) -> Array:
+def rollout(start: Array, u: Array, dt: ArrayLike) -> Array:
     """States reached from ``start`` (3,) under controls (n, 2): (n + 1, 3)."""
-    states = [np.asarray(start, dtype=np.float64).reshape(1, 3)]
-    for control in np.asarray(u, dtype=np.float64):
-        states.append(step(states[-1], control[None, :], dt))
-    return np.concatenate(states)
+    states = np.empty((len(u) + 1, 3))
+    states[0] = start
+    _advance_all(states[:-1], _rows(u, states[1:], 2), _samples(dt, states[1:]), states[1:])
+    return states
 
 
-def _dynamics(x: Array, u: Array, x_next: Array, dt: float) -> Array:
-    """(n, 3) defect x_next - f(x, u) in world axes (eq. 11), heading wrapped."""
-    heading = x[:, 2] + 0.5 * dt * u[:, 1]
-    advance = dt * u[:, 0]
-    defect = x_next - x
-    defect[:, 0] -= advance * np.cos(heading)
-    defect[:, 1] -= advance * np.sin(heading)
-    defect[:, 2] = wrap_angle(defect[:, 2] - dt * u[:, 1])
-    return defect
+def _rows(part: ArrayLike, moved: Array, size: int) -> Array:
+    """One contiguous row per result."""
+    return np.ascontiguousarray(np.broadcast_to(np.asarray(part, dtype=np.float64), (len(moved), size)))
 
 
-def _dynamics_jacobian(x: Array, u: Array, x_next: Array, dt: float) -> list[Array]:
-    count = len(x)
-    heading = x[:, 2] + 0.5 * dt * u[:, 1]
-    cosine, sine, advance = np.cos(heading), np.sin(heading), dt * u[:, 0]
-    before = -_world_from_body(x)
-    before[:, 0, 2] = advance * sine
-    before[:, 1, 2] = -advance * cosine
-    control = np.zeros((count, 3, 2))
-    control[:, 0, 0] = -dt * cosine
-    control[:, 1, 0] = -dt * sine
-    control[:, 0, 1] = 0.5 * dt * advance * sine
-    control[:, 1, 1] = -0.5 * dt * advance * cosine
-    control[:, 2, 1] = -dt
-    return [before, control, _world_from_body(x_next)]
+def _samples(dt: ArrayLike, moved: Array) -> Array:
+    """One sampling time per result."""
+    return np.ascontiguousarray(np.broadcast_to(np.asarray(dt, dtype=np.float64), len(moved)))
 
 
-def _tracking(x: Array, reference: Array) -> Array:
-    """(n, 3) deviation (p - p_ref, theta - theta_ref) in world axes (eq. 8), heading wrapped."""
-    error = x - reference
-    error[:, 2] = wrap_angle(error[:, 2])
-    return error
+@compiled
+def world_from_body(heading: float, J: Array, column: int) -> None:
+    """Write the (3, 3) derivative of (px, py, theta) along the right perturbation of SE(2), from a column on."""
+    cosine, sine = math.cos(heading), math.sin(heading)
+    J[0, column] = cosine
+    J[0, column + 1] = -sine
+    J[1, column] = sine
+    J[1, column + 1] = cosine
+    J[0, column + 2] = J[1, column + 2] = J[2, column] = J[2, column + 1] = 0.0
+    J[2, column + 2] = 1.0
 
 
-def _tracking_jacobian(x: Array, reference: Array) -> list[Array]:
-    return [_world_from_body(x)]
+@compiled
+def _dynamics(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """x_next - f(x, u) in world axes (eq. 11), heading wrapped."""
+    u, dt = vector(v, 3, 2), p[0]
+    cosine, sine = advance(v, u, dt, r)
+    r[0] = v[5] - r[0]
+    r[1] = v[6] - r[1]
+    r[2] = wrap(v[7] - r[2])
+    if len(J):
+        world_from_body(v[2], J, 0)
+        for i in range(3):
+            for k in range(3):
+                J[i, k] = -J[i, k]
+        along = dt * u[0]
+        J[0, 2] = along * sine
+        J[1, 2] = -along * cosine
+        J[0, 3] = -dt * cosine
+        J[1, 3] = -dt * sine
+        J[2, 3] = 0.0
+        J[0, 4] = 0.5 * dt * along * sine
+        J[1, 4] = -0.5 * dt * along * cosine
+        J[2, 4] = -dt
+        world_from_body(v[7], J, 5)
 
 
-def _rate(u: Array, u_next: Array) -> Array:
-    """(n, 2) change of control between neighbouring samples [m/s, rad/s]."""
-    return u_next - u
+@compiled
+def _tracking(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """(p - p_ref, theta - theta_ref) in world axes (eq. 8), heading wrapped."""
+    r[0] = v[0] - p[0]
+    r[1] = v[1] - p[1]
+    r[2] = wrap(v[2] - p[2])
+    if len(J):
+        world_from_body(v[2], J, 0)
 
 
-def _rate_jacobian(u: Array, u_next: Array) -> list[Array]:
-    identity = np.broadcast_to(np.eye(2), (len(u), 2, 2))
-    return [-identity, identity]
-
-
-def _world_from_body(x: Array) -> Array:
-    """(n, 3, 3) derivative of (px, py, theta) along the right perturbation of SE(2)."""
-    cosine, sine = np.cos(x[:, 2]), np.sin(x[:, 2])
-    block = np.zeros((len(x), 3, 3))
-    block[:, 0, 0] = block[:, 1, 1] = cosine
-    block[:, 0, 1] = -sine
-    block[:, 1, 0] = sine
-    block[:, 2, 2] = 1.0
-    return block
-
-
-dynamics = residual(_dynamics, _dynamics_jacobian, "dynamics")
+dynamics = residual(Kernel(_dynamics, (SE2, CONTROL, SE2, 0), 3, name="dynamics"))
 """``dynamics(x, u, x_next, dt)``: x_next - f(x, u), (n, 3) [m, m, rad] (Bazzana eq. 11-14)."""
 
-tracking = residual(_tracking, _tracking_jacobian, "tracking")
+tracking = residual(Kernel(_tracking, (SE2, (3,)), 3, name="tracking"))
 """``tracking(x, reference)``: deviation from a reference pose in world axes, (n, 3) [m, m, rad] (Bazzana eq. 8)."""
 
-rate = residual(_rate, _rate_jacobian, "rate")
+_change = difference.on(CONTROL).kernel
+assert _change is not None
+rate = residual(replace(_change, name="rate"))
 """``rate(u, u_next)``: change of control, (n, 2) [m/s, rad/s]."""
-
-state = SE2
-"""Manifold of the state."""

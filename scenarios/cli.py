@@ -22,6 +22,7 @@ from types import FrameType
 from unifg import __version__
 from unifg.errors import UnifgError
 from unifg.history import Iteration
+from unifg.scenarios import solve_arguments
 from unifg.scenarios.results import summary, write_results
 
 __all__ = ["SCENARIOS", "SOLVERS", "Outcome", "Scenario", "main"]
@@ -107,15 +108,20 @@ def _parser() -> argparse.ArgumentParser:
         one.add_argument("--solver", choices=SOLVERS, default="sqp", help="backend (default: %(default)s)")
         if scenario.random:
             one.add_argument("--seed", type=_count, default=0, metavar="S", help="of everything random (default: 0)")
-        one.add_argument(
-            "--out",
-            type=Path,
-            default=Path("out"),
-            metavar="DIR",
-            help="folder for results (default: %(default)s)",
-        )
-        one.set_defaults(command=_run, scenario=name)
+        _add_out(one)
+        one.set_defaults(command=_run, scenario=name, run=scenario.run)
+    about = solve_arguments.DESCRIPTION
+    solve = commands.add_parser("solve", help="solve a pose graph", description=about, allow_abbrev=False)
+    solve_arguments.add_arguments(solve)
+    _add_out(solve)
+    solve.set_defaults(command=_run, scenario="solve", run=_run_solve)
     return parser
+
+
+def _add_out(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--out", type=Path, default=Path("out"), metavar="DIR", help="folder for results (default: %(default)s)"
+    )
 
 
 def _run(chosen: argparse.Namespace) -> int:
@@ -126,7 +132,7 @@ def _run(chosen: argparse.Namespace) -> int:
     except OSError as error:
         return _refuse(f"--out {folder}: cannot make this folder ({error.strerror})")
     with _progress_bar(chosen.scenario) as progress:
-        outcome = SCENARIOS[chosen.scenario].run(chosen, progress)
+        outcome: Outcome = chosen.run(chosen, progress)
     try:
         files = outcome.write(folder)
     except OSError as error:
@@ -315,6 +321,17 @@ def _run_manoeuvres(chosen: argparse.Namespace, progress: Progress) -> Outcome:
         return [*(manoeuvre_plots.write_picture(folder / f"{m.case.name}.png", m) for m in solved), numbers]
 
     return Outcome(all(m.succeeded for m in solved), interrupted, manoeuvres.table(solved), write)
+
+
+def _run_solve(chosen: argparse.Namespace, progress: Progress) -> Outcome:
+    from unifg.scenarios import solve, solve_results
+
+    settings = solve.SolveSettings(chosen.file, chosen.solver, chosen.robust, chosen.init, chosen.residual)
+    solved = solve.solve_file(settings, progress)
+    text = solve_results.summary(solved)
+    return Outcome(
+        solved.solution.converged, solved.interrupted, text, lambda f: solve_results.write_results(f, solved)
+    )
 
 
 SCENARIOS = {

@@ -21,6 +21,9 @@ COLOURS = {
     "fixed": 0xF09000,
     "moving": 0xD62718,
     "detected": 0x000000,
+    "closure": 0x009E4F,
+    "outlier": 0xD62718,
+    "landmark": 0xF09000,
 }
 """Name to 0xRRGGBB."""
 

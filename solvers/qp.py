@@ -107,7 +107,7 @@ def subproblem(program: Program, lin: Linearization, damping: float) -> QP:
     return QP(
         program,
         hessian,
-        program.free_gradient(lin),
+        lin.gradient[program.columns.free],
         lin.constraint_jacobian,
         program.lower - lin.constraints,
         program.upper - lin.constraints,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.random import Generator
 from scipy.linalg import expm
 
-from unifg.lie import SE2, SO2, LieGroup, Product, Rn
+from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Product, Rn
 from unifg.typing import Array
 
 Batch: TypeAlias = tuple[int, ...]
@@ -32,11 +32,18 @@ CASES = {
     "Rn(3)": Case(Rn(3), (), []),
     "SO2": Case(SO2, (slice(0, 1),), [0]),
     "SE2": Case(SE2, (slice(2, 3),), [2]),
+    "SO3": Case(SO3, (slice(0, 3),), []),
+    "SE3": Case(SE3, (slice(3, 6),), []),
     "product": Case(Product(p=Rn(2), R=SO2, T=SE2), (slice(2, 3), slice(5, 6)), [2, 5]),
     "nested": Case(
         Product(robot=Product(T=SE2, v=Rn(2)), R=SO2, tool=Product(T=SE2)),
         (slice(2, 3), slice(5, 6), slice(8, 9)),
         [2, 5, 8],
+    ),
+    "space": Case(
+        Product(T=SE3, arm=Product(R=SO3, v=Rn(3)), joint=SO2),
+        (slice(3, 6), slice(6, 9), slice(12, 13)),
+        [14],
     ),
 }
 BATCHES = [(), (1,), (5,), (3, 1, 2), (0,)]

@@ -200,8 +200,8 @@ def test_unexpected_sign(rng: np.random.Generator) -> None:
 def test_bad_structure_is_refused(rng: np.random.Generator) -> None:
     pattern, _, label, _ = grid(rng, 3, 2)
     with pytest.raises(UnifgError, match="shape"):
-        Factorization(pattern, label[:-1])
+        Factorization(pattern, label[:-1]).factor(np.zeros(pattern.nnz))
     with pytest.raises(UnifgError, match="decreases at scalar 2"):
-        Factorization(pattern, label[::-1].copy())
+        Factorization(pattern, label[::-1].copy()).factor(np.zeros(pattern.nnz))
     with pytest.raises(UnifgError, match="permutation of the 9 nodes"):
-        Factorization(pattern, label, ordering=np.zeros(9, dtype=np.intp))
+        Factorization(pattern, label, ordering=np.zeros(9, dtype=np.intp)).factor(np.zeros(pattern.nnz))

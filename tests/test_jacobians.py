@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import math
 import pkgutil
+from itertools import combinations, product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +14,13 @@ import pytest
 import unifg as fg
 import unifg.models
 from unifg.differentiation import jacobian
+from unifg.jit import compiled
 from unifg.models import lidar, obstacles, rkmk, unicycle
+from unifg.models.compiled_field import CompiledField
 from unifg.models.distance_map import DistanceMap
 from unifg.models.potential import potential
 from unifg.models.smooth_field import SmoothField
+from unifg.pose_graphs import bearing, bearing_range, chart_between, distance, sighting
 from unifg.residuals import Residual
 from unifg.typing import Array
 
@@ -50,11 +56,18 @@ WALLS = obstacles.wall_distance(SmoothField(GRID))
 CASES["lidar.endpoint"] = (lidar.endpoint(GRID), [INSIDE], [fg.SE2], [RNG.uniform(-1.0, 1.0, (COUNT, 2))])
 CASES["obstacles.wall_distance"] = (WALLS, [INSIDE], [fg.SE2], [])
 CASES["obstacles.shortfall"] = (obstacles.shortfall(WALLS, 0.3), [INSIDE], [fg.SE2], [])
+group: fg.LieGroup
 for group in (fg.Rn(3), fg.SO2, fg.SE2, fg.Product(pose=fg.SE2, v=fg.Rn(2))):
     x, y, z = (group.random(RNG, (COUNT,)) for _ in range(3))
     CASES[f"prior on {group.name}"] = (fg.prior.on(group), [x], [group], [y])
     CASES[f"between on {group.name}"] = (fg.between.on(group), [x, y], [group, group], [z])
     CASES[f"difference on {group.name}"] = (fg.difference.on(group), [x, y], [group, group], [])
+for group, size in ((fg.SE2, 2), (fg.SE3, 3)):
+    x, y, z, points = *(group.random(RNG, (COUNT,)) for _ in range(3)), RNG.normal(size=(COUNT, size))
+    CASES[f"chart_between on {group.name}"] = (chart_between.on(group), [x, y], [group, group], [z])
+    CASES[f"sighting on {group.name}"] = (sighting.on(group), [x, points], [group, fg.Rn(size)], [points[::-1]])
+for case, size in ((bearing, 1), (distance, 1), (bearing_range, 2)):
+    CASES[case.name] = (case, [poses(), vectors(2)], [fg.SE2, fg.Rn(2)], [RNG.normal(size=(COUNT, size))])
 
 
 def current(x: Array, u: Array) -> Array:
@@ -81,6 +94,35 @@ CASES["rkmk.trapezoid, given derivative"] = (
 )  # fmt: skip
 CASES["rkmk.trapezoid, pose and velocity"] = (
     rkmk.trapezoid(MOVING, accelerated), MOTION, [MOVING, fg.Rn(2), MOVING], [0.3],
+)  # fmt: skip
+
+
+@compiled
+def swept(x: Array, u: Array, out: Array) -> None:
+    """Velocity of a vehicle in a current, for one pose."""
+    out[0] = u[0] * (1.2 + math.sin(x[1]))
+    out[1] = 0.4 * math.cos(x[2])
+    out[2] = u[1] + 0.2 * x[0]
+
+
+@compiled
+def swept_derivative(x: Array, u: Array, by_x: Array, by_u: Array) -> None:
+    c, s = math.cos(x[2]), math.sin(x[2])
+    along = u[0] * math.cos(x[1])  # by y in the world
+    by_x[0, 0], by_x[0, 1], by_x[0, 2] = along * s, along * c, 0.0
+    by_x[1, 0], by_x[1, 1], by_x[1, 2] = 0.0, 0.0, -0.4 * s
+    by_x[2, 0], by_x[2, 1], by_x[2, 2] = 0.2 * c, -0.2 * s, 0.0
+    by_u[:] = 0.0
+    by_u[0, 0], by_u[2, 1] = 1.2 + math.sin(x[1]), 1.0
+
+
+SWEPT = CompiledField(swept, 3, 2, swept_derivative)
+CASES["rkmk.trapezoid, compiled"] = (rkmk.trapezoid(fg.SE2, SWEPT), STEP, [fg.SE2, fg.Rn(2), fg.SE2], [0.3])
+CASES["rkmk.trapezoid, compiled, simplified"] = (
+    rkmk.trapezoid(fg.SE2, SWEPT, "simplified"), STEP, [fg.SE2, fg.Rn(2), fg.SE2], [0.3],
+)  # fmt: skip
+CASES["rkmk.trapezoid, compiled, by differences"] = (
+    rkmk.trapezoid(fg.SE2, CompiledField(swept, 3, 2)), STEP, [fg.SE2, fg.Rn(2), fg.SE2], [0.3],
 )  # fmt: skip
 DISCS: list[object] = [RNG.normal(size=(4, 2)), np.full(4, 0.3)]
 CASES["potential.potential"] = (potential(obstacles.disc_clearance), [poses()], [fg.SE2], DISCS)
@@ -126,3 +168,57 @@ def test_only_named_search_jacobians_are_exempt() -> None:
         blocks = case.search(*points, *constants)
         numerical = jacobian(lambda *p, c=case, k=constants: c.function(*p, *k), points, manifolds)
         assert max(np.abs(b - n).max() for b, n in zip(blocks, numerical, strict=True)) > 1e-2, f"{name}: not needed"
+
+
+# ---------------------------------------------------------------- the same in the compiled loop of a graph
+
+KERNELS = [name for name, (case, *_) in CASES.items() if case.kernel is not None]
+ACTIVE = np.arange(COUNT) % 4 != 1
+
+
+def in_graph(case: Residual, arguments: list[Any], families: dict[int, fg.Manifold]) -> tuple[Array, Array]:
+    """(n, m) residuals and (n, m, D) derivatives of a term whose arguments at the given places are variables."""
+    graph = fg.Graph()
+    guess: dict[fg.Family, Array] = {}
+    for place, manifold in families.items():
+        family = graph.variables(f"x{place}", manifold, COUNT)
+        guess[family], arguments[place] = arguments[place], family
+    graph.minimize(case, *arguments, active=ACTIVE)
+    lin = graph.compile().linearize(guess)
+    residual = lin.residual.reshape(COUNT, -1)
+    return residual, lin.jacobian.reshape(*residual.shape, -1)
+
+
+def parameter(constant: object, axes: int, each: bool) -> Array:
+    """One row for each factor, all different, or the first of them."""
+    array = np.asarray(constant, dtype=np.float64)
+    if array.ndim == axes:
+        array = array + 0.01 * np.arange(COUNT).reshape(-1, *[1] * axes)
+    return array if each else array[0]
+
+
+def test_models_are_kernels_unless_their_functions_are_batched() -> None:
+    models = {
+        name for name in CASES if name.partition(".")[0] in {"unicycle", "obstacles", "lidar", "potential", "rkmk"}
+    }
+    batched = {"rkmk.trapezoid", "rkmk.trapezoid, simplified", "rkmk.trapezoid, pose and velocity"}
+    assert models - set(KERNELS) == batched
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_in_a_graph(name: str) -> None:
+    """Some of the variables are constants, shared or one for each factor; so are parameters; factors are inactive."""
+    case, points, manifolds, constants = CASES[name]
+    assert case.kernel is not None and case.jacobian is not None
+    kinds = [kind for kind in case.kernel.arguments if not isinstance(kind, fg.Manifold)]
+    axes = [kind if isinstance(kind, int) else len(kind) for kind in kinds]
+    places = range(len(points))
+    subsets = [subset for size in range(1, len(points) + 1) for subset in combinations(places, size)]
+    for chosen, shared, each in product(subsets, (False, True), (False, True)):
+        arguments: list[Any] = [p[:1] if shared and k not in chosen else p for k, p in enumerate(points)]
+        arguments += [parameter(constant, n, each) for constant, n in zip(constants, axes, strict=True)]
+        residual, derivative = in_graph(case, list(arguments), {k: manifolds[k] for k in chosen})
+        expected, blocks = case.function(*arguments), case.jacobian(*arguments)
+        wanted = np.concatenate([blocks[k] for k in chosen], axis=2)
+        np.testing.assert_allclose(residual, expected * ACTIVE[:, None], rtol=1e-13, atol=1e-14)
+        np.testing.assert_allclose(derivative, wanted * ACTIVE[:, None, None], rtol=1e-12, atol=1e-13)

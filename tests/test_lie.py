@@ -1,8 +1,8 @@
 """The axioms of Lie groups, once, for every group, batch shape and corner of the tangent space.
 
 A new group joins by one line in ``groups.CASES``. Elements are compared through their matrices, so that
-theta = pi and theta = -pi are the same rotation; the references are ``scipy.linalg.expm`` of the Lie algebra
-and of ``ad``.
+theta = pi and theta = -pi are the same rotation, and a quaternion and its negative; the references are
+``scipy.linalg.expm`` of the Lie algebra and of ``ad``.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from groups import (
     tangents,
     times,
 )
-from unifg.lie import SE2, SO2, Rn
+from unifg.lie import SE2, SE3, SO2, SO3, Rn
 from unifg.typing import Array
 
 DIFFERENCE = 1e-7  # central differences with STEP
@@ -68,6 +68,8 @@ def test_closure(case: Case, batch: Batch, regime: str, rng: Generator) -> None:
     for tangent in (group.log(x), group.local(x, y)):
         assert tangent.dtype == np.float64
         assert tangent.shape == (*batch, group.dim)
+        for part in case.rotations:
+            assert np.all(np.linalg.norm(tangent[..., part], axis=-1) <= PI + 1e-15)
         for part in case.rotations:
             if part.stop - part.start == 1:
                 assert np.all((tangent[..., part] >= -PI) & (tangent[..., part] < PI))
@@ -248,7 +250,8 @@ def test_inverse_jacobian_sign(case: Case, rng: Generator) -> None:
     group = case.group
     xi, e = 1e-2 * rng.standard_normal((2, 20, group.dim))
     ad = group.ad(xi)
-    series = np.eye(group.dim) + ad / 2 + ad @ ad / 12  # the next term is ad^4 / 720
+    square = ad @ ad
+    series = np.eye(group.dim) + ad / 2 + square / 12 - square @ square / 720  # the next term is ad^6 / 30240
     assert_close(group.right_jacobian_inverse(xi), series, 1e-9)
     assert_close(group.left_jacobian_inverse(xi), series - ad, 1e-9)
 
@@ -257,7 +260,7 @@ def test_inverse_jacobian_sign(case: Case, rng: Generator) -> None:
     step = times(group.right_jacobian_inverse(xi), e)
     assert_close(group.local(group.exp(xi), group.exp(xi + step)), e, 1e-10)
     assert_close(group.local(group.exp(xi), group.exp(xi + e)), times(group.right_jacobian(xi), e), 1e-10)
-    if case.group in (SE2, CASES["product"].group):
+    if case.group in (SE2, SO3, SE3, CASES["product"].group):
         wrong = times(group.left_jacobian_inverse(xi), e)
         assert np.abs(group.local(group.exp(xi), group.exp(xi + wrong)) - e).max() > 1e-7
 
@@ -293,6 +296,12 @@ def test_action_through_matrices(rng: Generator) -> None:
     assert_close(SE2.act(pose, points), times(SE2.matrix(pose), homogeneous)[:, :2])
     assert_close(Rn(2).act(shift, points), times(Rn(2).matrix(shift), homogeneous)[:, :2])
     assert_close(SO2.act(angle, points), times(SO2.matrix(angle), points))
+
+    points = rng.standard_normal((7, 3))
+    turn, motion = SO3.random(rng, (7,)), SE3.random(rng, (7,))
+    homogeneous = np.concatenate([points, np.ones((7, 1))], axis=-1)
+    assert_close(SO3.act(turn, points), times(SO3.matrix(turn), points))
+    assert_close(SE3.act(motion, points), times(SE3.matrix(motion), homogeneous)[:, :3])
 
 
 def test_random_depends_on_the_generator_alone(case: Case) -> None:

@@ -14,7 +14,7 @@ from numpy.random import Generator
 
 from groups import BATCHES, CASES, PI, Batch, Case, assert_close
 from unifg.errors import UnifgError
-from unifg.lie import SE2, SO2, LieGroup, Manifold, Product, ProductGroup, Rn, wrap_angle
+from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Manifold, Product, ProductGroup, Rn, wrap_angle
 from unifg.typing import Array, BoolArray
 
 # -- wrapping --
@@ -22,7 +22,7 @@ from unifg.typing import Array, BoolArray
 TURN = Fraction(2 * PI)
 
 
-@given(st.floats(-1e6, 1e6))
+@given(st.one_of(st.floats(-1e6, 1e6), st.floats(allow_nan=False, allow_infinity=False)))
 def test_wrap_angle_is_exact(theta: float) -> None:
     wrapped = float(wrap_angle(theta))
     assert -PI <= wrapped < PI
@@ -39,6 +39,7 @@ def test_wrap_angle_at_the_ends() -> None:
     np.testing.assert_array_equal(wrapped[[4, 5]], [-below, below])
     np.testing.assert_array_equal(wrapped[8:], [0.0, 0.0, 1e-300, 5e-324])
     assert wrap_angle(np.zeros((2, 0, 3))).shape == (2, 0, 3)
+    assert np.isnan(wrap_angle([np.inf, -np.inf, np.nan])).all()
 
 
 # -- values: equality, hashing, pickling --
@@ -58,14 +59,14 @@ def test_manifolds_are_values(case: Case) -> None:
 
 
 def test_singletons_survive_pickling() -> None:
-    for group in (SE2, SO2):
+    for group in (SE2, SO2, SE3, SO3):
         assert pickle.loads(pickle.dumps(group)) is group
         assert copy.copy(group) is group
 
 
 def test_equal_arguments_make_equal_manifolds() -> None:
     assert Rn(2) == Rn(2) != Rn(3)
-    assert len({Rn(2), Rn(2), Rn(3), SE2, SO2}) == 4
+    assert len({Rn(2), Rn(2), Rn(3), SE2, SO2, SE3, SO3}) == 6
     assert Product(p=Rn(2), R=SO2) == Product(p=Rn(2), R=SO2)
     assert hash(Product(p=Rn(2), R=SO2)) == hash(Product(p=Rn(2), R=SO2))
     assert Product(p=Rn(2), R=SO2) != Product(R=SO2, p=Rn(2))  # another storage order

@@ -136,7 +136,8 @@ def test_wheel_holds_the_packages_and_nothing_else(source: Path, wheel: Path) ->
         f"unifg-{config()['project']['version']}.dist-info",
     }
     folders = {f"unifg/{side}": source / side for side in SIDES}
-    folders |= {folder: source / folder for folder in ("unifg", "unifg/lie", "unifg/files")}
+    inner = [path.parent for path in (source / "unifg").rglob("__init__.py")]
+    folders |= {folder.relative_to(source).as_posix(): folder for folder in inner if folder.name not in SIDES}
     expected = {f"{name}/{path.name}" for name, folder in folders.items() for path in folder.glob("*.py")}
     maps = [path for kind in ("*.pgm", "*.yaml") for path in (source / "scenarios").glob(kind)]
     assert {path.suffix for path in maps} == {".pgm", ".yaml"}, "no map is shipped"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 import pytest
+
 import unifg as fg
 from unifg.solvers import AugmentedLagrangian, GaussNewton
 from unifg.typing import Array

@@ -9,11 +9,15 @@ import unifg as fg
 from benchmarks.closed_loop import Formulation
 from benchmarks.reference_problems import Problem, problems
 from judge import judge
-from unifg.solvers import SQP, AugmentedLagrangian
+from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 
 # Minima that are not listed, at which IPOPT stays when it is started there (docs/reference-problems.md).
 CONFIRMED = {("ahead", True, 50): (580.25905,)}
-SOLVERS: dict[str, fg.Solver] = {"alm": AugmentedLagrangian(tolerance=1e-5), "sqp": SQP(tolerance=1e-5)}
+SOLVERS: dict[str, fg.Solver] = {
+    "alm": AugmentedLagrangian(tolerance=1e-5),
+    "sqp": SQP(tolerance=1e-5),
+    "ipm": InteriorPoint(tolerance=1e-5),
+}
 
 
 @pytest.mark.parametrize("problem", problems(), ids=lambda p: p.name)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 
 import numpy as np
 import pytest
 
 import unifg as fg
+from unifg.jit import compiled
 from unifg.models import rkmk, unicycle
+from unifg.models.compiled_field import CompiledField
 from unifg.models.rkmk import Form
 from unifg.solvers import SQP, LevenbergMarquardt
 from unifg.typing import Array
@@ -203,3 +206,53 @@ def test_unknown_form_is_refused_and_residuals_pickle() -> None:
         rkmk.trapezoid(fg.SE2, current, "half")  # type: ignore[arg-type]
     copy = pickle.loads(pickle.dumps(rkmk.trapezoid(fg.SE2, current)))
     assert np.isfinite(copy(START, CONTROL, START, 0.1)).all()
+
+
+# ---------------------------------------------------------------- compiled fields
+
+
+@compiled
+def spiral(x: Array, u: Array, out: Array) -> None:
+    """A velocity on any group, from the storage of the state and one control."""
+    for i in range(len(out)):
+        out[i] = u[0] * math.cos(0.3 * i) + 0.4 * math.sin(x[i % len(x)] + 0.5 * i)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("group", [fg.SE2, fg.SO2, fg.SO3, fg.SE3, fg.Rn(2)], ids=lambda g: g.name)
+def test_compiled_fields_agree_with_batched_ones(group: fg.LieGroup, form: Form) -> None:
+    field = CompiledField(spiral, group.dim, 1)
+    mine = rkmk.trapezoid(group, field, form)
+    reference = rkmk.trapezoid(group, lambda x, u: field(x, u), form)
+    assert mine.kernel is not None and reference.kernel is None
+    assert mine.jacobian is not None and reference.jacobian is not None
+    x = group.random(RNG, (20,))
+    arguments = (x, RNG.normal(size=(20, 1)), group.retract(x, 0.7 * RNG.normal(size=(20, group.dim))), 0.3)
+    np.testing.assert_allclose(mine(*arguments), reference(*arguments), atol=1e-13)
+    for block, expected in zip(mine.jacobian(*arguments), reference.jacobian(*arguments), strict=True):
+        np.testing.assert_allclose(block, expected, atol=1e-9)
+
+
+def test_compiled_fields_serve_where_no_kernel_can() -> None:
+    """On a product, and with derivatives of somebody else, they are batched fields."""
+    group, field = fg.Product(pose=fg.SE2, v=fg.Rn(1)), CompiledField(spiral, 4, 1)
+    x, u = group.random(RNG, (3,)), RNG.normal(size=(3, 1))
+    defect = rkmk.trapezoid(group, field)
+    assert defect.kernel is None and defect.jacobian is not None
+    np.testing.assert_allclose(defect(x, u, x, 0.1), -0.1 * field(x, u), atol=1e-14)
+    assert [block.shape for block in defect.jacobian(x, u, x, 0.1)] == [(3, 4, 4), (3, 4, 1), (3, 4, 4)]
+    given = rkmk.trapezoid(fg.SE2, rkmk.unicycle_field, jacobian=lambda x, u: rkmk.unicycle_field_jacobian(x, u))
+    assert given.kernel is None
+    assert rkmk.trapezoid(fg.SE2, rkmk.unicycle_field, jacobian=rkmk.unicycle_field_jacobian).kernel is not None
+
+
+def test_compiled_fields_are_checked_and_pickle() -> None:
+    field = CompiledField(spiral, 4, 1)
+    with pytest.raises(ValueError, match="the field has 4 velocities, SE2 takes 3"):
+        rkmk.trapezoid(fg.SE2, field)
+    with pytest.raises(ValueError, match="no derivative"):
+        field.jacobian(START, CONTROL)
+    with pytest.raises(ValueError, match=r"controls have shape \(1, 2\), expected \(n, 1\)"):
+        field(START, CONTROL)
+    copy = pickle.loads(pickle.dumps(rkmk.trapezoid(fg.SE2, rkmk.unicycle_field)))
+    np.testing.assert_allclose(copy(START, CONTROL, START, 0.1), [[-0.1, 0.0, -0.08]], rtol=1e-15)

@@ -8,7 +8,7 @@ import pytest
 import unifg as fg
 from judge import judge
 from problems import PROBLEMS, Problem, ecg2o, inactive_inequality, short_drive
-from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, LevenbergMarquardt
+from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, InteriorPoint, LevenbergMarquardt
 
 BACKENDS: list[fg.Solver] = [
     GaussNewton(),
@@ -16,13 +16,15 @@ BACKENDS: list[fg.Solver] = [
     AugmentedLagrangian(),
     SQP(),
     SQP(qp="piqp"),
+    InteriorPoint(),
+    InteriorPoint(hessian="gauss-newton"),
 ]
-IDS = ["gn", "lm", "alm", "sqp", "sqp-piqp"]
+IDS = ["gn", "lm", "alm", "sqp", "sqp-piqp", "ipm", "ipm-gn"]
 
 
 def takes(solver: fg.Solver, problem: Problem) -> bool:
     """Which class of problem a backend claims."""
-    if isinstance(solver, SQP):
+    if isinstance(solver, SQP | InteriorPoint):
         return True
     if isinstance(solver, AugmentedLagrangian):
         return not problem.scalar
@@ -53,7 +55,7 @@ def test_backend_solves_or_refuses(solver: fg.Solver, problem: Problem) -> None:
         np.testing.assert_array_equal(guess[family], array)
 
 
-@pytest.mark.parametrize("solver", [AugmentedLagrangian(), SQP()], ids=["alm", "sqp"])
+@pytest.mark.parametrize("solver", [AugmentedLagrangian(), SQP(), InteriorPoint()], ids=["alm", "sqp", "ipm"])
 def test_started_at_the_answer_takes_no_step(solver: fg.Solver) -> None:
     graph, guess = short_drive()
     first = solver.solve(graph, guess, check=True)

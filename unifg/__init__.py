@@ -18,9 +18,9 @@ from unifg.factors import ManifoldResidual, between, difference, prior
 from unifg.graph import Graph
 from unifg.history import Iteration
 from unifg.kkt import Optimality, optimality
-from unifg.lie import SE2, SO2, LieGroup, Manifold, Product, Rn, wrap_angle
+from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Manifold, Product, Rn, wrap_angle
 from unifg.residuals import Residual, residual
-from unifg.robust import Cauchy, Huber, Loss, Reweighted, Tukey
+from unifg.robust import DCS, Cauchy, GemanMcClure, Huber, Loss, Reweighted, TruncatedLeastSquares, Tukey
 from unifg.solution import Guess, Solution
 from unifg.solver import Prepared, Solver
 from unifg.status import Status
@@ -32,14 +32,18 @@ except PackageNotFoundError:  # running from a source tree that was never instal
     __version__ = "0.0.0"
 
 __all__ = [
+    "DCS",
     "SE2",
+    "SE3",
     "SO2",
+    "SO3",
     "BackendError",
     "Cauchy",
     "Data",
     "Family",
     "FileFormatError",
     "Finding",
+    "GemanMcClure",
     "Graph",
     "GraphError",
     "Guess",
@@ -62,6 +66,7 @@ __all__ = [
     "Solution",
     "Solver",
     "Status",
+    "TruncatedLeastSquares",
     "Tukey",
     "UnifgError",
     "between",

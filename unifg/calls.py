@@ -37,7 +37,10 @@ def address(function: Callable[..., Any], arguments: tuple[Any, ...]) -> int:
 
 def _primitive(generator: Callable[..., Any]) -> Any:
     """What compiled functions call and Numba replaces by the instructions ``generator`` emits."""
-    return intrinsic(prefer_literal=True)(generator)
+    primitive = intrinsic(prefer_literal=True)(generator)
+    # Kernels are pickled with what they call. Numba would rebuild a primitive that no longer sees literals.
+    primitive.__class__ = type("Primitive", (type(primitive),), {"__reduce__": lambda self: self._name})
+    return primitive
 
 
 def _caller(arguments: tuple[Any, ...]) -> Any:

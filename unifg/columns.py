@@ -87,6 +87,10 @@ class Columns:
             values[family][:] = parts[family]
         return values
 
+    def view(self, flat: Array) -> Values:
+        """The families' storage as one array, by families."""
+        return Values(self, flat)
+
     def nodes(self) -> tuple[IntArray, IntArray]:
         """For every full column its variable, numbered over all families; and the first unknown of each variable.
 

@@ -19,6 +19,7 @@ from unifg.jit import is_compiled
 from unifg.kernels import Kernel, side_by_side
 from unifg.lie import Manifold
 from unifg.per_factor import per_factor
+from unifg.residuals import Residual
 from unifg.terms import Constraint, Cost, Parameter, ScalarCost, Term
 from unifg.typing import Array, BoolArray, IntArray
 from unifg.variables import Data, Selection
@@ -95,8 +96,7 @@ class CompiledTerm:
         self._function = term.residual.function
         self._jacobian = term.residual.jacobian
         self.is_bound = isinstance(term, Constraint) and term.is_bound
-        self.kernel = None if isinstance(term, ScalarCost) else term.residual.kernel
-        self.search_kernel = term.residual.search_kernel
+        self.kernel, self.search_kernel = (None, None) if isinstance(term, ScalarCost) else _kernels(term.residual)
         self.place: IntArray = np.zeros(0, dtype=np.int64)
         self.bind({})
         if is_compiled(self._function) and not isinstance(term, ScalarCost):
@@ -159,6 +159,33 @@ class CompiledTerm:
                 )
         return [self._masked(block) for block in blocks]
 
+    def carry_back(self, residual: Array) -> Array:
+        """(n, m) W' r for whitened residuals."""
+        if self.whitening & DIAGONAL:
+            return residual * self.whitener
+        if self.whitening & FULL:
+            carried: Array = np.einsum(
+                "nab,na->nb", np.broadcast_to(self.whitener, (self.count, self.size, self.size)), residual
+            )
+            return carried
+        return residual
+
+    def second_derivatives(self, values: Values, weights: Array) -> Array:
+        """(n, D, D) Hessians of weights' r, weights (n, m), by differences of the Jacobians; zero where inactive."""
+        points = [gather(values) for gather in self.gathers]
+
+        def slope(*moved: Array) -> Array:
+            if self._jacobian is None:
+                blocks = jacobian(lambda *p: np.asarray(self._call(list(p))), moved, self.manifolds)
+            else:
+                given = [np.asarray(block) for block in self._jacobian(*self._fill(list(moved)))]
+                blocks = given if len(given) == len(self.dims) else [given[place] for place in self._places]
+            return np.concatenate([np.einsum("nm,nmd->nd", weights, block) for block in blocks], axis=1)
+
+        step = 1e-4 if self._jacobian is None else 6e-6
+        second = np.concatenate(jacobian(slope, points, self.manifolds, step), axis=2)
+        return self._masked(0.5 * (second + np.swapaxes(second, 1, 2)))
+
     def scalar_derivatives(self, values: Values) -> tuple[Array, Array]:
         """Gradient (n, D) and Hessian (n, D, D) of a scalar cost, zero where inactive."""
         points = [gather(values) for gather in self.gathers]
@@ -182,7 +209,7 @@ class CompiledTerm:
         keep: list[int] = []
         sizes, width = [], 0
         for argument, expected in zip(self.term.arguments, self.kernel.arguments, strict=True):
-            if isinstance(expected, int):
+            if isinstance(expected, int | tuple):
                 continue
             sizes.append(expected.storage)
             if isinstance(argument, Selection):
@@ -235,7 +262,7 @@ class CompiledTerm:
         packed = side_by_side(parameters)
         self.parameter_count = packed.shape[1]
         self.parameter_spread = packed.shape[1] if len(packed) > 1 else 0
-        places = [k for k, expected in enumerate(kernel.arguments) if not isinstance(expected, int)]
+        places = [k for k, expected in enumerate(kernel.arguments) if not isinstance(expected, int | tuple)]
         given = {slot: v for slot, (k, v) in enumerate(zip(places, variables, strict=True)) if k not in self._places}
         self._constants = given
         self.parameters = np.concatenate([packed.ravel(), *(array.ravel() for array in given.values())])
@@ -264,8 +291,8 @@ class CompiledTerm:
             )
         for place, selection in zip(self._places, self.term.selections, strict=True):
             expected = kernel.arguments[place]
-            if isinstance(expected, int) or expected != selection.manifold:
-                wanted = "a parameter, not a variable" if isinstance(expected, int) else expected.name
+            if expected != selection.manifold:
+                wanted = "a parameter, not a variable" if isinstance(expected, int | tuple) else expected.name
                 raise GraphError(
                     f"term '{self.name}': argument {place} of {kernel.name} is {wanted}; found {selection!r} on "
                     f"{selection.manifold.name}",
@@ -320,6 +347,15 @@ class CompiledTerm:
             else:
                 shapes.append(f"constant {np.shape(argument)}" if np.shape(argument) else f"{argument!r}")
         return ", ".join(shapes)
+
+
+def _kernels(residual: Residual) -> tuple[Kernel | None, Kernel | None]:
+    """The kernel and the one to search with; none when they do not belong together, and NumPy evaluates the term."""
+    kernel, search = residual.kernel, residual.search_kernel
+    if kernel is None or residual.search is None:
+        return kernel, None
+    same = search is not None and search.arguments == kernel.arguments and search.table is kernel.table
+    return (kernel, search) if same else (None, None)
 
 
 def resolve(parameter: Parameter, data: Bound) -> Array:

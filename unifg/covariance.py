@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.errors import GraphError
 from unifg.elimination.factorization import Factorization
+from unifg.errors import GraphError
 from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.sparse import Symmetric

@@ -17,13 +17,19 @@ FIRST_STEP = 6e-6  # eps ** (1/3): balances truncation and rounding of a central
 SECOND_STEP = 1e-4  # eps ** (1/4)
 
 
-def jacobian(function: Callable[..., Array], points: Sequence[Array], manifolds: Sequence[Manifold]) -> list[Array]:
+def jacobian(
+    function: Callable[..., Array],
+    points: Sequence[Array],
+    manifolds: Sequence[Manifold],
+    length: float = FIRST_STEP,
+) -> list[Array]:
     """Central differences of a batched function along each tangent direction.
 
     Args:
         function: maps arrays like ``points`` to (n, m).
         points: one (n, storage_k) array per variable.
         manifolds: the manifold of each variable.
+        length: of the steps.
 
     Returns:
         One (n, m, d_k) array per variable.
@@ -31,10 +37,10 @@ def jacobian(function: Callable[..., Array], points: Sequence[Array], manifolds:
     result = []
     for k, (point, manifold) in enumerate(zip(points, manifolds, strict=True)):
         columns = []
-        for step in _directions(len(point), manifold.dim, FIRST_STEP):
+        for step in _directions(len(point), manifold.dim, length):
             ahead = function(*points[:k], manifold.retract(point, step), *points[k + 1 :])
             behind = function(*points[:k], manifold.retract(point, -step), *points[k + 1 :])
-            columns.append((ahead - behind) / (2.0 * FIRST_STEP))
+            columns.append((ahead - behind) / (2.0 * length))
         result.append(np.stack(columns, axis=-1))
     return result
 

@@ -163,7 +163,7 @@ def _complete(
     assert isinstance(manifold, Manifold)
     functions = functions_of(manifold)
     if isinstance(manifold, Rn):
-        return residual(Kernel(vectors, arguments, manifold.dim, name=name))
+        return residual(Kernel(vectors, arguments, manifold.dim, name=name, linear=True))
     if isinstance(manifold, LieGroup) and functions is not None:
         return residual(Kernel(groups(manifold, functions), arguments, manifold.dim, name=name))
     function = batched(manifold)
@@ -171,14 +171,21 @@ def _complete(
 
 
 def _build_prior(manifold: Manifold) -> Residual:
-    return _complete(cast(Hashable, manifold), "prior", (manifold, 1), _vector_deviation, _deviation, _Prior)
+    return _complete(
+        cast(Hashable, manifold), "prior", (manifold, (manifold.storage,)), _vector_deviation, _deviation, _Prior
+    )
 
 
 def _build_between(manifold: Manifold) -> Residual:
     if not isinstance(manifold, LieGroup):
         raise TypeError(f"between needs a Lie group, found {manifold.name}; use difference")
     return _complete(
-        cast(Hashable, manifold), "between", (manifold, manifold, 1), _vector_relative, _relative, _Relative
+        cast(Hashable, manifold),
+        "between",
+        (manifold, manifold, (manifold.storage,)),
+        _vector_relative,
+        _relative,
+        _Relative,
     )
 
 

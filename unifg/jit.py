@@ -91,6 +91,8 @@ def _parts(function: Any, seen: set[int]) -> Iterator[str]:
             yield f"{python.__qualname__} {cell.cell_contents!r}"
     for name in code.co_names:
         found = python.__globals__.get(name)
+        if isinstance(found, int | float | str | tuple):  # constants are compiled in
+            yield f"{name} = {found!r}"
         candidates = [getattr(found, n, None) for n in code.co_names] if isinstance(found, ModuleType) else [found]
         for callee in candidates:
             if is_compiled(callee):

@@ -27,6 +27,7 @@ from unifg.jit import compiled
 from unifg.lie import Manifold
 from unifg.typing import Array
 
+Argument: TypeAlias = Manifold | int | tuple[int, ...]
 Rows: TypeAlias = int | Callable[..., int]
 NOTHING = np.zeros(0)
 
@@ -37,18 +38,25 @@ class Kernel:
 
     Attributes:
         function: compiled, as described in the module's docstring.
-        arguments: in the order of the residual's arguments, the manifold of each variable and the number of axes
-            that each parameter has for one factor (0 for a number, 1 for a vector).
+        arguments: in the order of the residual's arguments, the manifold of each variable, and of each parameter the
+            shape that it has for one factor, or the number of axes (0 for a number, 1 for a vector of any length).
         rows: m, or a function from the shapes of the parameters (for one factor) to m.
         table: flat array that all factors share.
         name: for messages.
+        linear: whether r is linear in tangent steps, so that it has no second derivatives.
     """
 
     function: Callable[..., None]
-    arguments: tuple[Manifold | int, ...]
+    arguments: tuple[Argument, ...]
     rows: Rows
     table: Array = field(default_factory=lambda: NOTHING)
     name: str = "kernel"
+    linear: bool = False
+
+    def __post_init__(self) -> None:
+        """Compiled code reads the table as it lies in memory."""
+        table = np.ascontiguousarray(self.table, dtype=np.float64)
+        object.__setattr__(self, "table", table if table.ndim == 1 else table.ravel())
 
     @cached_property
     def address(self) -> int:
@@ -62,7 +70,7 @@ class Kernel:
     @property
     def manifolds(self) -> list[Manifold]:
         """Of the variables, in order."""
-        return [argument for argument in self.arguments if not isinstance(argument, int)]
+        return [argument for argument in self.arguments if not isinstance(argument, int | tuple)]
 
     def size(self, shapes: Sequence[tuple[int, ...]]) -> int:
         """The number of rows m, given the shape of each parameter for one factor."""
@@ -86,13 +94,16 @@ class Kernel:
         variables, parameters = [], []
         for place, (expected, given) in enumerate(zip(self.arguments, arguments, strict=True)):
             array = np.asarray(given, dtype=np.float64)
-            if isinstance(expected, int):
-                if array.ndim not in (expected, expected + 1):
+            if isinstance(expected, int | tuple):
+                axes, shape = (expected, None) if isinstance(expected, int) else (len(expected), expected)
+                rows = array if array.ndim == axes + 1 else array[None]
+                if rows.ndim != axes + 1 or shape not in (None, rows.shape[1:]):
+                    wanted = f"{axes} axes" if shape is None else str(shape)
                     raise GraphError(
-                        f"{self.name}: argument {place} has shape {array.shape}, expected {expected} axes, or one more "
+                        f"{self.name}: argument {place} has shape {array.shape}, expected {wanted}, or one axis more "
                         "with a row for each factor"
                     )
-                parameters.append(array if array.ndim == expected + 1 else array[None])
+                parameters.append(rows)
             else:
                 array = array if array.ndim == 2 else array[None]
                 if array.ndim != 2 or array.shape[1] != expected.storage:

@@ -47,7 +47,7 @@ from unifg.whitening import DIAGONAL, FULL
 
 
 @inlined
-def _gather(
+def gather_variables(
     term: IntArray, i: int, gather: IntArray, sizes: IntArray, parameters: Array, values: Array, out: Array
 ) -> None:
     """Copy the variables of factor i side by side; negative starts are constants among the parameters."""
@@ -77,7 +77,7 @@ def _run(
     J: Array,
 ) -> None:
     """Call a kernel of factor i."""
-    _gather(term, i, gather, sizes, parameters, values, scratch)
+    gather_variables(term, i, gather, sizes, parameters, values, scratch)
     call_residual(
         where,
         vector(scratch, 0, term[STORAGE]),

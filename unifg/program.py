@@ -16,8 +16,8 @@ from unifg import passes
 from unifg.columns import Columns, Values
 from unifg.compiled import CompiledTerm
 from unifg.differentiation import convexified
-from unifg.errors import GraphError
 from unifg.elimination.factorization import Factorization
+from unifg.errors import GraphError
 from unifg.linearization import Evaluation, HeldWeights, Linearization
 from unifg.retraction import Retraction
 from unifg.rows import Rows
@@ -45,6 +45,10 @@ class Program:
         cost_terms, scalar_terms, constraint_terms: compiled terms in row order.
         slices: rows of each constraint term.
         bound_rows: (M,) whether a row bounds an unknown itself.
+        table: all terms as compiled loops take them.
+        batched: terms without a kernel, evaluated by NumPy.
+        retraction: moves all variables.
+        scratch: memory for compiled loops.
     """
 
     def __init__(self, graph: Graph) -> None:
@@ -64,10 +68,10 @@ class Program:
         self.blocks = variable[self.columns.free]
         self.normal = self._pattern(self.cost_terms + self.scalar_terms + self.constraint_terms, variable, starts)
         stacked = self.cost_terms + self.constraint_terms
-        self._table = Table(stacked, self.columns, self.normal)
-        self._python = [term for term in stacked if term.kernel is None and not term.is_bound]
-        self.costs = Rows(self._table, self.cost_terms, True, self.size)
-        self.constraints = Rows(self._table, self.constraint_terms, False, self.size)
+        self.table = Table(stacked, self.columns, self.normal)
+        self.batched = [term for term in stacked if term.kernel is None and not term.is_bound]
+        self.costs = Rows(self.table, self.cost_terms, True, self.size)
+        self.constraints = Rows(self.table, self.constraint_terms, False, self.size)
         self._cost_slices = _slices(self.cost_terms)
         self.slices = _slices(self.constraint_terms)
         self.bound_rows = np.zeros(self.constraints.count, dtype=bool)
@@ -75,15 +79,20 @@ class Program:
             self.bound_rows[rows] = term.is_bound
         self._scalar_blocks()
         self._hessian: tuple[Symmetric, IntArray] | None = None
-        self._retraction = Retraction(self.columns, graph.fixes)
+        self.retraction = Retraction(self.columns, graph.fixes)
         self._names = [term.name for term in stacked]
-        self._scratch = np.empty(self._table.scratch)
+        self.scratch = np.empty(self.table.scratch)
         self.bind({})
+
+    @property
+    def fully_compiled(self) -> bool:
+        """Whether a compiled loop can do without Python: every term a kernel, no robust loss, compiled retractions."""
+        return not (self.batched or self.scalar_terms or self.table.robust) and self.retraction.compiled
 
     @property
     def arrays(self) -> Terms:
         """What compiled loops need to know about the terms, with the present data."""
-        return self._table.arrays
+        return self.table.arrays
 
     @property
     def hessian(self) -> Symmetric:
@@ -113,8 +122,8 @@ class Program:
             name, index = self.row_name(int(crossed[0]))
             raise GraphError(f"term '{name}': lower exceeds upper in factor {index}", term=name, index=index)
         self.equality = self.lower == self.upper
-        self._table.bind(self.lower, self.upper)
-        self._retraction.bind(
+        self.table.bind(self.lower, self.upper)
+        self.retraction.bind(
             [
                 np.asarray(checked.get(fix.value, fix.value.value) if isinstance(fix.value, Data) else fix.value)
                 for fix in self.graph.fixes
@@ -148,7 +157,7 @@ class Program:
                     family=family.name,
                 )
             values[family][:] = array
-        self._retraction.fix(values)
+        self.retraction.fix(values)
         for family, array in values.items():
             valid = family.manifold.is_valid(array)
             if not valid.all():
@@ -162,7 +171,7 @@ class Program:
 
     def retract(self, values: Values, step: Array) -> Values:
         """Move the unknowns by a tangent step; fixed variables stay."""
-        return self._retraction(values, step)
+        return self.retraction(values, step)
 
     def within_bounds(self, values: Values) -> Values:
         """The nearest values that respect every bound of an unknown; ``values`` itself when all do."""
@@ -173,20 +182,20 @@ class Program:
             selection = term.gathers[0].selection
             part = moved[selection.family][selection.indices, selection.storage]
             moved[selection.family][selection.indices, selection.storage] = np.clip(part, term.lower, term.upper)
-        self._retraction.fix(moved)
+        self.retraction.fix(moved)
         return values if np.array_equal(moved.flat, values.flat) else moved
 
     # ---------------------------------------------------------------- evaluation
 
     def evaluate(self, values: Mapping[Family, Array], weights: HeldWeights | None = None) -> Evaluation:
         """Objective and constraints; ``weights`` are those of the linearisation whose line search this is."""
-        table, values = self._table, self.columns.values(values)
+        table, values = self.table, self.columns.values(values)
         residual, constraints = np.empty(table.residuals), np.empty(table.constraints)
         squares = np.empty(table.weights)
         with np.errstate(all="ignore"):
-            for term in self._python:
-                self._rows_of(term, residual, constraints)[:] = term.residual(values)
-            cost = passes.evaluate(table.arrays, values.flat, residual, constraints, squares, self._scratch)
+            for term in self.batched:
+                self.rows_of(term, residual, constraints)[:] = term.residual(values)
+            cost = passes.evaluate(table.arrays, values.flat, residual, constraints, squares, self.scratch)
             for term, part in table.robust:
                 assert isinstance(term.term, Cost) and term.term.robust is not None
                 held = weights.get(term.name) if weights else None
@@ -198,7 +207,7 @@ class Program:
 
     def linearize(self, values: Mapping[Family, Array], search: bool = False) -> Linearization:
         """Everything a backend needs at ``values``; with ``search``, by search Jacobians where a residual has one."""
-        table, values = self._table, self.columns.values(values)
+        table, values = self.table, self.columns.values(values)
         residual, jacobian = np.empty(table.residuals), np.empty(table.entries)
         constraints, constraint_jacobian = np.empty(table.constraints), np.empty(table.constraint_entries)
         squares, size = np.empty(table.weights), np.empty(len(table.arrays.fields))
@@ -206,8 +215,8 @@ class Program:
         norms: dict[str, float] = {}
         weights: HeldWeights = {}
         with np.errstate(all="ignore"):
-            for term in self._python:
-                self._rows_of(term, residual, constraints)[:] = term.residual(values)
+            for term in self.batched:
+                self.rows_of(term, residual, constraints)[:] = term.residual(values)
                 self._entries_of(term, jacobian, constraint_jacobian, term.jacobians(values, search=search))
             cost = passes.linearize(
                 table.arrays,
@@ -221,7 +230,7 @@ class Program:
                 size,
                 gradient,
                 hessian,
-                self._scratch,
+                self.scratch,
             )
             if table.robust:
                 cost += self._weigh(squares, residual, jacobian, gradient, hessian, weights)
@@ -248,7 +257,7 @@ class Program:
         held: HeldWeights,
     ) -> float:
         """Finish what robust terms began: find weights, scale, accumulate; return their cost."""
-        table = self._table
+        table = self.table
         weights, cost = np.empty(table.weights), 0.0
         for term, part in table.robust:
             assert isinstance(term.term, Cost) and term.term.robust is not None
@@ -260,7 +269,7 @@ class Program:
         passes.weigh(table.arrays, weights, residual, jacobian, gradient, hessian)
         return cost
 
-    def _rows_of(self, term: CompiledTerm, residual: Array, constraints: Array) -> Array:
+    def rows_of(self, term: CompiledTerm, residual: Array, constraints: Array) -> Array:
         """(n, m) rows of a term in the stacked residuals."""
         start = int(term.place[ROW])
         target = residual if isinstance(term.term, Cost) else constraints
@@ -285,12 +294,8 @@ class Program:
     def normal_entries(self, lin: Linearization, row_weights: Array) -> Array:
         """Gauss-Newton Hessian plus A' diag(row_weights) A, in the order of ``normal``."""
         entries = lin.hessian.copy()
-        passes.add_constraints(self._table.arrays, lin.constraint_jacobian, row_weights, entries)
+        passes.add_constraints(self.table.arrays, lin.constraint_jacobian, row_weights, entries)
         return entries
-
-    def free_gradient(self, lin: Linearization) -> Array:
-        """Gradient of the objective over the unknowns."""
-        return lin.gradient[self.columns.free]
 
     def lagrangian_gradient(self, lin: Linearization, multipliers: Array) -> Array:
         """Gradient of the objective plus A' multipliers, over the full tangent space."""
@@ -305,8 +310,6 @@ class Program:
     def normal_solver(self) -> Factorization:
         """A factorisation for matrices in the pattern ``normal``."""
         return Factorization(self.normal, self.blocks)
-
-    # ---------------------------------------------------------------- names
 
     def row_name(self, row: int) -> tuple[str, int]:
         """Term and factor of a constraint row."""
@@ -328,8 +331,6 @@ class Program:
                 raise GraphError(f"no cost is called '{name}' (there are: {', '.join(slices) or 'none'})", term=name)
             chosen[slices[name]] = True
         return chosen
-
-    # ---------------------------------------------------------------- compilation
 
     def _term_columns(self, term: CompiledTerm) -> list[IntArray]:
         """(n, d_k) full columns of each variable argument."""

@@ -75,7 +75,7 @@ def residual(
     looked_in = search.jacobian if isinstance(search, Kernel) else search
     if is_compiled(function) and rows < 1:
         raise GraphError(
-            f"the residual '{getattr(function, '__name__', name)}' is compiled: say how many numbers it writes, rows=..."
+            f"the residual '{getattr(function, '__name__', name)}' is compiled: say how many numbers it writes, rows="
         )
     if isinstance(function, Kernel) and jacobian is None:
         return Residual(function, function.jacobian, name or function.name, looked_in, function, search_kernel)

@@ -18,7 +18,11 @@ ADDITION = 0  # in the place of an address: the retraction is a sum
 
 
 class Retraction:
-    """x [+] d for every variable; fixed ones take their values."""
+    """x [+] d for every variable; fixed ones take their values.
+
+    Attributes:
+        parts: one row per component of a family, for :func:`retract_parts`.
+    """
 
     def __init__(self, columns: Columns, fixes: Sequence[Fix]) -> None:
         """Lay out the parts of every family."""
@@ -47,11 +51,16 @@ class Retraction:
                         leaf.dim,
                     ]
                 )
-        self._parts = np.array(parts, dtype=np.int64).reshape(-1, 8)
+        self.parts = np.array(parts, dtype=np.int64).reshape(-1, 8)
         places = [columns.starts(fix.selection)[:, None] + np.arange(fix.selection.manifold.storage) for fix in fixes]
         self._fixed = np.concatenate([np.zeros(0, dtype=np.intp), *(place.ravel() for place in places)])
         self._sizes = [place.shape for place in places]
         self._values = np.zeros(len(self._fixed))
+
+    @property
+    def compiled(self) -> bool:
+        """Whether every family has a compiled retraction."""
+        return not self._python
 
     def bind(self, values: Sequence[Array]) -> None:
         """Take the present value of every fix, (storage,) or (n, storage)."""
@@ -67,13 +76,31 @@ class Retraction:
         columns = self._columns
         full = np.zeros(columns.width)
         moved = Values(columns, values.flat.copy())
-        _retract(self._parts, columns.free, np.ascontiguousarray(step), full, values.flat, moved.flat)
+        retract_parts(self.parts, columns.free, np.ascontiguousarray(step), full, values.flat, moved.flat)
         for family in self._python:
             offset, dim = columns.offsets[family], family.manifold.dim
             part = full[offset : offset + family.count * dim].reshape(family.count, dim)
             moved[family][:] = family.manifold.retract(values[family], part)
         self.fix(moved)  # retractions wrap and renormalise; a fixed value stays as given
         return moved
+
+
+def retractions(manifolds: Sequence[Manifold]) -> list[list[int]]:
+    """For every part of several variables side by side: address, start, storage, dimension, first column.
+
+    Nothing when one of them has no compiled retraction.
+    """
+    parts: list[list[int]] = []
+    storage = tangent = 0
+    for manifold in manifolds:
+        for leaf, stored, moved in _leaves(manifold, storage, tangent):
+            function = _compiled_retraction(leaf)
+            if function is None:
+                return []
+            where = ADDITION if function == ADDITION else address(function, RETRACTION)  # type: ignore[arg-type]
+            parts.append([where, stored, leaf.storage, leaf.dim, moved])
+        storage, tangent = storage + manifold.storage, tangent + manifold.dim
+    return parts
 
 
 def _leaves(manifold: Manifold, storage: int, tangent: int) -> Iterator[tuple[Manifold, int, int]]:
@@ -94,7 +121,7 @@ def _compiled_retraction(manifold: Manifold) -> object:
 
 
 @compiled
-def _retract(parts: IntArray, free: IntArray, step: Array, full: Array, values: Array, moved: Array) -> None:
+def retract_parts(parts: IntArray, free: IntArray, step: Array, full: Array, values: Array, moved: Array) -> None:
     """Spread the step over the tangent space and move every part."""
     for k in range(len(free)):
         full[free[k]] = step[k]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -185,6 +185,36 @@ class Run:
         self.status = self._decide()
         if self._callback is not None and self._callback(row) and self.status is None:
             self.status = Status.INTERRUPTED
+
+    @property
+    def watched(self) -> bool:
+        """Whether somebody looks at every iteration: a callback, a log, kept values, a time limit."""
+        solver = self._solver
+        return bool(self._callback or solver.verbose or solver.keep_values or np.isfinite(solver.time_limit))
+
+    def conclude(
+        self, lin: Linearization, multipliers: Array, rows: Sequence[tuple[Array, Mapping[str, float | int | str]]]
+    ) -> None:
+        """Make ``lin`` the last iterate of a loop that ran without Python, and record its iterations.
+
+        Args:
+            lin: linearisation at the last iterate.
+            multipliers: (M,) there.
+            rows: per iteration its cost, stationarity, violation, complementarity, step norm and step length, and what
+                the backend adds.
+        """
+        for (cost, stationarity, violation, complementarity, step, length), details in rows[:-1]:
+            kkt = float(stationarity), float(violation), float(complementarity)
+            self.history.append(
+                Iteration(
+                    len(self.history), float(cost), *kkt, float(step), float(length), self.seconds, {}, dict(details)
+                )
+            )
+        if rows:
+            last, details = rows[-1]
+            self.accept(lin, multipliers, float(last[4]), float(last[5]), **details)
+        else:
+            self.lin, self.multipliers = lin, multipliers
 
     def begin_at(self, lin: Linearization) -> None:
         """Move the start, as onto the bounds, without spending an iteration."""

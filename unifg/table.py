@@ -14,6 +14,7 @@ import numpy as np
 from unifg.columns import Columns
 from unifg.compiled import CompiledTerm
 from unifg.jit import compiled
+from unifg.retraction import retractions
 from unifg.sparse import Symmetric
 from unifg.terms import Constraint, Cost
 from unifg.typing import Array, IntArray
@@ -44,8 +45,10 @@ from unifg.typing import Array, IntArray
     ENTRY,  # first entry of the stacked Jacobian
     COLUMN,  # first column in Terms.columns
     POSITION,  # first place in Terms.positions
+    LEAF,  # first row of Terms.leaves
+    LEAVES,  # parts of the variables that move on their own; 0: linear, or without a compiled retraction
     FIELDS,
-) = range(26)
+) = range(28)
 
 COST, CONSTRAINT, BOUND = 0, 1, 2
 
@@ -61,6 +64,8 @@ class Terms(NamedTuple):
         unknown: full column to unknown, or -1.
         positions: place of every pair (d, e <= d) of columns in the normal matrix; -1: fixed; -2 - p: the pair stands
             for both triangles, because both columns are the same unknown.
+        leaves: (L, 5) address of the retraction, start in the variables of the factor, storage, dimension, and first
+            column of the kernel's Jacobian, for every part of every variable of a term.
         active: flags.
         parameters: of kernels, and constants in the place of variables.
         whiteners: reciprocal standard deviations and upper triangular square roots.
@@ -73,6 +78,7 @@ class Terms(NamedTuple):
     columns: IntArray
     unknown: IntArray
     positions: IntArray
+    leaves: IntArray
     active: IntArray
     parameters: Array
     whiteners: Array
@@ -98,6 +104,7 @@ class Table:
         self._columns = columns
         fields = np.zeros((len(terms), FIELDS), dtype=np.int64)
         gather, sizes, tangent = [], [], []
+        leaves: list[list[int]] = []
         starts = {"gather": 0, "sizes": 0, "tangent": 0, "positions": 0, "parameters": 0, "whiteners": 0, "active": 0}
         self.residuals = self.weights = self.constraints = self.entries = self.constraint_entries = 0
         self.scratch = 1
@@ -115,6 +122,10 @@ class Table:
                 starts["whiteners"],
             )
             row[ACTIVE], row[WEIGHT] = -1, -1
+            row[LEAF] = len(leaves)
+            if term.kernel is not None and not term.kernel.linear:
+                leaves += retractions(term.kernel.manifolds)
+            row[LEAVES] = len(leaves) - row[LEAF]
             gather.append(layout.gather.ravel())
             sizes += [*layout.sizes, *(layout.keep or [])]
             tangent.append(layout.columns.ravel())
@@ -156,6 +167,7 @@ class Table:
             _joined(tangent),
             columns.unknown.astype(np.int64),
             np.empty(starts["positions"], dtype=np.int32),
+            np.array(leaves, dtype=np.int64).reshape(-1, 5),
             np.ones(int(counts.sum()), dtype=np.uint8),
             np.empty(max(starts["parameters"], 1)),
             np.empty(max(starts["whiteners"], 1)),

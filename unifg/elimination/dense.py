@@ -1,171 +1,201 @@
-"""Dense kernels of a front, in tiles of four rows.
+"""Dense kernels of a front, in tiles of four rows and eight columns.
 
-A panel holds pivots as rows: row k, from the diagonal on, is row k of the upper factor. With signs S it satisfies A = P' S P.
-``signed`` is the panel itself when all signs are positive, else a copy of its rows times their signs.
+A panel holds pivots as rows: row k, from the diagonal on, is row k of P in A = P' S P, S = diag(+-1). Arrays are
+flat; a matrix in one is an offset and the length of its rows.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from unifg.elimination.vectors import get, load, minus, put, splat, store, times
+from unifg.elimination.vectors import blend, get, inverse_root, lane, load, minus, pack, plus, splat, store, times
 from unifg.jit import compiled
 from unifg.typing import Array
 
 VANISHED = 8.9e-16  # pivots below this part of their original diagonal are rounding errors
+STRIP, DEPTH = 64, 192  # columns and products handled together: what stays in the second-level cache
 
 
 @compiled
 def subtract_products(
-    target: Array, at: int, stride: int, height: int, length: int,
-    left: Array, left_at: int, right: Array, right_at: int, step: int, depth: int,
+    numbers: Array, target: int, stride: int, height: int, length: int,
+    left: int, right: int, step: int, depth: int, sign: float,
 ) -> None:  # fmt: skip
-    """target[i, j] -= sum_k left[k, i] right[k, j] over i < height <= 4, j < length, k < depth.
+    """target[i, j] -= sign * sum_k left[k, i] right[k, j] over i < height <= 4, j < length, k < depth.
 
-    Arrays are flat; ``at`` are offsets of the first element, ``stride`` and ``step`` lengths of rows. Columns are taken
-    in fours: up to three beyond ``length`` are overwritten.
+    Up to three numbers beyond the last column are written as they were.
+
+    Args:
+        numbers: the array all three matrices live in.
+        target: offset of the target.
+        stride: length of its rows.
+        height: its rows.
+        length: its columns.
+        left: offset of the left factor.
+        right: offset of the right factor.
+        step: length of the rows of both.
+        depth: their rows.
+        sign: see above.
     """
-    j = 0
-    if height == 4:
-        while j + 4 < length:
-            t0, t1 = at + j, at + j + stride
-            t2, t3 = t1 + stride, t1 + 2 * stride
-            a0, b0 = load(target, t0), load(target, t0 + 4)
-            a1, b1 = load(target, t1), load(target, t1 + 4)
-            a2, b2 = load(target, t2), load(target, t2 + 4)
-            a3, b3 = load(target, t3), load(target, t3 + 4)
-            p, q = left_at, right_at + j
-            for _ in range(depth):
-                v, w = load(right, q), load(right, q + 4)
-                x0, x1, x2, x3 = get(left, p), get(left, p + 1), get(left, p + 2), get(left, p + 3)
-                a0, b0 = minus(a0, x0, v), minus(b0, x0, w)
-                a1, b1 = minus(a1, x1, v), minus(b1, x1, w)
-                a2, b2 = minus(a2, x2, v), minus(b2, x2, w)
-                a3, b3 = minus(a3, x3, v), minus(b3, x3, w)
-                p += step
-                q += step
-            store(target, t0, a0)
-            store(target, t0 + 4, b0)
-            store(target, t1, a1)
-            store(target, t1 + 4, b1)
-            store(target, t2, a2)
-            store(target, t2 + 4, b2)
-            store(target, t3, a3)
-            store(target, t3 + 4, b3)
-            j += 8
-        if j < length:
-            t0, t1 = at + j, at + j + stride
-            t2, t3 = t1 + stride, t1 + 2 * stride
-            a0, a1, a2, a3 = load(target, t0), load(target, t1), load(target, t2), load(target, t3)
-            p, q = left_at, right_at + j
-            for _ in range(depth):
-                v = load(right, q)
-                a0 = minus(a0, get(left, p), v)
-                a1 = minus(a1, get(left, p + 1), v)
-                a2 = minus(a2, get(left, p + 2), v)
-                a3 = minus(a3, get(left, p + 3), v)
-                p += step
-                q += step
-            store(target, t0, a0)
-            store(target, t1, a1)
-            store(target, t2, a2)
-            store(target, t3, a3)
-        return
-    i = 0
-    if height >= 2:
-        i = 2
-        while j < length:
-            t0, t1 = at + j, at + j + stride
-            a0, a1 = load(target, t0), load(target, t1)
-            p, q = left_at, right_at + j
-            for _ in range(depth):
-                v = load(right, q)
-                a0, a1 = minus(a0, get(left, p), v), minus(a1, get(left, p + 1), v)
-                p += step
-                q += step
-            store(target, t0, a0)
-            store(target, t1, a1)
-            j += 4
-    if i < height:
-        j = 0
-        while j < length:
-            t0 = at + i * stride + j
-            a0 = load(target, t0)
-            p, q = left_at + i, right_at + j
-            for _ in range(depth):
-                a0 = minus(a0, get(left, p), load(right, q))
-                p += step
-                q += step
-            store(target, t0, a0)
-            j += 4
+    zero = splat(0.0)
+    for j in range(0, length, 8):
+        a0, a1, a2, a3, b0, b1, b2, b3 = zero, zero, zero, zero, zero, zero, zero, zero
+        p, q = left, right + j
+        for _ in range(depth):
+            v, w = load(numbers, q), load(numbers, q + 4)
+            x0, x1, x2, x3 = get(numbers, p), get(numbers, p + 1), get(numbers, p + 2), get(numbers, p + 3)
+            a0, b0 = plus(a0, x0, v), plus(b0, x0, w)
+            a1, b1 = plus(a1, x1, v), plus(b1, x1, w)
+            a2, b2 = plus(a2, x2, v), plus(b2, x2, w)
+            a3, b3 = plus(a3, x3, v), plus(b3, x3, w)
+            p += step
+            q += step
+        rest, t = length - j, target + j
+        if rest < 8:
+            a0, a1, a2, a3 = blend(a0, zero, rest), blend(a1, zero, rest), blend(a2, zero, rest), blend(a3, zero, rest)
+            rest -= 4
+            b0, b1, b2, b3 = blend(b0, zero, rest), blend(b1, zero, rest), blend(b2, zero, rest), blend(b3, zero, rest)
+            rest += 4
+        store(numbers, t, minus(load(numbers, t), sign, a0))
+        if rest > 4:
+            store(numbers, t + 4, minus(load(numbers, t + 4), sign, b0))
+        if height > 1:
+            t += stride
+            store(numbers, t, minus(load(numbers, t), sign, a1))
+            if rest > 4:
+                store(numbers, t + 4, minus(load(numbers, t + 4), sign, b1))
+        if height > 2:
+            t += stride
+            store(numbers, t, minus(load(numbers, t), sign, a2))
+            if rest > 4:
+                store(numbers, t + 4, minus(load(numbers, t + 4), sign, b2))
+        if height > 3:
+            t += stride
+            store(numbers, t, minus(load(numbers, t), sign, a3))
+            if rest > 4:
+                store(numbers, t + 4, minus(load(numbers, t + 4), sign, b3))
+
+
+@compiled
+def subtract_signed(
+    numbers: Array, target: int, stride: int, size: int, left: int, step: int, depth: int,
+    signs: Array, first: int, rows: int,
+) -> None:  # fmt: skip
+    """Upper triangle of target -= left' S left, in blocks of four rows.
+
+    Args:
+        numbers: the array both matrices live in.
+        target: offset of the target.
+        stride: length of its rows.
+        size: its columns.
+        left: offset of the factor, a (depth, size) matrix.
+        step: length of its rows.
+        depth: its rows.
+        signs: diagonal of S, from ``first`` on.
+        first: see above.
+        rows: rows of the target to subtract from.
+    """
+    begin = 0
+    while begin < depth:
+        sign, end = get(signs, first + begin), begin + 1
+        while end < depth and end < begin + DEPTH and get(signs, first + end) == sign:
+            end += 1
+        base = left + begin * step
+        for strip in range(0, size, STRIP):
+            last = strip + STRIP if strip + STRIP < size else size
+            for i in range(0, rows if rows < last else last, 4):
+                j = i if i > strip else strip
+                subtract_products(
+                    numbers, target + i * stride + j, stride, 4 if rows - i > 4 else rows - i, last - j,
+                    base + i, base + j, step, end - begin, sign,
+                )  # fmt: skip
+        begin = end
 
 
 @compiled
 def eliminate(
-    panel: Array, at: int, stride: int, begin: int, end: int, columns: int,
-    scale: Array, pivots: Array, signs: Array, first: int, signed: Array,
+    numbers: Array, panel: int, stride: int, begin: int, end: int, columns: int,
+    scale: Array, pivots: Array, signs: Array, first: int,
 ) -> int:  # fmt: skip
     """Eliminate pivots begin..end of a panel within its columns begin..columns.
 
     Args:
-        panel: flat, with the panel at offset ``at``.
-        at: see above.
-        stride: length of a row of the panel.
+        numbers: the array of the panel.
+        panel: its offset.
+        stride: length of its rows.
         begin: first pivot, from 0.
         end: one past the last.
-        columns: one past the last column; up to three more are overwritten.
-        scale: size of each pivot before elimination; this and the next two start at the pivot ``first``.
+        columns: one past the last column.
+        scale: size of each pivot before elimination; the panel's first pivot is at ``first`` here and in the next two.
         pivots: receives 1 / diagonal.
         signs: receives the sign.
         first: see above.
-        signed: room for a copy of the panel, at offset 0.
 
     Returns:
-        -1, or the pivot that vanished; below -1 when no pivot did and some signs are negative (``signed`` is filled).
+        -1, or the pivot that vanished.
     """
-    negative = False
     for top in range(begin, end, 4):
-        height = min(4, end - top)
-        corner = at + top * stride + top
-        if top > begin:
-            if negative:
-                subtract_products(
-                    panel, corner, stride, height, columns - top, signed, begin * stride + top,
-                    panel, at + begin * stride + top, stride, top - begin,
-                )  # fmt: skip
-            else:
-                subtract_products(
-                    panel, corner, stride, height, columns - top, panel, at + begin * stride + top,
-                    panel, at + begin * stride + top, stride, top - begin,
-                )  # fmt: skip
-        # The corner, then the rest of its rows.
-        for i in range(height):
-            diagonal = corner + i * stride + i
-            pivot = get(panel, diagonal)
-            size = abs(pivot)
-            if not (size > VANISHED * get(scale, first + top + i) and size < np.inf):
-                return top + i
-            root = np.sqrt(size)
-            inverse = 1.0 / root
-            sign = 1.0 if pivot > 0.0 else -1.0
-            put(pivots, first + top + i, inverse)
-            put(signs, first + top + i, sign)
-            put(panel, diagonal, root)
-            inverse *= sign
-            for j in range(1, height - i):
-                put(panel, diagonal + j, get(panel, diagonal + j) * inverse)
-            for k in range(1, height - i):
-                factor = sign * get(panel, diagonal + k)
-                for j in range(k, height - i):
-                    place = diagonal + k * stride + j
-                    put(panel, place, get(panel, place) - factor * get(panel, diagonal + j))
-            if sign < 0.0 and not negative:
-                negative = True
-                for k in range(begin, top + i):
-                    for j in range(stride):
-                        put(signed, k * stride + j, get(signed, k * stride + j))
-        if top + height < columns:
-            finish(panel, corner, stride, height, columns - top, pivots, signs, first + top)
-        if negative:
-            pass
+        height = 4 if end - top > 4 else end - top
+        corner = panel + top * (stride + 1)
+        subtract_signed(
+            numbers, corner, stride, columns - top, panel + begin * stride + top, stride, top - begin,
+            signs, first + begin, height,
+        )  # fmt: skip
+        # The corner, in registers: L D L' first, roots afterwards, so that pivots wait for one division each.
+        c1, c2, c3 = corner + stride, corner + 2 * stride, corner + 3 * stride
+        x00, x01, x02, x03 = get(numbers, corner), 0.0, 0.0, 0.0
+        x11, x12, x13, x22, x23, x33 = 1.0, 0.0, 0.0, 1.0, 0.0, 1.0
+        if height > 1:
+            x01, x11 = get(numbers, corner + 1), get(numbers, c1 + 1)
+        if height > 2:
+            x02, x12, x22 = get(numbers, corner + 2), get(numbers, c1 + 2), get(numbers, c2 + 2)
+        if height > 3:
+            x03, x13, x23, x33 = (
+                get(numbers, corner + 3),
+                get(numbers, c1 + 3),
+                get(numbers, c2 + 3),
+                get(numbers, c3 + 3),
+            )
+        at = first + top
+        inverse = 1.0 / x00
+        f01, f02, f03 = x01 * inverse, x02 * inverse, x03 * inverse
+        x11, x12, x13 = x11 - f01 * x01, x12 - f01 * x02, x13 - f01 * x03
+        x22, x23, x33 = x22 - f02 * x02, x23 - f02 * x03, x33 - f03 * x03
+        inverse = 1.0 / x11
+        f12, f13 = x12 * inverse, x13 * inverse
+        x22, x23, x33 = x22 - f12 * x12, x23 - f12 * x13, x33 - f13 * x13
+        f23 = x23 / x22
+        x33 -= f23 * x23
+        if not (abs(x00) > VANISHED * get(scale, at) and abs(x00) < np.inf):
+            return top
+        if height > 1 and not (abs(x11) > VANISHED * get(scale, at + 1) and abs(x11) < np.inf):
+            return top + 1
+        if height > 2 and not (abs(x22) > VANISHED * get(scale, at + 2) and abs(x22) < np.inf):
+            return top + 2
+        if height > 3 and not (abs(x33) > VANISHED * get(scale, at + 3) and abs(x33) < np.inf):
+            return top + 3
+        roots = inverse_root(pack(x00, x11, x22, x33))
+        s0, s1 = 1.0 if x00 > 0.0 else -1.0, 1.0 if x11 > 0.0 else -1.0
+        s2, s3 = 1.0 if x22 > 0.0 else -1.0, 1.0 if x33 > 0.0 else -1.0
+        store(pivots, at, roots)
+        store(signs, at, pack(s0, s1, s2, s3))
+        g0, g1, g2, g3 = s0 * lane(roots, 0), s1 * lane(roots, 1), s2 * lane(roots, 2), s3 * lane(roots, 3)
+        # All columns, the corner's included: below the diagonal of the corner no one looks.
+        for j in range(0, columns - top, 4):
+            rest, t1, t2, t3 = columns - top - j, c1 + j, c2 + j, c3 + j
+            y0 = load(numbers, corner + j)
+            z0 = times(g0, y0)
+            store(numbers, corner + j, blend(z0, y0, rest))
+            if height > 1:
+                y1 = load(numbers, t1)
+                e1 = minus(y1, f01, y0)
+                store(numbers, t1, blend(times(g1, e1), y1, rest))
+                if height > 2:
+                    y2 = load(numbers, t2)
+                    e2 = minus(minus(y2, f02, y0), f12, e1)
+                    store(numbers, t2, blend(times(g2, e2), y2, rest))
+                    if height > 3:
+                        y3 = load(numbers, t3)
+                        e3 = minus(minus(minus(y3, f03, y0), f13, e1), f23, e2)
+                        store(numbers, t3, blend(times(g3, e3), y3, rest))
     return -1

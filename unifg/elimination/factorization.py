@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from unifg.elimination import fronts, substitution
-from unifg.elimination.blas import routines
-from unifg.elimination.layout import lay_out
-from unifg.elimination.ordering import block_graph, indistinguishable, minimum_degree
-from unifg.elimination.plan import FAILED, NEGATIVE, POSITIVE, ROWS, SURPRISE, WIDTH, ZERO, Plan
-from unifg.elimination.symbolic import supernodes
+from unifg.elimination.analysis import SLACK, Ordering, Structure, analyse
+from unifg.elimination.inverse import invert, locate
+from unifg.elimination.plan import (
+    FAILED,
+    INDEX,
+    NEGATIVE,
+    PANELS,
+    PIVOTS,
+    POSITIVE,
+    ROWS,
+    SURPRISE,
+    SURPRISES,
+    ZERO,
+    Plan,
+)
+from unifg.elimination.tree import EliminationTree
 from unifg.errors import UnifgError
 from unifg.sparse import Symmetric
 from unifg.typing import Array, BoolArray, IntArray
 
-Ordering: TypeAlias = Literal["auto", "minimum-degree", "nested-dissection", "natural"] | IntArray
-ROUTINES = routines()
+__all__ = ["Factorization", "Ordering"]
 NOTHING = np.zeros(0)
 
 
@@ -25,11 +35,10 @@ class Factorization:
     """Signed Cholesky factorisation A = L S L' of matrices of one pattern, by dense fronts on the elimination tree.
 
     Serves positive definite matrices and, in any order, symmetric quasi-definite ones, [[H + dI, A'], [A, -dI]].
+    Structure is analysed when first needed, once.
 
     Attributes:
         pattern: upper triangle of the matrices.
-        starts: (nodes + 1,) first scalar of each node.
-        plan: arguments of the compiled kernels in `fronts` and `substitution`.
     """
 
     def __init__(
@@ -40,59 +49,43 @@ class Factorization:
         ordering: Ordering = "auto",
         negative: BoolArray | None = None,
     ) -> None:
-        """Analyse the structure.
+        """Remember the structure.
 
         Args:
             pattern: upper triangle of the n x n matrix.
             blocks: (n,) non-decreasing label of the node each scalar belongs to; by default scalars that follow each
                 other and have the same neighbours are one node.
-            ordering: how to order the nodes, or a permutation of them: the nodes in the order of elimination.
+            ordering: how to order the nodes, or a permutation of them: the nodes in the order of elimination. "auto"
+                takes the cheapest of minimum degree, nested dissection (large graphs) and a chain of stages.
             negative: (n,) whether the pivot of each scalar is expected to be negative; see `unexpected`.
-
-        Raises:
-            UnifgError: labels or permutation are not what they should be.
         """
         self.pattern = pattern
+        self._asked = (blocks, ordering, negative)
+        self._structure: Structure | None = None
         self._indptr, self._indices = pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64)
-        size = pattern.size
-        label = indistinguishable(self._indptr, self._indices) if blocks is None else _labels(blocks, size)
-        nodes = int(label[-1]) + 1 if size else 0
-        self.starts = np.searchsorted(label, np.arange(nodes + 1))
-        weight = np.diff(self.starts)
-        pointer, neighbours = block_graph(self._indptr, self._indices, label, nodes)
-        if isinstance(ordering, str):
-            if ordering == "natural":
-                order = np.arange(nodes)
-            else:
-                order = minimum_degree(pointer, neighbours, weight)
-        else:
-            order = _permutation(ordering, nodes)
-        order, bounds, parent, passed, _ = supernodes(pointer, neighbours, weight, order)
-        table, scalar_order, rows, relative, entries, slots, waiting = lay_out(
-            self._indptr, self._indices, self.starts, pointer, neighbours, order, bounds, parent, passed
-        )
-        largest = int((table[:, WIDTH] + table[:, ROWS]).max(initial=0))
-        expected = np.zeros(size, np.int8)
-        if negative is not None:
-            expected[:] = np.where(np.asarray(negative)[scalar_order], -1, 1)
-        self.plan = Plan(
-            shape=np.array([size, len(parent), largest, 0]),
-            routines=ROUTINES,
-            fronts=table,
-            order=scalar_order,
-            rows=rows,
-            relative=relative,
-            entries=entries,
-            slots=slots,
-            expected=expected,
-            panels=np.zeros(int(table[-1, 3])),
-            updates=np.empty(waiting),
-            pivots=np.empty(size),
-            signs=np.empty(size),
-            work=np.empty(size + 64 * largest),
-            state=np.array([0, 0, 0, -1, 0, -1]),
-        )
         self._ready = False
+        self._inverse: tuple[Array, IntArray, BoolArray] | None = None  # panels, front of each scalar, fronts filled in
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the structure asked for, without numbers: a plan holds addresses of this process."""
+        blocks, ordering, negative = self._asked
+        return _rebuilt, (self.pattern, blocks, ordering, negative)
+
+    @property
+    def structure(self) -> Structure:
+        """Result of the symbolic analysis.
+
+        Raises:
+            UnifgError: labels, signs or permutation are not what they should be.
+        """
+        if self._structure is None:
+            self._structure = analyse(self._indptr, self._indices, *self._asked)
+        return self._structure
+
+    @property
+    def plan(self) -> Plan:
+        """Arguments of the compiled kernels `fronts.factor`, `substitution.solve` and `substitution.factor_solve`."""
+        return self.structure.plan
 
     def factor(self, data: Array, added: Array | None = None) -> bool:
         """Factorise; False when an entry is not finite or a pivot vanishes (see `failure`).
@@ -100,8 +93,35 @@ class Factorization:
         Args:
             data: (nnz,) entries in the order of the pattern.
             added: (n,) numbers added to the diagonal.
+
+        Raises:
+            UnifgError: an array has the wrong shape, or the structure asked for makes no sense.
         """
-        self._ready = bool(fronts.factor(self.plan, data, NOTHING if added is None else added))
+        data = _numbers(data, self.pattern.nnz, "data")
+        added = NOTHING if added is None else _numbers(added, self.pattern.size, "added")
+        self._forget()
+        self._ready = bool(fronts.factor(self.plan, data, added))
+        return self._ready
+
+    def factor_solve(self, data: Array, added: Array | None, right: Array, out: Array) -> bool:
+        """Factorise and solve in one compiled call.
+
+        Args:
+            data: (nnz,) entries in the order of the pattern.
+            added: (n,) numbers added to the diagonal, or None.
+            right: (n,).
+            out: (n,) contiguous doubles, receives the solution; untouched when the answer is False.
+
+        Raises:
+            UnifgError: an array has the wrong shape, or the structure asked for makes no sense.
+        """
+        data = _numbers(data, self.pattern.nnz, "data")
+        added = NOTHING if added is None else _numbers(added, self.pattern.size, "added")
+        right = _numbers(right, self.pattern.size, "the right-hand side")
+        if out.shape != right.shape or out.dtype != np.float64 or not out.flags.c_contiguous:
+            raise UnifgError(f"out must be {len(right)} contiguous doubles")
+        self._forget()
+        self._ready = bool(substitution.factor_solve(self.plan, data, added, right, out))
         return self._ready
 
     def solve(self, right: Array) -> Array:
@@ -109,14 +129,19 @@ class Factorization:
 
         Raises:
             RuntimeError: there is no factorisation.
+            UnifgError: the right-hand side has the wrong shape.
         """
-        self._demand()
-        out = np.empty(right.shape)
+        self._demand("solve")
         if right.ndim == 1:
+            right = _numbers(right, self.pattern.size, "the right-hand side")
+            out = np.empty(len(right))
             substitution.solve(self.plan, right, out)
-        else:
-            substitution.solve_columns(self.plan, right, out)
-        return out
+            return out
+        rows = np.array(right.T, dtype=np.float64, order="C")
+        if rows.ndim != 2 or rows.shape[1] != self.pattern.size:
+            raise UnifgError(f"right-hand sides have shape {right.shape}; expected ({self.pattern.size}, k)")
+        substitution.solve_columns(self.plan, rows, rows)
+        return rows.T
 
     def refine(self, data: Array, right: Array, *, tolerance: float = 1e-15, steps: int = 10) -> Array:
         """Solve A x = right for a matrix near the factorised one, by iterative refinement.
@@ -132,8 +157,11 @@ class Factorization:
 
         Raises:
             RuntimeError: there is no factorisation.
+            UnifgError: an array has the wrong shape.
         """
-        self._demand()
+        self._demand("refine")
+        data = _numbers(data, self.pattern.nnz, "data")
+        right = _numbers(right, self.pattern.size, "the right-hand side")
         out = np.empty(len(right))
         substitution.refine(self.plan, self._indptr, self._indices, data, right, out, tolerance, steps)
         return out
@@ -159,34 +187,143 @@ class Factorization:
         """Scalar of the first pivot whose sign is not the one ``negative`` announced, or -1."""
         return int(self.plan.state[SURPRISE])
 
+    @property
+    def unexpected_count(self) -> int:
+        """Number of pivots whose sign is not the one ``negative`` announced."""
+        return int(self.plan.state[SURPRISES])
+
     def pivots(self) -> Array:
-        """(n,) diagonal D of the factorisation L D L' with unit L, in the order of elimination."""
-        self._demand()
-        result: Array = self.plan.signs / self.plan.pivots**2
+        """(n,) diagonal D of the factorisation L D L' with unit L, in the order of elimination.
+
+        Raises:
+            RuntimeError: there is no factorisation.
+        """
+        self._demand("pivots")
+        result: Array = (self.plan.signs / self.plan.pivots**2)[: self.pattern.size]
         return result
 
-    def _demand(self) -> None:
+    @property
+    def tree(self) -> EliminationTree:
+        """The elimination tree, to look at and to print."""
+        plan, starts, order, bounds, parent, kind = self.structure
+        node = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+        begins = plan.fronts[:, INDEX]
+        separators = []
+        for s in range(len(parent)):
+            given = node[plan.order[plan.rows[begins[s] : begins[s + 1]]]]
+            separators.append(given[np.flatnonzero(np.diff(given, prepend=-1))])
+        return EliminationTree(
+            parent, plan.fronts[:-1, PIVOTS], plan.fronts[:-1, ROWS], order, bounds, tuple(separators), kind
+        )
+
+    def selected_inverse(self) -> Array:
+        """(nnz,) entries of the inverse at the places of the pattern, at the cost of about two factorisations.
+
+        Raises:
+            RuntimeError: there is no factorisation.
+        """
+        result: Array = self._filled(None)[self.plan.slots]
+        return result
+
+    def inverse_block(self, rows: IntArray) -> Array:
+        """(k, k) block of the inverse: the joint covariance of some scalars when A is an information matrix.
+
+        Scalars that share a front are read off the tree, and only the path from them to the root is computed; others
+        take a solve each.
+
+        Raises:
+            RuntimeError: there is no factorisation.
+        """
+        self._demand("inverse_block")
+        rows = np.asarray(rows, dtype=np.int64)
+        position = np.empty(self.pattern.size, np.int64)
+        position[self.plan.order] = np.arange(self.pattern.size)
+        places = np.zeros((len(rows), len(rows)), np.int64)
+        if locate(self.plan, self._owner(), position[rows], places):
+            block: Array = self._filled(position[rows])[places]
+            return block
+        right = np.zeros((len(rows), self.pattern.size))
+        right[np.arange(len(rows)), rows] = 1.0
+        substitution.solve_columns(self.plan, right, right)
+        block = right[:, rows]
+        return 0.5 * (block + block.T)
+
+    def diagonal_blocks(self) -> list[Array]:
+        """Marginal covariance (d, d) of every node, all in about the time of two factorisations.
+
+        Raises:
+            RuntimeError: there is no factorisation.
+        """
+        panels = self._filled(None)
+        plan, starts = self.plan, self.structure.starts
+        position = np.empty(self.pattern.size, np.int64)
+        position[plan.order] = np.arange(self.pattern.size)
+        sizes, result = np.diff(starts), [NOTHING] * (len(starts) - 1)
+        front = plan.fronts[self._owner()]  # one row per scalar
+        for size in np.unique(sizes).tolist():
+            chosen = np.flatnonzero(sizes == size)
+            first = position[starts[chosen]]  # scalars of a node stay together
+            table = front[first]
+            i, j = np.triu_indices(size)
+            base = table[:, 3] + (first - table[:, 0]) * (table[:, 4] + 1)
+            blocks = np.empty((len(chosen), size, size))
+            blocks[:, i, j] = panels[base[:, None] + i * table[:, 4, None] + j]
+            blocks[:, j, i] = blocks[:, i, j]
+            for node, block in zip(chosen.tolist(), blocks, strict=True):
+                result[node] = block
+        return result
+
+    def _owner(self) -> IntArray:
+        """Front that eliminates each scalar, in the order of elimination."""
+        if self._inverse is None:
+            plan = self.plan
+            widths = plan.fronts[:-1, PIVOTS]
+            largest = int(plan.shape[2])
+            panels = np.zeros(int(plan.shape[PANELS]) + 6 * largest * (largest + 4) + SLACK)
+            self._inverse = panels, np.repeat(np.arange(len(widths)), widths), np.zeros(len(widths), dtype=np.bool_)
+        return self._inverse[1]
+
+    def _filled(self, scalars: IntArray | None) -> Array:
+        """Panels of the inverse, filled in for the fronts of some scalars (in elimination order) or for all."""
+        self._demand("the inverse")
+        owner = self._owner()
+        assert self._inverse is not None
+        panels, _, done = self._inverse
+        parent = self.structure.parent
+        wanted = np.zeros(len(parent), dtype=np.bool_)
+        if scalars is None:
+            wanted[:] = True
+        else:
+            for s in np.unique(owner[scalars]).tolist():
+                while s >= 0 and not wanted[s]:
+                    wanted[s] = True
+                    s = int(parent[s])
+        wanted &= ~done
+        if wanted.any():
+            invert(self.plan, owner, wanted, panels, int(self.plan.shape[PANELS]))
+            done |= wanted
+        return panels
+
+    def _forget(self) -> None:
+        self._ready = False
+        if self._inverse is not None:
+            self._inverse[2][:] = False
+
+    def _demand(self, what: str) -> None:
         if not self._ready:
-            raise RuntimeError("solve called before a successful factor")
+            raise RuntimeError(f"{what} called before a successful factor")
 
 
-def _labels(blocks: IntArray, size: int) -> IntArray:
-    """Consecutive labels from 0, checked."""
-    blocks = np.asarray(blocks)
-    if blocks.shape != (size,):
-        raise UnifgError(f"blocks has shape {blocks.shape} where one label per scalar, ({size},), is needed")
-    change = np.diff(blocks)
-    if (change < 0).any():
-        at = int(np.argmax(change < 0)) + 1
-        raise UnifgError(f"blocks decreases at scalar {at}; number the nodes in the order of their scalars")
-    result = np.zeros(size, np.int64)
-    np.cumsum(change != 0, out=result[1:])
-    return result
+def _rebuilt(
+    pattern: Symmetric, blocks: IntArray | None, ordering: Ordering, negative: BoolArray | None
+) -> Factorization:
+    return Factorization(pattern, blocks, ordering=ordering, negative=negative)
 
 
-def _permutation(order: IntArray, nodes: int) -> IntArray:
-    """A permutation of the nodes, checked."""
-    order = np.asarray(order, dtype=np.int64)
-    if order.shape != (nodes,) or not np.array_equal(np.sort(order), np.arange(nodes)):
-        raise UnifgError(f"ordering is not a permutation of the {nodes} nodes; name each node once")
-    return order
+def _numbers(array: Array, size: int, name: str) -> Array:
+    """Contiguous doubles of the right length: compiled kernels check nothing."""
+    if array.dtype != np.float64 or not array.flags.c_contiguous:
+        array = np.ascontiguousarray(array, dtype=np.float64)
+    if array.shape != (size,):
+        raise UnifgError(f"{name} has shape {array.shape}; expected ({size},)")
+    return array

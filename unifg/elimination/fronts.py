@@ -2,178 +2,40 @@
 
 The factor is a signed Cholesky factor, A = L S L' with S = diag(+-1): all signs positive for a positive definite
 matrix, and available in any order for a quasi-definite one (R. Vanderbei, "Symmetric quasidefinite matrices", SIAM
-J. Optim. 5 (1995)).
+J. Optim. 5 (1995)). In a chain every update matrix falls on the leading part of the next panel: the multifrontal
+method is then the block tridiagonal recursion, without an index.
 """
 
 from __future__ import annotations
 
-import numpy as np
-
-from unifg.elimination.blas import GEMM, GENERAL, LOWER, PLAIN, RIGHT, SYRK, TRANSPOSED, TRSM, fortran
+from unifg.elimination.dense import eliminate, subtract_signed
 from unifg.elimination.plan import (
     CHILD,
-    ENTRY,
+    DIRECT,
     FAILED,
     FIRST,
     FRONTS,
     INDEX,
     NEGATIVE,
     PANEL,
+    PANELS,
+    PIVOTS,
     POSITIVE,
     ROWS,
-    SCALARS,
     SIBLING,
+    STRIDE,
     SURPRISE,
     SURPRISES,
     UPDATE,
-    WIDTH,
+    UPDATE_STRIDE,
     ZERO,
     Plan,
-)  # fmt: skip
+)
+from unifg.elimination.vectors import blend, get, load, plus, put, splat, store
 from unifg.jit import compiled
-from unifg.typing import Array, IntArray
+from unifg.typing import Array
 
-VANISHED = 8.9e-16  # pivots below this part of their original diagonal are rounding errors
-BLOCK = 32  # pivots eliminated between two calls of BLAS
-LARGE = 24000.0  # multiplications in a front from which BLAS is faster
-
-
-@compiled
-def eliminate(
-    panel: Array, stride: int, begin: int, end: int, columns: int, scale: Array, pivots: Array, signs: Array
-) -> int:
-    """Eliminate pivots begin..end of a panel within its columns begin..columns; -1 or the pivot that vanished.
-
-    Args:
-        panel: (pivots, stride) flat.
-        stride: length of a row.
-        begin, end, columns: see above.
-        scale: size of each pivot before elimination.
-        pivots, signs: receive 1 / diagonal and sign.
-    """
-    for i in range(begin, end):
-        row = panel[i * stride + i : i * stride + columns]
-        size = columns - i
-        k = begin
-        while k + 4 <= i:
-            p0 = panel[k * stride + i : k * stride + columns]
-            p1 = panel[(k + 1) * stride + i : (k + 1) * stride + columns]
-            p2 = panel[(k + 2) * stride + i : (k + 2) * stride + columns]
-            p3 = panel[(k + 3) * stride + i : (k + 3) * stride + columns]
-            a0, a1, a2, a3 = signs[k] * p0[0], signs[k + 1] * p1[0], signs[k + 2] * p2[0], signs[k + 3] * p3[0]
-            for j in range(size):
-                row[j] -= a0 * p0[j] + a1 * p1[j] + a2 * p2[j] + a3 * p3[j]
-            k += 4
-        while k < i:
-            p0 = panel[k * stride + i : k * stride + columns]
-            a0 = signs[k] * p0[0]
-            for j in range(size):
-                row[j] -= a0 * p0[j]
-            k += 1
-        pivot = row[0]
-        bar = abs(pivot)
-        if not (bar > VANISHED * scale[i] and bar < np.inf):
-            return i
-        root = np.sqrt(bar)
-        inverse = 1.0 / root
-        signs[i] = 1.0 if pivot > 0.0 else -1.0
-        pivots[i] = inverse
-        row[0] = root
-        factor = signs[i] * inverse
-        for j in range(1, size):
-            row[j] *= factor
-    return -1
-
-
-@compiled
-def subtract_products(panel: Array, width: int, rows: int, signs: Array, update: Array) -> None:
-    """Update matrix -= P' S P, upper triangle by rows, P the last ``rows`` columns of the panel."""
-    stride = width + rows
-    for i in range(rows):
-        row = update[i * rows + i : i * rows + rows]
-        at = width + i
-        k = 0
-        while k + 4 <= width:
-            p0 = panel[k * stride + at : (k + 1) * stride]
-            p1 = panel[(k + 1) * stride + at : (k + 2) * stride]
-            p2 = panel[(k + 2) * stride + at : (k + 3) * stride]
-            p3 = panel[(k + 3) * stride + at : (k + 4) * stride]
-            a0, a1, a2, a3 = signs[k] * p0[0], signs[k + 1] * p1[0], signs[k + 2] * p2[0], signs[k + 3] * p3[0]
-            for j in range(rows - i):
-                row[j] -= a0 * p0[j] + a1 * p1[j] + a2 * p2[j] + a3 * p3[j]
-            k += 4
-        while k < width:
-            p0 = panel[k * stride + at : (k + 1) * stride]
-            a0 = signs[k] * p0[0]
-            for j in range(rows - i):
-                row[j] -= a0 * p0[j]
-            k += 1
-
-
-@compiled
-def eliminate_large(
-    routines: IntArray, panel: Array, width: int, rows: int, scale: Array, pivots: Array, signs: Array, update: Array,
-    work: Array,
-) -> int:  # fmt: skip
-    """Both of the above through BLAS, which sees the panel as a (stride, width) array by columns."""
-    stride = width + rows
-    for begin in range(0, width, BLOCK):
-        end = min(begin + BLOCK, width)
-        failed = eliminate(panel, stride, begin, end, end, scale, pivots, signs)
-        if failed >= 0:
-            return failed
-        if end == stride:
-            break
-        beneath = panel[begin * stride + end :]
-        fortran(
-            routines[TRSM],
-            (RIGHT, LOWER, TRANSPOSED, GENERAL, stride - end, end - begin, 1.0, panel[begin * stride + begin :], stride,
-             beneath, stride),
-        )  # fmt: skip
-        for k in range(begin, end):
-            if signs[k] < 0.0:
-                row = panel[k * stride + end : (k + 1) * stride]
-                for j in range(len(row)):
-                    row[j] = -row[j]
-        if end < width:
-            signed = signed_copy(panel, stride, begin, end, end, width, signs, work)
-            fortran(
-                routines[GEMM],
-                (PLAIN, TRANSPOSED, stride - end, width - end, end - begin, -1.0, beneath, stride, signed, width - end,
-                 1.0, panel[end * stride + end :], stride),
-            )  # fmt: skip
-    if rows == 0:
-        return -1
-    sign = signs[0]
-    mixed = False
-    for k in range(width):
-        mixed |= signs[k] != sign
-    if not mixed:
-        fortran(routines[SYRK], (LOWER, PLAIN, rows, width, -sign, panel[width:], stride, 1.0, update, rows))
-        return -1
-    for begin in range(0, rows, 64):
-        end = min(begin + 64, rows)
-        signed = signed_copy(panel, stride, 0, width, width + begin, width + end, signs, work)
-        fortran(
-            routines[GEMM],
-            (PLAIN, TRANSPOSED, rows - begin, end - begin, width, -1.0, panel[width + begin :], stride, signed, end - begin,
-             1.0, update[begin * rows + begin :], rows),
-        )  # fmt: skip
-    return -1
-
-
-@compiled
-def signed_copy(
-    panel: Array, stride: int, begin: int, end: int, first: int, last: int, signs: Array, work: Array
-) -> Array:
-    """Rows begin..end and columns first..last of the panel times the signs, in ``work``."""
-    size = last - first
-    for k in range(begin, end):
-        row, copy = panel[k * stride + first : k * stride + last], work[(k - begin) * size : (k - begin + 1) * size]
-        sign = signs[k]
-        for j in range(size):
-            copy[j] = sign * row[j]
-    return work
+BLOCK = 96  # pivots eliminated before the rest of a panel is brought up to date
 
 
 @compiled
@@ -185,62 +47,76 @@ def factor(plan: Plan, data: Array, added: Array) -> bool:
         data: (nnz,) upper triangle in the order of the pattern.
         added: (n,) added to the diagonal, or empty.
     """
-    fronts, panels, updates, state = plan.fronts, plan.panels, plan.updates, plan.state
-    scale = plan.work
+    fronts, numbers, state, pivots, signs = plan.fronts, plan.numbers, plan.state, plan.pivots, plan.signs
+    scale, slots, relative, runs, order = plan.work, plan.slots, plan.relative, plan.runs, plan.order
     state[POSITIVE], state[NEGATIVE], state[ZERO], state[FAILED] = 0, 0, 0, -1
     state[SURPRISES], state[SURPRISE] = 0, -1
+    negative = 0
+    zero = splat(0.0)
+    for i in range(0, plan.shape[PANELS], 4):
+        store(numbers, i, zero)
+    for e in range(len(slots)):
+        put(numbers, get(slots, e), get(data, e))
+    # Sizes of the pivots before anything is subtracted.
     for s in range(plan.shape[FRONTS]):
-        first, width, rows, begin = fronts[s, FIRST], fronts[s, WIDTH], fronts[s, ROWS], fronts[s, PANEL]
-        stride = width + rows
-        panel = panels[begin : begin + width * stride]
-        for i in range(width * stride):
-            panel[i] = 0.0
-        for e in range(fronts[s, ENTRY], fronts[s + 1, ENTRY]):
-            panels[plan.slots[e]] = data[plan.entries[e]]
-        if len(added):
-            for i in range(width):
-                panel[i * stride + i] += added[plan.order[first + i]]
-        for i in range(width):
-            scale[first + i] = abs(panel[i * stride + i])
-        update = updates[fronts[s, UPDATE] : fronts[s, UPDATE] + rows * rows]
-        for i in range(rows * rows):
-            update[i] = 0.0
+        at = fronts[s, PANEL]
+        for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
+            if len(added):
+                put(numbers, at, get(numbers, at) + get(added, get(order, i)))
+            put(scale, i, abs(get(numbers, at)))
+            at += fronts[s, STRIDE] + 1
+    for s in range(plan.shape[FRONTS]):
+        first, width, rows, panel, stride = (
+            fronts[s, FIRST], fronts[s, PIVOTS], fronts[s, ROWS], fronts[s, PANEL], fronts[s, STRIDE],
+        )  # fmt: skip
+        update, apart = fronts[s, UPDATE], fronts[s, UPDATE_STRIDE]
+        if fronts[s, DIRECT] == 0:
+            for i in range(rows):
+                for j in range(update + i * apart + i // 4 * 4, update + (i + 1) * apart, 4):
+                    store(numbers, j, zero)
         child = fronts[s, CHILD]
         while child >= 0:
-            size = fronts[child, ROWS]
-            index = plan.relative[fronts[child, INDEX] : fronts[child, INDEX] + size]
-            passed = updates[fronts[child, UPDATE] : fronts[child, UPDATE] + size * size]
-            split = 0
-            while split < size and index[split] < width:
-                split += 1
-            for i in range(split):
-                target, source = panel[index[i] * stride :], passed[i * size :]
-                for j in range(i, size):
-                    target[index[j]] += source[j]
-            for i in range(split, size):
-                target, source = update[(index[i] - width) * rows :], passed[i * size :]
-                for j in range(i, size):
-                    target[index[j] - width] += source[j]
+            if fronts[child, DIRECT] == 0:
+                size, index, source = fronts[child, ROWS], fronts[child, INDEX], fronts[child, UPDATE]
+                step = fronts[child, UPDATE_STRIDE]
+                for i in range(size):
+                    row = get(relative, index + i)
+                    target = panel + row * stride if row < width else update + (row - width) * apart - width
+                    j = i
+                    while j < size:
+                        at, length = target + get(relative, index + j), get(runs, index + j)
+                        for k in range(0, length, 4):
+                            passed = blend(load(numbers, source + j + k), zero, length - k)
+                            store(numbers, at + k, plus(load(numbers, at + k), 1.0, passed))
+                        j += length
+                    source += step
             child = fronts[child, SIBLING]
-        pivots, signs = plan.pivots[first : first + width], plan.signs[first : first + width]
-        if float(width) * stride * stride > LARGE:
-            failed = eliminate_large(
-                plan.routines, panel, width, rows, scale[first : first + width], pivots, signs, update,
-                plan.work[plan.shape[SCALARS] :],
-            )  # fmt: skip
-        else:
-            failed = eliminate(panel, stride, 0, width, stride, scale[first : first + width], pivots, signs)
-            if failed < 0:
-                subtract_products(panel, width, rows, signs, update)
-        for i in range(failed if failed >= 0 else width):
-            negative = signs[i] < 0.0
-            state[NEGATIVE if negative else POSITIVE] += 1
-            if plan.expected[first + i] * signs[i] < 0.0:
+        begin, failed = 0, -1
+        while begin < width and failed < 0:
+            end = begin + BLOCK if begin + BLOCK < width else width
+            failed = eliminate(numbers, panel, stride, begin, end, width + rows, scale, pivots, signs, first)
+            if failed < 0 and end < width:
+                subtract_signed(
+                    numbers, panel + end * (stride + 1), stride, width + rows - end, panel + begin * stride + end, stride,
+                    end - begin, signs, first + begin, width - end,
+                )  # fmt: skip
+            begin = end
+        if failed < 0:
+            subtract_signed(numbers, update, apart, rows, panel + width, stride, width, signs, first, rows)
+        if failed >= 0:
+            width = failed
+        for i in range(first, first + width):
+            sign = get(signs, i)
+            if sign < 0.0:
+                negative += 1
+            if get(plan.expected, i) * sign < 0.0:
                 if state[SURPRISES] == 0:
-                    state[SURPRISE] = plan.order[first + i]
+                    state[SURPRISE] = order[i]
                 state[SURPRISES] += 1
         if failed >= 0:
+            state[POSITIVE], state[NEGATIVE] = first + width - negative, negative
             state[ZERO] = 1
-            state[FAILED] = plan.order[first + failed]
+            state[FAILED] = order[first + failed]
             return False
+    state[POSITIVE], state[NEGATIVE] = len(order) - negative, negative
     return True

@@ -5,7 +5,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from unifg.elimination.plan import CHILD, COLUMNS, ENTRY, FIRST, INDEX, PANEL, ROWS, SIBLING, UPDATE, WIDTH
+from unifg.elimination.ordering import filled
+from unifg.elimination.plan import (
+    ADJACENT,
+    CHILD,
+    COLUMNS,
+    DIRECT,
+    FIRST,
+    INDEX,
+    PANEL,
+    PIVOTS,
+    ROWS,
+    SIBLING,
+    STRIDE,
+    UPDATE,
+    UPDATE_STRIDE,
+)
 from unifg.jit import compiled
 from unifg.typing import IntArray
 
@@ -14,33 +29,33 @@ Narrow = NDArray[np.int32]
 
 @compiled
 def lay_out(
-    indptr: IntArray,
-    indices: IntArray,
-    starts: IntArray,
-    pointer: IntArray,
-    neighbours: IntArray,
-    order: IntArray,
-    bounds: IntArray,
-    parent: IntArray,
-    passed: IntArray,
-) -> tuple[IntArray, IntArray, Narrow, Narrow, Narrow, Narrow, int]:
+    indptr: IntArray, indices: IntArray, starts: IntArray, pointer: IntArray, neighbours: IntArray,
+    order: IntArray, bounds: IntArray, parent: IntArray, passed: IntArray,
+) -> tuple[IntArray, IntArray, Narrow, Narrow, Narrow, Narrow, int]:  # fmt: skip
     """Lay out the fronts of a tree.
 
     Args:
-        indptr, indices: upper triangle of the scalar pattern by columns.
+        indptr: upper triangle of the scalar pattern by columns.
+        indices: its rows.
         starts: (nodes + 1,) first scalar of each node.
-        pointer, neighbours: symmetric graph of the nodes.
-        order, bounds, parent, passed: as `symbolic.supernodes` returns them.
+        pointer: symmetric graph of the nodes.
+        neighbours: see above.
+        order: this and the following as `symbolic.supernodes` returns them.
+        bounds: see above.
+        parent: see above.
+        passed: see above.
 
     Returns:
-        ``fronts``, ``order``, ``rows``, ``relative``, ``entries``, ``slots`` of a `Plan`, and the size of its ``updates``.
+        ``fronts``, ``order``, ``rows``, ``relative``, ``runs``, ``slots`` of a `Plan`, and how many numbers its update
+        matrices hold.
     """
     nodes, count, scalars = len(order), len(parent), len(indptr) - 1
-    fronts = np.zeros((count + 1, COLUMNS), np.int64)
-    member, offset, position = np.empty(nodes, np.int64), np.zeros(nodes + 1, np.int64), np.empty(nodes, np.int64)
-    scalar_order, place, owner = (
-        np.empty(scalars, np.int64), np.empty(scalars, np.int64), np.empty(scalars, np.int64),
-    )  # fmt: skip
+    fronts = np.empty((count + 1, COLUMNS), np.int64)
+    for s in range(count + 1):
+        for k in range(COLUMNS):
+            fronts[s, k] = 0
+    offset, position = filled(nodes + 1, 0), filled(nodes, 0)
+    member, place, owner, scalar_order = filled(nodes, 0), filled(scalars, 0), filled(scalars, 0), filled(scalars, 0)
     for s in range(count):
         for k in range(bounds[s], bounds[s + 1]):
             node = order[k]
@@ -51,39 +66,30 @@ def lay_out(
                 scalar_order[offset[k] + i] = starts[node] + i
                 place[starts[node] + i] = offset[k] + i
                 owner[offset[k] + i] = s
-    # Offsets, children, and two stacks of update matrices: a front and its children never share one.
-    fronts[:, CHILD] = -1
-    fronts[:, SIBLING] = -1
-    level = np.zeros(count, np.int64)
+    level = filled(count + 1, 0)
     for s in range(count - 1, -1, -1):
         p = parent[s]
+        fronts[s, CHILD], fronts[s, SIBLING] = -1, -1
         if p >= 0:
             level[s] = 1 - level[p]
             fronts[s, SIBLING] = fronts[p, CHILD]
             fronts[p, CHILD] = s
-    top, peak = np.zeros(2, np.int64), np.zeros(2, np.int64)
     for s in range(count):
         fronts[s, FIRST] = offset[bounds[s]]
         w, r = offset[bounds[s + 1]] - offset[bounds[s]], passed[s]
-        fronts[s, WIDTH], fronts[s, ROWS] = w, r
-        fronts[s + 1, PANEL] = fronts[s, PANEL] + w * (w + r)
+        fronts[s, PIVOTS], fronts[s, ROWS], fronts[s, STRIDE] = w, r, (w + r + 3) // 4 * 4
+        fronts[s + 1, PANEL] = fronts[s, PANEL] + w * fronts[s, STRIDE]
         fronts[s + 1, INDEX] = fronts[s, INDEX] + r
-        child = fronts[s, CHILD]
-        if child >= 0:
-            top[1 - level[s]] = fronts[child, UPDATE]
-        fronts[s, UPDATE] = top[level[s]]
-        top[level[s]] += r * r
-        peak[level[s]] = max(peak[level[s]], top[level[s]])
     fronts[count, FIRST] = scalars
-    for s in range(count):
-        if level[s] == 1:
-            fronts[s, UPDATE] += peak[0]
     # Rows: every node walks up from its earlier neighbours to its own front, in order, so lists come sorted.
-    rows, relative = np.empty(fronts[count, INDEX], np.int32), np.empty(fronts[count, INDEX], np.int32)
-    fill, mark = fronts[:, INDEX].copy(), np.full(count, -1, np.int64)
+    size = fronts[count, INDEX]
+    rows, relative, runs = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int32)
+    fill, mark = filled(count + 1, 0), filled(count, -1)
+    for s in range(count):
+        fill[s] = fronts[s, INDEX]
     for k in range(nodes):
-        node, mine = order[k], member[k]
-        mark[mine] = k
+        node = order[k]
+        mark[member[k]] = k
         for e in range(pointer[node], pointer[node + 1]):
             if position[neighbours[e]] < k:
                 s = member[position[neighbours[e]]]
@@ -93,45 +99,68 @@ def lay_out(
                         rows[fill[s]] = i
                         fill[s] += 1
                     s = parent[s]
+    # Update matrices go straight into the parent's panel where they are its leading part; else on one of two stacks, of
+    # which a front uses one and its children the other.
+    top, peak = filled(2, 0), filled(2, 0)
     for s in range(count):
-        p = parent[s]
-        if p < 0:
-            continue
-        base, last, other = fronts[p, FIRST], fronts[p, FIRST] + fronts[p, WIDTH], fronts[p, INDEX]
-        for i in range(fronts[s, INDEX], fronts[s + 1, INDEX]):
-            if rows[i] < last:
-                relative[i] = rows[i] - base
-            else:
-                while rows[other] != rows[i]:
-                    other += 1
-                relative[i] = fronts[p, WIDTH] + other - fronts[p, INDEX]
-    # Entries belong to the front that eliminates the earlier of their two scalars.
+        child = fronts[s, CHILD]
+        while child >= 0:
+            if fronts[child, DIRECT] == 0:
+                if fronts[child, UPDATE] < top[1 - level[s]]:
+                    top[1 - level[s]] = fronts[child, UPDATE]
+            child = fronts[child, SIBLING]
+        p, r, begin = parent[s], passed[s], fronts[s, INDEX]
+        if p >= 0:
+            base, last, other = fronts[p, FIRST], fronts[p, FIRST] + fronts[p, PIVOTS], fronts[p, INDEX]
+            for i in range(begin, begin + r):
+                if rows[i] < last:
+                    relative[i] = rows[i] - base
+                else:
+                    while rows[other] != rows[i]:
+                        other += 1
+                    relative[i] = fronts[p, PIVOTS] + other - fronts[p, INDEX]
+            for i in range(begin + r - 1, begin - 1, -1):
+                follows = i + 1 < begin + r and relative[i + 1] == relative[i] + 1
+                runs[i] = runs[i + 1] + 1 if follows else 1
+        leading = p >= 0 and r > 0 and r <= fronts[p, PIVOTS] and relative[begin + r - 1] == r - 1
+        if r > 0 and rows[begin] == fronts[s + 1, FIRST] and rows[begin + r - 1] == fronts[s + 1, FIRST] + r - 1:
+            fronts[s, ADJACENT] = 1
+        if leading:
+            fronts[s, DIRECT] = 1
+            fronts[s, UPDATE], fronts[s, UPDATE_STRIDE] = fronts[p, PANEL], fronts[p, STRIDE]
+        else:
+            fronts[s, UPDATE], fronts[s, UPDATE_STRIDE] = top[level[s]], (r + 3) // 4 * 4
+            top[level[s]] += r * fronts[s, UPDATE_STRIDE]
+            if top[level[s]] > peak[level[s]]:
+                peak[level[s]] = top[level[s]]
+    for s in range(count):
+        if fronts[s, DIRECT] == 0:
+            fronts[s, UPDATE] += fronts[count, PANEL] + (peak[0] if level[s] == 1 else 0)
+    # Entries belong to the front that eliminates the earlier of their two scalars: one list of entries per front.
     total = indptr[scalars]
-    for column in range(scalars):
-        b = place[column]
-        for e in range(indptr[column], indptr[column + 1]):
-            fronts[owner[min(b, place[indices[e]])] + 1, ENTRY] += 1
+    following, row_of = np.empty(total, np.int32), np.empty(total, np.int32)
     for s in range(count):
-        fronts[s + 1, ENTRY] += fronts[s, ENTRY]
-    fill = fronts[:, ENTRY].copy()
-    entries, slots = np.empty(total, np.int32), np.empty(total, np.int32)
-    pairs = np.empty((total, 2), np.int32)
+        mark[s] = -1
     for column in range(scalars):
         b = place[column]
         for e in range(indptr[column], indptr[column + 1]):
             a = place[indices[e]]
-            s = owner[min(a, b)]
-            entries[fill[s]] = e
-            pairs[fill[s], 0], pairs[fill[s], 1] = min(a, b), max(a, b)
-            fill[s] += 1
-    local = np.empty(scalars, np.int64)
+            s = owner[a if a < b else b]
+            row_of[e] = column
+            following[e] = mark[s]
+            mark[s] = e
+    slots, local = np.empty(total, np.int32), filled(scalars, 0)
     for s in range(count):
-        base, w = fronts[s, FIRST], fronts[s, WIDTH]
-        m = w + fronts[s, ROWS]
+        base, w, stride = fronts[s, FIRST], fronts[s, PIVOTS], fronts[s, STRIDE]
         for i in range(w):
             local[base + i] = i
         for i in range(fronts[s, ROWS]):
             local[rows[fronts[s, INDEX] + i]] = w + i
-        for e in range(fronts[s, ENTRY], fronts[s + 1, ENTRY]):
-            slots[e] = fronts[s, PANEL] + (pairs[e, 0] - base) * m + local[pairs[e, 1]]
-    return fronts, scalar_order, rows, relative, entries, slots, peak[0] + peak[1]
+        e = mark[s]
+        while e >= 0:
+            a, b = place[indices[e]], place[row_of[e]]
+            if a > b:
+                a, b = b, a
+            slots[e] = fronts[s, PANEL] + (a - base) * stride + local[b]
+            e = int(following[e])
+    return fronts, scalar_order, rows, relative, runs, slots, peak[0] + peak[1]

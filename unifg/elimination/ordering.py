@@ -13,11 +13,21 @@ from unifg.typing import IntArray
 
 
 @compiled
+def filled(size: int, value: int) -> IntArray:
+    """Array of one integer; loops compile far sooner than array expressions."""
+    result = np.empty(size, np.int64)
+    for k in range(size):
+        result[k] = value
+    return result
+
+
+@compiled
 def block_graph(indptr: IntArray, indices: IntArray, label: IntArray, nodes: int) -> tuple[IntArray, IntArray]:
     """Graph of the nodes from the scalar pattern.
 
     Args:
-        indptr, indices: upper triangle by columns.
+        indptr: upper triangle by columns.
+        indices: its rows.
         label: (n,) node of each scalar, non-decreasing from 0 to nodes - 1.
         nodes: number of nodes.
 
@@ -25,15 +35,15 @@ def block_graph(indptr: IntArray, indices: IntArray, label: IntArray, nodes: int
         Pointers (nodes + 1,) and neighbours of each node, both directions, without the node itself.
     """
     scalars = len(label)
-    seen = np.full(nodes, -1, np.int64)
+    seen, pointer = filled(nodes, -1), filled(nodes + 1, 0)
+    first, second = filled(0, 0), filled(0, 0)
     pairs = 0
-    count = np.zeros(nodes + 1, np.int64)
-    upper = np.empty((0, 2), np.int64)
     for sweep in range(2):
         if sweep == 1:
-            upper = np.empty((pairs, 2), np.int64)
+            first, second = np.empty(pairs, np.int64), np.empty(pairs, np.int64)
             pairs = 0
-            seen[:] = -1
+            for k in range(nodes):
+                seen[k] = -1
         for column in range(scalars):
             b = label[column]
             previous = b
@@ -45,15 +55,17 @@ def block_graph(indptr: IntArray, indices: IntArray, label: IntArray, nodes: int
                 if a != b and seen[a] != b:
                     seen[a] = b
                     if sweep == 1:
-                        upper[pairs, 0], upper[pairs, 1] = a, b
-                        count[a + 1] += 1
-                        count[b + 1] += 1
+                        first[pairs], second[pairs] = a, b
+                        pointer[a + 1] += 1
+                        pointer[b + 1] += 1
                     pairs += 1
-    pointer = np.cumsum(count)
-    fill = pointer[:-1].copy()
+    fill = np.empty(nodes, np.int64)
+    for k in range(nodes):
+        fill[k] = pointer[k]
+        pointer[k + 1] += pointer[k]
     neighbours = np.empty(2 * pairs, np.int64)
     for k in range(pairs):
-        a, b = upper[k, 0], upper[k, 1]
+        a, b = first[k], second[k]
         neighbours[fill[a]] = b
         neighbours[fill[b]] = a
         fill[a] += 1
@@ -62,56 +74,67 @@ def block_graph(indptr: IntArray, indices: IntArray, label: IntArray, nodes: int
 
 
 @compiled
-def minimum_degree(pointer: IntArray, neighbours: IntArray, weight: IntArray) -> IntArray:
+def minimum_degree(pointer: IntArray, neighbours: IntArray, weight: IntArray, stage: IntArray) -> IntArray:
     """Approximate minimum degree on the quotient graph.
 
     Eliminated nodes live on as elements, the cliques they leave behind. A pivot absorbs the elements it touches;
     nodes found indistinguishable are merged, nodes that touch nothing but the new element leave with the pivot.
 
     Args:
-        pointer, neighbours: symmetric graph without self-loops.
+        pointer: symmetric graph without self-loops.
+        neighbours: see above.
         weight: (nodes,) scalars of each node, positive.
+        stage: (nodes,) non-negative; nodes of a lower stage are eliminated before those of a higher one.
 
     Returns:
         Nodes in the order of elimination.
     """
     nodes = len(weight)
-    total = weight.sum()
     capacity = len(neighbours) + len(neighbours) // 2 + 2 * nodes + 16
     lists = np.empty(capacity, np.int64)
     free = len(neighbours)
-    lists[:free] = neighbours
-    start, length = pointer[:-1].copy(), pointer[1:] - pointer[:-1]
-    elements = np.zeros(nodes, np.int64)  # how many entries at the front of a variable's list are elements
-    size = weight.copy()  # of a variable; 0 once absorbed or eliminated, negative while in the current element
-    degree = np.zeros(nodes, np.int64)
-    head = np.full(total + 1, -1, np.int64)
-    following, previous = np.full(nodes, -1, np.int64), np.full(nodes, -1, np.int64)
-    bucket = np.full(nodes, -1, np.int64)
-    bucket_next, key = np.full(nodes, -1, np.int64), np.zeros(nodes, np.int64)
-    outside = np.ones(nodes, np.int64)  # of an element: tag + weight outside the current one; 0 once absorbed
-    alive = np.ones(nodes, np.bool_)  # its list is still needed
-    absorber = np.full(nodes, -1, np.int64)
-    marked, stamp = np.zeros(nodes, np.int64), 0
+    for k in range(free):
+        lists[k] = neighbours[k]
+    start, length = np.empty(nodes, np.int64), np.empty(nodes, np.int64)
+    elements = filled(nodes, 0)  # how many entries at the front of a variable's list are elements
+    size = np.empty(
+        nodes, np.int64
+    )  # of a variable; 0 once absorbed or eliminated, negative while in the current element
+    total = 0
+    for i in range(nodes):
+        start[i], length[i], size[i] = pointer[i], pointer[i + 1] - pointer[i], weight[i]
+        total += weight[i]
+    degree, head = filled(nodes, 0), filled(total + 1, -1)
+    following, previous = filled(nodes, -1), filled(nodes, -1)
+    bucket, bucket_next, key = filled(nodes, -1), filled(nodes, -1), filled(nodes, 0)
+    outside = filled(nodes, 1)  # of an element: tag + weight outside the current one; 0 once absorbed
+    alive = filled(nodes, 1)  # its list is still needed
+    absorber, marked, stamp = filled(nodes, -1), filled(nodes, 0), 0
     pivots = np.empty(nodes, np.int64)
     count, tag, lowest, remaining = 0, 1, 0, total
-    dense = max(16, int(10.0 * np.sqrt(nodes)))
+    now, listed = -1, 0  # stage of the nodes in the lists of degrees, and their weight
+    dense = 16 + int(10.0 * np.sqrt(nodes))
     for i in range(nodes):
         if length[i] > dense:  # nearly every node touches it: last
             size[i] = 0
-            alive[i] = False
+            alive[i] = 0
             remaining -= weight[i]
     for i in range(nodes):
         if size[i] == 0:
             continue
         for e in range(start[i], start[i] + length[i]):
             degree[i] += size[lists[e]]
-        d = degree[i]
-        following[i] = head[d]
-        if head[d] >= 0:
-            previous[head[d]] = i
-        head[d] = i
     while remaining > 0:
+        while listed == 0:
+            now, lowest = now + 1, 0
+            for i in range(nodes):
+                if size[i] > 0 and stage[i] == now:
+                    d = degree[i]
+                    listed += size[i]
+                    previous[i], following[i] = -1, head[d]
+                    if head[d] >= 0:
+                        previous[head[d]] = i
+                    head[d] = i
         while head[lowest] < 0:
             lowest += 1
         p = head[lowest]
@@ -126,13 +149,13 @@ def minimum_degree(pointer: IntArray, neighbours: IntArray, weight: IntArray) ->
         bound = length[p]
         for e in range(start[p], start[p] + elements[p]):
             bound += length[lists[e]]
-        bound = min(bound, nodes)
-        if free + bound > capacity:
+        if free + (bound if bound < nodes else nodes) > capacity:
             packed = np.empty(capacity, np.int64)
             free = 0
             for i in range(nodes):
-                if alive[i]:
-                    packed[free : free + length[i]] = lists[start[i] : start[i] + length[i]]
+                if alive[i] == 1:
+                    for k in range(length[i]):
+                        packed[free + k] = lists[start[i] + k]
                     start[i] = free
                     free += length[i]
             lists = packed
@@ -142,7 +165,7 @@ def minimum_degree(pointer: IntArray, neighbours: IntArray, weight: IntArray) ->
             if k < elements[p]:
                 e = lists[start[p] + k]
                 first, last = start[e], start[e] + length[e]
-                alive[e] = False
+                alive[e] = 0
                 outside[e] = 0
             else:
                 first, last = start[p] + elements[p], start[p] + length[p]
@@ -154,6 +177,8 @@ def minimum_degree(pointer: IntArray, neighbours: IntArray, weight: IntArray) ->
                 size[i] = -size[i]
                 lists[free] = i
                 free += 1
+                if stage[i] != now:
+                    continue
                 if previous[i] >= 0:
                     following[previous[i]] = following[i]
                 else:
@@ -183,7 +208,7 @@ def minimum_degree(pointer: IntArray, neighbours: IntArray, weight: IntArray) ->
                     hashed += e
                 elif outside[e] == tag:  # a part of the new element
                     outside[e] = 0
-                    alive[e] = False
+                    alive[e] = 0
             variables = put
             for k in range(first + elements[i], first + length[i]):
                 j = lists[k]
@@ -192,19 +217,20 @@ def minimum_degree(pointer: IntArray, neighbours: IntArray, weight: IntArray) ->
                     lists[put] = j
                     put += 1
                     hashed += j
-            if external == 0:  # leaves together with the pivot
+            if external == 0 and stage[i] == now:  # leaves together with the pivot
                 absorber[i] = p
                 pivot_size -= size[i]
                 weight_p += size[i]
                 size[i] = 0
-                alive[i] = False
+                alive[i] = 0
                 continue
             lists[put] = lists[variables]
             lists[variables] = lists[first]
             lists[first] = p
             elements[i] = variables - first + 1
             length[i] = put - first + 1
-            degree[i] = min(degree[i], external)
+            if external < degree[i]:
+                degree[i] = external
             h = hashed % nodes
             key[i] = h
             bucket_next[i] = bucket[h]
@@ -223,7 +249,7 @@ def minimum_degree(pointer: IntArray, neighbours: IntArray, weight: IntArray) ->
                     marked[lists[k]] = stamp
                 before, j = i, bucket_next[i]
                 while j >= 0:
-                    same = length[i] == length[j] and elements[i] == elements[j]
+                    same = length[i] == length[j] and elements[i] == elements[j] and stage[i] == stage[j]
                     k = start[j] + 1
                     while same and k < start[j] + length[j]:
                         same = marked[lists[k]] == stamp
@@ -232,7 +258,7 @@ def minimum_degree(pointer: IntArray, neighbours: IntArray, weight: IntArray) ->
                         absorber[j] = i
                         size[i] += size[j]
                         size[j] = 0
-                        alive[j] = False
+                        alive[j] = 0
                         bucket_next[before] = bucket_next[j]
                     else:
                         before = j
@@ -245,31 +271,34 @@ def minimum_degree(pointer: IntArray, neighbours: IntArray, weight: IntArray) ->
             if size[i] == 0:
                 continue
             size[i] = -size[i]
-            d = min(degree[i] + weight_p - size[i], remaining - pivot_size - size[i])
+            d, most = degree[i] + weight_p - size[i], remaining - pivot_size - size[i]
+            d = d if d < most else most
             degree[i] = d
-            previous[i] = -1
-            following[i] = head[d]
-            if head[d] >= 0:
-                previous[head[d]] = i
-            head[d] = i
-            lowest = min(lowest, d)
+            if stage[i] == now:
+                previous[i], following[i] = -1, head[d]
+                if head[d] >= 0:
+                    previous[head[d]] = i
+                head[d] = i
+                lowest = lowest if lowest < d else d
             lists[free] = i
             free += 1
         length[p] = free - begin
-        alive[p] = length[p] > 0
+        alive[p] = 1 if length[p] > 0 else 0
         remaining -= pivot_size
+        listed -= pivot_size
         size[p] = 0
     # Nodes that left with a pivot follow it.
-    rank = np.full(nodes, count, np.int64)
-    rank[pivots[:count]] = np.arange(count)
-    place = np.zeros(count + 2, np.int64)
+    rank, place = filled(nodes, count), filled(count + 2, 0)
+    for k in range(count):
+        rank[pivots[k]] = k
     for i in range(nodes):
         root = i
         while absorber[root] >= 0:
             root = absorber[root]
         rank[i] = rank[root]
         place[rank[i] + 1] += 1
-    place = np.cumsum(place)
+    for k in range(count + 1):
+        place[k + 1] += place[k]
     order = np.empty(nodes, np.int64)
     for i in range(nodes):
         order[place[rank[i]]] = i
@@ -284,7 +313,7 @@ def indistinguishable(indptr: IntArray, indices: IntArray) -> IntArray:
     Neighbourhoods are compared by a 64-bit sum of mixed indices.
     """
     scalars = len(indptr) - 1
-    digest = np.zeros(scalars, np.int64)
+    digest = filled(scalars, 0)
     mixed = np.empty(scalars, np.int64)
     for i in range(scalars):
         z = (i + 1) * -7046029254386353131
@@ -297,7 +326,7 @@ def indistinguishable(indptr: IntArray, indices: IntArray) -> IntArray:
             digest[column] += mixed[row]
             if row != column:
                 digest[row] += mixed[column]
-    label = np.zeros(scalars, np.int64)
+    label = filled(scalars, 0)
     for i in range(1, scalars):
         label[i] = label[i - 1] + (1 if digest[i] != digest[i - 1] else 0)
     return label

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from unifg.typing import Array, IntArray
 
 # Columns of ``Plan.fronts``.
-FIRST, WIDTH, ROWS, PANEL, UPDATE, INDEX, ENTRY, CHILD, SIBLING = range(9)
-COLUMNS = 9
+FIRST, PIVOTS, ROWS, PANEL, STRIDE, UPDATE, UPDATE_STRIDE, DIRECT, INDEX, ADJACENT, CHILD, SIBLING = range(12)
+COLUMNS = 12
 # Entries of ``Plan.shape``.
-SCALARS, FRONTS, LARGEST, CHAIN = range(4)
+SCALARS, FRONTS, LARGEST, PANELS = range(4)
 # Entries of ``Plan.state``.
 POSITIVE, NEGATIVE, ZERO, FAILED, SURPRISES, SURPRISE = range(6)
 
@@ -21,23 +21,22 @@ POSITIVE, NEGATIVE, ZERO, FAILED, SURPRISES, SURPRISE = range(6)
 class Plan(NamedTuple):
     """Arguments of the compiled kernels `factor`, `solve` and `factor_solve`.
 
-    A front holds ``width`` pivots and ``rows`` scalars that are eliminated later. Its panel is a (width, width + rows)
-    array, rows contiguous, of which the entries on and right of the diagonal are the factor: with P the panel's part,
+    A front eliminates its pivots and passes an update matrix on the ``rows`` scalars it shares with later fronts. Its
+    panel is a (pivots, pivots + rows) matrix of which the entries on and right of the diagonal are the factor:
     A = sum P' S P. Scalars are numbered in the order of elimination; fronts are in postorder.
 
     Attributes:
-        shape: scalars, fronts, scalars of the largest front, whether the tree is a chain.
-        routines: addresses of the BLAS routines of `blas`.
-        fronts: (S, 9): first pivot, width, rows, offset of the panel, of the update matrix, of the row indices, of the
-            entries; first child and next sibling or -1. One more row closes the offsets.
+        shape: scalars, fronts, scalars of the largest front, numbers in all panels.
+        fronts: (S + 1, 12) per front: first pivot, pivots, rows, offset of the panel, length of its rows; offset of
+            the update matrix and length of its rows; whether that is the leading part of the parent's panel; offset
+            of the row indices, whether they are simply the next scalars; first child and next sibling or -1.
         order: (n,) original scalar of each eliminated one.
         rows: scalars of the update rows of all fronts.
         relative: where these rows are found in the parent's front.
-        entries: numbers of the entries of the pattern, front by front.
-        slots: where each of them goes in ``panels``.
+        runs: how many rows from this one on follow each other there.
+        slots: (nnz,) where the entries of the pattern go in ``numbers``.
         expected: (n,) sign each pivot should have, 0 when any will do.
-        panels: the factor.
-        updates: update matrices on their way to the parent.
+        numbers: panels, then update matrices.
         pivots: (n,) inverse of the diagonal of the factor.
         signs: (n,) S.
         work: (n + largest front) for solves.
@@ -45,16 +44,14 @@ class Plan(NamedTuple):
     """
 
     shape: IntArray
-    routines: IntArray
     fronts: IntArray
     order: IntArray
     rows: NDArray[np.int32]
     relative: NDArray[np.int32]
-    entries: NDArray[np.int32]
+    runs: NDArray[np.int32]
     slots: NDArray[np.int32]
     expected: NDArray[np.int8]
-    panels: Array
-    updates: Array
+    numbers: Array
     pivots: Array
     signs: Array
     work: Array

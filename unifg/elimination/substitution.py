@@ -4,94 +4,169 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.elimination.plan import FIRST, FRONTS, INDEX, PANEL, ROWS, SCALARS, WIDTH, Plan
+from unifg.elimination.fronts import factor
+from unifg.elimination.plan import ADJACENT, FIRST, FRONTS, INDEX, PANEL, PIVOTS, ROWS, SCALARS, STRIDE, Plan
+from unifg.elimination.vectors import blend, get, load, minus, plus_products, put, splat, store, total
 from unifg.jit import compiled
 from unifg.typing import Array, IntArray
 
 
 @compiled
+def forward(
+    x: Array,
+    local: int,
+    numbers: Array,
+    panel: int,
+    stride: int,
+    width: int,
+    size: int,
+    pivots: Array,
+    signs: Array,
+    first: int,
+) -> None:
+    """X <- S P^-T x for the pivots of a panel, and what they take from the rest of its ``size`` scalars."""
+    for top in range(0, width, 4):
+        height = width - top
+        r0 = panel + top * (stride + 1)
+        r1 = r0 + stride if height > 1 else r0
+        r2 = r1 + stride if height > 2 else r0
+        r3 = r2 + stride if height > 3 else r0
+        at, pivot = local + top, first + top
+        v0, v1, v2, v3 = get(x, at) * get(pivots, pivot), 0.0, 0.0, 0.0
+        put(x, at, v0 * get(signs, pivot))
+        if height > 1:
+            v1 = (get(x, at + 1) - get(numbers, r0 + 1) * v0) * get(pivots, pivot + 1)
+            put(x, at + 1, v1 * get(signs, pivot + 1))
+        if height > 2:
+            v2 = (get(x, at + 2) - get(numbers, r0 + 2) * v0 - get(numbers, r1 + 2) * v1) * get(pivots, pivot + 2)
+            put(x, at + 2, v2 * get(signs, pivot + 2))
+        if height > 3:
+            v3 = get(x, at + 3) - get(numbers, r0 + 3) * v0 - get(numbers, r1 + 3) * v1
+            v3 = (v3 - get(numbers, r2 + 3) * v2) * get(pivots, pivot + 3)
+            put(x, at + 3, v3 * get(signs, pivot + 3))
+            height = 4
+        for j in range(height, size - top, 4):
+            old = load(x, at + j)
+            new = minus(minus(old, v0, load(numbers, r0 + j)), v1, load(numbers, r1 + j))
+            new = minus(minus(new, v2, load(numbers, r2 + j)), v3, load(numbers, r3 + j))
+            store(x, at + j, blend(new, old, size - top - j))
+
+
+@compiled
+def backward(
+    x: Array, local: int, numbers: Array, panel: int, stride: int, width: int, size: int, pivots: Array, first: int
+) -> None:
+    """X <- P^-1 x for the pivots of a panel, given the rest of its ``size`` scalars."""
+    zero = splat(0.0)
+    for top in range((width - 1) // 4 * 4, -1, -4):
+        height = width - top
+        r0 = panel + top * (stride + 1)
+        r1 = r0 + stride if height > 1 else r0
+        r2 = r1 + stride if height > 2 else r0
+        r3 = r2 + stride if height > 3 else r0
+        at, pivot = local + top, first + top
+        s0, s1, s2, s3 = zero, zero, zero, zero
+        for j in range(height if height < 4 else 4, size - top, 4):
+            known = blend(load(x, at + j), zero, size - top - j)
+            s0, s1 = plus_products(s0, known, load(numbers, r0 + j)), plus_products(s1, known, load(numbers, r1 + j))
+            s2, s3 = plus_products(s2, known, load(numbers, r2 + j)), plus_products(s3, known, load(numbers, r3 + j))
+        y1, y2, y3 = 0.0, 0.0, 0.0
+        if height > 3:
+            y3 = (get(x, at + 3) - total(s3)) * get(pivots, pivot + 3)
+            put(x, at + 3, y3)
+        if height > 2:
+            y2 = (get(x, at + 2) - total(s2) - get(numbers, r2 + 3) * y3) * get(pivots, pivot + 2)
+            put(x, at + 2, y2)
+        if height > 1:
+            y1 = get(x, at + 1) - total(s1) - get(numbers, r1 + 3) * y3
+            y1 = (y1 - get(numbers, r1 + 2) * y2) * get(pivots, pivot + 1)
+            put(x, at + 1, y1)
+        y0 = get(x, at) - total(s0) - get(numbers, r0 + 3) * y3 - get(numbers, r0 + 2) * y2
+        put(x, at, (y0 - get(numbers, r0 + 1) * y1) * get(pivots, pivot))
+
+
+@compiled
 def solve(plan: Plan, right: Array, out: Array) -> None:
     """Solve for one right-hand side (n,) with the last factorisation; ``out`` may be ``right``."""
-    fronts, rows, panels, pivots, signs = plan.fronts, plan.rows, plan.panels, plan.pivots, plan.signs
-    scalars = plan.shape[SCALARS]
-    x, local = plan.work[:scalars], plan.work[scalars:]
+    fronts, rows, numbers, pivots, signs = plan.fronts, plan.rows, plan.numbers, plan.pivots, plan.signs
+    scalars, count, x, order = plan.shape[SCALARS], plan.shape[FRONTS], plan.work, plan.order
     for i in range(scalars):
-        x[i] = right[plan.order[i]]
-    for s in range(plan.shape[FRONTS]):
-        first, width, below, begin = fronts[s, FIRST], fronts[s, WIDTH], fronts[s, ROWS], fronts[s, PANEL]
-        stride = width + below
-        index = rows[fronts[s, INDEX] : fronts[s, INDEX] + below]
-        part = local[:stride]
-        for i in range(width):
-            part[i] = x[first + i]
-        for i in range(below):
-            part[width + i] = 0.0
-        for k in range(width):
-            value = part[k] * pivots[first + k]
-            part[k] = value * signs[first + k]
-            panel = panels[begin + k * stride : begin + (k + 1) * stride]
-            for j in range(k + 1, stride):
-                part[j] -= value * panel[j]
-        for i in range(width):
-            x[first + i] = part[i]
-        for i in range(below):
-            x[index[i]] += part[width + i]
-    for s in range(plan.shape[FRONTS] - 1, -1, -1):
-        first, width, below, begin = fronts[s, FIRST], fronts[s, WIDTH], fronts[s, ROWS], fronts[s, PANEL]
-        stride = width + below
-        index = rows[fronts[s, INDEX] : fronts[s, INDEX] + below]
-        part = local[:stride]
-        for i in range(width):
-            part[i] = x[first + i]
-        for i in range(below):
-            part[width + i] = x[index[i]]
-        for k in range(width - 1, -1, -1):
-            panel = panels[begin + k * stride : begin + (k + 1) * stride]
-            value = 0.0
-            for j in range(k + 1, stride):
-                value += panel[j] * part[j]
-            part[k] = (part[k] - value) * pivots[first + k]
-        for i in range(width):
-            x[first + i] = part[i]
+        put(x, i, get(right, get(order, i)))
+    for sweep in range(2):
+        for k in range(count):
+            s = k if sweep == 0 else count - 1 - k
+            first, width, below, panel, stride = (
+                fronts[s, FIRST], fronts[s, PIVOTS], fronts[s, ROWS], fronts[s, PANEL], fronts[s, STRIDE],
+            )  # fmt: skip
+            index, local = fronts[s, INDEX], first
+            apart = fronts[s, ADJACENT] == 0 and below > 0
+            if apart:
+                local = scalars
+                for i in range(width):
+                    put(x, local + i, get(x, first + i))
+                for i in range(below):
+                    put(x, local + width + i, get(x, get(rows, index + i)))
+            if sweep == 0:
+                forward(x, local, numbers, panel, stride, width, width + below, pivots, signs, first)
+            else:
+                backward(x, local, numbers, panel, stride, width, width + below, pivots, first)
+            if apart:
+                for i in range(width):
+                    put(x, first + i, get(x, local + i))
+                if sweep == 0:
+                    for i in range(below):
+                        put(x, get(rows, index + i), get(x, local + width + i))
     for i in range(scalars):
-        out[plan.order[i]] = x[i]
+        put(out, get(order, i), get(x, i))
+
+
+@compiled
+def factor_solve(plan: Plan, data: Array, added: Array, right: Array, out: Array) -> bool:
+    """Factorise and solve; arguments as for `fronts.factor` and `solve`. ``out`` is untouched when this fails."""
+    if not factor(plan, data, added):
+        return False
+    solve(plan, right, out)
+    return True
 
 
 @compiled
 def solve_columns(plan: Plan, right: Array, out: Array) -> None:
-    """Solve for the columns of (n, k)."""
-    column = np.empty(len(right))
-    for k in range(right.shape[1]):
-        column[:] = right[:, k]
-        solve(plan, column, column)
-        out[:, k] = column
+    """Solve for the rows of (k, n)."""
+    for k in range(right.shape[0]):
+        solve(plan, right[k], out[k])
 
 
 @compiled
-def residual(indptr: IntArray, indices: IntArray, data: Array, x: Array, right: Array, out: Array) -> tuple[float, float]:
-    """``out`` = right - A x for the upper triangle of A by columns.
+def residual(
+    indptr: IntArray, indices: IntArray, data: Array, x: Array, right: Array, out: Array, bulk: Array
+) -> tuple[float, float]:
+    """``out`` = right - A x for the upper triangle of A by columns; ``bulk`` = |right| + |A| |x|.
 
     Returns:
-        max |out|, and max (|A| |x| + |right|), what rounding errors of the residual are relative to.
+        max |out|, max bulk: what rounding errors of the residual are relative to.
     """
     scalars = len(x)
-    size = np.abs(right)
-    out[:] = right
+    for i in range(scalars):
+        out[i], bulk[i] = right[i], abs(right[i])
     for column in range(scalars):
-        value, total, bulk = x[column], 0.0, 0.0
+        value, products, sizes = x[column], 0.0, 0.0
         for e in range(indptr[column], indptr[column + 1]):
             row, entry = indices[e], data[e]
-            if row == column:
-                total += entry * value
-                bulk += abs(entry * value)
-            else:
-                total += entry * x[row]
-                bulk += abs(entry * x[row])
+            above = entry * x[row]
+            products += above
+            sizes += abs(above)
+            if row != column:
                 out[row] -= entry * value
-                size[row] += abs(entry * value)
-        out[column] -= total
-        size[column] += bulk
-    return np.abs(out).max(), size.max()
+                bulk[row] += abs(entry * value)
+        out[column] -= products
+        bulk[column] += sizes
+    error, size = 0.0, 0.0
+    for i in range(scalars):
+        if not abs(out[i]) <= error:  # so that NaN is not lost
+            error = abs(out[i])
+        if bulk[i] > size:
+            size = bulk[i]
+    return error, size
 
 
 @compiled
@@ -102,7 +177,9 @@ def refine(
 
     Args:
         plan: with its factorisation, say of A with something added to the diagonal.
-        indptr, indices, data: upper triangle of A.
+        indptr: upper triangle of A by columns.
+        indices: its rows.
+        data: its entries.
         right: (n,).
         out: (n,) receives x, the best of the iterates.
         tolerance: of max |right - A x|, relative to max (|A| |x| + |right|).
@@ -112,20 +189,22 @@ def refine(
         The relative residual reached.
     """
     scalars = len(right)
-    rest, step, trial = right.copy(), np.empty(scalars), np.zeros(scalars)
+    rest, step, trial, bulk = np.empty(scalars), np.empty(scalars), np.empty(scalars), np.empty(scalars)
     best = np.inf
-    out[:] = 0.0
+    for i in range(scalars):
+        out[i], trial[i], rest[i] = 0.0, 0.0, right[i]
     for _ in range(steps + 1):
         solve(plan, rest, step)
         for i in range(scalars):
             trial[i] += step[i]
-        error, size = residual(indptr, indices, data, trial, right, rest)
-        relative = error / size if size > 0.0 else 0.0
+        error, size = residual(indptr, indices, data, trial, right, rest, bulk)
+        relative = error / size if size > 0.0 else error
         if not relative < best:
             break
         slow = relative > 0.5 * best
         best = relative
-        out[:] = trial
+        for i in range(scalars):
+            out[i] = trial[i]
         if best <= tolerance or slow:
             break
     return best

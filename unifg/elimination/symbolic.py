@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.elimination.ordering import filled
 from unifg.jit import compiled
 from unifg.typing import Array, IntArray
 
@@ -32,19 +33,20 @@ def supernodes(
     """Elimination tree, supernodes and their merging.
 
     Args:
-        pointer, neighbours: symmetric graph of the nodes.
+        pointer: symmetric graph of the nodes.
+        neighbours: see above.
         weight: (nodes,) scalars of each node.
         order: (nodes,) order of elimination.
 
     Returns:
-        The final order (a postorder, equivalent to the one given), pointers of the S supernodes into it, the parent of each
-        supernode or -1, the scalars it passes on to the parent, and (flops, predicted nanoseconds).
+        The final order (a postorder, equivalent to the one given), pointers of the S supernodes into it, the parent of
+        each supernode or -1, the scalars it passes on to the parent, and (flops, predicted nanoseconds).
     """
     nodes = len(weight)
     position = np.empty(nodes, np.int64)
     for k in range(nodes):
         position[order[k]] = k
-    parent, ancestor = np.full(nodes, -1, np.int64), np.full(nodes, -1, np.int64)
+    parent, ancestor = filled(nodes, -1), filled(nodes, -1)
     for i in range(nodes):
         node = order[i]
         for e in range(pointer[node], pointer[node + 1]):
@@ -56,7 +58,7 @@ def supernodes(
                     parent[k] = i
                 k = above
     # Postorder.
-    first, following = np.full(nodes + 1, -1, np.int64), np.full(nodes, -1, np.int64)
+    first, following = filled(nodes + 1, -1), filled(nodes, -1)
     for k in range(nodes - 1, -1, -1):
         p = parent[k] if parent[k] >= 0 else nodes
         following[k] = first[p]
@@ -76,9 +78,7 @@ def supernodes(
             if k < nodes:
                 post[count] = k
                 count += 1
-    ordered, size, up, renamed = (
-        np.empty(nodes, np.int64), np.empty(nodes, np.int64), np.full(nodes, -1, np.int64), np.empty(nodes, np.int64),
-    )  # fmt: skip
+    ordered, size, up, renamed = filled(nodes, 0), filled(nodes, 0), filled(nodes, -1), filled(nodes, 0)
     for k in range(nodes):
         ordered[k] = order[post[k]]
         size[k] = weight[ordered[k]]
@@ -88,7 +88,7 @@ def supernodes(
         if parent[post[k]] >= 0:
             up[k] = renamed[parent[post[k]]]
     # Scalars below the diagonal of each column: every row walks its subtree once.
-    below, mark = np.zeros(nodes, np.int64), np.full(nodes, -1, np.int64)
+    below, mark = filled(nodes, 0), filled(nodes, -1)
     for i in range(nodes):
         mark[i] = i
         for e in range(pointer[ordered[i]], pointer[ordered[i] + 1]):
@@ -105,7 +105,7 @@ def supernodes(
         if k == 0 or up[k - 1] != k or below[k - 1] != below[k] + size[k]:
             fronts += 1
         member[k] = fronts - 1
-    width, rows, above_s = np.zeros(fronts, np.int64), np.zeros(fronts, np.int64), np.full(fronts, -1, np.int64)
+    width, rows, above_s, into = filled(fronts, 0), filled(fronts, 0), filled(fronts, -1), filled(fronts, 0)
     for k in range(nodes):
         s = member[k]
         width[s] += size[k]
@@ -113,12 +113,12 @@ def supernodes(
         if up[k] >= 0 and member[up[k]] != s:
             above_s[s] = member[up[k]]
     # Merge children into parents where it pays, from the leaves up.
-    into = np.arange(fronts)
-    head, sibling = np.full(fronts + 1, -1, np.int64), np.full(fronts, -1, np.int64)
+    head, sibling = filled(fronts + 1, -1), filled(fronts, -1)
     for s in range(fronts - 1, -1, -1):
         p = above_s[s] if above_s[s] >= 0 else fronts
         sibling[s] = head[p]
         head[p] = s
+        into[s] = s
     for p in range(fronts):
         kept, child = -1, head[p]
         while child >= 0:
@@ -140,9 +140,7 @@ def supernodes(
             child = after
         head[p] = kept
     # Postorder of what is left.
-    number = np.full(fronts, -1, np.int64)
-    final_parent, final_rows = np.empty(fronts, np.int64), np.empty(fronts, np.int64)
-    stack_s = np.empty(fronts + 1, np.int64)
+    number, named, stack_s = filled(fronts, -1), filled(fronts, 0), filled(fronts + 1, 0)
     stack_s[0] = fronts
     depth, count = 0, 0
     while depth >= 0:
@@ -156,29 +154,32 @@ def supernodes(
             depth -= 1
             if s < fronts:
                 number[s] = count
-                final_rows[count] = rows[s]
-                final_parent[count] = s  # for now, the old name
+                named[count] = s
                 count += 1
-    flops, predicted = 0.0, 0.0
+    final_parent, final_rows, forecast = filled(count, -1), filled(count, 0), np.empty(2)
+    forecast[0], forecast[1] = 0.0, 0.0
     for k in range(count):
-        s = final_parent[k]
+        s = named[k]
+        final_rows[k] = rows[s]
         p = above_s[s]
         while p >= 0 and into[p] != p:
             p = into[p]
-        final_parent[k] = number[p] if p >= 0 else -1
+        if p >= 0:
+            final_parent[k] = number[p]
         w, r = float(width[s]), float(rows[s])
-        flops += w * w * w / 3.0 + w * w * r + w * r * r
-        predicted += front_cost(width[s], rows[s])
-    bounds = np.zeros(count + 1, np.int64)
+        forecast[0] += w * w * w / 3.0 + w * w * r + w * r * r
+        forecast[1] += front_cost(width[s], rows[s])
+    bounds, fill, result = filled(count + 1, 0), filled(count, 0), filled(nodes, 0)
     for k in range(nodes):
         s = member[k]
         while into[s] != s:
             s = into[s]
         member[k] = number[s]
         bounds[member[k] + 1] += 1
-    bounds = np.cumsum(bounds)
-    fill, result = bounds[:-1].copy(), np.empty(nodes, np.int64)
+    for k in range(count):
+        bounds[k + 1] += bounds[k]
+        fill[k] = bounds[k]
     for k in range(nodes):
         result[fill[member[k]]] = ordered[k]
         fill[member[k]] += 1
-    return result, bounds, final_parent[:count].copy(), final_rows[:count].copy(), np.array([flops, predicted])
+    return result, bounds, final_parent, final_rows, forecast

@@ -12,7 +12,6 @@ from typing import Any, TypeAlias, cast
 
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
 
 from unifg.typing import Array
@@ -24,7 +23,7 @@ INDEX = ir.IntType(64)
 FLAGS = ("contract", "reassoc", "nsz")
 
 
-class VectorType(types.Type):
+class VectorType(types.Type):  # type: ignore[misc]
     """Type of a vector inside compiled code."""
 
     def __init__(self) -> None:
@@ -35,7 +34,7 @@ class VectorType(types.Type):
 kind = VectorType()
 
 
-@register_model(VectorType)  # type: ignore[untyped-decorator]
+@register_model(VectorType)
 class VectorModel(models.PrimitiveModel):  # type: ignore[misc]
     """A register."""
 
@@ -104,6 +103,14 @@ def _minus(typing_context: Any, start: Any, scalar: Any, vector: Any) -> Any:
     return kind(kind, types.float64, kind), generate
 
 
+def _plus(typing_context: Any, start: Any, scalar: Any, vector: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        product = builder.fmul(_spread(builder, values[1]), values[2], flags=FLAGS)
+        return builder.fadd(values[0], product, flags=FLAGS)
+
+    return kind(kind, types.float64, kind), generate
+
+
 def _times(typing_context: Any, scalar: Any, vector: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         return builder.fmul(_spread(builder, values[0]), values[1], flags=FLAGS)
@@ -111,11 +118,50 @@ def _times(typing_context: Any, scalar: Any, vector: Any) -> Any:
     return kind(types.float64, kind), generate
 
 
+def _blend(typing_context: Any, vector: Any, other: Any, count: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        lanes = ir.Constant(ir.VectorType(INDEX, WIDTH), list(range(WIDTH)))
+        empty = ir.Constant(lanes.type, ir.Undefined)
+        wanted = builder.insert_element(empty, values[2], ir.Constant(ir.IntType(32), 0))
+        mask = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
+        inside = builder.icmp_signed("<", lanes, builder.shuffle_vector(wanted, empty, mask))
+        return builder.select(inside, values[0], values[1])
+
+    return kind(kind, kind, types.int64), generate
+
+
 def _plus_products(typing_context: Any, start: Any, left: Any, right: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         return builder.fadd(values[0], builder.fmul(values[1], values[2], flags=FLAGS), flags=FLAGS)
 
     return kind(kind, kind, kind), generate
+
+
+def _pack(typing_context: Any, first: Any, second: Any, third: Any, fourth: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        result = ir.Constant(LANES, ir.Undefined)
+        for k, value in enumerate(values):
+            result = builder.insert_element(result, value, ir.Constant(ir.IntType(32), k))
+        return result
+
+    return kind(*[types.float64] * WIDTH), generate
+
+
+def _lane(typing_context: Any, vector: Any, number: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return builder.extract_element(values[0], values[1])
+
+    return types.float64(kind, types.int64), generate
+
+
+def _inverse_root(typing_context: Any, vector: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        root = builder.module.declare_intrinsic("llvm.sqrt", [LANES], ir.FunctionType(LANES, [LANES]))
+        size = builder.module.declare_intrinsic("llvm.fabs", [LANES], ir.FunctionType(LANES, [LANES]))
+        below = builder.call(root, [builder.call(size, [values[0]])])
+        return builder.fdiv(ir.Constant(LANES, [1.0] * WIDTH), below)
+
+    return kind(kind), generate
 
 
 def _total(typing_context: Any, vector: Any) -> Any:
@@ -132,6 +178,11 @@ get = cast(Callable[[Any, int], Any], intrinsic(_get))  # array[offset]
 put = cast(Callable[[Any, int, Any], None], intrinsic(_put))  # array[offset] = value
 splat = cast(Callable[[float], Vector], intrinsic(_splat))
 minus = cast(Callable[[Vector, float, Vector], Vector], intrinsic(_minus))  # start - scalar * vector
+plus = cast(Callable[[Vector, float, Vector], Vector], intrinsic(_plus))  # start + scalar * vector
 times = cast(Callable[[float, Vector], Vector], intrinsic(_times))
+blend = cast(Callable[[Vector, Vector, int], Vector], intrinsic(_blend))  # the first lanes of one, then the other's
 plus_products = cast(Callable[[Vector, Vector, Vector], Vector], intrinsic(_plus_products))
+pack = cast(Callable[[float, float, float, float], Vector], intrinsic(_pack))
+lane = cast(Callable[[Vector, int], float], intrinsic(_lane))
+inverse_root = cast(Callable[[Vector], Vector], intrinsic(_inverse_root))  # 1 / sqrt(abs(vector))
 total = cast(Callable[[Vector], float], intrinsic(_total))

@@ -42,12 +42,12 @@ class Trajectory:
 
 
 def write_tum(path: str | Path, time: ArrayLike, poses: ArrayLike) -> Path:
-    """Write planar poses, lifted to z = 0, with nine decimals.
+    """Write poses with nine decimals; planar ones are lifted to z = 0.
 
     Args:
         path: file to write; an existing one is replaced.
         time: (n,) [s].
-        poses: (n, 3) x, y, heading [m, m, rad].
+        poses: (n, 3) x, y, heading [m, m, rad], or (n, 7) poses of `unifg.SE3`.
 
     Returns:
         The path written.
@@ -56,17 +56,19 @@ def write_tum(path: str | Path, time: ArrayLike, poses: ArrayLike) -> Path:
         FileFormatError: the arrays do not fit each other, or a number is not finite.
     """
     path = Path(path)
-    times, planar = np.asarray(time, dtype=np.float64), np.asarray(poses, dtype=np.float64)
-    if times.ndim != 1 or planar.shape != (len(times), 3):
+    times, array = np.asarray(time, dtype=np.float64), np.asarray(poses, dtype=np.float64)
+    if times.ndim != 1 or array.shape not in ((len(times), 3), (len(times), 7)):
         raise FileFormatError(
-            f"{path}: time {times.shape} and poses {planar.shape} must be (n,) and (n, 3) of the same n"
+            f"{path}: time {times.shape} and poses {array.shape} must be (n,) and (n, 3) or (n, 7) of the same n"
         )
-    bad = np.flatnonzero(~(np.isfinite(times) & np.isfinite(planar).all(axis=1)))
+    bad = np.flatnonzero(~(np.isfinite(times) & np.isfinite(array).all(axis=1)))
     if bad.size:
-        raise FileFormatError(f"{path}: pose {bad[0]} is not finite (t = {times[bad[0]]}, pose {planar[bad[0]]})")
-    zero = np.zeros_like(times)
-    half = planar[:, 2] / 2.0
-    rows = np.column_stack([times, planar[:, :2], zero, zero, zero, np.sin(half), np.cos(half)])
+        raise FileFormatError(f"{path}: pose {bad[0]} is not finite (t = {times[bad[0]]}, pose {array[bad[0]]})")
+    rows = np.column_stack([times, array[:, :3], array[:, 4:], array[:, 3:4]])  # the scalar goes last
+    if array.shape == (len(times), 3):
+        zero = np.zeros_like(times)
+        half = array[:, 2] / 2.0
+        rows = np.column_stack([times, array[:, :2], zero, zero, zero, np.sin(half), np.cos(half)])
     rows = np.round(rows, 9) + 0.0  # the sum turns -0.0 into 0.0
     lines = [" ".join(f"{value:.9f}" for value in row) for row in rows.tolist()]
     path.write_text("".join(line + "\n" for line in lines), encoding="ascii", newline="\n")

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.lie.batch import over_one, over_two
 from unifg.lie.manifold import LieGroup, identities
+from unifg.lie.scalar import so2
+from unifg.lie.scalar.so2 import PI
 from unifg.typing import Array, ArrayLike
 
-PI = float(np.pi)
-TWO_PI = 2.0 * PI
+_wrap = over_one(so2.exp, 1, 1)
+_inverse = over_one(so2.inverse, 1, 1)
+_add = over_two(so2.compose, 1, 1, 1)
+_subtract = over_two(so2.between, 1, 1, 1)
+_act = over_two(so2.act, 1, 2, 2)
+_matrix = over_one(so2.matrix, 1, 2, 2)
 
 
 def wrap_angle(theta: ArrayLike, /) -> Array:
-    """Bring angles of any shape [rad] into [-pi, pi).
-
-    Angles already there come back bit for bit, and the result never leaves the interval: ``fmod`` is exact,
-    and so is the difference of two doubles within a factor two of each other. The usual shortcuts are not:
-    ``remainder(theta + pi, 2 pi) - pi`` loses digits near zero, ``rint(theta / 2 pi)`` leaves the interval
-    near pi.
-    """
-    rest = np.fmod(theta, TWO_PI)
-    turns = np.subtract(rest >= PI, rest < -PI, dtype=np.float64)
-    wrapped: Array = rest - TWO_PI * turns
+    """Bring angles of any shape [rad] into [-pi, pi), exactly: see :func:`unifg.lie.scalar.so2.wrap`."""
+    wrapped: Array = _wrap(np.asarray(theta, dtype=np.float64)[..., None])[..., 0][()]
     return wrapped
 
 
@@ -44,53 +43,39 @@ class SO2Group(LieGroup):
 
     def exp(self, d: ArrayLike, /) -> Array:
         """Wrap (..., 1) angles; Sola eq. 114 and 116."""
-        return wrap_angle(d)
+        return _wrap(d)
 
     def log(self, x: ArrayLike, /) -> Array:
         """Wrap (..., 1) angles; Sola eq. 115."""
-        return wrap_angle(x)
+        return _wrap(x)
 
     def compose(self, x: ArrayLike, y: ArrayLike, /) -> Array:
         """Add angles and wrap."""
-        return wrap_angle(np.add(x, y))
+        return _add(x, y)
 
     def inverse(self, x: ArrayLike, /) -> Array:
         """Negate angles and wrap: -pi is its own inverse; Sola eq. 118."""
-        return wrap_angle(np.negative(x))
+        return _inverse(x)
 
     def between(self, x: ArrayLike, y: ArrayLike, /) -> Array:
         """Subtract angles and wrap."""
-        return wrap_angle(np.subtract(y, x))
+        return _subtract(x, y)
 
     def retract(self, x: ArrayLike, d: ArrayLike, /) -> Array:
         """Add angles and wrap."""
-        return wrap_angle(np.add(x, d))
+        return _add(x, d)
 
     def local(self, x: ArrayLike, y: ArrayLike, /) -> Array:
         """Subtract angles and wrap."""
-        return wrap_angle(np.subtract(y, x))
+        return _subtract(x, y)
 
     def act(self, x: ArrayLike, points: ArrayLike, /) -> Array:
         """Rotate (..., 2) points [m]."""
-        theta = np.asarray(x, dtype=np.float64)[..., 0]
-        points = np.asarray(points, dtype=np.float64)
-        px, py = points[..., 0], points[..., 1]
-        c, s = np.cos(theta), np.sin(theta)
-        first = c * px - s * py
-        result = np.empty((*first.shape, 2))
-        result[..., 0] = first
-        result[..., 1] = s * px + c * py
-        return result
+        return _act(x, points)
 
     def matrix(self, x: ArrayLike, /) -> Array:
         """Return (..., 2, 2) rotation matrices."""
-        theta = np.asarray(x, dtype=np.float64)[..., 0]
-        result = np.empty((*theta.shape, 2, 2))
-        result[..., 0, 0] = result[..., 1, 1] = np.cos(theta)
-        sine = np.sin(theta)
-        result[..., 1, 0] = sine
-        result[..., 0, 1] = -sine
-        return result
+        return _matrix(x)
 
     def hat(self, d: ArrayLike, /) -> Array:
         """Return (..., 2, 2) skew-symmetric matrices."""

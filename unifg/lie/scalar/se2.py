@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 
 from unifg.jit import compiled
-from unifg.lie.scalar.series import c_value, k_value, sinc, x_cot_x
+from unifg.lie.scalar.series import c_value, k_value, sinc, sinc_and_cos, x_cot_x
 from unifg.lie.scalar.so2 import wrap
 from unifg.typing import Array
 
@@ -22,8 +22,8 @@ def exp(d: Array, out: Array) -> None:
     """Exponential; Sola eq. 156 and 158."""
     vx, vy, omega = d[0], d[1], d[2]
     half = 0.5 * omega
-    scale = sinc(half)
-    c, s = scale * math.cos(half), scale * math.sin(half)
+    scale, cosine = sinc_and_cos(half)
+    c, s = scale * cosine, scale * scale * half
     out[0] = c * vx - s * vy
     out[1] = s * vx + c * vy
     out[2] = wrap(omega)
@@ -140,11 +140,10 @@ def adjoint(x: Array, out: Array) -> None:
 def _jacobian(vx: float, vy: float, omega: float, out: Array) -> None:
     """Write Jr; Sola eq. 163."""
     half = 0.5 * omega
-    s = sinc(half)
+    s, cosine = sinc_and_cos(half)
+    a = s * cosine  # sin omega / omega
     e = 0.5 * s * s  # (1 - cos omega) / omega^2
-    sine = math.sin(omega)
-    f = omega * c_value(omega, sine)
-    a = s * math.cos(half)  # sin omega / omega
+    f = omega * c_value(omega, a * omega)
     with_column(a, -omega * e, f * vx - e * vy, f * vy + e * vx, out)
 
 

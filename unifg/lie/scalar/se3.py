@@ -143,7 +143,7 @@ def local(x: Array, y: Array, out: Array) -> None:
 
 @compiled
 def act(x: Array, p: Array, out: Array) -> None:
-    """Bring a (3,) point from the body frame to the frame of the pose; Sola eq. 181."""
+    """Bring a (3,) point from the body frame to the frame of the pose."""
     tx, ty, tz = x[0], x[1], x[2]
     px, py, pz = rotate(x[3], x[4], x[5], x[6], p[0], p[1], p[2])
     out[0] = tx + px
@@ -153,7 +153,7 @@ def act(x: Array, p: Array, out: Array) -> None:
 
 @compiled
 def matrix(x: Array, out: Array) -> None:
-    """Write the (4, 4) homogeneous matrix; Sola eq. 167."""
+    """Write the (4, 4) homogeneous matrix; Sola eq. 168."""
     write_matrix(x[3], x[4], x[5], x[6], out, 0)
     for i in range(3):
         out[i, 3] = x[i]
@@ -243,5 +243,5 @@ def left_jacobian(d: Array, out: Array) -> None:
 
 @compiled
 def left_jacobian_inverse(d: Array, out: Array) -> None:
-    """Write Jl^-1, (6, 6); Sola eq. 182; singular at a rotation of 2 pi."""
+    """Write Jl^-1, (6, 6); Sola eq. 179; singular at a rotation of 2 pi."""
     _jacobian_inverse(1.0, d, out)

@@ -40,6 +40,13 @@ def sinc(x: float) -> float:
 
 
 @compiled
+def sinc_and_cos(x: float) -> tuple[float, float]:
+    """Return sin(x) / x and cos(x) for the price of one; sin(x) is the first times x."""
+    floored = max(abs(x), TINY)
+    return math.sin(floored) / floored, math.cos(floored)
+
+
+@compiled
 def x_cot_x(x: float) -> float:
     """Return x cot(x), with 1 at zero."""
     floored = max(abs(x), TINY)

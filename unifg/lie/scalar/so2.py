@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from unifg.jit import compiled
 from unifg.typing import Array
 
@@ -17,15 +15,32 @@ TWO_PI = 2.0 * math.pi
 def wrap(theta: float) -> float:
     """Bring an angle [rad] into [-pi, pi), exactly.
 
-    Angles already there come back bit for bit, and the result never leaves the interval: ``fmod`` is exact, and so is
-    the difference of two doubles within a factor two of each other. The usual shortcuts are not:
+    Angles already there come back bit for bit, and the result never leaves the interval: each step is a difference of
+    two doubles within a factor two of each other, which is exact (Sterbenz). The usual shortcuts are not:
     ``remainder(theta + pi, 2 pi) - pi`` loses digits near zero, ``rint(theta / 2 pi)`` leaves the interval near pi.
     """
-    rest = theta
-    if not abs(rest) < TWO_PI:  # not finite, or worth the slow exact division
-        rest = np.fmod(rest, TWO_PI)
+    rest = theta if abs(theta) < TWO_PI else without_turns(theta)
     turns = (1.0 if rest >= PI else 0.0) - (1.0 if rest < -PI else 0.0)  # selected, not branched on
     return rest - TWO_PI * turns
+
+
+@compiled
+def without_turns(theta: float) -> float:
+    """Return what whole turns leave of an angle, in (-2 pi, 2 pi) and exact; NaN for what is not finite.
+
+    This is ``fmod(theta, 2 pi)``, which the compiler would compute for every angle, needed or not.
+    """
+    rest = abs(theta)
+    if not rest < math.inf:
+        return math.nan
+    turns = TWO_PI
+    while turns <= 0.5 * rest:
+        turns *= 2.0
+    while turns >= TWO_PI:
+        if rest >= turns:
+            rest -= turns
+        turns *= 0.5
+    return -rest if theta < 0.0 else rest
 
 
 @compiled

@@ -176,7 +176,7 @@ def local(x: Array, y: Array, out: Array) -> None:
 
 @compiled
 def act(x: Array, p: Array, out: Array) -> None:
-    """Rotate a (3,) point; Sola eq. 136."""
+    """Rotate a (3,) point."""
     px, py, pz = rotate(x[0], x[1], x[2], x[3], p[0], p[1], p[2])
     out[0] = px
     out[1] = py
@@ -229,15 +229,21 @@ def left_jacobian_inverse(d: Array, out: Array) -> None:
 
 
 @compiled
+def normalise(x: Array, out: Array) -> None:
+    """Bring a quaternion of any length to unit norm and w >= 0; one without direction gives NaN."""
+    write(x[0], x[1], x[2], x[3], out, 0)
+
+
+@compiled
 def from_matrix(m: Array, out: Array) -> None:
-    """Store the quaternion of a (3, 3) rotation matrix.
+    """Store the quaternion of a rotation matrix, given as (9,) numbers row by row.
 
     The four products 4 q_i q_j of the largest component with all others are sums of entries; dividing by the largest
     loses no digits (Shepperd 1978, *Quaternion from rotation matrix*).
     """
-    r00, r11, r22 = m[0, 0], m[1, 1], m[2, 2]
-    wx, wy, wz = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
-    xy, xz, yz = m[1, 0] + m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2]
+    r00, r11, r22 = m[0], m[4], m[8]
+    wx, wy, wz = m[7] - m[5], m[2] - m[6], m[3] - m[1]
+    xy, xz, yz = m[3] + m[1], m[2] + m[6], m[7] + m[5]
     trace = r00 + r11 + r22
     if trace >= r00 and trace >= r11 and trace >= r22:
         a, b, c, d = 1.0 + trace, wx, wy, wz

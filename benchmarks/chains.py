@@ -1,0 +1,217 @@
+"""The chains of control: a unicycle over fifty steps, with soft and with hard dynamics, and where its time goes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, TypeAlias
+from unittest import mock
+
+import numpy as np
+
+import unifg as fg
+from benchmarks.reference_problems import Problem
+from benchmarks.report import table
+from benchmarks.timing import Stopwatch, interleave, milliseconds, number, shown
+from unifg import passes, solver
+from unifg.elimination import fronts, substitution
+from unifg.jit import compiled
+from unifg.models import unicycle
+from unifg.program import Program
+from unifg.solvers import AugmentedLagrangian, GaussNewton, model
+from unifg.typing import Array
+
+Result: TypeAlias = dict[str, Any]
+
+HORIZON = 50
+SOFT = 0.01  # sigma of soft dynamics [m, m, rad]
+TARGET = 0.15  # [ms] per iteration
+REPEATS = 20  # of a compiled pass inside one timed call
+WATCHED: dict[str, tuple[Any, str]] = {
+    "linearise": (passes, "linearize"),
+    "evaluate": (passes, "evaluate"),
+    "primal step": (model, "_minimize"),
+    "eliminate": (fronts, "factor"),
+    "substitute": (substitution, "solve"),
+    "KKT test": (solver, "optimality"),
+    "retract": (Program, "retract"),
+}
+
+
+def chain(kind: str, horizon: int) -> tuple[fg.Solver, fg.Graph, fg.Guess]:
+    """A unicycle that is to follow a line it starts beside.
+
+    Args:
+        kind: "soft", "hard" or "bounded" (hard, with limits on the controls).
+        horizon: steps.
+    """
+    problem = Problem("straight", False, horizon)
+    weights, effort = problem.weights
+    reference, cruise = problem.reference()
+    graph = fg.Graph()
+    x = graph.variables("pose", fg.SE2, horizon + 1)
+    u = graph.variables("control", fg.Rn(2), horizon)
+    graph.fix(x[0], problem.start)
+    graph.minimize(unicycle.tracking, x, reference, sigma=weights**-0.5, name="tracking")
+    graph.minimize(fg.prior, u, cruise, sigma=effort**-0.5, name="effort")
+    if kind == "soft":
+        graph.minimize(unicycle.dynamics, x[:-1], u, x[1:], problem.dt, sigma=SOFT, name="dynamics")
+    else:
+        graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], problem.dt, lower=0.0, upper=0.0, name="dynamics")
+    if kind == "bounded":
+        graph.bound(u, lower=-problem.limit, upper=problem.limit, name="limits")
+    states, controls = problem.guess()
+    backend = GaussNewton() if kind == "soft" else AugmentedLagrangian()
+    return backend, graph, fg.Guess({x: states, u: controls})
+
+
+CASES = {
+    "soft": "Gauss-Newton, soft dynamics",
+    "hard": "augmented Lagrangian, hard dynamics",
+    "bounded": "augmented Lagrangian, hard dynamics, bounded controls",
+}
+
+
+def measure(rounds: int, small: bool = False) -> Result:
+    """All chains in one set of rounds; a round repeats each solve, the chains being short."""
+    horizon, repeats = (4, 1) if small else (HORIZON, REPEATS)
+    candidates: dict[str, Callable[[], float]] = {}
+    parts: dict[str, dict[str, list[float]]] = {}
+    rows: list[Result] = []
+    for kind in CASES:
+        backend, graph, guess = chain(kind, horizon)
+        run = backend.prepare(graph)
+        first = run.solve(guess)
+        parts[kind] = {part: [] for part in (*WATCHED, "Python")}
+        candidates[kind] = _plain(run, guess, first.iterations, repeats)
+        candidates[f"{kind}, split"] = _split(run, guess, first.iterations, repeats, parts[kind])
+        rows.append(
+            {
+                "kind": kind,
+                "horizon": horizon,
+                "unknowns": run.program.size,
+                "iterations": first.iterations,
+                "status": first.status.name.lower().replace("_", " "),
+                "eliminations": eliminations(run, guess) / first.iterations,
+                **_compiled_parts(run.program, guess, repeats, rounds),
+            }
+        )
+    times = interleave(candidates, rounds)
+    for row in rows:
+        kind = row["kind"]
+        row["ms"] = milliseconds(times[kind])
+        row["parts"] = {part: milliseconds(np.array(values[-rounds:])) for part, values in parts[kind].items()}
+    goals = [
+        {"name": f"{CASES[row['kind']]}, N = {horizon}, iteration", "unit": "ms", "value": row["ms"],
+         "target": TARGET, "floor": None}
+        for row in rows
+    ]  # fmt: skip
+    return {"rows": rows, "rounds": rounds, "goals": goals}
+
+
+def _plain(run: fg.Prepared, guess: fg.Guess, iterations: int, repeats: int) -> Callable[[], float]:
+    def time_of_an_iteration() -> float:
+        begin = time.perf_counter()
+        for _ in range(repeats):
+            run.solve(guess)
+        return (time.perf_counter() - begin) / (repeats * iterations)
+
+    return time_of_an_iteration
+
+
+def _split(
+    run: fg.Prepared, guess: fg.Guess, iterations: int, repeats: int, parts: dict[str, list[float]]
+) -> Callable[[], float]:
+    watch = Stopwatch(WATCHED)
+
+    def time_of_an_iteration() -> float:
+        with watch:
+            begin = time.perf_counter()
+            for _ in range(repeats):
+                run.solve(guess)
+            elapsed = time.perf_counter() - begin
+        for part, seconds in watch.seconds.items():
+            parts[part].append(seconds / (repeats * iterations))
+        parts["Python"].append((elapsed - sum(watch.seconds.values())) / (repeats * iterations))
+        return elapsed / (repeats * iterations)
+
+    return time_of_an_iteration
+
+
+def eliminations(run: fg.Prepared, guess: fg.Guess) -> float:
+    """Factorisations in one solve, those inside the compiled primal step included: it runs interpreted here."""
+    count = 0
+    real = fronts.factor
+
+    def counting(*arguments: Any) -> bool:
+        nonlocal count
+        count += 1
+        return real(*arguments)
+
+    interpreted = getattr(model._minimize, "py_func")  # noqa: B009 - an attribute of the compiled function
+    with (
+        mock.patch.object(model, "_minimize", interpreted),
+        mock.patch.object(model, "factor", counting),
+        mock.patch.object(fronts, "factor", counting),
+    ):
+        run.solve(guess)
+    return float(count)
+
+
+@compiled
+def _factor_often(plan: Any, data: Array, added: Array, count: int) -> None:
+    for _ in range(count):
+        fronts.factor(plan, data, added)
+
+
+@compiled
+def _assemble_often(terms: Any, jacobian: Array, weights: Array, hessian: Array, count: int) -> None:
+    for _ in range(count):
+        passes.add_constraints(terms, jacobian, weights, hessian)
+
+
+def _compiled_parts(program: Program, guess: fg.Guess, repeats: int, rounds: int) -> Result:
+    """One elimination and one assembly of the constraints' normal equations, without Python around them."""
+    lin = program.linearize(program.values_from(guess.values))
+    factorization = program.normal_solver()
+    weights = np.full(program.constraints.count, 100.0)
+    hessian = program.normal_entries(lin, weights)
+    spare, none = hessian.copy(), np.full(program.size, 1e-6)
+
+    def eliminate() -> float:
+        begin = time.perf_counter()
+        _factor_often(factorization.plan, hessian, none, repeats)
+        return (time.perf_counter() - begin) / repeats
+
+    def assemble() -> float:
+        begin = time.perf_counter()
+        _assemble_often(program.arrays, lin.constraint_jacobian, weights, spare, repeats)
+        return (time.perf_counter() - begin) / repeats
+
+    times = interleave({"one elimination": eliminate, "one assembly": assemble}, rounds)
+    return {part: milliseconds(values) for part, values in times.items()}
+
+
+def render(result: Result) -> str:
+    """Two tables."""
+    rows = result["rows"]
+    head = (
+        "chain", "unknowns", "iterations", "iteration [ms]", "target", "eliminations per iteration",
+        "one elimination [us]", "one assembly of the constraints [us]",
+    )  # fmt: skip
+    lines = [
+        (
+            CASES[row["kind"]], str(row["unknowns"]), f"{row['iterations']}, {row['status']}", shown(row["ms"]),
+            f"{TARGET:g}", f"{row['eliminations']:.2f}", number(1e3 * row["one elimination"][0]),
+            number(1e3 * row["one assembly"][0]),
+        )
+        for row in rows
+    ]  # fmt: skip
+    names = list(rows[0]["parts"])
+    split = [(CASES[row["kind"]], *(number(1e3 * row["parts"][name][0]) for name in names)) for row in rows]
+    notes = (
+        f"Horizon {rows[0]['horizon']}, from the cold guess; an iteration is a solve over its iterations, {REPEATS} "
+        "solves in a row. The primal step of the augmented Lagrangian is one compiled call with its assemblies, "
+        "eliminations and products; how many eliminations it takes is counted in a run of its own."
+    )
+    return "\n\n".join([table(head, lines), "Where an iteration goes [us]:", table(("chain", *names), split), notes])

@@ -1,0 +1,179 @@
+"""Generated planar graphs of growing size: time per iteration, symbolic work and memory, and how they grow.
+
+    python -m benchmarks.growth POSES
+
+prints the memory one size takes; every size is measured by itself in a new process.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import subprocess
+import sys
+import time
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from benchmarks.gtsam_peer import ORDERINGS, Peer, available
+from benchmarks.report import CHECKOUT, table
+from benchmarks.timing import Stopwatch, interleave, milliseconds, number, shown, spread
+from unifg.elimination.factorization import Factorization
+from unifg.pose_graphs import PoseGraph, manhattan
+from unifg.solvers import GaussNewton
+
+Result: TypeAlias = dict[str, Any]
+
+SIZES = (1000, 3000, 10000, 30000, 100000)
+PEER_UP_TO = 10000  # poses
+ITERATIONS = 3
+FEW = 5  # rounds of symbolic work on the largest graphs
+LINEAR = 1.15  # growth exponent that still counts as near-linear
+
+
+def walk(poses: int) -> PoseGraph:
+    """A drive through a square city, starting at the truth so that every size takes the same full steps."""
+    made = manhattan(poses, seed=1)
+    return made.pose_graph.with_poses(made.truth)
+
+
+def measure(rounds: int, small: bool = False) -> Result:
+    """All sizes."""
+    sizes = (40, 80) if small else SIZES
+    rows = [measure_size(size, rounds, small) for size in sizes]
+    exponents = {
+        what: float(np.polyfit(np.log([row["poses"] for row in rows]), np.log([row[what][0] for row in rows]), 1)[0])
+        for what in ("ours", "compile", "analyse")
+    }
+    exponents["factor"] = float(
+        np.polyfit(np.log([row["poses"] for row in rows]), np.log([row["factor"] for row in rows]), 1)[0]
+    )
+    goals = [
+        {"name": f"{sizes[0]} to {sizes[-1]} poses, iteration", "unit": "growth exponent",
+         "value": [exponents["ours"]] * 3, "target": LINEAR, "floor": None}
+    ]  # fmt: skip
+    return {"rows": rows, "exponents": exponents, "rounds": rounds, "goals": goals}
+
+
+def measure_size(poses: int, rounds: int, small: bool) -> Result:
+    """One size: iterations beside GTSAM, structure from scratch, and memory."""
+    pose_graph = walk(poses)
+    graph, _, guess = pose_graph.graph()
+    backend = GaussNewton(max_iterations=ITERATIONS, tolerance=1e-300)
+    run = backend.prepare(graph)
+    analysis = Stopwatch({"analyse": (Factorization, "__init__")})
+    compiling: list[float] = []
+
+    def ours() -> float:
+        begin = time.perf_counter()
+        solution = run.solve(guess)
+        return (time.perf_counter() - begin) / max(solution.iterations, 1)
+
+    def symbolic() -> float:
+        fresh = pose_graph.graph()[0]
+        begin = time.perf_counter()
+        program = fresh.compile()
+        compiling.append(time.perf_counter() - begin)
+        with analysis:
+            backend.workspace(program)
+        return analysis.seconds["analyse"]
+
+    candidates: dict[str, Callable[[], float]] = {"ours": ours}
+    structure: dict[str, Callable[[], float]] = {"analyse": symbolic}
+    if available() and poses <= PEER_UP_TO:
+        peer = Peer(pose_graph)
+        pilot = {ordering: peer.iterate(ordering, 1)[0] for ordering in ORDERINGS}
+        best = min(pilot, key=lambda ordering: pilot[ordering])
+        candidates["gtsam"] = lambda: peer.iterate(best, ITERATIONS)[0]
+    times = interleave(candidates, rounds)
+    few = min(rounds, FEW) if poses > PEER_UP_TO else rounds
+    times |= interleave(structure, few)
+    result: Result = {
+        "poses": poses,
+        "edges": len(pose_graph.edges),
+        "ours": milliseconds(times["ours"]),
+        "analyse": milliseconds(times["analyse"]),
+        "compile": milliseconds(np.array(compiling[-few:])),
+        "factor": int(graph.compile().normal_solver().plan.numbers.nbytes),
+        "gtsam": None,
+    }
+    if "gtsam" in times:
+        result |= {
+            "gtsam": milliseconds(times["gtsam"]),
+            "ordering": best,
+            "ratio": spread(times["gtsam"] / times["ours"]),
+        }
+    gc.collect()
+    return result | (memory(poses) if small else _elsewhere(poses))
+
+
+def memory(poses: int) -> Result:
+    """Bytes of one graph and one solve: what NumPy and Python hold at their peak, and the growth of the process."""
+    warm = walk(40).graph()
+    GaussNewton(max_iterations=1).solve(warm[0], warm[2])
+    pose_graph = walk(poses)
+    gc.collect()
+    before = _resident()
+    graph, _, guess = pose_graph.graph()
+    run = GaussNewton(max_iterations=1).prepare(graph)
+    solution = run.solve(guess)
+    grown = _resident() - before
+    del run, solution, graph, guess
+    gc.collect()
+    tracemalloc.start()
+    graph, _, guess = pose_graph.graph()
+    run = GaussNewton(max_iterations=1).prepare(graph)
+    run.solve(guess)
+    traced = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return {"resident": grown if grown > 0 else None, "traced": traced}
+
+
+def _resident() -> int:
+    """Bytes of the process in memory, 0 where the system does not tell."""
+    if sys.platform != "linux":
+        return 0
+    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def _elsewhere(poses: int) -> Result:
+    """The same in a process that has seen no other graph."""
+    command = [sys.executable, "-m", "benchmarks.growth", str(poses)]
+    done = subprocess.run(command, cwd=CHECKOUT, check=True, capture_output=True, text=True)
+    found: Result = json.loads(done.stdout)
+    return found
+
+
+def render(result: Result) -> str:
+    """A table and the exponents."""
+    head = (
+        "poses", "edges", "iteration [ms]", "us per pose", "GTSAM [ms]", "times faster", "compiling [ms]",
+        "ordering and symbolic [ms]", "factor [MB]", "peak, NumPy [MB]", "growth of the process [MB]",
+    )  # fmt: skip
+    lines = [
+        (
+            str(row["poses"]), str(row["edges"]), shown(row["ours"]), number(1e3 * row["ours"][0] / row["poses"]),
+            f"{shown(row['gtsam'])}, {row['ordering']}" if row["gtsam"] else "-", shown(row.get("ratio")),
+            number(row["compile"][0]), number(row["analyse"][0]), number(row["factor"] / 1e6),
+            number(row["traced"] / 1e6), number(row["resident"] / 1e6) if row["resident"] else "-",
+        )
+        for row in result["rows"]
+    ]  # fmt: skip
+    powers = result["exponents"]
+    text = (
+        f"Growth exponents, fitted over all sizes: iteration {powers['ours']:.2f}, compiling {powers['compile']:.2f}, "
+        f"ordering and symbolic work {powers['analyse']:.2f}, factor {powers['factor']:.2f}. An iteration is a third "
+        f"of a solve of {ITERATIONS} from the truth. Memory is that of compiling and one iteration, in a process of "
+        "its own: the peak of NumPy's arrays and Python's objects (tracemalloc), and what the resident set has grown "
+        f"by when graph, solver and solution are kept. Structure of more than {PEER_UP_TO} poses: {FEW} rounds."
+    )
+    return "\n\n".join([table(head, lines, text=0), text])
+
+
+if __name__ == "__main__":
+    print(json.dumps(memory(int(sys.argv[1]))))

@@ -1,0 +1,181 @@
+"""Marginal covariances at the optimum: every pose's, and joint ones of pairs, beside GTSAM's.
+
+Both hold the first pose by the same prior, and GTSAM is given our optimum and our linear factors: what differs is the
+elimination alone.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+
+import unifg as fg
+from benchmarks import pose_graphs
+from benchmarks.gtsam_peer import ANCHOR, Peer, available, joint
+from benchmarks.report import table
+from benchmarks.timing import interleave, milliseconds, shown, spread
+from unifg.linearization import Linearization
+from unifg.program import Program
+from unifg.solvers import GaussNewton
+from unifg.typing import Array, IntArray
+
+Result: TypeAlias = dict[str, Any]
+
+PAIRS = 10  # joint covariances of two poses
+FEW = 5  # rounds at most
+SLOW = 2.0  # [s]; what takes GTSAM longer is compared once
+SAMPLE = 500  # poses whose covariance is compared with GTSAM's of the same linear factors
+TARGET = 1e-8  # largest relative difference
+
+
+def measure(rounds: int, small: bool = False) -> Result:
+    """All pose graphs."""
+    few = min(rounds, FEW)
+    rows = [measure_case(case, few) for case in pose_graphs.cases(small)]
+    goals = [
+        {"name": f"{row['name']}, marginal covariances", "unit": "relative difference from GTSAM",
+         "value": [max(row["difference"], row["joint difference"])] * 3, "target": TARGET, "floor": None}
+        for row in rows if row["difference"] is not None
+    ]  # fmt: skip
+    return {"rows": rows, "rounds": few, "goals": goals}
+
+
+def measure_case(case: pose_graphs.Case, rounds: int) -> Result:
+    """All single marginals, and some joint ones, in three ways."""
+    graph, x = pose_graphs.posed(case.pose_graph, ANCHOR)
+    solution = GaussNewton().solve(graph, {x: case.pose_graph.poses})
+    program = graph.compile()
+    count, dim = len(case.pose_graph.poses), case.pose_graph.group.dim
+    rng = np.random.default_rng(0)
+    pairs = np.array([rng.choice(count, 2, replace=False) for _ in range(min(PAIRS, count // 2))])
+    tree = Tree(program, solution)
+    scalars = program.columns.unknown[program.columns.of(x[:])]
+    found: dict[str, Any] = {}
+
+    def every() -> float:
+        begin = time.perf_counter()
+        found["blocks"] = Tree(program, solution).blocks().reshape(count, dim, dim)
+        return time.perf_counter() - begin
+
+    def from_tree() -> float:
+        begin = time.perf_counter()
+        found["joint"] = np.array([tree.factorization.inverse_block(scalars[pair].ravel()) for pair in pairs])
+        return (time.perf_counter() - begin) / len(pairs)
+
+    def by_name() -> float:
+        begin = time.perf_counter()
+        found["named"] = np.array([solution.covariance(x[pair]) for pair in pairs])
+        return (time.perf_counter() - begin) / len(pairs)
+
+    candidates: dict[str, Callable[[], float]] = {"all": every, "tree": from_tree}
+    result: Result = {"name": case.name, "poses": count, "named": None, "difference": None, "refused": ""}
+    try:
+        by_name()
+        candidates["named"] = by_name
+    except fg.GraphError as error:
+        result["refused"] = str(error)
+    times = interleave(candidates, rounds)
+    result |= {what: milliseconds(values) for what, values in times.items()}
+    if "named" in found:
+        result["own difference"] = _largest(found["named"], found["joint"])
+    if available():
+        result |= _compared(case, tree.lin, solution[x], pairs, found, every, rounds)
+    return result
+
+
+def _compared(
+    case: pose_graphs.Case,
+    lin: Linearization,
+    poses: Array,
+    pairs: IntArray,
+    found: dict[str, Array],
+    every: Callable[[], float],
+    rounds: int,
+) -> Result:
+    """Times of all marginals in turn, and the differences: of the elimination alone, and with GTSAM's own Jacobians."""
+    peer, count, edges = Peer(case.pose_graph), len(poses), len(case.pose_graph.edges)
+    dim = case.pose_graph.group.dim
+    blocks: dict[str, Array] = {}
+
+    def theirs() -> float:
+        begin = time.perf_counter()
+        marginals = peer.marginals(poses)
+        blocks["own"] = np.array([marginals.marginalCovariance(k) for k in range(count)])
+        return time.perf_counter() - begin
+
+    few = rounds if theirs() < SLOW else 1
+    times = interleave({"all": every, "gtsam": theirs}, few, warm=0)
+    derivatives = lin.jacobian[: edges * 2 * dim * dim].reshape(edges, dim, 2 * dim)
+    marginals = peer.marginals_of(derivatives, lin.jacobian[edges * 2 * dim * dim :].reshape(dim, dim))
+    chosen = np.arange(0, count, max(1, count // SAMPLE))
+    single = np.array([marginals.marginalCovariance(int(k)) for k in chosen])
+    both = np.array([joint(marginals, first, second) for first, second in pairs.tolist()])
+    return {
+        "gtsam": milliseconds(times["gtsam"]),
+        "ratio": spread(times["gtsam"] / times["all"]),
+        "difference": _largest(found["blocks"][chosen], single),
+        "joint difference": _largest(found["joint"], both),
+        "with its own": _largest(found["blocks"], np.array([peer.ours(block) for block in blocks["own"]])),
+    }
+
+
+class Tree:
+    """The normal equations at a solution, factorised.
+
+    Attributes:
+        lin: where they come from.
+        factorization: what entries of the inverse are read from.
+    """
+
+    def __init__(self, program: Program, solution: fg.Solution) -> None:
+        """Linearise, order, factorise."""
+        self.lin = program.linearize(solution.values)
+        self.factorization = program.normal_solver()
+        if not self.factorization.factor(self.lin.hessian):
+            raise RuntimeError("the normal equations of this pose graph are singular")
+
+    def blocks(self) -> Array:
+        """(n, d, d) covariance of every pose."""
+        return np.array(self.factorization.diagonal_blocks())
+
+
+def _largest(ours: Array, reference: Array) -> float:
+    """Largest difference of a block relative to the largest entry of that block."""
+    size = np.abs(reference).max(axis=(1, 2))
+    return float((np.abs(ours - reference).max(axis=(1, 2)) / size).max())
+
+
+def render(result: Result) -> str:
+    """One table."""
+    head = (
+        "graph", "poses", "all poses, ours [ms]", "GTSAM [ms]", "times faster", "difference",
+        "with GTSAM's own Jacobians", "two poses, tree [ms]", "difference",
+        "two poses, `solution.covariance` [ms]", "difference from the tree",
+    )  # fmt: skip
+    lines = [
+        (
+            row["name"], str(row["poses"]), shown(row["all"]), shown(row.get("gtsam")), shown(row.get("ratio")),
+            _power(row["difference"]), _power(row.get("with its own")), shown(row["tree"]),
+            _power(row.get("joint difference")), "refused" if row["refused"] else shown(row["named"]),
+            _power(row.get("own difference")),
+        )
+        for row in result["rows"]
+    ]  # fmt: skip
+    refusals = "".join(f" {row['name']} was refused: {row['refused']}." for row in result["rows"] if row["refused"])
+    notes = (
+        "All poses: linearisation, ordering, factorisation and the entries of the inverse that the elimination tree "
+        "holds (`Factorization.diagonal_blocks`), against `gtsam.Marginals` with one call per pose. Two poses: joint "
+        f"covariance of {PAIRS} pairs anywhere in the graph, by `Factorization.inverse_block` of a factorisation "
+        "there is, and as a user asks for it. Differences, from GTSAM where nothing else is said, are relative to the "
+        "largest entry of a block. GTSAM is given our Jacobians for them, and every so many poses are compared; the "
+        "column after shows all poses with its own, whose derivative of the logarithm in the plane loses figures at "
+        f"small angles. {result['rounds']} rounds, one where GTSAM takes longer than {SLOW:g} s.{refusals}"
+    )
+    return "\n\n".join([table(head, lines), notes])
+
+
+def _power(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0e}"

@@ -1,0 +1,133 @@
+"""The benchmark of the elimination engine runs on tiny inputs; nothing here depends on time."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from benchmarks import chains, elimination, gtsam_peer, marginals, own_residuals, pose_graphs
+from benchmarks.timing import Stopwatch, interleave, number, shown, spread
+from unifg.pose_graphs import manhattan
+from unifg.program import Program
+from unifg.solvers import GaussNewton
+
+
+@pytest.mark.parametrize("name", elimination.SECTIONS)
+def test_a_section_measures_survives_json_and_renders(name: str) -> None:
+    section = elimination.SECTIONS[name]
+    result = json.loads(json.dumps(section.measure(2, True), allow_nan=False))
+    text = section.render(result)
+    assert all(line.count("|") == text.splitlines()[0].count("|") for line in text.split("\n\n")[0].splitlines()[1:2])
+    assert "nan" not in text
+    assert result["goals"] or not gtsam_peer.available()
+    store: elimination.Result = {}
+    elimination.record(store, name, result, 1.0)
+    elimination.record(store, name, result, 1.0)
+    assert store[name]["previous"]["goals"].keys() == {goal["name"] for goal in result["goals"]}
+    assert section.title in elimination.render(store)
+
+
+def test_the_page_shows_the_run_before(tmp_path: Path) -> None:
+    goal = {"name": "it", "unit": "times faster than GTSAM", "value": [5.0, 4.0, 6.0], "target": 6.0, "floor": 4.0}
+    store: elimination.Result = {}
+    elimination.record(store, "chains", {"goals": [goal], "rounds": 15}, 1.0)
+    elimination.record(store, "chains", {"goals": [{**goal, "value": [3.0, 3.0, 3.5]}], "rounds": 15}, 1.0)
+    (row,) = elimination.summary(store).splitlines()[2:]
+    assert [cell.strip() for cell in row.split("|")[3:-1]] == [
+        "3.00 (3.00 to 3.50)",
+        "6 (floor 4)",
+        "no",
+        "5.00 (4.00 to 6.00)",
+    ]
+    assert not elimination.met({**goal, "value": [3.0, 3.0, 3.0]}, "floor")
+    assert elimination.met({**goal, "unit": "ms", "value": [5.0, 5.0, 5.0]})
+    (tmp_path / "store.json").write_text(json.dumps({"sections": store}))
+    assert elimination.load(tmp_path / "store.json") == store
+    assert elimination.load(tmp_path / "none.json") == {}
+
+
+def test_rounds_are_interleaved_and_the_warm_ones_do_not_count() -> None:
+    order: list[str] = []
+    counts = {"a": 0, "b": 0}
+
+    def run(name: str) -> float:
+        order.append(name)
+        counts[name] += 1
+        return float(counts[name])
+
+    times = interleave({"a": lambda: run("a"), "b": lambda: run("b")}, 8)
+    assert times["a"].tolist() == times["b"].tolist() == list(range(2, 10))
+    pairs = [tuple(order[k : k + 2]) for k in range(0, len(order), 2)]
+    assert set(pairs) == {("a", "b"), ("b", "a")}
+
+
+def test_spreads_and_digits() -> None:
+    assert spread(np.arange(1.0, 6.0)) == [3.0, 2.0, 4.0]
+    assert shown([12.345, 1.0, 123.4]) == "12.3 (1.00 to 123)"
+    assert [number(value) for value in (0.0123, 0.0, 4567.0)] == ["0.0123", "0.000", "4567"]
+
+
+def test_a_stopwatch_counts_and_puts_back() -> None:
+    pose_graph = manhattan(20).pose_graph
+    graph, _, guess = pose_graph.graph()
+    original = Program.linearize
+    with Stopwatch({"linearise": (Program, "linearize")}) as watch:
+        solution = GaussNewton().solve(graph, guess)
+    assert Program.linearize is original
+    assert watch.calls["linearise"] == solution.iterations + 1
+    assert watch.seconds["linearise"] > 0.0
+
+
+@pytest.mark.parametrize("kind", chains.CASES)
+def test_eliminations_are_counted(kind: str) -> None:
+    backend, graph, guess = chains.chain(kind, 4)
+    run = backend.prepare(graph)
+    solution = run.solve(guess)
+    assert solution.converged
+    count = chains.eliminations(run, guess)
+    if kind == "bounded":
+        assert count >= solution.iterations
+    else:
+        assert count == solution.iterations
+
+
+def test_residuals_written_by_hand_are_the_shipped_one() -> None:
+    pose_graph, known = own_residuals.drive(25)
+    reference = None
+    for residual in own_residuals.RESIDUALS.values():
+        graph, x = own_residuals.stated(pose_graph, known, residual)
+        lin = graph.compile().linearize({x: pose_graph.poses})
+        reference = reference or lin
+        np.testing.assert_allclose(lin.residual, reference.residual, rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(lin.jacobian, reference.jacobian, rtol=1e-6, atol=1e-6)
+    graph, x = own_residuals.stated(pose_graph, known, own_residuals.RESIDUALS["derived"])
+    assert graph.check({x: pose_graph.poses})
+
+
+def test_marginals_are_blocks_of_the_inverse() -> None:
+    pose_graph = manhattan(30).pose_graph
+    graph, x = pose_graphs.posed(pose_graph, 0.1)
+    solution = GaussNewton().solve(graph, {x: pose_graph.poses})
+    program = graph.compile()
+    tree = marginals.Tree(program, solution)
+    upper = program.normal.matrix(tree.lin.hessian).toarray()
+    inverse = np.linalg.inv(upper + upper.T - np.diag(upper.diagonal()))
+    expected = np.array([inverse[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(30)])
+    np.testing.assert_allclose(tree.blocks(), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("group", ["SE2", "SE3"])
+def test_the_peer_solves_the_same_problem(group: str) -> None:
+    pytest.importorskip("gtsam")
+    pose_graph = pose_graphs.cases(small=True)[group == "SE3"].pose_graph
+    peer = gtsam_peer.Peer(pose_graph)
+    graph, x, guess = pose_graph.graph()
+    start = 2.0 * peer.graph.error(peer.start)
+    assert start == pytest.approx(pose_graph.chi2(), rel=1e-9)
+    solution = GaussNewton().solve(graph, guess)
+    assert isinstance(solution, fg.Solution)
+    assert peer.solve("COLAMD")[2] == pytest.approx(pose_graph.with_poses(solution[x]).chi2(), rel=1e-6)

@@ -1,0 +1,280 @@
+"""Pose graphs in g2o and TORO files: what is read, what is written, what is refused."""
+
+from __future__ import annotations
+
+import gzip
+import logging
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.errors import FileFormatError
+from unifg.files.g2o import read_g2o, write_g2o
+from unifg.files.pose_graph import read_pose_graph
+from unifg.files.toro import read_toro, write_toro
+from unifg.pose_graphs import Edges, PoseGraph, Sightings
+
+PLANAR = """\
+# two poses and a tree
+VERTEX_SE2 10 0 0 0
+VERTEX_XY 5 2.0 1.0
+
+  EDGE_SE2 10 7   1.0 0.5 0.25   1 2 3 4 5 6
+VERTEX_SE2 7 1.0 0.5 0.25
+FIX 10
+EDGE_SE2_XY 10 5 2.0 1.0 9 1 8
+EDGE_BEARING_SE2_XY 7 5 0.5 100
+EDGE_RANGE_SE2_XY 7 5 1.5 50
+BR 10 5 0.1 2.0 0.5 0.25
+"""
+
+SPATIAL = """\
+VERTEX_SE3:QUAT 6989586621679009792 0 0 0 0 0 0 1
+VERTEX_SE3:QUAT 6989586621679009793 1 2 3 0 0 0.6 0.8
+VERTEX_TRACKXYZ 3 1 1 1
+EDGE_SE3:QUAT 6989586621679009792 6989586621679009793 1 2 3 0 0 1.2 1.6 """ + " ".join(map(str, range(1, 22)))
+
+
+def write(folder: Path, text: str, name: str = "graph.g2o") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def same(a: PoseGraph, b: PoseGraph) -> None:
+    """Bit by bit."""
+    for name in ("ids", "poses", "landmark_ids", "landmarks", "fixed_ids"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    for part in fields(Edges):
+        np.testing.assert_array_equal(getattr(a.edges, part.name), getattr(b.edges, part.name))
+    assert list(a.sightings) == list(b.sightings)
+    for kind, seen in a.sightings.items():
+        for part in fields(Sightings):
+            np.testing.assert_array_equal(getattr(seen, part.name), getattr(b.sightings[kind], part.name))
+
+
+def random_graph(rng: np.random.Generator, group: fg.LieGroup) -> PoseGraph:
+    count, size, dim = 12, group.point_dim, group.dim
+    first, second = rng.integers(0, count, (2, 30)).astype(np.intp)
+    root = rng.normal(size=(30, dim, dim))
+    information = root @ np.swapaxes(root, 1, 2)
+    information = 0.5 * (information + np.swapaxes(information, 1, 2))
+    seen = Sightings(first[:5], second[:5] % 3, rng.normal(size=(5, size)), np.tile(np.eye(size) / 3.0, (5, 1, 1)))
+    return PoseGraph(
+        rng.choice(10**12, count, replace=False),
+        group.random(rng, (count,)),
+        Edges(first, second, group.random(rng, (30,)), information),
+        rng.choice(10**6, 3, replace=False) + 10**13,
+        rng.normal(size=(3, size)),
+        {"point": seen},
+    )
+
+
+def without_landmarks(graph: PoseGraph) -> PoseGraph:
+    return PoseGraph(graph.ids, graph.poses, graph.edges)
+
+
+def test_planar_lines_in_any_order(tmp_path: Path) -> None:
+    graph = read_g2o(write(tmp_path, PLANAR))
+    assert graph.ids.tolist() == [10, 7]
+    assert graph.poses.tolist() == [[0.0, 0.0, 0.0], [1.0, 0.5, 0.25]]
+    assert (graph.edges.first.tolist(), graph.edges.second.tolist()) == ([0], [1])
+    assert graph.edges.information[0].tolist() == [[1, 2, 3], [2, 4, 5], [3, 5, 6]]  # row by row
+    assert graph.landmark_ids.tolist() == [5]
+    assert graph.fixed_ids == (10,)
+    assert graph.sightings["point"].information[0].tolist() == [[9, 1], [1, 8]]
+    assert graph.sightings["bearing"].information.tolist() == [[[100]]]
+    assert graph.sightings["range"].measured.tolist() == [[1.5]]
+    assert graph.sightings["bearing-range"].information[0].tolist() == [[4, 0], [0, 16]]
+    assert graph.skipped == {}
+
+
+def test_spatial_identifiers_of_64_bits_and_quaternions(tmp_path: Path) -> None:
+    graph = read_g2o(write(tmp_path, SPATIAL))
+    assert graph.ids.tolist() == [6989586621679009792, 6989586621679009793]  # equal as floats
+    assert graph.edges.second.tolist() == [1]
+    np.testing.assert_allclose(graph.poses[1], [1, 2, 3, 0.8, 0, 0, 0.6])  # scalar first in SE3
+    np.testing.assert_allclose(graph.edges.measured[0], graph.poses[1], atol=1e-15)  # normalised
+    assert graph.edges.information[0, 0].tolist() == [1, 2, 3, 4, 5, 6]
+    assert graph.edges.information[0, 3:, 3:].tolist() == [[16, 17, 18], [17, 19, 20], [18, 20, 21]]
+
+
+def test_a_sensor_off_the_body_is_moved_there(tmp_path: Path, rng: np.random.Generator) -> None:
+    pose, offset = fg.SE3.random(rng, (2,))
+    landmark, measured = rng.normal(size=(2, 3))
+    root = rng.normal(size=(3, 3))
+    information = root @ root.T
+    error = fg.SE3.act(fg.SE3.inverse(fg.SE3.compose(pose, offset)), landmark) - measured
+
+    def numbers(x: np.ndarray) -> str:
+        return " ".join(map(repr, x.tolist()))
+
+    def spatial(x: np.ndarray) -> str:
+        return numbers(x[[0, 1, 2, 4, 5, 6, 3]])
+
+    text = (
+        f"VERTEX_SE3:QUAT 0 {spatial(pose)}\nVERTEX_TRACKXYZ 1 {numbers(landmark)}\n"
+        f"PARAMS_SE3OFFSET 4 {spatial(offset)}\n"
+        f"EDGE_SE3_TRACKXYZ 0 1 4 {numbers(measured)} {numbers(information[np.triu_indices(3)])}\n"
+    )
+    graph = read_g2o(write(tmp_path, text))
+    np.testing.assert_allclose(graph.chi2(), error @ information @ error)
+
+
+@pytest.mark.parametrize("ending", ["g2o", "g2o.gz"])
+@pytest.mark.parametrize("group", [fg.SE2, fg.SE3], ids=lambda group: group.name)
+def test_round_trip_is_exact(tmp_path: Path, rng: np.random.Generator, group: fg.LieGroup, ending: str) -> None:
+    graph = random_graph(rng, group)
+    graph = replace(graph, fixed_ids=(int(graph.ids[3]), int(graph.landmark_ids[1])))
+    path = write_g2o(tmp_path / f"graph.{ending}", graph)
+    assert path.read_bytes().startswith(b"\x1f\x8b") == ending.endswith("gz")
+    same(read_g2o(path), graph)
+
+
+def test_every_sighting_survives(tmp_path: Path) -> None:
+    graph = read_g2o(write(tmp_path, PLANAR))
+    again = read_g2o(write_g2o(tmp_path / "again.g2o", graph))
+    # Bearing and range of one line come back as two measurements of the same.
+    assert len(again.sightings["bearing"]) == len(again.sightings["range"]) == 2
+    np.testing.assert_allclose(again.chi2(), graph.chi2(), rtol=1e-14)
+
+
+def test_gzipped_whatever_its_name(tmp_path: Path) -> None:
+    path = tmp_path / "graph.g2o"
+    path.write_bytes(gzip.compress(PLANAR.encode()))
+    assert read_g2o(path).ids.tolist() == [10, 7]
+
+
+def test_unknown_tags_are_counted_and_named_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    text = PLANAR + "VERTEX_CAM 1 2 3\nEDGE_SOMETHING\nVERTEX_CAM 4 5 6\n"
+    with caplog.at_level(logging.WARNING, "unifg"):
+        graph = read_g2o(write(tmp_path, text))
+    assert graph.skipped == {"VERTEX_CAM": 2, "EDGE_SOMETHING": 1}
+    (record,) = caplog.records
+    assert "EDGE_SOMETHING (1), VERTEX_CAM (2)" in record.getMessage()
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("EDGE_SE2 10 7 1 0 0 1 0 0 1 0", r"line 12: EDGE_SE2 has 10 fields, expected 11"),
+        ("EDGE_SE2 10 7 1 0 0 1 0 0 1 0 0 0", r"line 12: EDGE_SE2 has 12 fields"),
+        ("EDGE_SE2 10 7 1 0 x 1 0 0 1 0 0", r"line 12: EDGE_SE2: field dtheta is 'x', not a number"),
+        ("EDGE_SE2 10 7 1 0 nan 1 0 0 1 0 0", r"line 12: EDGE_SE2: field dtheta is nan, not a finite"),
+        ("EDGE_SE2 10 7.5 1 0 0 1 0 0 1 0 0", r"line 12: EDGE_SE2: field j is '7.5', not an integer"),
+        ("EDGE_SE2 10 99999999999999999999 1 0 0 1 0 0 1 0 0", r"line 12: EDGE_SE2: field j .* 64 bits"),
+        ("EDGE_SE2 10 8 1 0 0 1 0 0 1 0 0", r"line 12: there is no pose 8 in the file"),
+        ("EDGE_SE2 10 5 1 0 0 1 0 0 1 0 0", r"line 12: there is no pose 5 in the file"),  # a landmark
+        ("EDGE_SE2_XY 10 7 1 0 1 0 1", r"line 12: there is no landmark 7"),
+        ("VERTEX_SE2 7 0 0 0", r"line 12: vertex 7 is defined twice, first in line 6"),
+        ("VERTEX_XY 7 0 0", r"vertex 7 is defined twice"),
+        ("VERTEX_SE2,1,0,0,0", r"nothing"),  # an unknown tag: no error
+        ("FIX 11", r"line 12: FIX 11: there is no such vertex"),
+        ("BR 10 5 0 1 0 1", r"line 12: BR: standard deviations must be positive"),
+        ("VERTEX_SE3:QUAT 1 0 0 0 0 0 0 1", r"both VERTEX_SE2 and VERTEX_SE3:QUAT"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_line(tmp_path: Path, line: str, message: str) -> None:
+    path = write(tmp_path, PLANAR + line + "\n")
+    if message == "nothing":
+        assert read_g2o(path).skipped == {"VERTEX_SE2,1,0,0,0": 1}
+        return
+    with pytest.raises(FileFormatError, match=message) as error:
+        read_g2o(path)
+    assert str(error.value).startswith(str(path))
+
+
+def test_two_wrong_counts_do_not_hide_each_other(tmp_path: Path) -> None:
+    text = "VERTEX_SE2 0 0 0\nVERTEX_SE2 1 0 0 0 0\n"
+    with pytest.raises(FileFormatError, match="line 1: VERTEX_SE2 has 3 fields"):
+        read_g2o(write(tmp_path, text))
+
+
+def test_a_quaternion_of_nothing_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=r"line 1: the quaternion .* has norm 0"):
+        read_g2o(write(tmp_path, "VERTEX_SE3:QUAT 1 0 0 0 0 0 0 0\n"))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(None, "no such file"), (b"", "neither VERTEX_SE2"), (b"\xff\xfe", "as text"), (b"\x1f\x8b\x08zz", "cannot be")],
+)
+def test_files_that_are_none(tmp_path: Path, content: bytes | None, message: str) -> None:
+    path = tmp_path / "graph.g2o"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(FileFormatError, match=message):
+        read_g2o(path)
+
+
+def test_numbers_that_are_not_finite_are_not_written(tmp_path: Path, rng: np.random.Generator) -> None:
+    graph = random_graph(rng, fg.SE2)
+    graph.edges.measured[4, 1] = np.inf
+    with pytest.raises(FileFormatError, match=r"EDGE_SE2 .* is not finite"):
+        write_g2o(tmp_path / "graph.g2o", graph)
+
+
+def test_toro_has_its_own_order_of_information(tmp_path: Path, rng: np.random.Generator) -> None:
+    path = write(tmp_path, "VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEQUIV 0 1\nEDGE2 0 1 1 0 0 11 12 22 33 13 23\n")
+    graph = read_toro(path)
+    assert graph.edges.information[0].tolist() == [[11, 12, 13], [12, 22, 23], [13, 23, 33]]
+    assert graph.skipped == {"EQUIV": 1}
+    graph = without_landmarks(random_graph(rng, fg.SE2))
+    same(read_toro(write_toro(path, graph)), graph)
+
+
+def test_toro_in_space(tmp_path: Path, rng: np.random.Generator) -> None:
+    path = write(tmp_path, "VERTEX3 0 0 0 0 0 0 1.5707963267948966\nVERTEX3 1 0 0 0 0.1 -0.2 0.3\n")
+    poses = read_toro(path).poses
+    np.testing.assert_allclose(fg.SE3.act(poses[0], [1.0, 0.0, 0.0]), [0.0, 1.0, 0.0], atol=1e-15)  # yaw is about z
+    np.testing.assert_allclose(fg.SE3.log(poses[1])[3:], [0.1, -0.2, 0.3], atol=0.05)
+    graph = without_landmarks(random_graph(rng, fg.SE3))
+    again = read_toro(write_toro(path, graph))
+    np.testing.assert_allclose(fg.SE3.matrix(again.poses), fg.SE3.matrix(graph.poses), atol=1e-14)
+    np.testing.assert_array_equal(again.edges.information, graph.edges.information)
+
+
+def test_toro_refuses_what_it_cannot_say(tmp_path: Path, rng: np.random.Generator) -> None:
+    with pytest.raises(FileFormatError, match="no landmarks"):
+        write_toro(tmp_path / "g.graph", random_graph(rng, fg.SE2))
+    with pytest.raises(FileFormatError, match="line 2: EDGE2 has 4 fields"):
+        read_toro(write(tmp_path, "VERTEX2 0 0 0 0\nEDGE2 0 0 1 0\n"))
+
+
+def test_formats_are_told_apart_by_their_tags(tmp_path: Path) -> None:
+    assert len(read_pose_graph(write(tmp_path, PLANAR, "a.graph")).poses) == 2
+    assert len(read_pose_graph(write(tmp_path, "VERTEX2 0 0 0 0\n", "b.g2o")).poses) == 1
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "poses", "edges"),
+    [
+        ("M3500.g2o.gz", 3500, 5453),
+        ("intel.g2o.gz", 1728, 2512),
+        ("sphere2500.g2o.gz", 2500, 4949),
+        ("parking-garage.g2o.gz", 1661, 6275),
+        ("rpgo_robot_a.g2o", 50, 52),
+        ("gtsam_w100.graph", 100, 300),
+        ("gtsam_noisyToyGraph.txt", 4, 5),
+        ("gtsam_pose2example.txt", 11, 12),
+        ("gtsam_pose3example-offdiagonal.txt", 2, 1),
+    ],
+)
+def test_published_files(shared_data: Path, tmp_path: Path, name: str, poses: int, edges: int) -> None:
+    graph = read_pose_graph(shared_data / "pose_graphs" / name)
+    assert (len(graph.poses), len(graph.edges)) == (poses, edges)
+    assert np.all(np.linalg.eigvalsh(graph.edges.information) > -1e-9) or "w100" in name
+    same(read_g2o(write_g2o(tmp_path / "again.g2o", graph)), graph)
+
+
+@pytest.mark.data
+def test_information_off_the_diagonal(shared_data: Path) -> None:
+    graph = read_g2o(shared_data / "pose_graphs" / "gtsam_pose3example-offdiagonal.txt")
+    expected = np.diag(np.full(6, 10000.0))
+    for row in range(6):
+        expected[row, row + 1 :] = expected[row + 1 :, row] = row + 1
+    np.testing.assert_array_equal(graph.edges.information[0], expected)

@@ -1,0 +1,179 @@
+"""The compiled functions of one element, the loops over them, and the functions of an angle they share."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from fractions import Fraction
+from math import comb, factorial
+from types import ModuleType
+
+import numpy as np
+import pytest
+from numpy.random import Generator
+
+from groups import PI
+from unifg.errors import UnifgError
+from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Rn
+from unifg.lie.batch import over_one, over_two
+from unifg.lie.scalar import rn, se2, se3, series, so2, so3
+from unifg.typing import Array
+
+PAIRS: list[tuple[LieGroup, ModuleType]] = [(Rn(3), rn), (SO2, so2), (SE2, se2), (SO3, so3), (SE3, se3)]
+EVERY = pytest.mark.parametrize(("group", "functions"), PAIRS, ids=[str(group) for group, _ in PAIRS])
+ROUNDING = 4e-16  # a call of its own and one inside a loop may fuse products and sums differently
+
+
+def arguments(group: LieGroup, name: str, rng: Generator) -> tuple[Array, ...]:
+    """Draw (6, ...) arguments of a method."""
+    x, y = group.random(rng, (6,)), group.random(rng, (6,))
+    d, p = rng.standard_normal((6, group.dim)), rng.standard_normal((6, group.point_dim))
+    if name in ("compose", "between", "local"):
+        return x, y
+    if name == "retract":
+        return x, d
+    if name == "act":
+        return x, p
+    return (x,) if name in ("log", "inverse", "matrix", "adjoint") else (d,)
+
+
+NAMES = ["exp", "log", "compose", "inverse", "between", "retract", "local", "act", "matrix", "adjoint"]
+NAMES += ["right_jacobian", "right_jacobian_inverse", "left_jacobian", "left_jacobian_inverse"]
+
+
+@EVERY
+@pytest.mark.parametrize("name", NAMES)
+def test_one_element_and_a_batch_agree(group: LieGroup, functions: ModuleType, name: str, rng: Generator) -> None:
+    given = arguments(group, name, rng)
+    expected = getattr(group, name)(*given)
+    function = getattr(functions, name)
+    for i in range(6):
+        out = np.full(expected[i].shape, np.nan)
+        before = [np.array(a[i]) for a in given]
+        assert function(*(np.array(a[i]) for a in given), out) is None
+        np.testing.assert_allclose(out, expected[i], rtol=0, atol=ROUNDING * max(1.0, np.abs(expected[i]).max()))
+        for array, copy in zip(given, before, strict=True):
+            np.testing.assert_array_equal(array[i], copy)
+
+
+@EVERY
+@pytest.mark.parametrize("name", ["exp", "log", "compose", "inverse", "between", "retract", "local", "act"])
+def test_a_result_may_take_the_place_of_an_argument(
+    group: LieGroup, functions: ModuleType, name: str, rng: Generator
+) -> None:
+    given = arguments(group, name, rng)
+    function = getattr(functions, name)
+    for position in range(len(given)):
+        one = [np.array(a[0]) for a in given]
+        out = np.empty_like(getattr(group, name)(*given)[0])
+        function(*one, out)
+        if one[position].shape == out.shape:
+            function(*one, one[position])
+            np.testing.assert_array_equal(one[position], out)
+
+
+# -- batches --
+
+
+def test_wrong_lengths_are_named() -> None:
+    with pytest.raises(UnifgError, match=r"se2.exp takes \(..., 3\) arrays; got shape \(5, 4\)"):
+        SE2.exp(np.zeros((5, 4)))
+    with pytest.raises(UnifgError, match=r"se3.retract takes \(..., 6\) arrays; got shape \(3,\)"):
+        SE3.retract(SE3.identity(), np.zeros(3))
+    with pytest.raises(UnifgError, match=r"so2.exp takes \(..., 1\) arrays; got shape \(\)"):
+        SO2.exp(0.3)
+    with pytest.raises(ValueError, match="broadcast"):
+        SE2.compose(np.zeros((2, 3)), np.zeros((4, 3)))
+
+
+def test_any_layout_will_do(rng: Generator) -> None:
+    x, y = SE3.random(rng, (4, 6)), SE3.random(rng, (4, 6))
+    expected = SE3.compose(x, y)
+    wide = rng.standard_normal((4, 6, 20))
+    wide[..., 3:17:2] = x
+    frozen = y.copy()
+    frozen.flags.writeable = False
+    layouts: list[Callable[[Array], Array]] = [np.asfortranarray, lambda a: a.astype(">f8"), lambda a: a[::-1][::-1]]
+    for layout in layouts:
+        np.testing.assert_array_equal(SE3.compose(layout(x), layout(y)), expected)
+    np.testing.assert_array_equal(SE3.compose(wide[..., 3:17:2], frozen), expected)
+    np.testing.assert_array_equal(SE3.compose(x.tolist(), y.tolist()), expected)
+    assert SE2.compose([1, 2, 0], [3, 4, 0]).dtype == np.float64
+    np.testing.assert_array_equal(SE2.compose([1, 2, 0], [3, 4, 0]), [4, 6, 0])
+
+
+def test_a_group_of_your_own(rng: Generator) -> None:
+    """The helpers take any compiled function of the right form."""
+    double = over_one(rn.inverse, 2, 2)
+    plus = over_two(rn.compose, 2, 2, 2)
+    x, y = rng.standard_normal((3, 1, 2)), rng.standard_normal((5, 2))
+    np.testing.assert_array_equal(double(x), -x)
+    np.testing.assert_array_equal(plus(x, y), x + y)
+
+
+def test_import_compiles_nothing() -> None:
+    code = """
+from numba.core import event
+listener = event.RecordingListener()
+with event.install_listener("numba:compile", listener):
+    import unifg
+assert not listener.buffer, listener.buffer
+with event.install_listener("numba:compile", listener):
+    import numba
+    numba.njit(lambda x: x + 1)(1.0)
+assert listener.buffer  # the witness sees what there is to see
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# -- functions of an angle --
+
+
+def bernoulli(count: int) -> list[Fraction]:
+    numbers = [Fraction(1)]
+    for n in range(1, count):
+        numbers.append(-sum((comb(n + 1, k) * numbers[k] for k in range(n)), Fraction(0)) / (n + 1))
+    return numbers
+
+
+TERMS = 40
+B = [Fraction((-1) ** n, factorial(2 * n + 2)) for n in range(TERMS)]
+C = [Fraction((-1) ** n, factorial(2 * n + 3)) for n in range(TERMS)]
+K = [abs(number) / factorial(2 * n + 2) for n, number in enumerate(bernoulli(2 * TERMS + 2)[2::2])]
+
+
+def slope(series_of_t: list[Fraction]) -> list[Fraction]:
+    """Twice the derivative with respect to t: that with respect to theta, over theta."""
+    return [2 * n * a for n, a in enumerate(series_of_t)][1:]
+
+
+def total(series_of_t: list[Fraction], t: Fraction) -> float:
+    return float(sum(a * t**n for n, a in enumerate(series_of_t)))
+
+
+@pytest.mark.parametrize(
+    "theta", [0.0, 1e-300, 1e-160, 1e-12, 1e-4, 0.1, 0.49, 0.4999999, 0.5, 0.51, 0.7, 1.0, 2.0, 3.0]
+)
+def test_functions_of_an_angle(theta: float) -> None:
+    """Against exact sums of the power series; the slopes are multiplied by theta^3 at least wherever they serve."""
+    square, t = Fraction(theta) ** 2, theta * theta
+    half, a = series.sinc(theta / 2), series.sinc(theta)
+    b, c, g = 0.5 * half * half, series.c_value(theta, np.sin(theta)), series.x_cot_x(theta / 2)
+    values = [(b, B), (c, C), (series.k_value(t, g), K)]
+    for value, exact in values:
+        assert value == pytest.approx(total(exact, square), rel=1e-14, abs=0.0)
+    slopes = [(series.b_slope(t, a, b), B), (series.c_slope(t, b, c), C), (series.k_slope(t, g), K)]
+    weight = 1.0 if t < series.SERIES_BELOW else theta**3
+    for value, exact in slopes:
+        desired = total(slope(exact), square)
+        assert abs(value - desired) * weight < 1e-15
+        if t < series.SERIES_BELOW:
+            assert value == pytest.approx(desired, rel=1e-15, abs=0.0)
+
+
+def test_halves(rng: Generator) -> None:
+    for x in [0.0, 1e-300, -1e-8, *rng.uniform(-PI, PI, 20)]:
+        scale, cosine = series.sinc_and_cos(x)
+        assert scale == series.sinc(x) == pytest.approx(np.sinc(x / PI), rel=1e-14)
+        assert cosine == pytest.approx(np.cos(x), rel=0, abs=2e-16)

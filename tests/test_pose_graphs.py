@@ -1,0 +1,328 @@
+"""Pose graphs as problems: residual conventions, what is held fixed, first guesses, published optima."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.errors import GraphError
+from unifg.files.pose_graph import read_pose_graph
+from unifg.pose_graphs import (
+    Edges,
+    PoseGraph,
+    Sightings,
+    chart_between,
+    chordal,
+    lago,
+    manhattan,
+    odometric,
+    sphere,
+)
+from unifg.solvers import GaussNewton, LevenbergMarquardt
+from unifg.typing import Array
+
+# chi2 = sum r' Omega r in the file and at the optimum, r the full logarithm.
+PUBLISHED = {
+    "M3500.g2o.gz": (2634712.545, 137.9148782),
+    "intel.g2o.gz": (553.9957956, 45.0042331),
+    "sphere2500.g2o.gz": (2611315.424, 1351.4019259),
+    "parking-garage.g2o.gz": (16727.2039, 1.2683848),
+    "smallGrid3D.g2o": (167788.667, 1035.8506647),
+    "tinyGrid3D.g2o": (286.63575, 18.6278189),
+    "rpgo_robot_a.g2o": (664.247, 46.4731341),
+}
+
+
+Method = Callable[[PoseGraph], Array]
+
+
+def solved(graph: PoseGraph, **options: object) -> PoseGraph:
+    problem, x, guess = graph.graph(**options)  # type: ignore[arg-type]
+    return graph.with_poses(GaussNewton().solve(problem, guess, check=True)[x])
+
+
+def chain(group: fg.LieGroup, count: int, rng: np.random.Generator) -> tuple[PoseGraph, Array]:
+    """Consistent measurements with full information matrices, some backwards, loops among them; and the truth."""
+    steps = group.exp(rng.uniform(-0.8, 0.8, (count, group.dim)) + np.eye(group.dim)[0])
+    truth = [group.identity()]
+    for step in steps[1:]:
+        truth.append(group.compose(truth[-1], step))
+    poses = np.array(truth)
+    first = np.concatenate([np.arange(count - 1), [count - 1, 5, 2]])
+    second = np.concatenate([np.arange(1, count), [0, 1, count - 2]])
+    backwards = rng.random(len(first)) < 0.4
+    first, second = np.where(backwards, second, first), np.where(backwards, first, second)
+    root = rng.normal(size=(len(first), group.dim, group.dim))
+    information = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(group.dim)
+    edges = Edges(first, second, group.between(poses[first], poses[second]), information)
+    return PoseGraph(np.arange(count), poses, edges), poses
+
+
+def distance(group: fg.LieGroup, a: Array, b: Array) -> float:
+    return float(np.abs(group.local(a, b)).max())
+
+
+# ---------------------------------------------------------------- residuals
+
+
+def test_charts_agree_with_logarithms_only_to_first_order_and_half(rng: np.random.Generator) -> None:
+    for group, factor in ((fg.SE2, 1.0), (fg.SE3, 0.5)):
+        x, z = group.random(rng, (2, 8))
+        d = 1e-5 * rng.normal(size=(8, group.dim))
+        y = group.compose(x, group.retract(z, d))
+        log, chart = fg.between.on(group)(x, y, z), chart_between.on(group)(x, y, z)
+        np.testing.assert_allclose(log, d, atol=1e-10)
+        size = group.point_dim
+        np.testing.assert_allclose(chart[:, :size], d[:, :size], atol=1e-9)
+        np.testing.assert_allclose(chart[:, size:], factor * d[:, size:], atol=1e-9)
+
+
+def test_the_spatial_chart_does_not_care_for_the_sign_of_a_quaternion(rng: np.random.Generator) -> None:
+    x, y, z = fg.SE3.random(rng, (3, 20))
+    flipped = y * np.array([1, 1, 1, -1, -1, -1, -1.0])
+    chart = chart_between.on(fg.SE3)
+    np.testing.assert_allclose(chart(x, flipped, z), chart(x, y, z), atol=1e-14)
+    error = fg.SE3.between(z, fg.SE3.between(x, y))
+    np.testing.assert_allclose(np.linalg.norm(chart(x, y, z)[:, 3:], axis=1), np.sqrt(1.0 - error[:, 3] ** 2))
+
+
+def test_the_planar_chart_is_a_difference(rng: np.random.Generator) -> None:
+    x, y, z = fg.SE2.random(rng, (3, 20))
+    relative = np.linalg.inv(fg.SE2.matrix(z)) @ np.linalg.inv(fg.SE2.matrix(x)) @ fg.SE2.matrix(y)
+    chart = chart_between.on(fg.SE2)(x, y, z)
+    np.testing.assert_allclose(chart[:, :2], relative[:, :2, 2], atol=1e-12)
+    np.testing.assert_allclose(fg.wrap_angle(y - x - z)[:, 2], chart[:, 2], atol=1e-12)
+
+
+def test_charts_are_for_poses_and_pickle() -> None:
+    with pytest.raises(TypeError, match="needs poses in SE2 or SE3, found Rn"):
+        chart_between.on(fg.Rn(2))
+    for group in (fg.SE2, fg.SE3):
+        assert pickle.loads(pickle.dumps(chart_between.on(group))).name == "chart between"
+
+
+@pytest.mark.parametrize("residual", ["log", "g2o"])
+@pytest.mark.parametrize("group", [fg.SE2, fg.SE3], ids=lambda group: group.name)
+def test_the_graph_means_what_chi2_says(rng: np.random.Generator, group: fg.LieGroup, residual: str) -> None:
+    graph, truth = chain(group, 9, rng)
+    size = group.point_dim
+    landmarks = rng.normal(size=(2, size))
+    seen = Sightings(
+        np.array([0, 3, 3, 8]), np.array([0, 0, 1, 1]), rng.normal(size=(4, size)), np.tile(np.eye(size), (4, 1, 1))
+    )
+    kinds = {"point": seen}
+    if group is fg.SE2:
+        for kind, width in (("bearing", 1), ("range", 1), ("bearing-range", 2)):
+            kinds[kind] = replace(
+                seen, measured=rng.normal(size=(4, width)), information=np.tile(np.eye(width), (4, 1, 1))
+            )
+    graph = replace(
+        graph, poses=group.retract(truth, 0.1 * rng.normal(size=(9, group.dim))), landmarks=landmarks,
+        landmark_ids=np.array([100, 101]), sightings=kinds,
+    )  # fmt: skip
+    problem, _, guess = graph.graph(residual=residual)  # type: ignore[arg-type]
+    start = LevenbergMarquardt(max_iterations=0).solve(problem, guess)
+    np.testing.assert_allclose(2.0 * start.cost, graph.chi2(residual), rtol=1e-12)  # type: ignore[arg-type]
+    assert problem.check(guess), problem.check(guess)  # attached Jacobians among them
+    assert {term.name for term in problem.terms} == {"odometry", "closures", *kinds}
+
+
+def test_unknown_words_are_refused(rng: np.random.Generator) -> None:
+    graph, _ = chain(fg.SE2, 9, rng)
+    with pytest.raises(GraphError, match="residual is 'chordal': expected 'log' or 'g2o'"):
+        graph.graph(residual="chordal")  # type: ignore[arg-type]
+    with pytest.raises(GraphError, match="robust_on"):
+        graph.graph(robust_on="odometry")  # type: ignore[arg-type]
+    with pytest.raises(GraphError, match="no measurement"):
+        replace(graph, edges=graph.edges[:0]).graph()
+
+
+def test_a_loss_sits_on_loop_closures_unless_told_otherwise(rng: np.random.Generator) -> None:
+    graph, _ = chain(fg.SE2, 9, rng)
+    for on, expected in (("closures", {"closures"}), ("all", {"odometry", "closures"})):
+        problem, _, _ = graph.graph(fg.Huber(), robust_on=on)  # type: ignore[arg-type]
+        assert {term.name for term in problem.terms if getattr(term, "robust", None)} == expected
+
+
+# ---------------------------------------------------------------- what is held
+
+
+def test_first_pose_is_held_where_nothing_is_known(rng: np.random.Generator) -> None:
+    graph, truth = chain(fg.SE2, 9, rng)
+    assert graph.anchors()[0].tolist() == [0]
+    assert replace(graph, fixed_ids=(4, 6)).anchors()[0].tolist() == [4, 6]
+    held = replace(graph, fixed_ids=(4,), poses=fg.SE2.retract(truth, 0.2 * rng.normal(size=(9, 3))))
+    np.testing.assert_array_equal(solved(held).poses[4], held.poses[4])
+
+
+def test_every_part_gets_an_anchor(rng: np.random.Generator) -> None:
+    graph, _ = chain(fg.SE2, 9, rng)
+    edges = graph.edges[(graph.edges.first < 4) == (graph.edges.second < 4)]
+    parts = replace(graph, edges=edges)
+    assert parts.anchors()[0].tolist() == [0, 4]
+    assert replace(parts, fixed_ids=(6,)).anchors()[0].tolist() == [0, 6]
+    assert solved(parts).chi2() < 1e-12
+
+
+def test_a_landmark_can_be_known(rng: np.random.Generator) -> None:
+    graph, truth = chain(fg.SE2, 9, rng)
+    graph, edges = graph.with_poses(truth[:3]), graph.edges[:2]
+    landmarks = np.array([[3.0, 1.0], [0.0, 2.0]])
+    pose = np.repeat(np.arange(3), 2)
+    mark = np.tile([0, 1], 3)
+    local = fg.SE2.act(fg.SE2.inverse(graph.poses[pose]), landmarks[mark])
+    seen = Sightings(pose, mark, local, np.tile(np.eye(2), (6, 1, 1)))
+    graph = replace(
+        graph, ids=graph.ids[:3], edges=edges, landmarks=landmarks, landmark_ids=np.array([10, 11]),
+        sightings={"point": seen}, fixed_ids=(10, 11), poses=fg.SE2.retract(graph.poses, 0.1 * rng.normal(size=(3, 3))),
+    )  # fmt: skip
+    assert graph.anchors()[0].tolist() == []
+    assert solved(graph).chi2() < 1e-12
+
+
+# ---------------------------------------------------------------- first guesses
+
+
+@pytest.mark.parametrize("method", [odometric, chordal, lago])
+@pytest.mark.parametrize("group", [fg.SE2, fg.SE3], ids=lambda group: group.name)
+def test_consistent_measurements_give_the_truth(method: Method, group: fg.LieGroup, rng: np.random.Generator) -> None:
+    graph, truth = chain(group, 30, rng)  # three times around: headings beyond pi
+    start = graph.with_poses(group.random(rng, (30,)))
+    start.poses[0] = truth[0]
+    if method is lago and group is fg.SE3:
+        with pytest.raises(GraphError, match="use chordal"):
+            lago(start)
+        return
+    assert distance(group, truth, method(start)) < 1e-8
+
+
+@pytest.mark.parametrize("method", [odometric, chordal, lago])
+def test_known_poses_stay(method: Method, rng: np.random.Generator) -> None:
+    graph, truth = chain(fg.SE2, 12, rng)
+    moved = fg.SE2.compose([3.0, -2.0, 2.5], truth)
+    start = replace(graph, poses=fg.SE2.random(rng, (12,)), fixed_ids=(3, 7))
+    start.poses[[3, 7]] = moved[[3, 7]]
+    guess = method(start)
+    np.testing.assert_array_equal(guess[[3, 7]], moved[[3, 7]])
+    assert distance(fg.SE2, moved, guess) < 1e-8
+
+
+def test_linear_guesses_are_better_than_odometry() -> None:
+    for graph, methods in ((manhattan(400, 1).pose_graph, (lago, chordal)), (sphere(8, 12).pose_graph, (chordal,))):
+        best = solved(graph).chi2()
+        for method in methods:
+            assert graph.with_poses(method(graph)).chi2() < 1.3 * best < 0.1 * graph.chi2()
+
+
+def test_long_drives_do_not_confuse_lago() -> None:
+    """After 8000 steps of odometry a heading is uncertain by 1.8 rad; whole turns are found along short paths only."""
+    graph = manhattan(8000, 0).pose_graph
+    degrees = 3 * len(graph.edges) - 3 * len(graph.poses)
+    assert graph.with_poses(lago(graph)).chi2() < 3.0 * degrees
+
+
+def test_correlations_count() -> None:
+    """With strong correlation between position and heading, positions given headings must use it."""
+    sim = manhattan(300, 2)
+    root = np.linalg.cholesky(sim.pose_graph.edges.information[0])
+    mixing = np.eye(3) + np.array([[0, 0, 0.9], [0, 0, -0.9], [0, 0, 0]])
+    information = root @ mixing @ mixing.T @ root.T
+    edges = replace(sim.pose_graph.edges, information=np.tile(information, (len(sim.outliers), 1, 1)))
+    graph = replace(sim.pose_graph, edges=edges)
+    blind = np.tile(np.diag(np.diag(information)), (len(sim.outliers), 1, 1))
+    guess = graph.with_poses(lago(graph)).chi2()
+    assert guess < graph.with_poses(lago(replace(graph, edges=replace(edges, information=blind)))).chi2()
+
+
+def test_landmarks_alone_do_not_initialise(rng: np.random.Generator) -> None:
+    graph, _ = chain(fg.SE2, 6, rng)
+    seen = Sightings(np.arange(6), np.zeros(6, np.intp), np.ones((6, 2)), np.tile(np.eye(2), (6, 1, 1)))
+    graph = replace(
+        graph, edges=graph.edges[:1], landmarks=np.zeros((1, 2)), landmark_ids=np.array([9]), sightings={"point": seen}
+    )
+    with pytest.raises(GraphError, match="through landmarks only") as error:
+        odometric(graph)
+    assert error.value.family == "poses"
+
+
+# ---------------------------------------------------------------- made-up graphs
+
+
+def test_simulations_repeat_and_say_what_is_wrong() -> None:
+    for one, two, other in (
+        [manhattan(300, seed, 0.3) for seed in (4, 4, 5)],
+        [sphere(6, 10, seed, 0.3) for seed in (4, 4, 5)],
+    ):
+        np.testing.assert_array_equal(one.pose_graph.edges.measured, two.pose_graph.edges.measured)
+        assert not np.array_equal(one.pose_graph.edges.measured[:50], other.pose_graph.edges.measured[:50])
+        share = one.outliers.sum() / len(one.pose_graph.closures)
+        assert share == pytest.approx(0.3, abs=0.01)
+        assert not (one.outliers & one.pose_graph.edges.odometry).any()
+        right = one.pose_graph.with_poses(one.truth)
+        errors = right.squared_errors()
+        dim = right.group.dim
+        assert errors[~one.outliers].mean() == pytest.approx(dim, rel=0.15)  # chi-squared: noise is as it says
+        assert np.median(errors[one.outliers]) > 100.0 * dim
+
+
+@pytest.mark.parametrize("bad", [{"count": 1}, {"outliers": 1.0}, {"block": 0}])
+def test_simulations_refuse(bad: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        manhattan(**bad)  # type: ignore[arg-type]
+
+
+# ---------------------------------------------------------------- published graphs
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_published_optima(shared_data: Path, name: str) -> None:
+    graph = read_pose_graph(shared_data / "pose_graphs" / name)
+    start, best = PUBLISHED[name]
+    assert graph.chi2() == pytest.approx(start, rel=1e-6)
+    assert solved(graph).chi2() == pytest.approx(best, abs=2e-7)
+
+
+@pytest.mark.data
+def test_the_other_residual_has_another_optimum(shared_data: Path) -> None:
+    graph = read_pose_graph(shared_data / "pose_graphs" / "sphere2500.g2o.gz")
+    problem, x, guess = graph.graph(residual="g2o")
+    after = graph.with_poses(GaussNewton().solve(problem, guess)[x])
+    assert after.chi2("g2o") == pytest.approx(727.1497, abs=1e-3)  # as g2o itself reports
+    assert after.chi2() == pytest.approx(1581.38, abs=0.05)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        ("M3500.g2o.gz", lago),
+        ("M3500.g2o.gz", chordal),
+        ("intel.g2o.gz", lago),  # information matrices are full
+        ("gtsam_noisyToyGraph.txt", lago),
+        ("sphere2500.g2o.gz", chordal),
+        ("parking-garage.g2o.gz", chordal),
+        ("smallGrid3D.g2o", chordal),
+    ],
+)
+def test_guesses_from_nothing_lead_to_the_optimum(shared_data: Path, name: str, method: Method) -> None:
+    graph = read_pose_graph(shared_data / "pose_graphs" / name)
+    nothing = graph.group.random(np.random.default_rng(3), (len(graph.poses),))
+    nothing[0] = graph.poses[0]
+    guess = graph.with_poses(method(graph.with_poses(nothing)))
+    assert guess.chi2() < 2.0 * solved(graph).chi2()
+    if name in PUBLISHED:
+        assert solved(guess).chi2() == pytest.approx(PUBLISHED[name][1], abs=2e-7)
+
+
+@pytest.mark.data
+def test_gtsam_optimum_of_the_toy_graph(shared_data: Path) -> None:
+    folder = shared_data / "pose_graphs"
+    before, after = (read_pose_graph(folder / f"gtsam_{name}ToyGraph.txt") for name in ("noisy", "optimizedNoisy"))
+    assert distance(fg.SE2, solved(before).poses, after.poses) < 3e-3

@@ -1,0 +1,195 @@
+"""Robust losses, their surrogates, and graduated non-convexity."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.errors import BackendError, GraphError, NotConverged
+from unifg.files.g2o import read_g2o
+from unifg.history import Iteration
+from unifg.pose_graphs import manhattan, sphere
+from unifg.robust import Graduated, Loss
+from unifg.solvers import GaussNewton, GraduatedNonConvexity, LevenbergMarquardt
+from unifg.typing import Array, BoolArray
+
+LOSSES: list[Loss] = [
+    fg.Huber(1.3),
+    fg.Cauchy(1.7),
+    fg.Tukey(3.0),
+    fg.DCS(0.7),
+    fg.GemanMcClure(1.4),
+    fg.GemanMcClure(1.4, mu=9.0),
+    fg.TruncatedLeastSquares(2.0),
+    *(fg.TruncatedLeastSquares(2.0, mu) for mu in (1e-5, 0.3, 1.0, 50.0)),
+]
+GRADUATED: list[Graduated] = [fg.GemanMcClure(1.4), fg.TruncatedLeastSquares(2.0)]
+
+
+@pytest.mark.parametrize("loss", LOSSES, ids=repr)
+def test_weight_is_the_derivative_of_the_value(loss: Loss) -> None:
+    squared = np.concatenate([np.geomspace(1e-4, 1e4, 200), np.linspace(0.1, 12.0, 199)])
+    kink = squared[np.abs(squared - 4.0) > 0.02] if loss == fg.TruncatedLeastSquares(2.0) else squared
+    step = 1e-5 * kink
+    slope = (loss.value(kink + step) - loss.value(kink - step)) / (2.0 * step)
+    np.testing.assert_allclose(loss.weight(kink), slope, atol=2e-5)
+    assert float(loss.value(np.zeros(1))[0]) == 0.0
+    assert np.all(np.diff(loss.value(np.sort(squared))) >= -1e-12)
+
+
+@pytest.mark.parametrize("loss", LOSSES, ids=repr)
+def test_small_residuals_are_squares(loss: Loss) -> None:
+    small = np.array([1e-9])
+    if getattr(loss, "mu", 1.0) > 1e-3:
+        np.testing.assert_allclose(loss.value(small), small, rtol=1e-6)
+    np.testing.assert_allclose(loss.weight(1e-5 * small), 1.0, rtol=1e-6)
+
+
+def test_dcs_is_a_switchable_constraint_without_its_switch() -> None:
+    """The scaled cost plus the cost of its switch, minimised over the switch, is the loss (where it scales at all)."""
+    loss, squared = fg.DCS(0.8), np.geomspace(0.9, 1e3, 50)
+    scale = loss.scaling(squared)
+    np.testing.assert_allclose(scale, 2 * 0.8 / (0.8 + squared))
+    np.testing.assert_allclose(loss.weight(squared), scale**2)
+    switches = np.geomspace(1e-4, 1.0, 20001)[:, None]
+    penalty = 0.8 * (1.0 - switches) * (3.0 - switches)  # zero for a switch that is on
+    np.testing.assert_allclose((switches**2 * squared + penalty).min(axis=0), loss.value(squared), rtol=1e-6)
+    np.testing.assert_allclose(fg.DCS(0.8).value(np.array([1e12])), 3 * 0.8, rtol=1e-6)
+
+
+@pytest.mark.parametrize("loss", GRADUATED, ids=repr)
+def test_surrogates_go_from_convex_to_the_loss(loss: Graduated) -> None:
+    assert isinstance(loss, Graduated)
+    stages = list(loss.surrogates(largest=1e3, growth=1.4))
+    assert stages[-1] == loss and 10 < len(stages) < 80
+    norms = np.linspace(0.0, 1e3**0.5, 2000)
+    bends = [np.diff(stage.value(norms**2), 2) for stage in stages]  # curvature over the norm of the residual
+    concave = [float(-bend.min() / bend.max()) for bend in bends]
+    assert concave[0] < 0.2 < concave[-1]
+    assert all(after > before - 1e-9 for before, after in pairwise(concave[:10]))
+    np.testing.assert_allclose(stages[-2].value(norms**2), loss.value(norms**2), rtol=0.3)
+
+
+def test_no_outlier_needs_no_surrogate() -> None:
+    for loss in GRADUATED:
+        assert list(loss.surrogates(largest=0.1, growth=1.4)) == [loss]
+
+
+@pytest.mark.parametrize("make", [fg.DCS, fg.GemanMcClure, fg.TruncatedLeastSquares])
+@pytest.mark.parametrize("bad", [0.0, -1.0, float("nan")])
+def test_parameters_must_be_positive(make: type, bad: float) -> None:
+    with pytest.raises(GraphError, match=f"{make.__name__}: its parameter must be positive"):
+        make(bad)
+
+
+def line_with_outliers() -> tuple[fg.Graph, fg.Family, BoolArray, dict[fg.Family, Array]]:
+    """A straight line through 40 points of which 18 are wrong, all on one side."""
+    rng = np.random.default_rng(2)
+    x = np.linspace(0.0, 1.0, 40)
+    y = 2.0 * x + 1.0 + 0.01 * rng.standard_normal(40)
+    wrong = rng.random(40) < 0.45
+    y[wrong] += rng.uniform(1.0, 6.0, int(wrong.sum()))
+    graph = fg.Graph()
+    line = graph.variables("line", fg.Rn(2), 1)
+
+    def misfit(line: Array, x: Array, y: Array) -> Array:
+        return line[:, :1] * x + line[:, 1:] - y
+
+    points = graph.data("x", x[:, None], each=True), graph.data("y", y[:, None], each=True)
+    graph.minimize(misfit, line, *points, sigma=0.01, robust=fg.TruncatedLeastSquares(3.0), name="points")
+    return graph, line, wrong, {line: np.zeros((1, 2))}
+
+
+def test_graduation_finds_what_a_plain_robust_solve_misses() -> None:
+    graph, line, wrong, guess = line_with_outliers()
+    history: list[Iteration] = []
+    solution = GraduatedNonConvexity().solve(graph, guess, check=True, callback=history.append)
+    np.testing.assert_allclose(solution[line][0], [2.0, 1.0], atol=0.02)
+    assert 2.0 * solution.cost < 9.0 * (wrong.sum() + 2) + 40.0
+    plain = LevenbergMarquardt().solve(graph, guess)
+    assert np.abs(plain[line][0] - [2.0, 1.0]).max() > 0.5
+    # One history through all stages, as the callback saw it; the same graph can be solved again.
+    assert [row.number for row in solution.history] == list(range(solution.iterations + 1))
+    stages = [int(row.details["stage"]) for row in solution.history]
+    assert stages == sorted(stages) and stages[-1] > 10
+    assert history[-1].number == solution.iterations
+    assert solution.solver == "GraduatedNonConvexity (LevenbergMarquardt)"
+    assert graph.terms[0].robust == fg.TruncatedLeastSquares(3.0)  # type: ignore[attr-defined]
+
+
+def test_data_and_interruptions_reach_the_stages() -> None:
+    graph, line, _, guess = line_with_outliers()
+    y = graph._data["y"]
+    moved = GraduatedNonConvexity().solve(graph, guess, data={y: y.value + 7.0})
+    np.testing.assert_allclose(moved[line][0], [2.0, 8.0], atol=0.02)
+    stopped = GraduatedNonConvexity().solve(graph, guess, callback=lambda row: row.number >= 4)
+    assert stopped.status is fg.Status.INTERRUPTED
+    assert 4 <= stopped.iterations <= 6
+    with pytest.raises(NotConverged):
+        GraduatedNonConvexity().solve(graph, guess, check=True, callback=lambda row: row.number >= 4)
+
+
+def test_graduation_wants_a_loss_it_can_graduate() -> None:
+    graph = fg.Graph()
+    line = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, line, [1.0], robust=fg.Huber())
+    with pytest.raises(BackendError, match="no term has a loss with surrogates"):
+        GraduatedNonConvexity().solve(graph, {line: [[0.0]]})
+    for bad in ({"growth": 1.0}, {"stage_iterations": 0}):
+        with pytest.raises(BackendError, match=next(iter(bad))):
+            GraduatedNonConvexity(**bad)
+
+
+@pytest.mark.parametrize("loss", [fg.TruncatedLeastSquares(3.4), fg.GemanMcClure(3.4)], ids=repr)
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_third_of_all_loop_closures_wrong(loss: Loss, seed: int) -> None:
+    sim = manhattan(300, seed, outliers=0.3)
+    graph = sim.pose_graph
+    clean = replace(graph, edges=graph.edges[~sim.outliers])
+    problem, x, guess = clean.graph()
+    right = GaussNewton().solve(problem, guess, check=True)[x]
+    problem, x, guess = graph.graph(robust=loss)
+    found = GraduatedNonConvexity().solve(problem, guess, check=True)[x]
+    assert np.linalg.norm(found[:, :2] - right[:, :2], axis=1).max() < 0.25  # 0.05 m in every measurement
+    weights = loss.weight(graph.with_poses(found).squared_errors())
+    assert weights[sim.outliers].max() < 0.01
+    rejected = (weights < 0.1) & ~graph.edges.odometry & ~sim.outliers
+    assert rejected.sum() <= 0.05 * len(clean.closures)
+    problem, x, guess = graph.graph()
+    naive = LevenbergMarquardt().solve(problem, guess)[x]
+    assert np.linalg.norm(naive[:, :2] - right[:, :2], axis=1).max() > 5.0
+
+
+def test_outliers_in_space() -> None:
+    sim = sphere(6, 12, outliers=0.3)
+    graph = sim.pose_graph
+    problem, x, guess = replace(graph, edges=graph.edges[~sim.outliers]).graph()
+    right = GaussNewton().solve(problem, guess, check=True)[x]
+    loss = fg.TruncatedLeastSquares(4.1)
+    problem, x, guess = graph.graph(robust=loss)
+    found = GraduatedNonConvexity(solver=GaussNewton()).solve(problem, guess)[x]
+    assert np.abs(found[:, :3] - right[:, :3]).max() < 0.15
+    assert loss.weight(graph.with_poses(found).squared_errors())[sim.outliers].max() == 0.0
+
+
+@pytest.mark.data
+def test_wrong_loop_closures_between_weak_odometry(shared_data: Path) -> None:
+    """The optimum without losses hides three contradictory closures: none exceeds 1.3 standard deviations there."""
+    graph = read_g2o(shared_data / "pose_graphs" / "rpgo_robot_a.g2o")
+    plain, x, guess = graph.graph()
+    hidden = graph.with_poses(GaussNewton().solve(plain, guess)[x]).squared_errors()
+    assert hidden[~graph.edges.odometry].max() < 1.7
+    closed = np.flatnonzero(~graph.edges.odometry)
+    # The best of all subsets: keep 28-39 and 33-27 (26.65), pay c^2 for the third, or keep none.
+    for threshold, kept, cost in ((4.1, closed[1:], 0.5 * (26.6493 + 4.1**2)), (3.548, closed[:0], 1.5 * 3.548**2)):
+        loss = fg.TruncatedLeastSquares(threshold)
+        problem, x, guess = graph.graph(robust=loss)
+        solution = GraduatedNonConvexity().solve(problem, guess, check=True)
+        weights = loss.weight(graph.with_poses(solution[x]).squared_errors())
+        assert closed[weights[closed] > 0.0].tolist() == kept.tolist()
+        assert solution.cost == pytest.approx(cost, abs=1e-3)

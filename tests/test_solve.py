@@ -1,0 +1,204 @@
+"""The command ``unifg solve``: options, files, pictures and the scene."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.errors import ScenarioError
+from unifg.files.g2o import read_g2o, write_g2o
+from unifg.files.toro import write_toro
+from unifg.files.tum import read_tum
+from unifg.pose_graphs import PoseGraph, Sightings, manhattan, sphere
+from unifg.scenarios import cli
+from unifg.scenarios.solve import SolveSettings, robust_loss, solve_file
+
+FILES = ("scene.html", "graph.png", "graph.g2o", "trajectory.tum", "metrics.json")
+
+
+@pytest.fixture
+def city(tmp_path: Path) -> Path:
+    return write_g2o(tmp_path / "city.g2o", manhattan(120, 1).pose_graph)
+
+
+@pytest.fixture
+def dirty(tmp_path: Path) -> Path:
+    return write_g2o(tmp_path / "dirty.g2o.gz", manhattan(300, 0, outliers=0.3).pose_graph)
+
+
+@pytest.fixture
+def globe(tmp_path: Path) -> Path:
+    return write_g2o(tmp_path / "globe.g2o", sphere(4, 8).pose_graph)
+
+
+def numbers(folder: Path) -> dict[str, object]:
+    loaded: dict[str, object] = json.loads((folder / "metrics.json").read_text())
+    return loaded
+
+
+@pytest.mark.parametrize("name", ["city", "globe"])
+def test_writes_every_file_and_says_what_came_out(
+    name: str, request: pytest.FixtureRequest, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, out = request.getfixturevalue(name), tmp_path / "out"
+    assert cli.main(["solve", str(file), "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    for written in FILES:
+        assert (out / written).stat().st_size > 0
+        assert str(out / written) in said.out.splitlines()
+    assert "100%" in said.err and "100%" not in said.out
+    before, after, metrics = read_g2o(file), read_g2o(out / "graph.g2o"), numbers(out)
+    assert metrics["converged"] is True
+    assert metrics["chi2_start"] == pytest.approx(before.chi2())
+    assert metrics["chi2"] == pytest.approx(after.chi2())
+    assert after.chi2() < 0.5 * before.chi2()
+    assert f"{after.chi2():.9g}" in said.out
+    trajectory = read_tum(out / "trajectory.tum")
+    size = after.group.point_dim
+    np.testing.assert_allclose(trajectory.position[:, :size], after.poses[:, :size], atol=1e-8)
+    assert set(metrics["seconds"]) == {"read", "initialise", "compile", "solve"}  # type: ignore[call-overload]
+
+
+@pytest.mark.parametrize("solver", ["gn", "lm"])
+@pytest.mark.parametrize("init", ["file", "odometry", "lago", "chordal"])
+def test_every_way_to_the_same_optimum(city: Path, solver: str, init: str) -> None:
+    reference = solve_file(SolveSettings(city))
+    solved = solve_file(SolveSettings(city, solver=solver, init=init))
+    assert solved.chi2[2] == pytest.approx(reference.chi2[2], rel=1e-9)
+    assert solved.chi2[0] == reference.chi2[0]
+    linear = init in ("lago", "chordal")
+    assert (solved.chi2[1] < 2.0 * solved.chi2[2]) == linear
+    np.testing.assert_array_equal(solved.steps[0], solved.before.poses)
+    np.testing.assert_array_equal(solved.steps[-1], solved.after.poses)
+    assert solved.step_numbers[-1] == solved.solution.iterations
+
+
+def test_residuals_have_their_own_optima(globe: Path) -> None:
+    log, chart = (solve_file(SolveSettings(globe, residual=name)) for name in ("log", "g2o"))
+    assert chart.chi2[2] == pytest.approx(chart.after.chi2("g2o"))
+    assert chart.chi2[2] < log.after.chi2("g2o") and log.chi2[2] < chart.after.chi2()
+
+
+def test_outliers_are_found_and_named(dirty: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert cli.main(["solve", str(dirty), "--robust", "gnc", "--out", str(out)]) == 0
+    sim, metrics = manhattan(300, 0, outliers=0.3), numbers(out)
+    edges = sim.pose_graph.edges
+    wrong = {(int(a), int(b)) for a, b in zip(edges.first[sim.outliers], edges.second[sim.outliers], strict=True)}
+    found = {tuple(pair) for pair in metrics["outlier_edges"]}  # type: ignore[attr-defined]
+    assert wrong <= found and len(found - wrong) <= 0.05 * len(sim.pose_graph.closures)
+    assert metrics["outliers"] == len(metrics["outlier_edges"])  # type: ignore[arg-type]
+    assert metrics["chi2_inliers"] < 1e-3 * metrics["chi2"]  # type: ignore[operator]
+    assert "TruncatedLeastSquares" in capsys.readouterr().out
+    assert "loop closures taken for outliers" in (out / "scene.html").read_text()
+
+
+@pytest.mark.parametrize("robust", ["huber", "cauchy:1.5", "tukey:3e4", "dcs:1e4"])
+def test_other_losses_solve_clean_graphs(city: Path, robust: str) -> None:
+    solved = solve_file(SolveSettings(city, robust=robust, init="chordal"))
+    assert solved.solution.converged
+    assert solved.chi2[2] < 1.3 * solve_file(SolveSettings(city)).chi2[2]
+
+
+def test_loss_names_and_parameters() -> None:
+    assert robust_loss(None, 3) is None
+    assert robust_loss("huber", 3) == fg.Huber(1.345)
+    assert robust_loss("dcs:2.5", 3) == fg.DCS(2.5)
+    for dim, squared in ((3, 11.345), (6, 16.812)):  # chi-squared tables, 99 %
+        loss = robust_loss("gnc", dim)
+        assert isinstance(loss, fg.TruncatedLeastSquares)
+        assert loss.threshold**2 == pytest.approx(squared, abs=1e-3)
+    for bad in ("l2", "huber:", "huber:-1", "huber:x", "gnc:inf"):
+        with pytest.raises(ScenarioError, match="--robust"):
+            robust_loss(bad, 3)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--robust", "l1"], "--robust l1: expected one of huber, cauchy, tukey, dcs, gnc"),
+        (["--solver", "sqp"], "invalid choice: 'sqp'"),
+        (["--init", "zero"], "invalid choice: 'zero'"),
+        (["--residual", "chord"], "invalid choice: 'chord'"),
+    ],
+)
+def test_bad_options_exit_2(
+    city: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    assert cli.main(["solve", str(city), *words, "--out", str(tmp_path / "out")]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_lago_is_planar(globe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["solve", str(globe), "--init", "lago", "--out", str(tmp_path)]) == 2
+    assert "use --init chordal" in capsys.readouterr().err
+
+
+def test_bad_files_are_messages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["solve", "nowhere.g2o"]) == 2
+    assert "nowhere.g2o: no such file" in capsys.readouterr().err
+    for text, message in (
+        ("VERTEX_SE2 0 0 0 0\n", "there is no edge"),
+        ("VERTEX_SE2 0 0\n", "line 1: VERTEX_SE2 has 2"),
+    ):
+        (tmp_path / "bad.g2o").write_text(text)
+        assert cli.main(["solve", str(tmp_path / "bad.g2o"), "--out", str(tmp_path)]) == 2
+        assert message in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_toro_files_and_landmarks(tmp_path: Path) -> None:
+    graph = manhattan(40, 3).pose_graph
+    file = write_toro(tmp_path / "city.graph", graph)
+    assert solve_file(SolveSettings(file)).chi2[0] == pytest.approx(graph.chi2())
+    seen = Sightings(np.arange(40), np.zeros(40, np.intp), np.ones((40, 2)), np.tile(np.eye(2), (40, 1, 1)))
+    marked = PoseGraph(
+        graph.ids, graph.poses, graph.edges, np.array([99]), np.array([[1.0, 1.0]]), {"point": seen}
+    )  # fmt: skip
+    out = tmp_path / "out"
+    assert cli.main(["solve", str(write_g2o(tmp_path / "marked.g2o", marked)), "--out", str(out)]) == 0
+    after = read_g2o(out / "graph.g2o")
+    assert numbers(out)["landmarks"] == 1 and numbers(out)["sightings"] == 40
+    assert not np.array_equal(after.landmarks, marked.landmarks)
+    assert "landmarks" in (out / "scene.html").read_text()
+
+
+def test_an_interrupt_keeps_what_there_is(city: Path) -> None:
+    def stop(done: float, text: str) -> None:
+        if text.startswith("iteration 2"):
+            raise KeyboardInterrupt
+
+    solved = solve_file(SolveSettings(city), progress=stop)
+    assert solved.interrupted and solved.solution.iterations == 2
+
+
+def test_the_scene_needs_nothing_else(city: Path, tmp_path: Path) -> None:
+    from unifg.scenarios.solve_scene import record_scene, strips
+
+    solved = solve_file(SolveSettings(city))
+    recorder, shown = record_scene(solved)
+    paths = {str(command["path"]) for command in recorder.commands if command["type"] == "set_object"}
+    assert shown == list(range(len(solved.steps)))
+    assert {f"/meshcat/steps/{k}/{part}" for k in shown for part in ("trajectory", "closures")} <= paths
+    assert {"/meshcat/start", "/meshcat/first"} <= paths
+    assert cli.main(["solve", str(city), "--out", str(tmp_path)]) == 0
+    page = (tmp_path / "scene.html").read_text()
+    assert "default-src 'none'" in page and "@@" not in page.split("<script>")[0]
+    assert not re.search(r"(src|href)=\"http", page)
+    lines = np.array([[[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]], [[1.0, 1.0, 0.0], [1.0, 1.0, 3.0]]])
+    vertices, faces = strips(lines, 0.2, crossed=True)
+    assert vertices.shape == (16, 3) and faces.shape == (8, 3)
+    assert np.isfinite(vertices).all()  # also for the vertical line
+    np.testing.assert_allclose(np.ptp(vertices[:4], axis=0), [2.2, 0.2, 0.0], atol=1e-12)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("name", "chi2"), [("M3500.g2o.gz", 137.9148782), ("sphere2500.g2o.gz", 1351.4019259)])
+def test_published_graphs(shared_data: Path, name: str, chi2: float) -> None:
+    solved = solve_file(SolveSettings(shared_data / "pose_graphs" / name))
+    assert solved.chi2[2] == pytest.approx(chi2, abs=2e-7)
+    assert len(solved.steps) <= 12

@@ -1,0 +1,132 @@
+"""Symbolic analysis: choose an order, build the tree, lay out the fronts."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple, TypeAlias
+
+import numpy as np
+
+from unifg.elimination.chain import stages
+from unifg.elimination.dissection import separators
+from unifg.elimination.layout import lay_out
+from unifg.elimination.ordering import block_graph, indistinguishable, minimum_degree
+from unifg.elimination.plan import PANEL, PIVOTS, ROWS, Plan
+from unifg.elimination.symbolic import supernodes
+from unifg.errors import UnifgError
+from unifg.typing import BoolArray, IntArray
+
+Ordering: TypeAlias = Literal["auto", "minimum-degree", "nested-dissection", "natural"] | IntArray
+SLACK = 16  # numbers the kernels may read beyond the last matrix
+DISSECT = 4e6, 3e3  # predicted nanoseconds, in all and per node, from which nested dissection is tried
+COST = 4  # where `supernodes` returns its forecast
+
+
+class Structure(NamedTuple):
+    """What the analysis found.
+
+    Attributes:
+        plan: arguments of the compiled kernels.
+        starts: (nodes + 1,) first scalar of each node.
+        order: (nodes,) nodes in the order of elimination.
+        bounds: (S + 1,) where the nodes of each front begin in ``order``.
+        parent: (S,) parent of each front or -1.
+        kind: how the order was found.
+    """
+
+    plan: Plan
+    starts: IntArray
+    order: IntArray
+    bounds: IntArray
+    parent: IntArray
+    kind: str
+
+
+def analyse(
+    indptr: IntArray, indices: IntArray, blocks: IntArray | None, ordering: Ordering, negative: BoolArray | None
+) -> Structure:
+    """Analyse a pattern; arguments as for `factorization.Factorization`, the pattern as its two arrays.
+
+    Raises:
+        UnifgError: labels, signs or permutation are not what they should be.
+    """
+    size = len(indptr) - 1
+    label = indistinguishable(indptr, indices) if blocks is None else _labels(blocks, size)
+    nodes = int(label[-1]) + 1 if size else 0
+    starts = np.searchsorted(label, np.arange(nodes + 1))
+    weight = np.diff(starts)
+    pointer, neighbours = block_graph(indptr, indices, label, nodes)
+    kind: str = ordering if isinstance(ordering, str) else "given order"
+    if not isinstance(ordering, str):
+        tree = supernodes(pointer, neighbours, weight, _permutation(ordering, nodes))
+    elif ordering == "natural":
+        tree = supernodes(pointer, neighbours, weight, np.arange(nodes))
+    elif ordering == "nested-dissection":
+        staged = minimum_degree(pointer, neighbours, weight, separators(pointer, neighbours, weight))
+        tree = supernodes(pointer, neighbours, weight, staged)
+    elif ordering in ("auto", "minimum-degree"):
+        flat = np.zeros(nodes, np.int64)
+        tree = supernodes(pointer, neighbours, weight, minimum_degree(pointer, neighbours, weight, flat))
+        if ordering == "auto":
+            kind = "minimum-degree"
+            if tree[COST][1] > max(DISSECT[0], DISSECT[1] * nodes):
+                staged = minimum_degree(pointer, neighbours, weight, separators(pointer, neighbours, weight))
+                dissected = supernodes(pointer, neighbours, weight, staged)
+                if dissected[COST][1] < tree[COST][1]:
+                    kind, tree = "nested-dissection", dissected
+            chain, line = stages(pointer, neighbours, weight)
+            if chain and line[COST][1] <= tree[COST][1]:
+                kind, tree = "chain", line
+    else:
+        raise UnifgError(
+            f"ordering {ordering!r} is unknown: choose auto, minimum-degree, nested-dissection, natural or give a "
+            "permutation"
+        )
+    order, bounds, parent, passed, _ = tree
+    table, scalar_order, rows, relative, runs, slots, waiting = lay_out(
+        indptr, indices, starts, pointer, neighbours, order, bounds, parent, passed
+    )
+    largest = int((table[:, PIVOTS] + table[:, ROWS]).max(initial=0))
+    panels = int(table[-1, PANEL])
+    expected = np.zeros(size, np.int8)
+    if negative is not None:
+        if np.shape(negative) != (size,):
+            raise UnifgError(f"negative has shape {np.shape(negative)}; expected one flag per scalar, ({size},)")
+        expected[:] = np.where(np.asarray(negative)[scalar_order], -1, 1)
+    plan = Plan(
+        shape=np.array([size, len(parent), largest, panels]),
+        fronts=table,
+        order=scalar_order,
+        rows=rows,
+        relative=relative,
+        runs=runs,
+        slots=slots,
+        expected=expected,
+        numbers=np.zeros(panels + waiting + SLACK),
+        pivots=np.ones(size + 3),
+        signs=np.ones(size + 3),
+        work=np.zeros(size + largest + SLACK),
+        state=np.array([0, 0, 0, -1, 0, -1]),
+    )
+    return Structure(plan, starts, order, bounds, parent, kind)
+
+
+def _labels(blocks: IntArray, size: int) -> IntArray:
+    """Consecutive labels from 0, checked."""
+    blocks = np.asarray(blocks)
+    if blocks.shape != (size,):
+        raise UnifgError(f"blocks has shape {blocks.shape} where one label per scalar, ({size},), is needed")
+    change = np.diff(blocks)
+    if (change < 0).any():
+        at = int(np.argmax(change < 0)) + 1
+        raise UnifgError(f"blocks decreases at scalar {at}; number the nodes in the order of their scalars")
+    result = np.zeros(size, np.int64)
+    np.cumsum(change != 0, out=result[1:])
+    return result
+
+
+def _permutation(order: IntArray, nodes: int) -> IntArray:
+    """A permutation of the nodes, checked."""
+    order = np.asarray(order, dtype=np.int64)
+    if order.shape != (nodes,) or not np.array_equal(np.sort(order), np.arange(nodes)):
+        raise UnifgError(f"ordering is not a permutation of the {nodes} nodes; name each node once")
+    return order

@@ -1,0 +1,93 @@
+"""Trajectories in the KITTI format: one line per pose, the 3 x 4 matrix [R t] row by row, without times.
+
+Format: the README of https://www.cvlibs.net/datasets/kitti/eval_odometry.php.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from unifg.errors import FileFormatError
+from unifg.files.tagged import read_bytes, write_text
+from unifg.lie import SE2, SE3
+from unifg.typing import Array, ArrayLike
+
+__all__ = ["read_kitti", "write_kitti"]
+
+_FIELDS = 12
+_ROTATION = 1e-2  # largest |R'R - I| that rounding and single precision excuse
+
+
+def read_kitti(path: str | Path) -> Array:
+    """Read poses; empty lines are skipped, matrices are moved to the nearest rotation.
+
+    Args:
+        path: the file, gzipped or not.
+
+    Returns:
+        (n, 7) poses of `unifg.SE3`.
+
+    Raises:
+        FileFormatError: the file is missing, or a line (named in the message) is not twelve finite numbers with a
+            rotation among them.
+    """
+    path = Path(path)
+    try:
+        text = read_bytes(path).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f"{path}: cannot be read as text ({error})") from error
+    rows, lines = [], []
+    for number, line in enumerate(text.split("\n"), start=1):
+        words = line.split()
+        if not words:
+            continue
+        if len(words) != _FIELDS:
+            hint = "; fields are separated by blanks, not commas" if "," in line else ""
+            raise FileFormatError(f"{path}, line {number}: {len(words)} fields, expected {_FIELDS}{hint}")
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError:
+            raise FileFormatError(f"{path}, line {number}: not twelve numbers: {line.strip()!r}") from None
+        lines.append(number)
+    matrices = np.array(rows, dtype=np.float64).reshape(-1, 3, 4)
+    rotations = matrices[:, :, :3]
+    # In this order NaN counts as too far.
+    right = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2), initial=0.0) < _ROTATION
+    right &= np.isfinite(matrices).all(axis=(1, 2)) & (np.linalg.det(np.nan_to_num(rotations)) > 0.0)
+    if not right.all():
+        k = int(np.flatnonzero(~right)[0])
+        raise FileFormatError(f"{path}, line {lines[k]}: columns 1 to 3, 5 to 7, 9 to 11 are not a rotation matrix")
+    full = np.tile(np.eye(4), (len(matrices), 1, 1))
+    full[:, :3] = matrices
+    return SE3.from_matrix(full)
+
+
+def write_kitti(path: str | Path, poses: ArrayLike) -> Path:
+    """Write poses with nine decimals of the mantissa; planar ones are lifted to z = 0.
+
+    Args:
+        path: file to write; an existing one is replaced.
+        poses: (n, 7) of `unifg.SE3`, or (n, 3) of `unifg.SE2`.
+
+    Returns:
+        The path written.
+
+    Raises:
+        FileFormatError: the array has another shape, or a number is not finite.
+    """
+    path, array = Path(path), np.asarray(poses, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] not in (3, 7):
+        raise FileFormatError(f"{path}: poses have shape {array.shape}, expected (n, 7) or (n, 3)")
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    if bad.size:
+        raise FileFormatError(f"{path}: pose {bad[0]} is not finite: {array[bad[0]]}")
+    rows = np.zeros((len(array), 3, 4))
+    if array.shape[1] == 7:
+        rows[:] = SE3.matrix(array)[:, :3]
+    else:
+        rows[:, 2, 2] = 1.0
+        rows[:, :2, [0, 1, 3]] = SE2.matrix(array)[:, :2]
+    lines = [" ".join(f"{value + 0.0:.9e}" for value in row) for row in rows.reshape(-1, _FIELDS).tolist()]
+    return write_text(path, "".join(line + "\n" for line in lines))

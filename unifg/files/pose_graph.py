@@ -1,0 +1,26 @@
+"""Pose graphs in whichever format a file has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from unifg.files.g2o import parse_g2o
+from unifg.files.tagged import TaggedFile
+from unifg.files.toro import parse_toro
+from unifg.pose_graphs.pose_graph import PoseGraph
+
+__all__ = ["read_pose_graph"]
+
+
+def read_pose_graph(path: str | Path) -> PoseGraph:
+    """Read a pose graph in the g2o or TORO format, told apart by their tags and not by the name of the file.
+
+    Args:
+        path: the file, gzipped or not.
+
+    Raises:
+        FileFormatError: as `unifg.files.g2o.read_g2o` and `unifg.files.toro.read_toro`.
+    """
+    file = TaggedFile.read(path)
+    toro = "VERTEX2" in file.texts or "VERTEX3" in file.texts
+    return parse_toro(file) if toro else parse_g2o(file)

@@ -1,0 +1,116 @@
+"""Pose graphs in the TORO format (ending ``.graph``), read and written: https://openslam-org.github.io/toro.html.
+
+============ =======================================================================================
+``VERTEX2``  id x y theta
+``EDGE2``    i j dx dy dtheta Ixx Ixy Iyy Itt Ixt Iyt: **not** row by row
+``VERTEX3``  id x y z roll pitch yaw
+``EDGE3``    i j dx dy dz roll pitch yaw and 21 numbers, the upper triangle row by row, rotations last
+============ =======================================================================================
+
+Rotations are R = Rz(yaw) Ry(pitch) Rx(roll). Information of EDGE3 speaks of roll, pitch and yaw errors; they are small
+where it matters, and are taken for the rotation vector, as g2o and GTSAM do.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from unifg.errors import FileFormatError
+from unifg.files.tagged import (
+    TaggedFile,
+    decimal_lines,
+    distinct,
+    from_triangle,
+    positions_of,
+    report_skipped,
+    triangle_names,
+    upper_triangle,
+    write_text,
+)
+from unifg.lie import SE3, SO3
+from unifg.pose_graphs.pose_graph import Edges, PoseGraph
+from unifg.typing import Array
+
+__all__ = ["parse_toro", "read_toro", "write_toro"]
+
+_KNOWN = {"VERTEX2", "EDGE2", "VERTEX3", "EDGE3"}
+_PLANAR_ORDER = [0, 1, 3, 5, 2, 4]  # where the row-by-row entries xx xy xt yy yt tt stand in TORO's list ...
+_TO_ROWS = [0, 1, 4, 2, 5, 3]  # ... and TORO's xx xy yy tt xt yt in the row-by-row list
+
+
+def read_toro(path: str | Path) -> PoseGraph:
+    """Read a pose graph; gzipped files are unpacked.
+
+    Lines with other tags, such as ``EQUIV``, are counted in ``skipped`` and named in one warning.
+
+    Args:
+        path: the file.
+
+    Raises:
+        FileFormatError: the file is missing or holds no pose, mixes planar and spatial poses, or a line (named in the
+            message) has the wrong number of fields, is not made of finite numbers, repeats a vertex or refers to one
+            that is not there.
+    """
+    return parse_toro(TaggedFile.read(path))
+
+
+def parse_toro(file: TaggedFile) -> PoseGraph:
+    """The pose graph of a file that has been read already; see `read_toro`."""
+    skipped = report_skipped(file, _KNOWN)
+    planar, spatial = "VERTEX2" in file.texts, "VERTEX3" in file.texts
+    if planar == spatial:
+        what = "both VERTEX2 and VERTEX3" if planar else "neither VERTEX2 nor VERTEX3"
+        raise FileFormatError(f"{file.path}: found {what} lines; a pose graph has poses of one kind")
+    if planar:
+        vertices = file.block("VERTEX2", 1, "id x y theta")
+        edges = file.block("EDGE2", 2, "i j dx dy dtheta Ixx Ixy Iyy Itt Ixt Iyt")
+        poses, measured = vertices.numbers, edges.numbers[:, :3].copy()
+        information = from_triangle(edges.numbers[:, 3:][:, _TO_ROWS], 3)
+    else:
+        vertices = file.block("VERTEX3", 1, "id x y z roll pitch yaw")
+        edges = file.block("EDGE3", 2, f"i j dx dy dz roll pitch yaw {triangle_names(6)}")
+        poses, measured = from_angles(vertices.numbers), from_angles(edges.numbers[:, :6])
+        information = from_triangle(edges.numbers[:, 6:], 6)
+    places = distinct(file, vertices.integers[:, 0], vertices.lines)
+    first, second = (positions_of(file, places, edges.integers[:, k], edges.lines, "pose") for k in (0, 1))
+    return PoseGraph(vertices.integers[:, 0], poses, Edges(first, second, measured, information), skipped=skipped)
+
+
+def write_toro(path: str | Path, pose_graph: PoseGraph) -> Path:
+    """Write poses and edges; planar ones are read back bit by bit, spatial ones as far as angles allow.
+
+    Args:
+        path: file to write; an existing one is replaced, and a name that ends in ``.gz`` is gzipped.
+        pose_graph: what to write; TORO knows neither landmarks nor fixed poses.
+
+    Returns:
+        The path written.
+
+    Raises:
+        FileFormatError: the pose graph has landmarks, or a number is not finite.
+    """
+    path, edges, ids = Path(path), pose_graph.edges, pose_graph.ids
+    if len(pose_graph.landmarks):
+        raise FileFormatError(f"{path}: TORO files have no landmarks; write g2o")
+    triangle = upper_triangle(edges.information)
+    poses, measured, name = pose_graph.poses, edges.measured, "2"
+    if poses.shape[1] == 7:
+        poses, measured, name = to_angles(poses), to_angles(measured), "3"
+    else:
+        triangle = triangle[:, _PLANAR_ORDER]
+    lines = decimal_lines(path, f"VERTEX{name}", [ids], poses)
+    numbers = np.concatenate([measured, triangle], axis=1)
+    lines += decimal_lines(path, f"EDGE{name}", [ids[edges.first], ids[edges.second]], numbers)
+    return write_text(path, "\n".join(lines) + "\n")
+
+
+def from_angles(numbers: Array) -> Array:
+    """SE3 poses (n, 7) from x, y, z, roll, pitch, yaw (n, 6) [m, rad]."""
+    return SE3.from_parts(numbers[:, :3], SO3.from_rpy(*numbers[:, 3:].T))
+
+
+def to_angles(poses: Array) -> Array:
+    """The inverse of `from_angles`."""
+    return np.column_stack([poses[:, :3], *SO3.to_rpy(poses[:, 3:])])

@@ -1,0 +1,23 @@
+"""Pose graphs: the data, residuals in two conventions, first guesses, and made-up examples."""
+
+from unifg.pose_graphs.generate import Simulated, manhattan, sphere
+from unifg.pose_graphs.initialise import chordal, lago, odometric
+from unifg.pose_graphs.pose_graph import Edges, PoseGraph, Sightings
+from unifg.pose_graphs.residuals import bearing, bearing_range, chart_between, distance, sighting
+
+__all__ = [
+    "Edges",
+    "PoseGraph",
+    "Sightings",
+    "Simulated",
+    "bearing",
+    "bearing_range",
+    "chart_between",
+    "chordal",
+    "distance",
+    "lago",
+    "manhattan",
+    "odometric",
+    "sighting",
+    "sphere",
+]

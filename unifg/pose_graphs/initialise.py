@@ -1,0 +1,223 @@
+"""First guesses for pose graphs: along a spanning tree, LAGO in the plane, chordal relaxation anywhere.
+
+All take general information matrices and keep the poses that are fixed (see `PoseGraph.anchors`) where they are.
+Comparison of the methods: L. Carlone, R. Tron, K. Daniilidis, F. Dellaert, "Initialization techniques for 3D SLAM: a
+survey on rotation estimation and its use in pose graph optimization", ICRA 2015.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import breadth_first_order, dijkstra, minimum_spanning_tree
+
+from unifg.errors import GraphError
+from unifg.lie import SE2, SE3, SO3, LieGroup
+from unifg.pose_graphs.linear import block_least_squares
+from unifg.pose_graphs.pose_graph import PoseGraph
+from unifg.typing import Array, BoolArray, IntArray
+
+__all__ = ["chordal", "lago", "odometric"]
+
+_CLOSURE_COST = 1e6  # a spanning tree takes loop closures only where there is no odometry
+_BLIND = 1e-12  # [1 / rad^2]; an edge with less information about the turn is the last that a tree takes
+
+
+def odometric(pose_graph: PoseGraph) -> Array:
+    """Poses (n, storage) from the measurements of a spanning tree, odometry before loop closures.
+
+    Raises:
+        GraphError: a pose is connected to the others through landmarks only.
+    """
+    group, fixed = pose_graph.group, pose_graph.anchors()[0]
+    cost = np.where(pose_graph.edges.odometry, 1.0, _CLOSURE_COST)
+    parent, edge, forward = _tree(pose_graph, fixed, cost, shortest=False)
+    count = len(pose_graph.poses)
+    relative = np.tile(group.identity(), (count + 1, 1))
+    inner = np.flatnonzero(edge >= 0)
+    measured = pose_graph.edges.measured[edge[inner]]
+    along = forward[inner][:, None]
+    relative[inner] = np.where(along, measured, group.inverse(measured))
+    relative[fixed] = pose_graph.poses[fixed]
+    # Every pose relative to its parent, then to its grandparent, ...: as many rounds as the logarithm of the depth.
+    while np.any(parent[:count] != count):
+        relative[:count] = group.compose(relative[parent[:count]], relative[:count])
+        parent = parent[parent]
+    return relative[:count].copy()
+
+
+def lago(pose_graph: PoseGraph) -> Array:
+    """Linear approximation for graph optimisation: poses (n, 3) in the plane (Carlone et al. 2014).
+
+    Headings first: along a spanning tree, each measured turn is freed from the whole turns that wrapping has taken from
+    its cycle, so that headings are real numbers and their estimate is linear. Positions given headings are linear too.
+    The tree is that of the most certain paths: along odometry alone, the noise of a long drive amounts to whole turns.
+    L. Carlone, R. Aragues, J. Castellanos, B. Bona, "A fast and accurate approximation for planar pose graph
+    optimization", IJRR 33(7), 2014.
+
+    Raises:
+        GraphError: the poses are not planar, or the edges do not determine them.
+    """
+    if pose_graph.group is not SE2:
+        raise GraphError("lago is for poses in SE2; use chordal")
+    edges, fixed = pose_graph.edges, pose_graph.anchors()[0]
+    precision = _marginal(edges.information, slice(2, 3))
+    along_tree = _tree_headings(pose_graph, fixed, 1.0 / np.maximum(precision[:, 0, 0], _BLIND))
+    turn = edges.measured[:, 2]
+    turns = np.round((along_tree[edges.second] - along_tree[edges.first] - turn) / (2.0 * np.pi))
+    root = np.sqrt(np.maximum(precision, 0.0))
+    headings = block_least_squares(
+        edges.first, edges.second, -root, root, root * (turn + 2.0 * np.pi * turns)[:, None, None],
+        along_tree[:, None, None], fixed,
+    )[:, 0, 0]  # fmt: skip
+    poses = pose_graph.poses.copy()
+    free = np.setdiff1d(np.arange(len(poses)), fixed)
+    poses[free, 2] = headings[free]
+    return _positions(pose_graph, SE2.retract(poses, np.zeros(3)), fixed)
+
+
+def chordal(pose_graph: PoseGraph) -> Array:
+    """Chordal relaxation: poses (n, storage) in the plane or in space.
+
+    The sum of kappa |R_j - R_i R_ij|^2 (Frobenius norm) is minimised over all matrices, the minimisers are moved to
+    the nearest rotations by SVD, and positions given rotations are linear. The rows of the matrices do not mix, so one
+    factorisation serves all. D. Martinec and T. Pajdla, "Robust rotation and translation estimation in multiview
+    reconstruction", CVPR 2007; weights kappa as in D. Rosen et al., "SE-Sync", IJRR 38(2-3), 2019: the inverse
+    variance of an isotropic rotation error with the same trace.
+
+    Raises:
+        GraphError: the edges do not determine the poses.
+    """
+    group, edges, fixed = pose_graph.group, pose_graph.edges, pose_graph.anchors()[0]
+    dim = group.point_dim
+    rotations = _rotations(group, pose_graph.poses)
+    measured = _rotations(group, edges.measured)
+    angles = group.dim - dim
+    precision = _marginal(edges.information, slice(dim, group.dim))
+    kappa = angles / np.trace(np.linalg.pinv(precision, hermitian=True), axis1=1, axis2=2)
+    root = np.sqrt(kappa)[:, None, None]
+    start = np.zeros((len(rotations), dim, dim))
+    start[fixed] = np.swapaxes(rotations[fixed], 1, 2)  # blocks are rows of R, as columns
+    relaxed = block_least_squares(
+        edges.first, edges.second, -root * np.swapaxes(measured, 1, 2), root * np.eye(dim), np.zeros_like(measured),
+        start, fixed,
+    )  # fmt: skip
+    poses = _with_rotations(group, pose_graph.poses, np.swapaxes(relaxed, 1, 2))
+    poses[fixed] = pose_graph.poses[fixed]
+    return _positions(pose_graph, poses, fixed)
+
+
+def _positions(pose_graph: PoseGraph, poses: Array, fixed: IntArray) -> Array:
+    """The best positions for given rotations, with what the rotation errors say about them through correlation.
+
+    In the chart of `chart_between`, R_ij' (R_i' (t_j - t_i) - t_ij) is linear in positions.
+    """
+    group, edges = pose_graph.group, pose_graph.edges
+    dim = group.point_dim
+    turned = _rotations(group, edges.measured)
+    to_edge = np.swapaxes(_rotations(group, poses[edges.first]) @ turned, 1, 2)
+    target = (np.swapaxes(turned, 1, 2) @ edges.measured[:, :dim, None]).copy()
+    error = group.log(group.between(edges.measured, group.between(poses[edges.first], poses[edges.second])))
+    inner, cross = edges.information[:, :dim, :dim], edges.information[:, :dim, dim:]
+    # Omega_tt |t + Omega_tt^-1 Omega_tr r|^2: the cross term moves the target.
+    target -= np.linalg.pinv(inner, hermitian=True) @ cross @ error[:, dim:, None]
+    eigenvalues, vectors = np.linalg.eigh(inner)
+    root = np.sqrt(np.maximum(eigenvalues, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2)
+    block = root @ to_edge
+    start = np.zeros((len(poses), dim, 1))
+    start[fixed, :, 0] = poses[fixed, :dim]
+    result = poses.copy()
+    result[:, :dim] = block_least_squares(edges.first, edges.second, -block, block, root @ target, start, fixed)[..., 0]
+    return result
+
+
+def _marginal(information: Array, part: slice) -> Array:
+    """Information about some coordinates when the others are free: the Schur complement, (m, k, k)."""
+    size = information.shape[-1]
+    kept = np.arange(size)[part]
+    others = np.setdiff1d(np.arange(size), kept)
+    cross = information[:, kept[:, None], others]
+    inner = np.linalg.pinv(information[:, others[:, None], others], hermitian=True)
+    result: Array = information[:, kept[:, None], kept] - cross @ inner @ np.swapaxes(cross, 1, 2)
+    return result
+
+
+def _rotations(group: LieGroup, poses: Array) -> Array:
+    """Rotation matrices (n, d, d) of poses."""
+    size = group.point_dim
+    return group.matrix(poses)[:, :size, :size]
+
+
+def _with_rotations(group: LieGroup, poses: Array, matrices: Array) -> Array:
+    """Poses with the rotations nearest to (n, d, d) matrices."""
+    result = poses.copy()
+    if group is SE3:
+        result[:, 3:] = SO3.from_matrix(matrices)
+    else:  # the nearest rotation maximises tr(R' M)
+        sine, cosine = matrices[:, 1, 0] - matrices[:, 0, 1], matrices[:, 0, 0] + matrices[:, 1, 1]
+        result[:, 2] = np.arctan2(sine, cosine)
+    return result
+
+
+def _tree_headings(pose_graph: PoseGraph, fixed: IntArray, variance: Array) -> Array:
+    """(n,) headings along the paths of least variance, not wrapped: sums of measured turns from a fixed pose."""
+    parent, edge, forward = _tree(pose_graph, fixed, variance, shortest=True)
+    count = len(pose_graph.poses)
+    total = np.zeros(count + 1)
+    inner = np.flatnonzero(edge >= 0)
+    total[inner] = np.where(forward[inner], 1.0, -1.0) * pose_graph.edges.measured[edge[inner], 2]
+    total[fixed] = pose_graph.poses[fixed, 2]
+    while np.any(parent[:count] != count):
+        total[:count] += total[parent[:count]]
+        parent = parent[parent]
+    return total[:count]
+
+
+def _tree(pose_graph: PoseGraph, fixed: IntArray, cost: Array, shortest: bool) -> tuple[IntArray, IntArray, BoolArray]:
+    """A spanning tree whose root, node n, stands above all fixed poses.
+
+    Args:
+        pose_graph: the graph.
+        fixed: positions of the fixed poses.
+        cost: (m,) of every edge, positive.
+        shortest: whether the paths from the root are to be short, or the tree as a whole.
+
+    Returns:
+        (n + 1,) parents, the root being its own and that of every fixed pose; (n,) the edge to the parent, or -1; and
+        (n,) whether that edge was measured from the parent.
+
+    Raises:
+        GraphError: a pose cannot be reached.
+    """
+    edges, count = pose_graph.edges, len(pose_graph.poses)
+    low, high = np.minimum(edges.first, edges.second), np.maximum(edges.first, edges.second)
+    keys = low * (count + 1) + high
+    order = np.lexsort((np.arange(len(keys)), cost, keys))  # one edge for each pair
+    pairs, place = np.unique(keys[order], return_index=True)
+    chosen = order[place]
+    rows = np.concatenate([low[chosen], np.full(len(fixed), count)])
+    columns = np.concatenate([high[chosen], fixed])
+    costs = np.concatenate([cost[chosen], np.full(len(fixed), 1e-6 * cost.min(initial=1.0))])
+    size = count + 1
+    adjacency = coo_matrix((costs, (rows, columns)), shape=(size, size)).tocsr()
+    if shortest:
+        found = dijkstra(adjacency, directed=False, indices=count, return_predecessors=True)[1]
+    else:
+        found = breadth_first_order(minimum_spanning_tree(adjacency), count, directed=False)[1]
+    unreached = np.flatnonzero(found[:count] < 0)
+    if unreached.size:
+        lost = int(unreached[0])
+        raise GraphError(
+            f"pose {pose_graph.ids[lost]} is connected to the fixed poses through landmarks only, or not at all: "
+            "give its first guess yourself",
+            family="poses",
+            index=lost,
+        )
+    parent = found.astype(np.intp)
+    parent[count] = count
+    nodes, above = np.arange(count), parent[:count]
+    inner = above != count
+    edge = np.full(count, -1, dtype=np.intp)
+    wanted = np.minimum(nodes, above) * (count + 1) + np.maximum(nodes, above)
+    edge[inner] = chosen[np.searchsorted(pairs, wanted[inner])]
+    return parent, edge, np.where(edge >= 0, edges.first[edge] == above, False)

@@ -1,0 +1,241 @@
+"""A pose graph as data: poses, relative measurements, landmarks; and the factor graph it states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from unifg.errors import GraphError
+from unifg.factors import ManifoldResidual, between
+from unifg.graph import Graph
+from unifg.lie import SE2, SE3, LieGroup, Rn
+from unifg.pose_graphs.residuals import bearing, bearing_range, chart_between, distance, sighting
+from unifg.residuals import Residual
+from unifg.robust import Loss
+from unifg.typing import Array, BoolArray, IntArray
+from unifg.variables import Family
+
+__all__ = ["Edges", "Ids", "PoseGraph", "ResidualName", "RobustOn", "Sightings"]
+
+Ids: TypeAlias = NDArray[np.int64]
+ResidualName: TypeAlias = Literal["log", "g2o"]
+RobustOn: TypeAlias = Literal["closures", "all"]
+
+_RELATIVE: dict[str, ManifoldResidual] = {"log": between, "g2o": chart_between}
+_SEEN: dict[str, ManifoldResidual | Residual] = {
+    "point": sighting,
+    "bearing": bearing,
+    "range": distance,
+    "bearing-range": bearing_range,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Relative measurements between poses.
+
+    Attributes:
+        first, second: (m,) positions of the poses in `PoseGraph.poses`.
+        measured: (m, storage) pose of the second seen from the first.
+        information: (m, d, d), translation before rotation.
+    """
+
+    first: IntArray
+    second: IntArray
+    measured: Array
+    information: Array
+
+    def __len__(self) -> int:
+        """Number of edges."""
+        return len(self.first)
+
+    def __getitem__(self, chosen: IntArray | BoolArray | slice) -> Edges:
+        """Some of the edges, by mask, positions or slice."""
+        return Edges(self.first[chosen], self.second[chosen], self.measured[chosen], self.information[chosen])
+
+    @property
+    def odometry(self) -> BoolArray:
+        """(m,) whether an edge joins neighbours in the order of the file; the rest are loop closures."""
+        neighbours: BoolArray = np.abs(self.second - self.first) == 1
+        return neighbours
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Measurements of landmarks from poses.
+
+    Attributes:
+        pose: (k,) positions in `PoseGraph.poses`.
+        landmark: (k,) positions in `PoseGraph.landmarks`.
+        measured: (k, p).
+        information: (k, p, p).
+    """
+
+    pose: IntArray
+    landmark: IntArray
+    measured: Array
+    information: Array
+
+    def __len__(self) -> int:
+        """Number of sightings."""
+        return len(self.pose)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGraph:
+    """Poses in SE(2) or SE(3) with what has been measured between them.
+
+    Attributes:
+        ids: (n,) identifiers of the poses, 64 bits, in the order of the file.
+        poses: (n, 3) x, y, heading [m, m, rad], or (n, 7) position [m] and quaternion, as `unifg.SE3`.
+        edges: relative measurements.
+        landmark_ids: (k,) identifiers of the landmarks.
+        landmarks: (k, 2) or (k, 3) points [m].
+        sightings: measurements of landmarks by kind: "point" (in the frame of the pose [m]), "bearing" [rad],
+            "range" [m], "bearing-range" [rad, m]; the last three in the plane only.
+        fixed_ids: identifiers of poses and landmarks that are known.
+        skipped: tags a reader did not know, with the number of lines it left out.
+    """
+
+    ids: Ids
+    poses: Array
+    edges: Edges
+    landmark_ids: Ids = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    landmarks: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    sightings: Mapping[str, Sightings] = field(default_factory=dict)
+    fixed_ids: tuple[int, ...] = ()
+    skipped: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def group(self) -> LieGroup:
+        """SE2 or SE3, whichever the poses live in."""
+        return SE2 if self.poses.shape[1] == SE2.storage else SE3
+
+    @property
+    def closures(self) -> Edges:
+        """The loop closures: edges between poses that are not neighbours."""
+        return self.edges[~self.edges.odometry]
+
+    def with_poses(self, poses: Array, landmarks: Array | None = None) -> PoseGraph:
+        """The same measurements around other values, (n, storage), and landmarks (k, p) where given."""
+        return replace(self, poses=poses, landmarks=self.landmarks if landmarks is None else landmarks)
+
+    def graph(
+        self, robust: Loss | None = None, residual: ResidualName = "log", robust_on: RobustOn = "closures"
+    ) -> tuple[Graph, Family, dict[Family, Array]]:
+        """State the factor graph.
+
+        The terms are called ``odometry``, ``closures`` and, by kind, ``point``, ``bearing``, ... Known poses are fixed;
+        every connected part of the graph without one has its first pose fixed where it is.
+
+        Args:
+            robust: loss on the whitened residuals of the loop closures.
+            residual: ``"log"`` is Log(Z^-1 Xi^-1 Xj), as in GTSAM; ``"g2o"`` is g2o's chart (see
+                `unifg.pose_graphs.chart_between`). Both take the information matrices as the file has them.
+            robust_on: ``"all"`` puts the loss on odometry and sightings too.
+
+        Returns:
+            The graph, the family of the poses, called ``poses``, and a guess made of the present values. Landmarks are
+            ``graph.families["landmarks"]``.
+
+        Raises:
+            GraphError: on an unknown residual or kind of sighting, or a graph without edges.
+        """
+        relative = self._relative(residual)
+        if robust_on not in ("closures", "all"):
+            raise GraphError(f"robust_on is {robust_on!r}: expected 'closures' or 'all'")
+        everywhere = robust if robust_on == "all" else None
+        graph = Graph()
+        x = graph.variables("poses", self.group, len(self.poses))
+        guess = {x: self.poses}
+        along = self.edges.odometry
+        for name, edges, loss in (
+            ("odometry", self.edges[along], everywhere),
+            ("closures", self.edges[~along], robust),
+        ):
+            if len(edges):
+                measured = graph.data(name, edges.measured, each=True)
+                graph.minimize(
+                    relative, x[edges.first], x[edges.second], measured,
+                    information=edges.information, robust=loss, name=name,
+                )  # fmt: skip
+        if len(self.landmarks):
+            places = graph.variables("landmarks", Rn(self.landmarks.shape[1]), len(self.landmarks))
+            guess[places] = self.landmarks
+            for kind, seen in self.sightings.items():
+                measured = graph.data(kind, seen.measured, each=True)
+                graph.minimize(
+                    self._seen(kind), x[seen.pose], places[seen.landmark], measured,
+                    information=seen.information, robust=everywhere, name=kind,
+                )  # fmt: skip
+        fixed, known = self.anchors()
+        if len(fixed):
+            graph.fix(x[fixed], self.poses[fixed], name="anchor")
+        if len(known):
+            graph.fix(graph.families["landmarks"][known], self.landmarks[known], name="known landmarks")
+        return graph, x, guess
+
+    def chi2(self, residual: ResidualName = "log") -> float:
+        """Sum of r' Omega r over all measurements at the present values: no 1/2, no robust loss."""
+        squared = [self.squared_errors(residual).sum()]
+        for kind, seen in self.sightings.items():
+            function = self._seen(kind)
+            whole = function.on(self.group) if isinstance(function, ManifoldResidual) else function
+            squared.append(_squared(whole, seen, self.poses[seen.pose], self.landmarks[seen.landmark]).sum())
+        return float(sum(squared))
+
+    def squared_errors(self, residual: ResidualName = "log") -> Array:
+        """(m,) r' Omega r of every edge at the present values."""
+        function = self._relative(residual).on(self.group)
+        return _squared(function, self.edges, self.poses[self.edges.first], self.poses[self.edges.second])
+
+    def anchors(self) -> tuple[IntArray, IntArray]:
+        """Positions of the poses and landmarks held fixed: those known, or the first pose of a connected part."""
+        known = np.array(self.fixed_ids, dtype=np.int64)
+        poses, landmarks = np.flatnonzero(np.isin(self.ids, known)), np.flatnonzero(np.isin(self.landmark_ids, known))
+        part = self.parts()
+        held = np.concatenate([part[poses], part[len(self.poses) + landmarks]])
+        present, firsts = np.unique(part[: len(self.poses)], return_index=True)
+        loose = firsts[~np.isin(present, held)]
+        return np.sort(np.concatenate([poses, loose])), landmarks
+
+    def parts(self) -> IntArray:
+        """(n + k,) number of the connected part of every pose, then of every landmark."""
+        count = len(self.poses)
+        rows = [self.edges.first, *(seen.pose for seen in self.sightings.values())]
+        columns = [self.edges.second, *(count + seen.landmark for seen in self.sightings.values())]
+        row, column = np.concatenate(rows), np.concatenate(columns)
+        total = count + len(self.landmarks)
+        adjacency = coo_matrix((np.ones(len(row)), (row, column)), shape=(total, total))
+        part: IntArray = connected_components(adjacency, directed=False)[1].astype(np.intp)
+        return part
+
+    def _relative(self, residual: str) -> ManifoldResidual:
+        if residual not in _RELATIVE:
+            raise GraphError(f"residual is {residual!r}: expected {' or '.join(map(repr, _RELATIVE))}")
+        if not len(self.edges) and not self.sightings:
+            raise GraphError("the pose graph has no measurement: there is nothing to solve")
+        return _RELATIVE[residual]
+
+    def _seen(self, kind: str) -> ManifoldResidual | Residual:
+        if kind not in _SEEN:
+            raise GraphError(f"sightings of kind {kind!r}: expected one of {', '.join(map(repr, _SEEN))}")
+        return _SEEN[kind]
+
+    def __repr__(self) -> str:
+        """Counts."""
+        seen = sum(map(len, self.sightings.values()))
+        more = f", {len(self.landmarks)} landmarks, {seen} sightings" if len(self.landmarks) else ""
+        return f"<PoseGraph: {len(self.poses)} poses in {self.group.name}, {len(self.edges)} edges{more}>"
+
+
+def _squared(function: Residual, batch: Edges | Sightings, *points: Any) -> Array:
+    error = function(*points, batch.measured)
+    result: Array = np.einsum("ni,nij,nj->n", error, batch.information, error)
+    return result
