@@ -22,6 +22,8 @@ class KktArrays(NamedTuple):
         size: unknowns and equality rows.
         rows: (E,) equality rows among the constraints.
         normal: where the entries of ``Program.normal`` go.
+        normal_row: row of each of them.
+        normal_column: column of each of them.
         entries: which entries of the constraint Jacobian belong to equality rows and unknowns.
         places: where they go.
     """
@@ -30,6 +32,8 @@ class KktArrays(NamedTuple):
     size: IntArray
     rows: IntArray
     normal: IntArray
+    normal_row: IntArray
+    normal_column: IntArray
     entries: IntArray
     places: IntArray
 
@@ -70,6 +74,8 @@ class KktSystem:
             np.array([n, len(rows)]),
             rows,
             self.pattern.positions(normal.indices, normal_columns).astype(np.int64),
+            normal.indices.astype(np.int64),
+            normal_columns.astype(np.int64),
             constraints.free[chosen].astype(np.int64),
             self.pattern.positions(columns, multipliers).astype(np.int64),
         )

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.errors import BackendError
 from unifg.linearization import Evaluation, Linearization
 from unifg.program import Program
 from unifg.solver import Run, Solver
 from unifg.solvers.damping import norm
 from unifg.solvers.qp import QP, QPAnswer, Route, subproblem
+from unifg.solvers.qp_graph import GraphRoute
 from unifg.solvers.qp_osqp import OsqpRoute
 from unifg.solvers.qp_piqp import ElasticRoute, PiqpRoute
 from unifg.solvers.qp_qpsolvers import QpsolversRoute
@@ -44,8 +44,10 @@ class SQP(Solver):
 
     Attributes:
         max_iterations: subproblems before giving up.
-        qp: "osqp" (called directly, warm-started) or any name qpsolvers knows.
-        fallback: "piqp" (called directly) or any name qpsolvers knows: repeats a QP which missed its accuracy.
+        qp: "osqp" (called directly, warm-started), "graph" (an interior point whose systems are eliminated on the
+            graph) or any name qpsolvers knows. A subproblem without inequalities is one linear system: it goes to
+            "graph" whatever is said here.
+        fallback: "piqp" (called directly), "graph" or any name qpsolvers knows: repeats a QP which missed its accuracy.
             None leaves inaccurate answers as they are, and infeasible subproblems unsolved.
         qp_iterations: limit for OSQP before the fallback takes over.
         second_order_correction: try to repair a full step that the merit function rejects.
@@ -203,12 +205,9 @@ class Subproblems:
             BackendError: when a named solver is not installed.
         """
         self.program = program
-        unconstrained = program.constraints.count == 0
-        if unconstrained and options.qp == "osqp" and options.fallback is None:
-            raise BackendError("SQP: OSQP needs at least one constraint; set fallback='piqp' or use GaussNewton")
+        linear = bool(program.equality.all())
         self.fallback = None if options.fallback is None else _route(program, options.fallback, 0)
-        first = options.fallback if unconstrained and options.fallback is not None else options.qp
-        self.first = _route(program, first, options.qp_iterations)
+        self.first = _route(program, "graph" if linear else options.qp, options.qp_iterations)
         self.elastic = None if options.fallback is None else ElasticRoute(program)
         self._misses = 0
 
@@ -250,7 +249,9 @@ class Subproblems:
 
 
 def _route(program: Program, name: str, osqp_iterations: int) -> Route:
-    """OSQP and PIQP are called directly, everything else through qpsolvers."""
+    """The engine, OSQP and PIQP are called directly, everything else through qpsolvers."""
+    if name == "graph":
+        return GraphRoute(program)
     if name == "osqp":
         return OsqpRoute(program, osqp_iterations)
     return PiqpRoute(program) if name == "piqp" else QpsolversRoute(program, name)

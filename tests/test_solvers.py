@@ -8,18 +8,20 @@ import pytest
 import unifg as fg
 from judge import judge
 from problems import PROBLEMS, Problem, ecg2o, inactive_inequality, short_drive
-from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, InteriorPoint, LevenbergMarquardt
+from unifg.solvers import SQP, AugmentedLagrangian, DogLeg, GaussNewton, InteriorPoint, LevenbergMarquardt
 
 BACKENDS: list[fg.Solver] = [
     GaussNewton(),
     LevenbergMarquardt(),
+    DogLeg(),
     AugmentedLagrangian(),
     SQP(),
     SQP(qp="piqp"),
+    SQP(qp="graph"),
     InteriorPoint(),
     InteriorPoint(hessian="gauss-newton"),
 ]
-IDS = ["gn", "lm", "alm", "sqp", "sqp-piqp", "ipm", "ipm-gn"]
+IDS = ["gn", "lm", "dogleg", "alm", "sqp", "sqp-piqp", "sqp-graph", "ipm", "ipm-gn"]
 
 
 def takes(solver: fg.Solver, problem: Problem) -> bool:
@@ -176,6 +178,11 @@ def test_time_limit_and_callback_end_a_solve() -> None:
 
 def test_full_steps_and_no_fallback_are_options() -> None:
     graph, guess = ecg2o((0.5, -0.5))
+    solution = SQP(full_steps=True).solve(graph, guess)
+    assert solution.converged, solution.report()
+    # Equalities only: every subproblem is one linear system, which the engine solves.
+    assert {row.details["qp"] for row in solution.history[1:]} == {"graph"}
+    graph, guess = inactive_inequality()
     solution = SQP(full_steps=True, fallback=None, qp_iterations=4000).solve(graph, guess)
     assert solution.converged, solution.report()
     assert {row.details["qp"] for row in solution.history[1:]} == {"osqp"}

@@ -24,6 +24,7 @@ from unifg.rows import Rows
 from unifg.sparse import Symmetric
 from unifg.table import ENTRY, ROW, WIDTH, Table, Terms
 from unifg.terms import Constraint, Cost, ScalarCost
+from unifg.touched import require_touched, term_columns
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 from unifg.variables import Data, Family
 
@@ -63,7 +64,7 @@ class Program:
         self.cost_terms = [c for c in self.terms if isinstance(c.term, Cost)]
         self.scalar_terms = [c for c in self.terms if isinstance(c.term, ScalarCost)]
         self.constraint_terms = [c for c in self.terms if isinstance(c.term, Constraint)]
-        self._require_touched()
+        require_touched(self.columns, self.terms)
         variable, starts = self.columns.nodes()
         self.blocks = variable[self.columns.free]
         self.normal = self._pattern(self.cost_terms + self.scalar_terms + self.constraint_terms, variable, starts)
@@ -98,6 +99,11 @@ class Program:
     def hessian(self) -> Symmetric:
         """Pattern of the Gauss-Newton Hessian of the objective alone."""
         return self._objective()[0]
+
+    @property
+    def objective_places(self) -> IntArray:
+        """Where the entries of ``hessian`` stand in ``normal``."""
+        return self._objective()[1]
 
     # ---------------------------------------------------------------- data and values
 
@@ -289,7 +295,7 @@ class Program:
 
     def hessian_entries(self, lin: Linearization) -> Array:
         """Gauss-Newton Hessian of the objective in the order of ``hessian``."""
-        return lin.hessian[self._objective()[1]]
+        return lin.hessian[self.objective_places]
 
     def normal_entries(self, lin: Linearization, row_weights: Array) -> Array:
         """Gauss-Newton Hessian plus A' diag(row_weights) A, in the order of ``normal``."""
@@ -332,16 +338,11 @@ class Program:
             chosen[slices[name]] = True
         return chosen
 
-    def _term_columns(self, term: CompiledTerm) -> list[IntArray]:
-        """(n, d_k) full columns of each variable argument."""
-        parts = [self.columns.of(selection) for selection in term.term.selections]
-        return [np.broadcast_to(part, (term.count, part.shape[1])) for part in parts]
-
     def _pattern(self, terms: Sequence[CompiledTerm], variable: IntArray, starts: IntArray) -> Symmetric:
         """Every two variables of a factor share a block."""
         first, second = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
         for term in terms:
-            members = [variable[columns[:, 0]] for columns in self._term_columns(term)]
+            members = [variable[columns[:, 0]] for columns in term_columns(self.columns, term)]
             for k, a in enumerate(members):
                 for b in members[:k]:
                     first.append(np.minimum(a, b))
@@ -364,27 +365,12 @@ class Program:
         """Where gradient and Hessian blocks of scalar costs go."""
         self._scalars: dict[str, tuple[IntArray, IntArray, IntArray, IntArray, IntArray]] = {}
         for term in self.scalar_terms:
-            full = np.concatenate(self._term_columns(term), axis=1)
+            full = np.concatenate(term_columns(self.columns, term), axis=1)
             mapped = self.columns.unknown[full]
             keep = (mapped[:, :, None] <= mapped[:, None, :]) & (mapped[:, :, None] >= 0)
             factor, a, b = np.nonzero(keep)
             place = self.normal.positions(mapped[factor, a], mapped[factor, b])
             self._scalars[term.name] = full, factor, a, b, place
-
-    def _require_touched(self) -> None:
-        touched = np.zeros(self.columns.width, dtype=bool)
-        for term in self.terms:
-            for columns in self._term_columns(term):
-                touched[columns] = True
-        idle = self.columns.free[~touched[self.columns.free]]
-        if len(idle):
-            family, index = self.columns.name(int(idle[0]))
-            raise GraphError(
-                f"{family}[{index}] is in no cost or constraint and is not fixed: {len(idle)} tangent coordinates "
-                "are free to be anything; add a term, fix it, or make the family shorter",
-                family=family,
-                index=index,
-            )
 
 
 def _slices(terms: Sequence[CompiledTerm]) -> list[slice]:

@@ -1,0 +1,213 @@
+"""Quadratic subproblems by elimination on the graph: one linear system, or an interior point over such systems.
+
+Without inequalities the subproblem is the KKT system itself. With them, Mehrotra's predictor-corrector method (SIAM J.
+Optim. 2 (1992)) solves two systems with one factorisation per iteration; every finite limit is a side v >= 0 with slack
+s and multiplier y.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from unifg.elimination.fronts import factor
+from unifg.elimination.substitution import solve
+from unifg.elimination.threads import one_thread
+from unifg.jit import compiled
+from unifg.passes import add_constraints, times, transposed_times
+from unifg.program import Program
+from unifg.solvers.kkt_system import KktArrays, KktSystem, fill
+from unifg.solvers.qp import QP, QPAnswer, qp_error
+from unifg.table import Terms
+from unifg.typing import Array, BoolArray, IntArray
+
+ITERATIONS = 60
+BOUNDARY = 0.995  # fraction of the way to the boundary
+SHIFT = 1e-10  # keeps the KKT matrix quasi-definite, relative to nothing: rows are in the problem's own units
+HOPELESS = 1e9  # multipliers beyond this mean that the rows contradict each other
+
+
+class GraphRoute:
+    """The engine as a QP solver.
+
+    Attributes:
+        name: "graph".
+    """
+
+    name = "graph"
+
+    def __init__(self, program: Program) -> None:
+        """Analyse the KKT matrix."""
+        self.program = program
+        self._system = KktSystem(program, program.equality)
+
+    def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
+        """Solve to ``accuracy`` and measure."""
+        program = self.program
+        equality = qp.lower == qp.upper
+        if not np.array_equal(equality, self._system.equality):
+            self._system = KktSystem(program, equality)
+        below = np.flatnonzero(np.isfinite(qp.lower) & ~equality)
+        above = np.flatnonzero(np.isfinite(qp.upper) & ~equality)
+        step, dual = np.zeros(program.size), np.where(equality, multipliers, 0.0)
+        hessian = np.zeros(program.normal.nnz)
+        hessian[program.objective_places] = qp.hessian
+        with one_thread():
+            iterations = _minimize(
+                program.arrays,
+                self._system.arrays,
+                program.columns.free,
+                hessian,
+                qp.gradient,
+                qp.jacobian,
+                np.concatenate([below, above]),
+                np.repeat([1.0, -1.0], [len(below), len(above)]),
+                np.concatenate([qp.lower[below], qp.upper[above]]),
+                qp.lower,
+                equality,
+                max(accuracy, 1e-12),
+                step,
+                dual,
+            )
+        infeasible = bool(np.abs(dual).max(initial=0.0) > HOPELESS) or iterations < 0
+        return QPAnswer(step, dual, self.name, abs(iterations), qp_error(qp, step, dual), infeasible)
+
+
+@compiled
+def _minimize(
+    terms: Terms,
+    kkt: KktArrays,
+    free: IntArray,
+    hessian: Array,
+    gradient: Array,
+    jacobian: Array,
+    side_row: IntArray,
+    side_sign: Array,
+    side_limit: Array,
+    lower: Array,
+    equality: BoolArray,
+    accuracy: float,
+    step: Array,
+    dual: Array,
+) -> int:
+    """Mehrotra's method from step zero; returns the iterations, negative when a system was singular."""
+    n, equalities, sides, count = kkt.size[0], kkt.size[1], len(side_row), len(lower)
+    linear, row_terms, weights, move = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count)
+    full, data = np.zeros(len(terms.unknown)), np.zeros(len(kkt.plan.slots))
+    right, found, shift = np.zeros(n + equalities), np.zeros(n + equalities), np.zeros(n + equalities)
+    shift[:n], shift[n:] = SHIFT, -SHIFT
+    matrix = np.empty_like(hessian)
+    s, y, ds, dy, target = np.ones(sides), np.ones(sides), np.zeros(sides), np.zeros(sides), np.zeros(sides)
+    for k in range(sides):
+        s[k] = max(1.0, -side_sign[k] * side_limit[k])
+    for iteration in range(ITERATIONS):
+        times(terms, False, jacobian, step, linear)
+        row_terms[:] = 0.0
+        for row in range(count):
+            if equality[row]:
+                row_terms[row] = dual[row]
+        gap = worst = 0.0
+        for k in range(sides):
+            row_terms[side_row[k]] -= side_sign[k] * y[k]
+            value = side_sign[k] * (linear[side_row[k]] - side_limit[k])
+            worst = max(worst, abs(value - s[k]), s[k] * y[k])
+            gap += s[k] * y[k]
+        mu = gap / max(1, sides)
+        _residual(terms, kkt, free, hessian, gradient, jacobian, lower, linear, row_terms, step, full, right)
+        for k in range(n + equalities):
+            worst = max(worst, abs(right[k]))
+        if worst <= accuracy and iteration > 0:
+            break
+        if sides == 0 and iteration > 3:
+            break
+        weights[:] = 0.0
+        for k in range(sides):
+            weights[side_row[k]] += y[k] / s[k]
+        matrix[:] = hessian
+        add_constraints(terms, jacobian, weights, matrix)
+        fill(kkt, matrix, jacobian, data)
+        if not factor(kkt.plan, data, shift):
+            return -iteration - 1
+        # Predictor: aim at complementarity zero; corrector: at what the predictor suggests is within reach.
+        centre = 0.0
+        for corrector in range(1 if sides == 0 else 2):
+            row_terms[:] = 0.0
+            for k in range(sides):
+                target[k] = s[k] * y[k] - centre + (ds[k] * dy[k] if corrector == 1 else 0.0)
+                value = side_sign[k] * (linear[side_row[k]] - side_limit[k])
+                row_terms[side_row[k]] += side_sign[k] * (target[k] - y[k] * (s[k] - value)) / s[k]
+            full[:] = 0.0
+            transposed_times(terms, False, jacobian, row_terms, full)
+            for k in range(n):
+                found[k] = right[k] - full[free[k]]
+            for k in range(equalities):
+                found[n + k] = right[n + k]
+            solve(kkt.plan, found.copy(), found)
+            times(terms, False, jacobian, found, move)
+            primal = longest = 1.0
+            for k in range(sides):
+                value = side_sign[k] * (linear[side_row[k]] - side_limit[k])
+                ds[k] = value - s[k] + side_sign[k] * move[side_row[k]]
+                dy[k] = -(target[k] + y[k] * ds[k]) / s[k]
+                if ds[k] < 0.0:
+                    primal = min(primal, -s[k] / ds[k])
+                if dy[k] < 0.0:
+                    longest = min(longest, -y[k] / dy[k])
+            if corrector == 0 and sides > 0:
+                reached = 0.0
+                for k in range(sides):
+                    reached += (s[k] + primal * ds[k]) * (y[k] + longest * dy[k])
+                centre = mu * (reached / max(gap, 1e-300)) ** 3
+        length = 1.0 if sides == 0 else min(1.0, BOUNDARY * min(primal, longest))
+        largest = 0.0
+        for k in range(n):
+            step[k] += length * found[k]
+            largest = max(largest, abs(found[k]))
+        if not math.isfinite(largest):
+            return -iteration - 1
+        for k in range(equalities):
+            dual[kkt.rows[k]] += length * found[n + k]
+        for k in range(sides):
+            s[k] += length * ds[k]
+            y[k] += length * dy[k]
+    for k in range(sides):
+        dual[side_row[k]] -= side_sign[k] * y[k]
+    return iteration
+
+
+@compiled
+def _residual(
+    terms: Terms,
+    kkt: KktArrays,
+    free: IntArray,
+    hessian: Array,
+    gradient: Array,
+    jacobian: Array,
+    lower: Array,
+    linear: Array,
+    row_terms: Array,
+    step: Array,
+    full: Array,
+    right: Array,
+) -> None:
+    """Minus the gradient of the Lagrangian, then minus the equality rows."""
+    n = kkt.size[0]
+    full[:] = 0.0
+    transposed_times(terms, False, jacobian, row_terms, full)
+    _symmetric(kkt, hessian, step, right)
+    for k in range(n):
+        right[k] = -(right[k] + gradient[k] + full[free[k]])
+    for k in range(len(kkt.rows)):
+        right[n + k] = lower[kkt.rows[k]] - linear[kkt.rows[k]]
+
+
+@compiled
+def _symmetric(kkt: KktArrays, hessian: Array, step: Array, out: Array) -> None:
+    """H d into the first entries of ``out``."""
+    out[:] = 0.0
+    for k in range(len(hessian)):
+        row, column = kkt.normal_row[k], kkt.normal_column[k]
+        out[row] += hessian[k] * step[column]
+        if row != column:
+            out[column] += hessian[k] * step[row]
