@@ -13,7 +13,6 @@ import numpy as np
 
 from unifg.elimination.fronts import factor
 from unifg.elimination.substitution import solve
-from unifg.elimination.threads import one_thread
 from unifg.jit import compiled
 from unifg.passes import add_constraints, times, transposed_times
 from unifg.program import Program
@@ -53,23 +52,22 @@ class GraphRoute:
         step, dual = np.zeros(program.size), np.where(equality, multipliers, 0.0)
         hessian = np.zeros(program.normal.nnz)
         hessian[program.objective_places] = qp.hessian
-        with one_thread():
-            iterations = _minimize(
-                program.arrays,
-                self._system.arrays,
-                program.columns.free,
-                hessian,
-                qp.gradient,
-                qp.jacobian,
-                np.concatenate([below, above]),
-                np.repeat([1.0, -1.0], [len(below), len(above)]),
-                np.concatenate([qp.lower[below], qp.upper[above]]),
-                qp.lower,
-                equality,
-                max(accuracy, 1e-12),
-                step,
-                dual,
-            )
+        iterations = _minimize(
+            program.arrays,
+            self._system.arrays,
+            program.columns.free,
+            hessian,
+            qp.gradient,
+            qp.jacobian,
+            np.concatenate([below, above]),
+            np.repeat([1.0, -1.0], [len(below), len(above)]),
+            np.concatenate([qp.lower[below], qp.upper[above]]),
+            qp.lower,
+            equality,
+            max(accuracy, 1e-12),
+            step,
+            dual,
+        )
         infeasible = bool(np.abs(dual).max(initial=0.0) > HOPELESS) or iterations < 0
         return QPAnswer(step, dual, self.name, abs(iterations), qp_error(qp, step, dual), infeasible)
 

@@ -171,6 +171,8 @@ def test_covariance_of_a_chain_and_of_a_constrained_pose() -> None:
     graph.minimize(fg.difference, x[:-1], x[1:], sigma=0.2)
     solution = GaussNewton().solve(graph, {x: np.ones((3, 1))})
     np.testing.assert_allclose(np.diag(solution.covariance(x)), [0.01, 0.05, 0.09], rtol=1e-9)
+    np.testing.assert_allclose(solution.marginals(x).ravel(), [0.01, 0.05, 0.09], rtol=1e-9)
+    np.testing.assert_array_equal(solution.covariance(x[2], x[0]), solution.covariance(x)[np.ix_([2, 0], [2, 0])])
     graph = fg.Graph()
     p = graph.variables("p", fg.Rn(2), 1)
     graph.minimize(fg.prior, p, [0.0, 0.0], sigma=[1.0, 2.0])

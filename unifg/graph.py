@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -18,6 +19,7 @@ from unifg.variables import Data, Family, Selection, Variable, as_selection, is_
 
 if TYPE_CHECKING:
     from unifg.check import Report
+    from unifg.elimination.tree import EliminationTree
     from unifg.program import Program
 
 AnyResidual: TypeAlias = Function | Residual | ManifoldResidual
@@ -203,6 +205,14 @@ class Graph:
         from unifg.check import check_graph
 
         return check_graph(self, guess, data)
+
+    def elimination_tree(self) -> EliminationTree:
+        """How the engine eliminates the variables of this graph: its Bayes tree, to print and to look at."""
+        program = self.compile()
+        columns, blocks = program.columns, program.blocks
+        first = [int(columns.free[k]) for k in np.unique(blocks, return_index=True)[1]]
+        names = tuple("{}[{}]".format(*columns.name(column)) for column in first)
+        return replace(program.normal_solver().tree, names=names)
 
     def compile(self) -> Program:
         """Offsets, ordering and sparsity; computed once and kept until the graph changes.

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
-from unifg.covariance import covariance
+from unifg.covariance import Covariances
 from unifg.errors import GraphError
 from unifg.history import HEADER, Iteration, line
 from unifg.kkt import Optimality
@@ -146,17 +147,29 @@ class Solution:
                 multipliers[term.name] = multipliers[term.name][_shifted_rows(first.indices, by)]
         return Guess(values, multipliers)
 
-    def covariance(self, variable: Variable) -> Array:
-        """Joint covariance of the selected unknowns, in their tangent space.
+    def covariance(self, *variables: Variable) -> Array:
+        """(k, k) joint covariance of the selected unknowns, in their tangent spaces, in the order given.
 
         Raises:
             GraphError: when a selected variable is fixed, or the system is singular.
         """
-        selection = as_selection(variable)
-        self._require(selection)
-        program = self._program
-        active = self._equality | self._held()
-        return covariance(program, self._lin, program.columns.of(selection).ravel(), active)
+        for variable in variables:
+            self._require(as_selection(variable))
+        columns = [self._program.columns.of(as_selection(variable)).ravel() for variable in variables]
+        return self._covariances.joint(np.concatenate(columns))
+
+    def marginals(self, variable: Variable) -> Array:
+        """(n, d, d) covariance of each selected unknown by itself, all of them at about the cost of one solve.
+
+        Raises:
+            GraphError: when a selected variable is fixed, or the system is singular.
+        """
+        self._require(as_selection(variable))
+        return self._covariances.blocks(self._program.columns.of(as_selection(variable)))
+
+    @cached_property
+    def _covariances(self) -> Covariances:
+        return Covariances(self._program, self._lin, self._equality | self._held())
 
     def information(self, terms: Sequence[str], *variables: Variable) -> Array:
         """Information matrix (d, d) of the named costs over the selected variables; see :mod:`unifg.marginal`."""

@@ -26,9 +26,11 @@ sys.path[:0] = [str(CHECKOUT), str(CHECKOUT / "tests")]
 from fences import fences  # noqa: E402
 from unifg.lie import SE2  # noqa: E402
 from unifg.models.lidar import in_world  # noqa: E402
+from unifg.pose_graphs import manhattan  # noqa: E402
 from unifg.scenarios.episode import EpisodeLog  # noqa: E402
 from unifg.scenarios.navigation import NavigationSettings, run_navigation  # noqa: E402
 from unifg.scenarios.palette import css  # noqa: E402
+from unifg.solvers import GaussNewton  # noqa: E402
 from unifg.typing import Array  # noqa: E402
 
 Point = tuple[float, float]
@@ -39,6 +41,7 @@ def main() -> None:
     """Draw all pictures, or those named on the command line."""
     plt.rcParams.update({"font.size": 10, "font.family": "DejaVu Sans", "savefig.dpi": 130})
     pictures = {"worked-problem": worked_problem, "graphs": graphs, "joint": joint, "overview": overview}
+    pictures["bayes-tree"] = bayes_tree
     for name in sys.argv[1:] or pictures:
         pictures[name]().savefig(HERE / f"{name}.png", bbox_inches="tight", facecolor="white")
 
@@ -318,6 +321,68 @@ def arrow(ax: Axes, pose: Array, colour: str, length: float) -> None:
     """A stroke along the heading."""
     tip = SE2.compose(pose, np.array([length, 0.0, 0.0]))
     ax.plot([pose[0], tip[0]], [pose[1], tip[1]], color=colour, lw=2.2, zorder=7, solid_capstyle="round")
+
+
+# ---------------------------------------------------------------- elimination
+
+
+def bayes_tree() -> Any:
+    """A small pose graph and the tree in which the engine eliminates it, cliques coloured alike on both sides."""
+    city = manhattan(60, seed=4, block=4)
+    pose_graph = city.pose_graph
+    graph, x, guess = pose_graph.graph()
+    poses = GaussNewton().solve(graph, guess)[x]
+    tree = graph.elimination_tree()
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11.0, 4.6), width_ratios=[1.0, 1.35])
+    colours = plt.get_cmap("viridis")(np.linspace(0.05, 0.95, len(tree)))
+    for i, j in zip(pose_graph.edges.first, pose_graph.edges.second, strict=True):
+        left.plot(poses[[i, j], 0], poses[[i, j], 1], color="#9a9a9a", lw=1.2, zorder=1)
+    left.plot(poses[0, 0], poses[0, 1], "s", color="#222222", ms=8, zorder=3)
+    left.annotate("fixed", poses[0, :2], xytext=(6, 6), textcoords="offset points")
+    place = _places(tree.parent)
+    for s in range(len(tree)):
+        members = [int(tree.names[k].split("[")[1][:-1]) for k in tree.nodes(s)]
+        left.plot(*poses[members, :2].T, "o", color=colours[s], ms=7, mec="black", mew=0.4, zorder=2)
+        at, below = place[s], int(tree.parent[s])
+        if below >= 0:
+            right.plot([at[0], place[below][0]], [at[1], place[below][1]], color="#9a9a9a", lw=1.2, zorder=1)
+        label = ",".join(map(str, sorted(members)))
+        right.annotate(
+            label, at, ha="center", va="center", fontsize=7.5, zorder=2, color="white" if s < 0.6 * len(tree) else "black",
+            bbox={"boxstyle": "round,pad=0.25", "fc": colours[s], "ec": "black", "lw": 0.5},
+        )  # fmt: skip
+    left.set_title("Pose graph: loop closures tie the streets together")
+    left.set_aspect("equal")
+    left.set_xlabel("x [m]")
+    left.set_ylabel("y [m]")
+    right.set_title("Its Bayes tree: leaves are eliminated first, the root last")
+    right.axis("off")
+    right.margins(0.06)
+    figure.tight_layout()
+    return figure
+
+
+def _places(parent: Array) -> dict[int, Point]:
+    """Where to draw the nodes of a tree: leaves side by side, parents above the middle of their children."""
+    children: dict[int, list[int]] = {s: [] for s in range(-1, len(parent))}
+    for s in range(len(parent)):
+        children[int(parent[s])].append(s)
+    place: dict[int, Point] = {}
+    column = [0.0]
+
+    def put(s: int, depth: int) -> None:
+        for child in children[s]:
+            put(child, depth + 1)
+        if children[s]:
+            across = float(np.mean([place[child][0] for child in children[s]]))
+        else:
+            across = column[0]
+            column[0] += 1.0
+        place[s] = across, -float(depth)
+
+    for root in children[-1]:
+        put(root, 0)
+    return place
 
 
 if __name__ == "__main__":

@@ -8,9 +8,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.elimination.vectors import blend, get, inverse_root, lane, load, minus, pack, plus, splat, store, times
+from unifg.elimination.vectors import (
+    Address,
+    blend,
+    get,
+    inverse_root,
+    lane,
+    load,
+    minus,
+    pack,
+    plus,
+    splat,
+    store,
+    times,
+)
 from unifg.jit import compiled
-from unifg.typing import Array
 
 VANISHED = 8.9e-16  # pivots below this part of their original diagonal are rounding errors
 STRIP, DEPTH = 64, 192  # columns and products handled together: what stays in the second-level cache
@@ -18,7 +30,7 @@ STRIP, DEPTH = 64, 192  # columns and products handled together: what stays in t
 
 @compiled
 def subtract_products(
-    numbers: Array, target: int, stride: int, height: int, length: int,
+    numbers: Address, target: int, stride: int, height: int, length: int,
     left: int, right: int, step: int, depth: int, sign: float,
 ) -> None:  # fmt: skip
     """target[i, j] -= sign * sum_k left[k, i] right[k, j] over i < height <= 4, j < length, k < depth.
@@ -26,7 +38,7 @@ def subtract_products(
     Up to three numbers beyond the last column are written as they were.
 
     Args:
-        numbers: the array all three matrices live in.
+        numbers: address of the array all three matrices live in.
         target: offset of the target.
         stride: length of its rows.
         height: its rows.
@@ -78,13 +90,13 @@ def subtract_products(
 
 @compiled
 def subtract_signed(
-    numbers: Array, target: int, stride: int, size: int, left: int, step: int, depth: int,
-    signs: Array, first: int, rows: int,
+    numbers: Address, target: int, stride: int, size: int, left: int, step: int, depth: int,
+    signs: Address, first: int, rows: int,
 ) -> None:  # fmt: skip
     """Upper triangle of target -= left' S left, in blocks of four rows.
 
     Args:
-        numbers: the array both matrices live in.
+        numbers: address of the array both matrices live in.
         target: offset of the target.
         stride: length of its rows.
         size: its columns.
@@ -114,13 +126,13 @@ def subtract_signed(
 
 @compiled
 def eliminate(
-    numbers: Array, panel: int, stride: int, begin: int, end: int, columns: int,
-    scale: Array, pivots: Array, signs: Array, first: int,
+    numbers: Address, panel: int, stride: int, begin: int, end: int, columns: int,
+    scale: Address, pivots: Address, signs: Address, first: int,
 ) -> int:  # fmt: skip
     """Eliminate pivots begin..end of a panel within its columns begin..columns.
 
     Args:
-        numbers: the array of the panel.
+        numbers: address of the array of the panel.
         panel: its offset.
         stride: length of its rows.
         begin: first pivot, from 0.

@@ -31,7 +31,7 @@ from unifg.elimination.plan import (
     ZERO,
     Plan,
 )
-from unifg.elimination.vectors import blend, get, load, plus, put, splat, store
+from unifg.elimination.vectors import address, blend, get, load, plus, put, splat, store
 from unifg.jit import compiled
 from unifg.typing import Array
 
@@ -47,8 +47,11 @@ def factor(plan: Plan, data: Array, added: Array) -> bool:
         data: (nnz,) upper triangle in the order of the pattern.
         added: (n,) added to the diagonal, or empty.
     """
-    fronts, numbers, state, pivots, signs = plan.fronts, plan.numbers, plan.state, plan.pivots, plan.signs
-    scale, slots, relative, runs, order = plan.work, plan.slots, plan.relative, plan.runs, plan.order
+    fronts, state = plan.fronts, plan.state
+    numbers, pivots, signs, scale = (
+        address(plan.numbers), address(plan.pivots), address(plan.signs), address(plan.work),
+    )  # fmt: skip
+    slots, relative, runs, order = plan.slots, plan.relative, plan.runs, plan.order
     state[POSITIVE], state[NEGATIVE], state[ZERO], state[FAILED] = 0, 0, 0, -1
     state[SURPRISES], state[SURPRISE] = 0, -1
     negative = 0
@@ -97,8 +100,8 @@ def factor(plan: Plan, data: Array, added: Array) -> bool:
             failed = eliminate(numbers, panel, stride, begin, end, width + rows, scale, pivots, signs, first)
             if failed < 0 and end < width:
                 subtract_signed(
-                    numbers, panel + end * (stride + 1), stride, width + rows - end, panel + begin * stride + end, stride,
-                    end - begin, signs, first + begin, width - end,
+                    numbers, panel + end * (stride + 1), stride, width + rows - end, panel + begin * stride + end,
+                    stride, end - begin, signs, first + begin, width - end,
                 )  # fmt: skip
             begin = end
         if failed < 0:

@@ -10,23 +10,26 @@ from __future__ import annotations
 
 from unifg.elimination.dense import subtract_products, subtract_signed
 from unifg.elimination.plan import FIRST, FRONTS, INDEX, PANEL, PIVOTS, ROWS, STRIDE, Plan
-from unifg.elimination.vectors import get, load, minus, put, splat, store, times
+from unifg.elimination.vectors import address, get, load, minus, put, splat, store, times
 from unifg.jit import compiled
 from unifg.typing import Array, BoolArray, IntArray
 
 
 @compiled
-def invert(plan: Plan, owner: IntArray, wanted: BoolArray, inverse: Array, free: int) -> None:
+def invert(plan: Plan, owner: IntArray, wanted: BoolArray, panels: Array, free: int) -> None:
     """Fill in the entries of the inverse that belong to the panels of some fronts.
 
     Args:
         plan: with its factorisation.
         owner: (n,) front that eliminates each scalar, in the order of elimination.
         wanted: fronts to fill in; ancestors of a wanted front are wanted or were filled in before.
-        inverse: laid out as the panels of ``plan.numbers``, then room for six matrices of the largest front.
+        panels: laid out as the panels of ``plan.numbers``, then room for six matrices of the largest front.
         free: where that room begins.
     """
-    fronts, numbers, rows, pivots, signs = plan.fronts, plan.numbers, plan.rows, plan.pivots, plan.signs
+    fronts, rows = plan.fronts, plan.rows
+    numbers, pivots, signs, inverse = (
+        address(plan.numbers), address(plan.pivots), address(plan.signs), address(panels),
+    )  # fmt: skip
     zero = splat(0.0)
     for s in range(plan.shape[FRONTS] - 1, -1, -1):
         if not wanted[s]:

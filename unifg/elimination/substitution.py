@@ -6,22 +6,22 @@ import numpy as np
 
 from unifg.elimination.fronts import factor
 from unifg.elimination.plan import ADJACENT, FIRST, FRONTS, INDEX, PANEL, PIVOTS, ROWS, SCALARS, STRIDE, Plan
-from unifg.elimination.vectors import blend, get, load, minus, plus_products, put, splat, store, total
+from unifg.elimination.vectors import Address, address, blend, get, load, minus, plus_products, put, splat, store, total
 from unifg.jit import compiled
 from unifg.typing import Array, IntArray
 
 
 @compiled
 def forward(
-    x: Array,
+    x: Address,
     local: int,
-    numbers: Array,
+    numbers: Address,
     panel: int,
     stride: int,
     width: int,
     size: int,
-    pivots: Array,
-    signs: Array,
+    pivots: Address,
+    signs: Address,
     first: int,
 ) -> None:
     """X <- S P^-T x for the pivots of a panel, and what they take from the rest of its ``size`` scalars."""
@@ -54,7 +54,15 @@ def forward(
 
 @compiled
 def backward(
-    x: Array, local: int, numbers: Array, panel: int, stride: int, width: int, size: int, pivots: Array, first: int
+    x: Address,
+    local: int,
+    numbers: Address,
+    panel: int,
+    stride: int,
+    width: int,
+    size: int,
+    pivots: Address,
+    first: int,
 ) -> None:
     """X <- P^-1 x for the pivots of a panel, given the rest of its ``size`` scalars."""
     zero = splat(0.0)
@@ -88,8 +96,9 @@ def backward(
 @compiled
 def solve(plan: Plan, right: Array, out: Array) -> None:
     """Solve for one right-hand side (n,) with the last factorisation; ``out`` may be ``right``."""
-    fronts, rows, numbers, pivots, signs = plan.fronts, plan.rows, plan.numbers, plan.pivots, plan.signs
-    scalars, count, x, order = plan.shape[SCALARS], plan.shape[FRONTS], plan.work, plan.order
+    fronts, rows, order = plan.fronts, plan.rows, plan.order
+    numbers, pivots, signs, x = address(plan.numbers), address(plan.pivots), address(plan.signs), address(plan.work)
+    scalars, count = plan.shape[SCALARS], plan.shape[FRONTS]
     for i in range(scalars):
         put(x, i, get(right, get(order, i)))
     for sweep in range(2):

@@ -24,6 +24,7 @@ class EliminationTree:
         bounds: (S + 1,) where the nodes of each supernode begin in ``order``.
         separators: (S,) nodes of each separator.
         kind: how the order was found.
+        names: of the nodes; numbers when empty.
     """
 
     parent: IntArray
@@ -33,6 +34,7 @@ class EliminationTree:
     bounds: IntArray
     separators: tuple[IntArray, ...]
     kind: str
+    names: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Number of supernodes."""
@@ -66,13 +68,15 @@ class EliminationTree:
                 depth[s] = depth[self.parent[s]] + 1
         return depth
 
-    def text(self, name: Callable[[int], str] = str, limit: int = 60) -> str:
+    def text(self, name: Callable[[int], str] | None = None, limit: int = 60) -> str:
         """Indented outline, roots first: the nodes of each supernode, then ``|`` and its separator.
 
         Args:
-            name: what to call a node.
+            name: what to call a node; by default ``names``, or its number.
             limit: supernodes shown at most.
         """
+        if name is None:
+            name = self.names.__getitem__ if self.names else str
         head = (
             f"{len(self)} supernodes of {len(self.order)} nodes, height {self.height}, {self.fill} entries, "
             f"{self.flops:.3g} flops, {self.kind}"

@@ -2,7 +2,8 @@
 
 Explicit vectors give small fronts, where loops are too short to vectorise by themselves, the speed of a tuned
 kernel, and compile in a fraction of the time. Offsets are neither wrapped nor checked: callers guarantee
-``0 <= offset`` and ``offset + 4 <= len(array)``.
+``0 <= offset`` and ``offset + 4 <= len(array)``. Where an array is read or written its address will do; kernels take
+addresses from each other, because handing over an array costs two atomic operations on its count of references.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ from typing import Any, TypeAlias, cast
 
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
 
 from unifg.typing import Array
 
 WIDTH = 4
 Vector: TypeAlias = Any  # a value of `kind`, inside compiled code only
+Address: TypeAlias = int  # of doubles that an array keeps alive
 LANES = ir.VectorType(ir.DoubleType(), WIDTH)
 INDEX = ir.IntType(64)
 FLAGS = ("contract", "reassoc", "nsz")
@@ -44,8 +47,21 @@ class VectorModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def _address(context: Any, builder: Any, array_type: Any, array: Any, offset: Any) -> Any:
-    """Pointer to an element of a contiguous array."""
+    """Pointer to an element of a contiguous array, or of doubles at an address."""
+    if isinstance(array_type, types.Integer):
+        return builder.gep(builder.inttoptr(array, ir.DoubleType().as_pointer()), [offset])
     return builder.gep(context.make_array(array_type)(context, builder, array).data, [offset])
+
+
+def _address_of(typing_context: Any, array: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return builder.ptrtoint(context.make_array(signature.args[0])(context, builder, values[0]).data, INDEX)
+
+    return types.int64(array), generate
+
+
+def _element(array: Any) -> Any:
+    return types.float64 if isinstance(array, types.Integer) else array.dtype
 
 
 def _spread(builder: Any, scalar: Any) -> Any:
@@ -77,7 +93,7 @@ def _get(typing_context: Any, array: Any, offset: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         return builder.load(_address(context, builder, signature.args[0], values[0], values[1]))
 
-    return array.dtype(array, types.int64), generate
+    return _element(array)(array, types.int64), generate
 
 
 def _put(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
@@ -85,7 +101,7 @@ def _put(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
         builder.store(values[2], _address(context, builder, signature.args[0], values[0], values[1]))
         return context.get_dummy_value()
 
-    return types.void(array, types.int64, array.dtype), generate
+    return types.void(array, types.int64, _element(array)), generate
 
 
 def _splat(typing_context: Any, scalar: Any) -> Any:
@@ -156,8 +172,9 @@ def _lane(typing_context: Any, vector: Any, number: Any) -> Any:
 
 def _inverse_root(typing_context: Any, vector: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        root = builder.module.declare_intrinsic("llvm.sqrt", [LANES], ir.FunctionType(LANES, [LANES]))
-        size = builder.module.declare_intrinsic("llvm.fabs", [LANES], ir.FunctionType(LANES, [LANES]))
+        unary = ir.FunctionType(LANES, [LANES])
+        root = cgutils.get_or_insert_function(builder.module, unary, "llvm.sqrt.v4f64")
+        size = cgutils.get_or_insert_function(builder.module, unary, "llvm.fabs.v4f64")
         below = builder.call(root, [builder.call(size, [values[0]])])
         return builder.fdiv(ir.Constant(LANES, [1.0] * WIDTH), below)
 
@@ -172,8 +189,9 @@ def _total(typing_context: Any, vector: Any) -> Any:
     return types.float64(kind), generate
 
 
-load = cast(Callable[[Array, int], Vector], intrinsic(_load))  # array[offset : offset + 4]
-store = cast(Callable[[Array, int, Vector], None], intrinsic(_store))  # array[offset : offset + 4] = vector
+address = cast(Callable[[Array], Address], intrinsic(_address_of))  # of the first element
+load = cast(Callable[[Array | Address, int], Vector], intrinsic(_load))  # array[offset : offset + 4]
+store = cast(Callable[[Array | Address, int, Vector], None], intrinsic(_store))  # array[offset : offset + 4] = vector
 get = cast(Callable[[Any, int], Any], intrinsic(_get))  # array[offset]
 put = cast(Callable[[Any, int, Any], None], intrinsic(_put))  # array[offset] = value
 splat = cast(Callable[[float], Vector], intrinsic(_splat))
