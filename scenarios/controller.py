@@ -41,6 +41,7 @@ class ControllerSettings:
         control_sigma: (v, omega) deviation from the reference control [m/s, rad/s].
         rate_sigma: (v, omega) change between samples [m/s, rad/s].
         control_weight: factor on all costs of the controller; matters where they meet those of the estimate.
+        pull: most by which they may move a joint estimate from where the past puts it [m, m, rad].
         robot_radius: [m].
         wall_clearance: least distance of the hull to walls [m].
         disc_clearance: least distance of the hull to tracked discs [m].
@@ -48,7 +49,7 @@ class ControllerSettings:
         mover_allowance: most that is added to the clearance from discs that have ever moved [m].
         mover_margin: added to the soft margin around such discs [m].
         approach: share of the gap to such a disc that one step may close.
-        squeeze: how much nearer than at rest a plan may pass where the clearance is violated already [m].
+        squeeze: how much nearer than at rest a plan may pass a standing disc where the clearance is violated [m].
         courtesy: gap at which movers wait for a robot at rest [m].
         yield_distance: gap to a mover that closes in at which the robot rests [m].
         margin: distance of the hull below which the soft costs begin [m].
@@ -68,6 +69,7 @@ class ControllerSettings:
     control_sigma: tuple[float, float] = (1.0, 2.0)
     rate_sigma: tuple[float, float] = (0.5, 1.0)
     control_weight: float = 1.0
+    pull: tuple[float, float, float] = (0.01, 0.01, 0.01)
     robot_radius: float = 0.17
     wall_clearance: float = 0.03
     disc_clearance: float = 0.06
@@ -334,8 +336,10 @@ class Controller:
         allowance = np.minimum(s.mover_speed * s.dt * stages, s.mover_allowance)
         least = s.robot_radius + s.disc_clearance + np.where(movers, allowance, 0.0)
         spare = np.where(movers, np.maximum(at_rest[0] - least, 0.0), 0.0)
-        # A little nearer is allowed, or a robot beside a disc could not even turn its nose past it.
-        kept = np.minimum(at_rest, np.maximum(at_rest - s.squeeze, s.robot_radius + s.squeeze))
+        # A little nearer is allowed, or a robot beside a disc could not even turn its nose past it; not so to a disc
+        # that moves, for one that waits beside a robot at rest goes on as soon as the robot does.
+        squeezed = np.minimum(at_rest, np.maximum(at_rest - s.squeeze, s.robot_radius + s.squeeze))
+        kept = np.where(movers, at_rest, squeezed)
         limits: Array = np.minimum(least + spare * (1.0 - s.approach) ** stages, kept)
         return limits
 
