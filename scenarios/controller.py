@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import unifg as fg
+from unifg.lie import wrap_angle
 from unifg.models import obstacles, unicycle
 from unifg.models.distance_map import DistanceMap
 from unifg.models.smooth_field import SmoothField
@@ -24,6 +25,9 @@ COLD_PATIENCE = 3  # a tick without a warm start may iterate longer
 YIELD_SPEED = 0.05  # [m/s] towards the robot
 LEFT_BEHIND = 0.6  # [m] between the ends of plan and reference
 BRAKING = 6  # ticks to come to rest when no new plan is found
+PURSUIT = 0.3  # [m] ahead of the robot, where a guess aims at the reference
+PURSUIT_TIME = 0.2  # [s] in which it would turn there
+ARRIVED = 0.05  # [m] to the end of the reference, where it only turns
 PATIENCE = 5  # ticks of being left behind before the plan starts over from the reference
 
 
@@ -266,12 +270,26 @@ class Controller:
         return fg.Guess({self._x: np.tile(pose, (n + 1, 1)), self._u: np.zeros((n, 2))})
 
     def _along(self, pose: Array, reference: Array) -> fg.Guess:
-        """Guess the reference itself: it leads around whatever the route leads around."""
-        states = reference.copy()
-        states[0] = pose
-        controls = np.zeros((self.settings.horizon, 2))
-        controls[:, 0] = self._cruising(reference)
-        return fg.Guess({self._x: states, self._u: np.clip(controls, *_box(self.settings))})
+        """Guess how a simple pursuit would follow the reference, which leads around whatever the route leads around.
+
+        It keeps limits and dynamics: it turns first where the reference begins behind the robot's back.
+        """
+        s = self.settings
+        speeds, controls = self._cruising(reference), np.zeros((s.horizon, 2))
+        states = np.tile(pose, (s.horizon + 1, 1))
+        aim = 0
+        for k in range(s.horizon):
+            here = states[k]
+            while aim < s.horizon and np.hypot(*(reference[aim] - here)[:2]) < PURSUIT:
+                aim += 1
+            ahead = reference[aim] - here
+            distance = float(np.hypot(*ahead[:2]))
+            bearing = np.arctan2(ahead[1], ahead[0]) if distance > ARRIVED else reference[aim, 2]
+            turn = float(wrap_angle(bearing - here[2]))
+            speed = min(speeds[k], distance / s.dt) * max(np.cos(turn), 0.0) ** 2 if distance > ARRIVED else 0.0
+            controls[k] = np.clip([speed, turn / PURSUIT_TIME], *_box(s))
+            states[k + 1] = unicycle.step(here[None], controls[k : k + 1], s.dt)[0]
+        return fg.Guess({self._x: states, self._u: controls})
 
     def _cruising(self, reference: Array) -> Array:
         """(N,) speeds between reference poses [m/s]."""

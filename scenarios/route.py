@@ -7,7 +7,7 @@ import numpy as np
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.path import PathFollower
+from unifg.scenarios.path import PathFollower, headed, path_length, resample
 from unifg.scenarios.perception import Tracks
 from unifg.scenarios.planner import SPACING, plan
 from unifg.typing import Array
@@ -22,6 +22,9 @@ WALL_GAP = 0.03  # [m] between hull and wall that a detour must leave: less, the
 WIDE = 0.25  # [m] added to discs when the robot is stuck
 STUCK_TICKS = 25
 STUCK_DISTANCE = 0.1  # [m]
+BESIDE = 0.3  # [m] between hulls: a mover as near as this may be waiting for the robot
+RETREAT = 1.5  # [m] that a robot goes back to let a mover pass; a path out and back must not fool the follower
+CRUMB = 0.1  # [m] between remembered places
 NEAR_GOAL = 0.5  # [m] of path left, where turning on the spot is normal
 STANDING_GAP = 0.01  # [m] a planned path needs around its start
 PATIENCE = 5  # ticks between two repairs
@@ -54,6 +57,7 @@ class Route:
         self.repairs = 0
         self._rest = 0
         self._trail: list[Array] = []
+        self._crumbs: list[Array] = []
         self._follow(plan(occupancy, distance_map, start, goal, robot_radius=robot_radius))
 
     def _follow(self, path: Array) -> None:
@@ -69,12 +73,14 @@ class Route:
     def repair(self, pose: Array, tracks: Tracks) -> bool:
         """Plan a detour if a standing disc blocks the path ahead, or the robot is stuck.
 
-        A robot that is stuck and finds no wide way nearby looks for another one on the whole map; movers are left
-        out of that, for they will be elsewhere.
+        A robot that is stuck and finds no wide way nearby goes back the way it came if a mover is beside it, for each
+        may be waiting for the other. Otherwise it looks for another way on the whole map, movers left out.
 
         Returns:
             Whether the controller should start over from the path: it changed, or the robot is stuck on it.
         """
+        if not self._crumbs or np.hypot(*(pose[:2] - self._crumbs[-1])) > CRUMB:
+            self._crumbs = [*self._crumbs[-round(RETREAT / CRUMB) :], pose[:2].copy()]
         self._rest = max(self._rest - 1, 0)
         self._trail = [*self._trail[-STUCK_TICKS + 1 :], pose[:2].copy()]
         if self._rest:
@@ -84,7 +90,11 @@ class Route:
             self._trail = []
             if len(tracks):  # wide around everything, whatever it does just now: the near side has been tried
                 rejoin = min(self._reached + 2.0 * REJOIN, float(arc[-1]))
-                if not self._detour(pose, rejoin, tracks, WIDE):
+                if self._detour(pose, rejoin, tracks, WIDE):
+                    pass
+                elif self._beside_a_mover(pose, tracks):
+                    self._retreat(pose)
+                else:
                     self._detour(pose, float(arc[-1]), tracks.at(~tracks.mover), ALLOWANCE, everywhere=True)
             return True
         standing = tracks.at(np.hypot(*tracks.velocity.T) < STANDING)
@@ -105,6 +115,22 @@ class Route:
         if len(self._trail) < STUCK_TICKS or end - self._reached < NEAR_GOAL:
             return False
         return bool(np.ptp(np.array(self._trail), axis=0).max() < STUCK_DISTANCE)
+
+    def _beside_a_mover(self, pose: Array, tracks: Tracks) -> bool:
+        gap = np.hypot(*(tracks.centre - pose[:2]).T) - tracks.radius - self._radius
+        return bool((tracks.mover & (gap < BESIDE)).any())
+
+    def _retreat(self, pose: Array) -> None:
+        """Go back the way the robot came, and then to the goal again."""
+        back = np.stack([pose[:2], *self._crumbs[::-1]])
+        if path_length(back) < CRUMB:
+            return
+        way = headed(resample(back, SPACING), float(pose[2]))
+        try:
+            onward = plan(self._occupancy, self._distance_map, back[-1], self.path[-1], robot_radius=self._radius)
+        except ScenarioError:
+            return
+        self._follow(np.concatenate([way[:-1], onward]))
 
     def _detour(self, pose: Array, rejoin: float, tracks: Tracks, allowance: float, everywhere: bool = False) -> bool:
         """Whether a way around discs was found: on the map around the path up to ``rejoin`` [m], or on all of it."""
