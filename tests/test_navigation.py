@@ -13,8 +13,10 @@ import pytest
 import unifg as fg
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map, save_map
+from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.building import building_map
+from unifg.scenarios.controller import Controller, ControllerSettings
 from unifg.scenarios.episode import EpisodeLog
 from unifg.scenarios.geometry import polyline_distance
 from unifg.scenarios.localiser import Localiser
@@ -22,6 +24,7 @@ from unifg.scenarios.metrics import episode_metrics, pose_errors
 from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigation
 from unifg.scenarios.path import path_length
 from unifg.scenarios.perception import Tracks
+from unifg.scenarios.planner import SPACING
 from unifg.scenarios.route import ALLOWANCE, GAP, PATIENCE, STUCK_TICKS, WALL_GAP, Route
 from unifg.scenarios.world import Scan, World
 from unifg.typing import Array
@@ -337,6 +340,40 @@ def test_stuck_robot_looks_for_another_way_on_the_whole_map() -> None:
         highest = route.path[:, 1].max()
         assert highest < 1.9 if moved else highest > 2.3, "what moves will be elsewhere; what stands stays"
         assert np.allclose(route.path[-1], goal)
+
+
+def test_robot_that_waits_beside_a_mover_goes_back_the_way_it_came() -> None:
+    """A mover that waits for a resting robot, which waits for the mover: the robot makes room, then drives on."""
+    route = Route(*hall(0.9), np.array([1.0, 0.45, 0.0]), np.array([11.0, 0.45, 0.0]), RADIUS)
+    nothing = disc(20.0, 1.0, 0.2)
+    for x in np.arange(1.0, 4.01, 0.1):
+        here = np.array([x, 0.45, 0.0])
+        route.repair(here, nothing)
+        route.reference(here, 0.1, 2)
+    waiting = replace(disc(4.47, 0.45, 0.2), mover=np.array([True]))
+    assert any(route.repair(here, waiting) for _ in range(STUCK_TICKS + 2 * PATIENCE))
+    furthest = route.path[: round(2.0 / SPACING), 0].min()
+    assert 2.3 < furthest < 2.7
+    assert np.allclose(route.path[0, :2], here[:2], atol=0.02)
+    assert np.allclose(route.path[-1], [11.0, 0.45, 0.0])
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.6, 3.1])
+def test_a_guess_without_a_warm_start_can_be_driven(heading: float) -> None:
+    """It keeps limits and dynamics, turns before it drives, and ends near the end of the reference."""
+    controller = Controller(hall()[1], "sqp", ControllerSettings())
+    route, start = through_the_hall()
+    pose = np.array([start[0], start[1], heading])
+    reference = route.reference(pose, 0.1, 31)
+    values = controller._along(pose, reference).values
+    states, controls = np.asarray(values[controller._x]), np.asarray(values[controller._u])
+    assert np.abs(controls).max() <= 1.0
+    np.testing.assert_allclose(states, unicycle.rollout(pose, controls, 0.1), atol=1e-9)
+    if heading > 1.5:
+        assert abs(controls[0, 0]) < 0.1
+        assert abs(controls[0, 1]) == 1.0
+    else:
+        assert np.hypot(*(states[-1] - reference[-1])[:2]) < 0.4
 
 
 @pytest.mark.parametrize(
