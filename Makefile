@@ -44,6 +44,7 @@ bench: $(VENV)/ready-bench
 	$(BIN)/python -m benchmarks.reference_problems
 	$(BIN)/python -m benchmarks.obstacle_fields
 	$(BIN)/python -m benchmarks.navigation
+	$(BIN)/python -m benchmarks.navigation --coupling joint
 	$(BIN)/python -m benchmarks.coupling
 	$(BIN)/python -m benchmarks.elimination
 

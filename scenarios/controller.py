@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import unifg as fg
+from unifg.lie import wrap_angle
 from unifg.models import obstacles, unicycle
 from unifg.models.distance_map import DistanceMap
 from unifg.models.smooth_field import SmoothField
@@ -24,6 +25,9 @@ COLD_PATIENCE = 3  # a tick without a warm start may iterate longer
 YIELD_SPEED = 0.05  # [m/s] towards the robot
 LEFT_BEHIND = 0.6  # [m] between the ends of plan and reference
 BRAKING = 6  # ticks to come to rest when no new plan is found
+PURSUIT = 0.3  # [m] ahead of the robot, where a guess aims at the reference
+PURSUIT_TIME = 0.2  # [s] in which it would turn there
+ARRIVED = 0.05  # [m] to the end of the reference, where it only turns
 PATIENCE = 5  # ticks of being left behind before the plan starts over from the reference
 
 
@@ -41,6 +45,7 @@ class ControllerSettings:
         control_sigma: (v, omega) deviation from the reference control [m/s, rad/s].
         rate_sigma: (v, omega) change between samples [m/s, rad/s].
         control_weight: factor on all costs of the controller; matters where they meet those of the estimate.
+        pull: most by which they may move a joint estimate from where the past puts it [m, m, rad].
         robot_radius: [m].
         wall_clearance: least distance of the hull to walls [m].
         disc_clearance: least distance of the hull to tracked discs [m].
@@ -48,7 +53,7 @@ class ControllerSettings:
         mover_allowance: most that is added to the clearance from discs that have ever moved [m].
         mover_margin: added to the soft margin around such discs [m].
         approach: share of the gap to such a disc that one step may close.
-        squeeze: how much nearer than at rest a plan may pass where the clearance is violated already [m].
+        squeeze: how much nearer than at rest a plan may pass a standing disc where the clearance is violated [m].
         courtesy: gap at which movers wait for a robot at rest [m].
         yield_distance: gap to a mover that closes in at which the robot rests [m].
         margin: distance of the hull below which the soft costs begin [m].
@@ -68,6 +73,7 @@ class ControllerSettings:
     control_sigma: tuple[float, float] = (1.0, 2.0)
     rate_sigma: tuple[float, float] = (0.5, 1.0)
     control_weight: float = 1.0
+    pull: tuple[float, float, float] = (0.01, 0.01, 0.01)
     robot_radius: float = 0.17
     wall_clearance: float = 0.03
     disc_clearance: float = 0.06
@@ -264,12 +270,26 @@ class Controller:
         return fg.Guess({self._x: np.tile(pose, (n + 1, 1)), self._u: np.zeros((n, 2))})
 
     def _along(self, pose: Array, reference: Array) -> fg.Guess:
-        """Guess the reference itself: it leads around whatever the route leads around."""
-        states = reference.copy()
-        states[0] = pose
-        controls = np.zeros((self.settings.horizon, 2))
-        controls[:, 0] = self._cruising(reference)
-        return fg.Guess({self._x: states, self._u: np.clip(controls, *_box(self.settings))})
+        """Guess how a simple pursuit would follow the reference, which leads around whatever the route leads around.
+
+        It keeps limits and dynamics: it turns first where the reference begins behind the robot's back.
+        """
+        s = self.settings
+        speeds, controls = self._cruising(reference), np.zeros((s.horizon, 2))
+        states = np.tile(pose, (s.horizon + 1, 1))
+        aim = 0
+        for k in range(s.horizon):
+            here = states[k]
+            while aim < s.horizon and np.hypot(*(reference[aim] - here)[:2]) < PURSUIT:
+                aim += 1
+            ahead = reference[aim] - here
+            distance = float(np.hypot(*ahead[:2]))
+            bearing = np.arctan2(ahead[1], ahead[0]) if distance > ARRIVED else reference[aim, 2]
+            turn = float(wrap_angle(bearing - here[2]))
+            speed = min(speeds[k], distance / s.dt) * max(np.cos(turn), 0.0) ** 2 if distance > ARRIVED else 0.0
+            controls[k] = np.clip([speed, turn / PURSUIT_TIME], *_box(s))
+            states[k + 1] = unicycle.step(here[None], controls[k : k + 1], s.dt)[0]
+        return fg.Guess({self._x: states, self._u: controls})
 
     def _cruising(self, reference: Array) -> Array:
         """(N,) speeds between reference poses [m/s]."""
@@ -334,8 +354,10 @@ class Controller:
         allowance = np.minimum(s.mover_speed * s.dt * stages, s.mover_allowance)
         least = s.robot_radius + s.disc_clearance + np.where(movers, allowance, 0.0)
         spare = np.where(movers, np.maximum(at_rest[0] - least, 0.0), 0.0)
-        # A little nearer is allowed, or a robot beside a disc could not even turn its nose past it.
-        kept = np.minimum(at_rest, np.maximum(at_rest - s.squeeze, s.robot_radius + s.squeeze))
+        # A little nearer is allowed, or a robot beside a disc could not even turn its nose past it; not so to a disc
+        # that moves, for one that waits beside a robot at rest goes on as soon as the robot does.
+        squeezed = np.minimum(at_rest, np.maximum(at_rest - s.squeeze, s.robot_radius + s.squeeze))
+        kept = np.where(movers, at_rest, squeezed)
         limits: Array = np.minimum(least + spare * (1.0 - s.approach) ** stages, kept)
         return limits
 

@@ -6,6 +6,7 @@ The rules (what makes this more than gluing two graphs together):
 - a control that has been applied becomes odometry: its cost and its limits leave with it;
 - state and obstacle limits begin one step after the present;
 - ``control_weight`` scales the costs of the future, which pull on the estimate;
+- ``pull`` bounds how far they may move it from where the past alone puts it;
 - covariances of the estimate count the past's terms alone.
 """
 
@@ -21,6 +22,8 @@ from unifg.scenarios.window import Window, WindowTerms
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
 
+ROUNDS = 8  # of choosing the beams that count and moving the estimate
+STEADY = 0.01  # [m, rad]; an estimate that moves less has found its beams
 SETTLED = (fg.Status.CONVERGED, fg.Status.STOP_RULE)
 
 
@@ -32,7 +35,7 @@ class JointController(Controller):
     """
 
     def __init__(self, distance_map: DistanceMap, solver: str, settings: ControllerSettings, window: Window) -> None:
-        """State the joint graph, and the past's graph alone for ticks on which no plan is found."""
+        """State the joint graph, and the past's graph alone, which registers the scan beforehand."""
         self.window = window
         self._beams = len(window.now.seen)
         self._map = distance_map
@@ -40,13 +43,28 @@ class JointController(Controller):
         alone = fg.Graph()
         present = alone.variables("present", fg.SE2, 1)
         self._smoother = WindowTerms(alone, present[:], distance_map, window.length, self._beams)
-        self._smooth = GaussNewton(max_iterations=12, step_tolerance=1e-5).prepare(alone)
+        self._smooth = GaussNewton(max_iterations=12, step_tolerance=1e-3).prepare(alone)
+
+    def register(self) -> int:
+        """Put the window where its own terms want it; returns the iterations that took.
+
+        What has to be decided before the joint solve needs a pose: which beams count, where obstacles stand, from
+        where to guess.
+        """
+        terms, window = self._smoother, self.window
+        iterations = 0
+        for _ in range(ROUNDS):
+            before = window.now.pose
+            guess = {terms.past: terms.poses(window), terms.present.family: before[None]}
+            self._registered = self._smooth.solve(guess, data=terms.data(window))
+            terms.move(window, self._registered)
+            iterations += self._registered.iterations
+            if np.abs(fg.SE2.between(before, window.now.pose)).max() < STEADY:
+                break
+        return iterations
 
     def plan(self, pose: Array, reference: Array, tracks: Tracks) -> Plan:
-        """Estimate and decide in one solve; ``pose`` is the prediction from odometry."""
-        if self._guess is None:  # a cold start localises first: a wrong pose would be planned around
-            self._estimate_alone()
-            pose = self.window.now.pose
+        """Estimate and decide in one solve; ``pose`` is that of :meth:`register`."""
         data = self._data(pose, reference, tracks)
         run, guess = self._beginning(pose, reference)
         values = {**guess.values, self._terms.past: self._terms.poses(self.window)}
@@ -54,19 +72,16 @@ class JointController(Controller):
         solution = run.solve(fg.Guess(values, guess.multipliers), data=data)
         plan = self._judge(solution, pose, reference, tracks)
         if plan.emergency or plan.status not in SETTLED:
-            self._estimate_alone()
+            self._smoother.accept(self.window, self._registered)
         else:
             self._terms.accept(self.window, solution)
         return plan
 
-    def _estimate_alone(self) -> None:
-        """Localise by the past's terms, where the joint solve did not settle."""
-        terms = self._smoother
-        guess = {terms.past: terms.poses(self.window), terms.present.family: self.window.now.pose[None]}
-        terms.accept(self.window, self._smooth.solve(guess, data=terms.data(self.window)))
-
     def _anchor(self, graph: fg.Graph, x: fg.Family) -> None:
         self._terms = WindowTerms(graph, x[0], self._map, self.window.length, self._beams)
+        self._past_says = graph.data("estimate of the past alone", np.zeros(3))
+        pull = np.array(self.settings.pull)
+        graph.constrain(fg.prior, x[0], self._past_says, lower=-pull, upper=pull, name="pull")
 
     def _anchored(self, pose: Array) -> dict[fg.Data, Array]:
-        return self._terms.data(self.window)
+        return {**self._terms.data(self.window), self._past_says: pose}

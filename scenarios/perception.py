@@ -22,7 +22,8 @@ __all__ = ["Tracker", "Tracks", "nearest"]
 
 _GATE = 0.4  # [m]; a disc farther than this from where a track is expected is another disc
 _SPEED_FLOOR = 0.1  # [m/s]; slower counts as standing still
-_ACCELERATION = 0.3  # [m/s^2]; standard deviation of a mover's acceleration
+_ACCELERATION = 0.3  # [m/s^2]; standard deviation of the acceleration of a disc that has not moved yet
+_BRISK = 0.45  # [m/s^2]; of one that has: it stops, turns round and goes on from one moment to the next
 _SURPRISE = 6.0  # squared innovation, in variances, that only a change of motion explains
 _FIRST_SPEED = 0.2  # [m/s]; standard deviation of the velocity of a new track, per axis
 _DRIFT = 0.03  # [m/sqrt(s)]; how fast the memory of a standing disc fades
@@ -145,9 +146,9 @@ class Tracker:
     def tracks(self) -> Tracks:
         """The confirmed tracks as they stand."""
         confirmed = self._hits >= 2
-        moving = self._moving[confirmed, None]
-        return Tracks(
-            centre=np.where(moving, self._mean[confirmed, 0], self._anchor[confirmed]),
+        moving, has_moved = self._moving[confirmed, None], self._has_moved[confirmed, None]
+        return Tracks(  # a mover that stands is not averaged over time: it would lag behind when it goes on
+            centre=np.where(has_moved, self._mean[confirmed, 0], self._anchor[confirmed]),
             velocity=np.where(moving, self._mean[confirmed, 1], 0.0),
             radius=self._radius[confirmed],
             identity=self._identity[confirmed],
@@ -157,14 +158,15 @@ class Tracker:
 
     def _predict(self, dt: float) -> None:
         transition = np.array([[1.0, dt], [0.0, 1.0]])
-        noise = _ACCELERATION**2 * np.array([[dt**4 / 4.0, dt**3 / 2.0], [dt**3 / 2.0, dt**2]])
+        agility = np.where(self._has_moved, _BRISK, _ACCELERATION)[:, None, None]
+        noise = agility**2 * np.array([[dt**4 / 4.0, dt**3 / 2.0], [dt**3 / 2.0, dt**2]])
         self._mean = transition @ self._mean
         self._covariance = transition @ self._covariance @ transition.T + noise
         self._anchor_variance = self._anchor_variance + _DRIFT**2 * dt
 
     def _associate(self, discs: Discs) -> tuple[IntArray, IntArray]:
         """Pairs (track, disc), nearest first, each used once, none farther apart than the gate."""
-        expected = np.where(self._moving[:, None], self._mean[:, 0], self._anchor)
+        expected = np.where(self._has_moved[:, None], self._mean[:, 0], self._anchor)
         apart = np.linalg.norm(expected[:, None, :] - discs.centre[None, :, :], axis=2)
         pairs: list[tuple[int, int]] = []
         for flat in np.argsort(apart, axis=None, kind="stable"):

@@ -107,23 +107,26 @@ class JointPilot:
     ) -> None:
         """Prepare the joint graph."""
         self._window = Window(WINDOW, pose, np.diag(np.asarray(sigma) ** 2), beams)
-        self.controller: Controller = JointController(distance_map, solver, settings, self._window)
+        self._joint = JointController(distance_map, solver, settings, self._window)
+        self.controller: Controller = self._joint
+        self._iterations = 0
 
     @property
     def pose(self) -> Array:
-        """(3,) predicted pose before the plan, estimated pose after it."""
+        """(3,) registered pose before the plan, estimated pose after it."""
         return self._window.now.pose
 
     @property
     def iterations(self) -> int:
-        """Zero: localisation has no solve of its own."""
-        return 0
+        """Gauss-Newton iterations of the last registration."""
+        return self._iterations
 
     def estimate(self, scan: Scan, odometry: Array | None, dt: float) -> None:
-        """Move the window by odometry and attach the scan."""
+        """Move the window by odometry, attach the scan and register it."""
         if odometry is not None:
             self._window.move(odometry, dt)
         self._window.look(scan)
+        self._iterations = self._joint.register()
 
     def plan(self, reference: Array, tracks: Tracks) -> Plan:
         """Estimate and control at once."""

@@ -125,6 +125,7 @@ def plan(
     *,
     robot_radius: float,
     clearance_preferred: float | None = None,
+    clearance_least: float | None = None,
     extra_discs: ArrayLike | None = None,
 ) -> Array:
     """Find a short path that prefers the middle of free space and still passes the gaps that must be passed.
@@ -136,7 +137,8 @@ def plan(
         goal: (3,) [m, m, rad].
         robot_radius: radius of the robot's disc [m].
         clearance_preferred: distance from the robot's centre to walls that is tried first [m], by default the
-            radius plus 0.15 m; where no such way exists it is lowered step by step down to the radius.
+            radius plus 0.15 m; where no such way exists it is lowered step by step.
+        clearance_least: the lowest that is tried [m], by default the radius.
         extra_discs: (K, 3) x, y, radius [m] of obstacles that are not on the map.
 
     Returns:
@@ -155,10 +157,11 @@ def plan(
     clearance = _Clearance(occupancy, distance_map, extra_discs)
     for name, pose in (("start", start_pose), ("goal", goal_pose)):
         _check_standing(clearance, name, pose, robot_radius)
-    preferred = robot_radius + _COMFORT if clearance_preferred is None else max(clearance_preferred, robot_radius)
+    least = robot_radius if clearance_least is None else max(clearance_least, robot_radius)
+    preferred = max(robot_radius + _COMFORT if clearance_preferred is None else clearance_preferred, least)
 
-    steps = math.ceil((preferred - robot_radius) / _LEVEL_STEP - 1e-9)
-    for level in np.linspace(preferred, robot_radius, max(2, steps + 1)):
+    steps = math.ceil((preferred - least) / _LEVEL_STEP - 1e-9)
+    for level in np.linspace(preferred, least, max(2, steps + 1)):
         route = _connected(clearance, start_pose[:2], goal_pose[:2], float(level), robot_radius)
         if route is not None:
             break

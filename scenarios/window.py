@@ -106,7 +106,8 @@ class WindowTerms:
     ) -> None:
         """Add priors, odometry and lidar factors for ``length`` past poses and the present."""
         kept = len(range(0, beams, STRIDE))
-        self.length, self._kept = length, kept
+        self.length, self._kept, self._map = length, kept, distance_map
+        self._loss = lidar.endpoint_loss(BEAM_SIGMA, distance_map.resolution)
         self.present = present
         self.past = past = graph.variables("past", fg.SE2, length)
         square = np.zeros((length, 3, 3))
@@ -122,21 +123,27 @@ class WindowTerms:
         self._seen = graph.data("past seen", np.zeros(length * kept, dtype=bool), each=True)
         self._points_now = graph.data("end-points now", np.zeros((beams, 2)), each=True)
         self._seen_now = graph.data("seen now", np.zeros(beams, dtype=bool), each=True)
+        self._counts = graph.data("past beam information", np.zeros((length * kept, 1, 1)), each=True)
+        self._counts_now = graph.data("beam information now", np.zeros((beams, 1, 1)), each=True)
         graph.minimize(fg.prior, past, self._means, information=self._weights, name="arrival")
         graph.minimize(fg.prior, present, self._mean, information=self._weight, name="arrival now")
         graph.minimize(fg.between, past[:-1], past[1:], self._steps, information=self._trust, name="odometry")
         graph.minimize(fg.between, past[-1], present, self._step, information=self._trust_now, name="odometry now")
         endpoint = lidar.endpoint(distance_map)
         which = np.repeat(np.arange(length), kept)
-        for sigma, poses, points, seen, name in (
-            (BEAM_SIGMA / STRIDE**0.5, past[which], self._points, self._seen, "lidar past"),
-            (BEAM_SIGMA, present, self._points_now, self._seen_now, "lidar now"),
+        for counts, poses, points, seen, name in (
+            (self._counts, past[which], self._points, self._seen, "lidar past"),
+            (self._counts_now, present, self._points_now, self._seen_now, "lidar now"),
         ):
-            loss = lidar.endpoint_loss(sigma, distance_map.resolution)
-            graph.minimize(endpoint, poses, points, sigma=sigma, robust=loss, active=seen, name=name)
+            graph.minimize(endpoint, poses, points, information=counts, active=seen, name=name)
 
     def data(self, window: Window) -> dict[fg.Data, Array]:
-        """What the window knows, with empty slots held in place by a weak prior."""
+        """What the window knows, with empty slots held in place by a weak prior.
+
+        Which beams count, and by how much, is decided here at the present beliefs and holds for the whole solve: a
+        beam that changes its weight from one iteration to the next can keep a solver going round for ever, and a long
+        step of the plan could throw out every beam that ties the estimate to the map.
+        """
         length, kept, count = self.length, self._kept, len(window.slots)
         empty = length - count
         means, weights = np.tile(window.now.pose, (length, 1)), np.zeros((length, 3, 3))
@@ -146,7 +153,10 @@ class WindowTerms:
         for k, slot in enumerate(window.slots, start=empty):
             steps[k], trust[k] = slot.step, slot.information
             points[k], seen[k] = slot.beams[::STRIDE], slot.seen[::STRIDE]
-        mean, weight = window.now.pose, np.zeros((3, 3))
+        now = window.now
+        counts = self._information(np.repeat(self.poses(window), kept, axis=0), points.reshape(-1, 2)) * STRIDE
+        counts_now = self._information(now.pose[None], now.beams)
+        mean, weight = now.pose, np.zeros((3, 3))
         if count:
             means[empty], weights[empty] = window.arrival
         else:
@@ -161,22 +171,33 @@ class WindowTerms:
             self._step: steps[-1],
             self._trust_now: trust[-1],
             self._points: points.reshape(-1, 2),
-            self._seen: seen.ravel(),
-            self._points_now: window.now.beams,
-            self._seen_now: window.now.seen,
+            self._seen: seen.ravel() & (counts > 0.0),
+            self._points_now: now.beams,
+            self._seen_now: now.seen & (counts_now > 0.0),
+            self._counts: counts[:, None, None],
+            self._counts_now: counts_now[:, None, None],
         }
+
+    def _information(self, x: Array, beams: Array) -> Array:
+        """(n,) information of end-points (n, 2) [1/m^2] by the weights of Bazzana et al., section VII-A."""
+        distance = self._map.distance(lidar.in_world(x, beams))
+        return self._loss.weight((distance / BEAM_SIGMA) ** 2) / BEAM_SIGMA**2
 
     def poses(self, window: Window) -> Array:
         """(length, 3) guess for the past."""
         known = [slot.pose for slot in window.slots]
         return np.array([window.now.pose] * (self.length - len(known)) + known)
 
-    def accept(self, window: Window, solution: fg.Solution) -> None:
-        """Take the estimate from a solution; marginalise the oldest pose if the next move drops it."""
+    def move(self, window: Window, solution: fg.Solution) -> None:
+        """Take the estimate from a solution."""
         poses = solution[self.past]
         for slot, pose in zip(window.slots, poses[self.length - len(window.slots) :], strict=True):
             slot.pose = pose
         window.now.pose = solution[self.present][0]
+
+    def accept(self, window: Window, solution: fg.Solution) -> None:
+        """Take the estimate from a solution; marginalise the oldest pose if the next move drops it."""
+        self.move(window, solution)
         if window.full:
             mean, weight = solution.marginal_prior(PAST_TERMS, self.past[0], self.past[1])
             window.departure = mean[0], weight

@@ -136,6 +136,8 @@ class AugmentedLagrangian(Solver):
                     return Status.STOP_RULE
                 if run.status is not None:
                     return None
+                if norm(step) < self.step_tolerance:
+                    break  # too short to be of use: what violation remains is for the multipliers to remove
             after = primal.next_multipliers(run.lin.constraints, multipliers, penalty)
             change = largest((after - multipliers) / penalty)
             if len(run.history) == before:  # nothing moved: the dual step alone is this iteration

@@ -101,22 +101,44 @@ def test_the_past_ignores_a_weightless_future(field: DistanceMap) -> None:
     """With a tiny control weight the joint estimate is that of the window alone."""
     episode, controller = settled(field, 1e-6)
     joint = controller.window.now.pose.copy()
-    controller._estimate_alone()
+    controller.register()
     alone = controller.window.now.pose
     assert np.hypot(*(joint - alone)[:2]) < 1e-3
     assert np.hypot(*(joint - episode.world.pose)[:2]) < 0.15  # one step of motion after the last tick
 
 
 def test_a_heavy_future_pulls_the_estimate() -> None:
-    """The bias the documentation warns of: it exists, and it grows with the control weight."""
+    """The bias the documentation warns of: where nothing bounds it, it grows with the control weight."""
     errors = []
-    for weight in (1e-3, 30.0):
+    for weight in (1e-3, 100.0):
         settings = NavigationSettings(
             start=HERE, goals=(THERE,), coupling="joint", seed=3,
-            controller=replace(ControllerSettings(), control_weight=weight),
+            controller=replace(ControllerSettings(), control_weight=weight, pull=(0.5, 0.5, 0.5)),
         )  # fmt: skip
         errors.append(episode_metrics(run_navigation(settings))["localisation_error_m"]["mean"])
     assert errors[1] > 1.2 * errors[0]
+
+
+def test_the_pull_is_bounded(field: DistanceMap) -> None:
+    """However heavy the future, the estimate stays within the bound around what the past alone says."""
+    _, controller = settled(field, 1000.0)
+    alone = controller._registered[controller._smoother.present]
+    moved = fg.SE2.log(fg.SE2.between(alone, controller.window.now.pose[None]))[0]
+    bound = np.array(controller.settings.pull)
+    assert (np.abs(moved) <= bound + 5e-4).all()
+    assert (np.abs(moved) > 0.9 * bound).any()
+
+
+def test_beams_keep_their_weights_during_a_solve(field: DistanceMap) -> None:
+    """Weights are chosen at the belief before the solve: a beam off the map counts nothing, however the poses move."""
+    _, controller = settled(field, 1.0)
+    terms, window = controller._smoother, controller.window
+    right = terms.data(window)[terms._seen_now].sum()
+    window.now.pose = window.now.pose + np.array([2.0, 0.0, 0.0])
+    wrong = terms.data(window)[terms._seen_now].sum()
+    assert wrong < 0.8 * right
+    information = terms.data(window)[terms._counts_now]
+    assert set(np.unique(np.round(information * 0.01, 9))) <= {0.0, 0.25, 1.0}
 
 
 def test_window_keeps_its_length_and_its_prior_is_of_the_past_alone(field: DistanceMap) -> None:

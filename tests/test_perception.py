@@ -169,6 +169,27 @@ def test_mover_that_turns_round_is_followed() -> None:
     assert np.mean(away) < 0.06
 
 
+def test_mover_that_waited_is_followed_when_it_goes_on() -> None:
+    """A mover that has stood for two seconds, for the robot's sake, is not left behind by its track."""
+    occupancy = hall()
+    mover = Obstacle(np.array([6.5, 4.0]), 0.2, np.array([4.0, 4.0]), 0.3)
+    world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(4))
+    tracker, rng = Tracker(field(occupancy)), np.random.default_rng(5)
+    still = np.zeros(3)
+    waited = 0
+    for _ in range(80):
+        before = world.obstacle_states()[0, :2]
+        watch(world, tracker, 1, still, rng)
+        waited += bool(np.allclose(world.obstacle_states()[0, :2], before))
+    assert waited > 20
+    away = []
+    for _ in range(12):
+        tracks = tracker.update(world.scan(), world.pose, 0.1)
+        away.append(float(np.linalg.norm(tracks.centre[0] - world.obstacle_states()[0, :2])))
+        world.step(-1.0, 0.0)  # no longer at rest: the mover goes on
+    assert max(away) < 0.05
+
+
 def test_memory_of_things_out_of_view() -> None:
     """A fixed disc behind a pillar is remembered; a mover is forgotten after a second and a half."""
     occupancy = hall(pillar=True)

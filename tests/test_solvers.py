@@ -200,3 +200,16 @@ def test_backends_are_silent(capfd: pytest.CaptureFixture[str]) -> None:
         graph, guess = problem.build()
         SQP().solve(graph, guess)
     assert capfd.readouterr() == ("", "")
+
+
+def test_alm_leaves_a_subproblem_whose_steps_are_too_short_to_be_of_use() -> None:
+    """At a kink the gradient never vanishes; what violation remains is for the multipliers, not for more steps."""
+    graph = fg.Graph()
+    x, y = graph.variables("x", fg.Rn(1), 1), graph.variables("y", fg.Rn(1), 1)
+    graph.minimize(lambda a: np.hstack([1.0 + np.abs(a), 30.0 * a]), x, name="kink")
+    graph.minimize(fg.prior, y, [0.0], name="rest")
+    graph.constrain(lambda b: b, y, lower=1.0, upper=1.0, name="hold")
+    solver = AugmentedLagrangian(penalty=10.0, step_tolerance=5e-3, max_iterations=18)
+    solution = solver.solve(graph, {x: np.full((1, 1), 0.3), y: np.zeros((1, 1))})
+    assert solution.status is fg.Status.STOP_RULE
+    assert solution.violation < 1e-4
