@@ -5,70 +5,108 @@ Jacobians are in right perturbation, X Exp(d), as everywhere.
 
 from __future__ import annotations
 
-import numpy as np
+import math
+from collections.abc import Callable
+from functools import cache
+from types import ModuleType
 
+from unifg.calls import local_matrix, local_vector, vector
 from unifg.factors import ManifoldResidual
-from unifg.lie import SE2, LieGroup, Manifold, wrap_angle
+from unifg.jit import compiled
+from unifg.kernels import Kernel
+from unifg.lie import SE2, SE3, LieGroup, Manifold, Rn
+from unifg.lie.lookup import functions_of
+from unifg.lie.scalar.so2 import wrap
 from unifg.residuals import Residual, residual
 from unifg.typing import Array
 
 __all__ = ["bearing", "bearing_range", "chart_between", "distance", "sighting"]
 
 
-class _PlanarChart:
-    """(dx, dy, dtheta) of Z^-1 Xi^-1 Xj; picklable."""
-
-    def __call__(self, x: Array, y: Array, measured: Array) -> Array:
-        return SE2.between(measured, SE2.between(x, y))
-
-    def jacobian(self, x: Array, y: Array, measured: Array) -> list[Array]:
-        error = self(x, y, measured)
-        after = np.zeros((len(error), 3, 3))
-        after[:, :2, :2] = SE2.matrix(error)[:, :2, :2]
-        after[:, 2, 2] = 1.0
-        return [-after @ SE2.adjoint(SE2.between(y, x)), after]
+# ---------------------------------------------------------------- g2o's chart
 
 
-class _SpatialChart:
-    """Translation and vector part of the quaternion, scalar part positive, of Z^-1 Xi^-1 Xj; picklable."""
-
-    def __init__(self, group: LieGroup) -> None:
-        self.group = group
-
-    def __call__(self, x: Array, y: Array, measured: Array) -> Array:
-        error = self._error(x, y, measured)
-        positions = error[:, :3]
-        return np.concatenate([positions, error[:, 4:] * _sign(error)], axis=1)
-
-    def jacobian(self, x: Array, y: Array, measured: Array) -> list[Array]:
-        group, error = self.group, self._error(x, y, measured)
-        sign = _sign(error)
-        w, vx, vy, vz = 0.5 * sign.T * error[:, 3:].T
-        after = np.zeros((len(error), 6, 6))
-        after[:, :3, :3] = group.matrix(error)[:, :3, :3]
-        # q (1, d/2) has the vector part v + (w I + [v]x) d / 2.
-        after[:, 3, 3], after[:, 3, 4], after[:, 3, 5] = w, -vz, vy
-        after[:, 4, 3], after[:, 4, 4], after[:, 4, 5] = vz, w, -vx
-        after[:, 5, 3], after[:, 5, 4], after[:, 5, 5] = -vy, vx, w
-        return [-after @ group.adjoint(group.between(y, x)), after]
-
-    def _error(self, x: Array, y: Array, measured: Array) -> Array:
-        return self.group.between(measured, self.group.between(x, y))
+@compiled
+def _planar_chart(error: Array, r: Array, after: Array) -> None:
+    """(dx, dy, dtheta) of E and its derivative along E Exp(d)."""
+    for k in range(3):
+        r[k] = error[k]
+    if len(after):
+        c, s = math.cos(error[2]), math.sin(error[2])
+        after[:] = 0.0
+        after[0, 0], after[0, 1], after[1, 0], after[1, 1] = c, -s, s, c
+        after[2, 2] = 1.0
 
 
-def _sign(error: Array) -> Array:
-    """(n, 1) factor that makes the scalar part of the quaternions non-negative."""
-    return np.where(error[:, 3:4] < 0.0, -1.0, 1.0)
+def _spatial_chart_of(functions: ModuleType) -> Callable[..., None]:
+    """Translation and vector part of the quaternion, scalar part positive, of E, and its derivative along E Exp(d)."""
+    homogeneous = functions.matrix
+
+    @compiled
+    def chart(error: Array, r: Array, after: Array) -> None:
+        sign = -1.0 if error[3] < 0.0 else 1.0
+        for k in range(3):
+            r[k] = error[k]
+            r[3 + k] = sign * error[4 + k]
+        if len(after):
+            pose = local_matrix(4, 4)
+            homogeneous(error, pose)
+            w, x, y, z = 0.5 * sign * error[3], 0.5 * r[3], 0.5 * r[4], 0.5 * r[5]
+            after[:] = 0.0
+            for i in range(3):
+                for k in range(3):
+                    after[i, k] = pose[i, k]
+            # q (1, d/2) has the vector part v + (w I + [v]x) d / 2.
+            after[3, 3], after[3, 4], after[3, 5] = w, -z, y
+            after[4, 3], after[4, 4], after[4, 5] = z, w, -x
+            after[5, 3], after[5, 4], after[5, 5] = -y, x, w
+
+    return chart
+
+
+def _relative(group: LieGroup, functions: ModuleType, chart: Callable[..., None]) -> Callable[..., None]:
+    """A chart of measured^-1 x^-1 y."""
+    storage, dim = group.storage, group.dim
+    between, adjoint = functions.between, functions.adjoint
+
+    @compiled
+    def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+        x, y = vector(v, 0, storage), vector(v, storage, storage)
+        seen, error = local_vector(storage), local_vector(storage)
+        between(x, y, seen)
+        between(p, seen, error)
+        if len(J) == 0:
+            chart(error, r, J)
+            return
+        after, transport = local_matrix(dim, dim), local_matrix(dim, dim)
+        chart(error, r, after)
+        between(y, x, seen)
+        adjoint(seen, transport)
+        for i in range(dim):
+            for k in range(dim):
+                total = 0.0
+                for j in range(dim):
+                    total += after[i, j] * transport[j, k]
+                J[i, k] = -total
+                J[i, dim + k] = after[i, k]
+
+    return kernel
+
+
+@cache
+def _chart_kernel(space: bool) -> Kernel:
+    group: LieGroup = SE3 if space else SE2
+    functions = functions_of(group)
+    assert functions is not None
+    chart = _spatial_chart_of(functions) if space else _planar_chart
+    arguments = (group, group, (group.storage,))
+    return Kernel(_relative(group, functions, chart), arguments, group.dim, name="chart between")
 
 
 def _build_chart(manifold: Manifold) -> Residual:
-    if manifold.name == "SE2":
-        planar = _PlanarChart()
-        return Residual(planar, planar.jacobian, "chart between")
-    if manifold.name == "SE3" and isinstance(manifold, LieGroup):
-        spatial = _SpatialChart(manifold)
-        return Residual(spatial, spatial.jacobian, "chart between")
-    raise TypeError(f"chart_between needs poses in SE2 or SE3, found {manifold.name}; use between")
+    if manifold not in (SE2, SE3):
+        raise TypeError(f"chart_between needs poses in SE2 or SE3, found {manifold.name}; use between")
+    return residual(_chart_kernel(manifold == SE3))
 
 
 chart_between = ManifoldResidual("chart between", _build_chart)
@@ -80,94 +118,108 @@ order in the plane, not in space. measured is (storage,) or (n, storage).
 """
 
 
-class _Sighting:
-    """The landmark in the frame of the pose, less where it was seen; picklable."""
+# ---------------------------------------------------------------- sightings
 
-    def __init__(self, group: LieGroup) -> None:
-        self.group = group
 
-    def __call__(self, pose: Array, landmark: Array, measured: Array) -> Array:
-        return self.group.act(self.group.inverse(pose), landmark) - measured
+@compiled
+def _planar_local(v: Array, local: Array, J: Array) -> None:
+    """Write p = pose^-1 landmark in the plane; derivatives [-I, -[1]x p] and R'."""
+    c, s = math.cos(v[2]), math.sin(v[2])
+    dx, dy = v[3] - v[0], v[4] - v[1]
+    local[0], local[1] = c * dx + s * dy, c * dy - s * dx
+    if len(J):
+        J[0, 0], J[0, 1], J[0, 2], J[0, 3], J[0, 4] = -1.0, 0.0, local[1], c, s
+        J[1, 0], J[1, 1], J[1, 2], J[1, 3], J[1, 4] = 0.0, -1.0, -local[0], -s, c
 
-    def jacobian(self, pose: Array, landmark: Array, measured: Array) -> list[Array]:
-        return _local_jacobian(self.group, pose, landmark)
+
+@compiled
+def _planar_sighting(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """The landmark in the frame of the pose, less where it was seen."""
+    _planar_local(v, r, J)
+    r[0] -= p[0]
+    r[1] -= p[1]
+
+
+def _spatial_sighting(functions: ModuleType) -> Callable[..., None]:
+    """The same in space; derivatives [-I, [p]x] and R'."""
+    homogeneous = functions.matrix
+
+    @compiled
+    def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+        pose = local_matrix(4, 4)
+        homogeneous(vector(v, 0, 7), pose)
+        for i in range(3):
+            r[i] = 0.0
+            for k in range(3):
+                r[i] += pose[k, i] * (v[7 + k] - pose[k, 3])
+        if len(J):
+            J[:] = 0.0
+            x, y, z = r[0], r[1], r[2]
+            J[0, 0] = J[1, 1] = J[2, 2] = -1.0
+            J[0, 4], J[0, 5], J[1, 3], J[1, 5], J[2, 3], J[2, 4] = -z, y, z, -x, -y, x
+            for i in range(3):
+                for k in range(3):
+                    J[i, 6 + k] = pose[k, i]
+        for i in range(3):
+            r[i] -= p[i]
+
+    return kernel
+
+
+@cache
+def _sighting_kernel(space: bool) -> Kernel:
+    if not space:
+        return Kernel(_planar_sighting, (SE2, Rn(2), (2,)), 2, name="sighting")
+    functions = functions_of(SE3)
+    assert functions is not None
+    return Kernel(_spatial_sighting(functions), (SE3, Rn(3), (3,)), 3, name="sighting")
 
 
 def _build_sighting(manifold: Manifold) -> Residual:
-    if not isinstance(manifold, LieGroup) or manifold.name not in ("SE2", "SE3"):
+    if manifold not in (SE2, SE3):
         raise TypeError(f"sighting needs poses in SE2 or SE3, found {manifold.name}")
-    function = _Sighting(manifold)
-    return Residual(function, function.jacobian, "sighting")
+    return residual(_sighting_kernel(manifold == SE3))
 
 
 sighting = ManifoldResidual("sighting", _build_sighting)
 """``sighting(pose, landmark, measured)``: pose^-1 landmark - measured [m], in the plane or in space."""
 
 
-def _local_jacobian(group: LieGroup, pose: Array, landmark: Array) -> list[Array]:
-    """Derivatives of p = pose^-1 landmark: [-I, -[1]x p] or [-I, [p]x], and R'."""
-    size = landmark.shape[1]
-    local = group.act(group.inverse(pose), landmark)
-    by_pose = np.zeros((len(local), size, group.dim))
-    by_pose[:, :, :size] = -np.eye(size)
-    if size == 2:
-        by_pose[:, 0, 2], by_pose[:, 1, 2] = local[:, 1], -local[:, 0]
-    else:
-        px, py, pz = local.T
-        by_pose[:, 0, 4], by_pose[:, 0, 5] = -pz, py
-        by_pose[:, 1, 3], by_pose[:, 1, 5] = pz, -px
-        by_pose[:, 2, 3], by_pose[:, 2, 4] = -py, px
-    rotation = group.matrix(pose)[:, :size, :size]
-    return [by_pose, np.swapaxes(rotation, 1, 2)]
+@compiled
+def _polar(v: Array, J: Array, row: int, of_bearing: bool) -> float:
+    """Bearing [rad] or distance [m] of the landmark, and its derivatives in a row of J."""
+    local, by = local_vector(2), local_matrix(2, 5)
+    _planar_local(v, local, by)
+    x, y = local[0], local[1]
+    length = math.hypot(x, y)
+    if len(J):
+        first, second = (-y / (length * length), x / (length * length)) if of_bearing else (x / length, y / length)
+        for d in range(5):
+            J[row, d] = first * by[0, d] + second * by[1, d]
+    return math.atan2(y, x) if of_bearing else length
 
 
-def _polar(pose: Array, landmark: Array) -> tuple[Array, Array, Array]:
-    """(n, 2) the landmark in the frame of the pose, (n,) its bearing [rad] and distance [m]."""
-    local = SE2.act(SE2.inverse(pose), landmark)
-    return local, np.arctan2(local[:, 1], local[:, 0]), np.hypot(local[:, 0], local[:, 1])
+@compiled
+def _bearing(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    r[0] = wrap(_polar(v, J, 0, True) - p[0])
 
 
-def _polar_jacobian(pose: Array, landmark: Array) -> list[Array]:
-    """Derivatives (n, 2, d) of (bearing, distance) by pose and landmark."""
-    local, _, distances = _polar(pose, landmark)
-    x, y = (local / distances[:, None]).T
-    outer = np.empty((len(local), 2, 2))
-    outer[:, 0, 0], outer[:, 0, 1] = -y / distances, x / distances
-    outer[:, 1, 0], outer[:, 1, 1] = x, y
-    return [outer @ block for block in _local_jacobian(SE2, pose, landmark)]
+@compiled
+def _distance(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    r[0] = _polar(v, J, 0, False) - p[0]
 
 
-def _bearing(pose: Array, landmark: Array, measured: Array) -> Array:
-    return wrap_angle(_polar(pose, landmark)[1][:, None] - measured)
+@compiled
+def _bearing_range(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    r[0] = wrap(_polar(v, J, 0, True) - p[0])
+    r[1] = _polar(v, J, 1, False) - p[1]
 
 
-def _bearing_jacobian(pose: Array, landmark: Array, measured: Array) -> list[Array]:
-    return [block[:, :1] for block in _polar_jacobian(pose, landmark)]
-
-
-def _distance(pose: Array, landmark: Array, measured: Array) -> Array:
-    return _polar(pose, landmark)[2][:, None] - measured
-
-
-def _distance_jacobian(pose: Array, landmark: Array, measured: Array) -> list[Array]:
-    return [block[:, 1:] for block in _polar_jacobian(pose, landmark)]
-
-
-def _bearing_range(pose: Array, landmark: Array, measured: Array) -> Array:
-    error: Array = np.stack(_polar(pose, landmark)[1:], axis=1) - measured
-    error[:, 0] = wrap_angle(error[:, 0])
-    return error
-
-
-def _bearing_range_jacobian(pose: Array, landmark: Array, measured: Array) -> list[Array]:
-    return _polar_jacobian(pose, landmark)
-
-
-bearing = residual(_bearing, _bearing_jacobian, "bearing")
+bearing = residual(Kernel(_bearing, (SE2, Rn(2), (1,)), 1, name="bearing"))
 """``bearing(pose, landmark, measured)``: SE2 poses, points in the plane, measured (n, 1) [rad], wrapped."""
 
-distance = residual(_distance, _distance_jacobian, "distance")
+distance = residual(Kernel(_distance, (SE2, Rn(2), (1,)), 1, name="distance"))
 """``distance(pose, landmark, measured)``: SE2 poses, points in the plane, measured (n, 1) [m]."""
 
-bearing_range = residual(_bearing_range, _bearing_range_jacobian, "bearing and range")
+bearing_range = residual(Kernel(_bearing_range, (SE2, Rn(2), (2,)), 2, name="bearing and range"))
 """``bearing_range(pose, landmark, measured)``: SE2 poses, points in the plane, measured (n, 2) [rad, m]."""
