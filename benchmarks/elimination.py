@@ -52,12 +52,20 @@ SECTIONS = {
 }
 
 
-def record(store: Result, name: str, result: Result, seconds: float) -> None:
-    """Put a section's result into the store, and keep from the run before what can be compared."""
+def record(store: Result, name: str, result: Result, seconds: float, code: str) -> None:
+    """Put a section's result into the store, and keep from the run before what can be compared.
+
+    Args:
+        store: all sections; changed.
+        name: of the section.
+        result: what it measured.
+        seconds: it took.
+        code: digest of the package that was measured.
+    """
     before = store.get(name)
     store[name] = {
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "code": code_digest(),
+        "code": code,
         "machine": machine(*PACKAGES),
         "seconds": round(seconds),
         "result": result,
@@ -75,8 +83,8 @@ def met(goal: Result, bound: str = "target") -> bool:
     """Whether a goal's median reaches its target or floor."""
     if goal[bound] is None:
         return True
-    value: float = goal["value"][0]
-    return value >= goal[bound] if goal["unit"].startswith("times faster") else value <= goal[bound]
+    value = goal["value"][0]
+    return bool(value >= goal[bound] if goal["unit"].startswith("times faster") else value <= goal[bound])
 
 
 def summary(store: Result) -> str:
@@ -155,14 +163,14 @@ def main(arguments: list[str] | None = None) -> int:
     if not gtsam_peer.available():
         print("gtsam is not installed: no comparison, and the page in docs/ is left alone.")
     pin()
-    store = load(STORE)
+    store, code = load(STORE), code_digest()
     goals: list[Result] = []
     chosen = options.only or list(SECTIONS)
     for name in chosen:
         print(f"{SECTIONS[name].title} ...", flush=True)
         begin = time.perf_counter()
         result = SECTIONS[name].measure(options.rounds, False)
-        record(store, name, result, time.perf_counter() - begin)
+        record(store, name, result, time.perf_counter() - begin, code)
         goals += result["goals"]
     print(render({name: store[name] for name in chosen}))
     if options.rounds >= ENOUGH and gtsam_peer.available():

@@ -135,7 +135,7 @@ def stated(pose_graph: PoseGraph, known: Array, residual: Any) -> tuple[fg.Graph
 
 def measure(rounds: int, small: bool = False) -> Result:
     """Both chains."""
-    lengths = (5, 9) if small else LENGTHS
+    lengths = (9,) if small else LENGTHS
     rows = [measure_length(length, rounds) for length in lengths]
     goals = [
         {"name": f"own residual, {NAMES[name]}", "unit": "times the time of `fg.between`",

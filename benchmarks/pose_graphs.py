@@ -16,8 +16,7 @@ from benchmarks.gtsam_peer import ORDERINGS, Peer, available
 from benchmarks.report import CHECKOUT, table
 from benchmarks.timing import Spread, Stopwatch, interleave, milliseconds, number, shown, spread
 from unifg import passes, solver
-from unifg.elimination import fronts, substitution
-from unifg.elimination.factorization import Factorization
+from unifg.elimination import factorization, fronts, substitution
 from unifg.files.g2o import read_g2o
 from unifg.pose_graphs import PoseGraph, manhattan, sphere
 from unifg.program import Program
@@ -78,10 +77,10 @@ def cases(small: bool = False) -> list[Case]:
         return [Case("manhattan 40", planar, np.nan, 6.0, 4.0), Case("sphere 20", spatial, np.nan, 2.0, 1.5)]
     folder = data_folder()
     if folder is None:
-        planar, spatial = manhattan(3500), sphere(50, 50)
+        city, ball = manhattan(3500), sphere(50, 50)
         return [
-            Case("manhattan 3500", planar.pose_graph.with_poses(planar.truth), np.nan, 6.0, 4.0),
-            Case("sphere 2500", spatial.pose_graph.with_poses(spatial.truth), np.nan, 2.0, 1.5),
+            Case("manhattan 3500", city.pose_graph.with_poses(city.truth), np.nan, 6.0, 4.0),
+            Case("sphere 2500", ball.pose_graph.with_poses(ball.truth), np.nan, 2.0, 1.5),
         ]
     return [Case(name, read_g2o(folder / f"{name}.g2o.gz"), *numbers) for name, numbers in PUBLISHED.items()]
 
@@ -105,8 +104,8 @@ def measure_case(case: Case, rounds: int) -> Result:
     first = run.solve(guess)
     count = first.iterations
     watch = Stopwatch(WATCHED)
-    parts: dict[str, list[float]] = {part: [] for part in WATCHED} | {"Python": []}
-    analysis = Stopwatch({"analyse": (Factorization, "__init__")})
+    parts: dict[str, list[float]] = {part: [] for part in (*WATCHED, "Python")}
+    analysis = Stopwatch({"analyse": (factorization, "analyse")})
     compiling: list[float] = []
     analysing: list[float] = []
 

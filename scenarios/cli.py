@@ -22,7 +22,7 @@ from types import FrameType
 from unifg import __version__
 from unifg.errors import UnifgError
 from unifg.history import Iteration
-from unifg.scenarios import solve_arguments
+from unifg.scenarios import solve_arguments, velocity_tracking_arguments
 from unifg.scenarios.results import summary, write_results
 
 __all__ = ["SCENARIOS", "SOLVERS", "Outcome", "Scenario", "main"]
@@ -35,7 +35,7 @@ MANOEUVRES = ("behind", "obstacle")
 Pose = tuple[float, float, float]
 Progress = Callable[[float, str], None]
 
-_POSE_OPTIONS = ("--start", "--goal")
+_PAIRED_OPTIONS = ("--start", "--goal", "--force-bounds")
 _NEGATIVE = re.compile(r"-[\d.]")
 
 
@@ -65,12 +65,16 @@ class Scenario:
         arguments: adds the scenario's arguments to its parser.
         run: runs it; raises KeyboardInterrupt when stopped before there is anything to write.
         random: whether a seed makes a difference.
+        solvers: names to choose from.
+        solver: the default.
     """
 
     summary: str
     arguments: Callable[[argparse.ArgumentParser], None]
     run: Callable[[argparse.Namespace, Progress], Outcome]
     random: bool = True
+    solvers: tuple[str, ...] = SOLVERS
+    solver: str = "sqp"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -105,7 +109,9 @@ def _parser() -> argparse.ArgumentParser:
     for name, scenario in SCENARIOS.items():
         one = scenarios.add_parser(name, help=scenario.summary, description=scenario.summary, allow_abbrev=False)
         scenario.arguments(one)
-        one.add_argument("--solver", choices=SOLVERS, default="sqp", help="backend (default: %(default)s)")
+        one.add_argument(
+            "--solver", choices=scenario.solvers, default=scenario.solver, help="backend (default: %(default)s)"
+        )
         if scenario.random:
             one.add_argument("--seed", type=_count, default=0, metavar="S", help="of everything random (default: 0)")
         _add_out(one)
@@ -190,7 +196,7 @@ def _join_negative(arguments: list[str]) -> list[str]:
     """``--start -2,-0.5,0`` as ``--start=-2,-0.5,0``: argparse would take the value for an option."""
     joined: list[str] = []
     for argument in arguments:
-        if joined and joined[-1] in _POSE_OPTIONS and _NEGATIVE.match(argument):
+        if joined and joined[-1] in _PAIRED_OPTIONS and _NEGATIVE.match(argument):
             joined[-1] += f"={argument}"
         else:
             joined.append(argument)
@@ -323,6 +329,28 @@ def _run_manoeuvres(chosen: argparse.Namespace, progress: Progress) -> Outcome:
     return Outcome(all(m.succeeded for m in solved), interrupted, manoeuvres.table(solved), write)
 
 
+def _run_velocity_tracking(chosen: argparse.Namespace, progress: Progress) -> Outcome:
+    from unifg.scenarios import velocity_tracking, velocity_tracking_plots
+    from unifg.status import Status
+
+    settings = velocity_tracking.TrackingSettings(
+        chosen.length, chosen.solver, chosen.profile, chosen.linear, chosen.force_bounds, tolerance=chosen.tolerance
+    )
+
+    def tell(row: Iteration) -> None:
+        progress(1.0 - 0.7**row.number, f"iteration {row.number}, cost {2.0 * row.cost:.8g}")
+
+    drive = velocity_tracking.run_tracking(settings, progress=tell)
+    progress(1.0, "solved")
+
+    def write(folder: Path) -> list[Path]:
+        picture = velocity_tracking_plots.write_picture(folder / "velocity_tracking.png", drive)
+        return [picture, velocity_tracking.write_metrics(folder / "metrics.json", drive)]
+
+    interrupted = drive.solution.status is Status.INTERRUPTED
+    return Outcome(drive.succeeded, interrupted, velocity_tracking.table(drive), write)
+
+
 def _run_solve(chosen: argparse.Namespace, progress: Progress) -> Outcome:
     from unifg.scenarios import solve, solve_results
 
@@ -345,6 +373,14 @@ SCENARIOS = {
         _manoeuvres_arguments,
         _run_manoeuvres,
         random=False,
+    ),
+    "velocity-tracking": Scenario(
+        velocity_tracking_arguments.DESCRIPTION,
+        velocity_tracking_arguments.add_arguments,
+        _run_velocity_tracking,
+        random=False,
+        solvers=velocity_tracking_arguments.SOLVERS,
+        solver="kkt",
     ),
 }
 """Everything ``unifg run`` can run."""

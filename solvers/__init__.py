@@ -5,10 +5,13 @@ from unifg.solvers.dog_leg import DogLeg
 from unifg.solvers.gauss_newton import GaussNewton
 from unifg.solvers.graduated_non_convexity import GraduatedNonConvexity
 from unifg.solvers.interior_point import InteriorPoint
+from unifg.solvers.kkt import KKT
 from unifg.solvers.levenberg_marquardt import LevenbergMarquardt
+from unifg.solvers.penalty import Penalty
 from unifg.solvers.sqp import SQP
 
 __all__ = [
+    "KKT",
     "SQP",
     "AugmentedLagrangian",
     "DogLeg",
@@ -16,4 +19,5 @@ __all__ = [
     "GraduatedNonConvexity",
     "InteriorPoint",
     "LevenbergMarquardt",
+    "Penalty",
 ]

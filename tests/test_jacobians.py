@@ -15,7 +15,7 @@ import unifg as fg
 import unifg.models
 from unifg.differentiation import jacobian
 from unifg.jit import compiled
-from unifg.models import lidar, obstacles, rkmk, unicycle
+from unifg.models import lidar, obstacles, rkmk, unicycle, vehicle
 from unifg.models.compiled_field import CompiledField
 from unifg.models.distance_map import DistanceMap
 from unifg.models.potential import potential
@@ -129,6 +129,14 @@ CASES["potential.potential"] = (potential(obstacles.disc_clearance), [poses()], 
 CASES["potential.potential, walls"] = (potential(WALLS), [INSIDE], [fg.SE2], [])
 CASES["potential.potential, vortex"] = (potential(obstacles.disc_clearance, vortex=0.7), [poses()], [fg.SE2], DISCS)
 
+# Drag of three kinds at once, on slopes; forces large enough to matter beside the speeds.
+CAR = vehicle.Vehicle(drag_constant=3.0, drag_linear=20.0)
+CASES["vehicle.dynamics"] = (
+    vehicle.dynamics(CAR),
+    [RNG.uniform(0.0, 30.0, (COUNT, 1)), RNG.normal(0.0, 2000.0, (COUNT, 1)), RNG.uniform(0.0, 30.0, (COUNT, 1))],
+    [vehicle.SPEED, vehicle.FORCE, vehicle.SPEED], [0.7, RNG.uniform(-0.1, 0.1, COUNT)],
+)  # fmt: skip
+
 # Their search Jacobians are the derivative of nothing; everything else about them is tested like the rest.
 EXEMPT_SEARCH = {"potential.potential, vortex"}
 
@@ -143,7 +151,9 @@ def shipped() -> set[str]:
                 names.add(f"{module.name}.{name}")
             if callable(value) and getattr(value, "__annotations__", {}).get("return") == "Residual":
                 names.add(f"{module.name}.{name}")  # a function that makes residuals
-    return names - {f"{module}.residual" for module in ("lidar", "obstacles", "potential", "rkmk", "unicycle")}
+    return names - {
+        f"{module}.residual" for module in ("lidar", "obstacles", "potential", "rkmk", "unicycle", "vehicle")
+    }
 
 
 def test_every_shipped_residual_has_a_case() -> None:
@@ -199,7 +209,9 @@ def parameter(constant: object, axes: int, each: bool) -> Array:
 
 def test_models_are_kernels_unless_their_functions_are_batched() -> None:
     models = {
-        name for name in CASES if name.partition(".")[0] in {"unicycle", "obstacles", "lidar", "potential", "rkmk"}
+        name
+        for name in CASES
+        if name.partition(".")[0] in {"unicycle", "obstacles", "lidar", "potential", "rkmk", "vehicle"}
     }
     batched = {"rkmk.trapezoid", "rkmk.trapezoid, simplified", "rkmk.trapezoid, pose and velocity"}
     assert models - set(KERNELS) == batched

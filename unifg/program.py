@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from unifg import passes
+from unifg.binding import Binding
+from unifg.buffers import Buffers
 from unifg.columns import Columns, Values
 from unifg.compiled import CompiledTerm
 from unifg.differentiation import convexified
@@ -83,6 +85,12 @@ class Program:
         self.retraction = Retraction(self.columns, graph.fixes)
         self._names = [term.name for term in stacked]
         self.scratch = np.empty(self.table.scratch)
+        costs, rows = (
+            (self.table.residuals, self.table.entries),
+            (self.table.constraints, self.table.constraint_entries),
+        )
+        self._buffers = Buffers([*costs, *rows, self.columns.width, self.normal.nnz])
+        self._binding, self._fresh = Binding(graph._data), True
         self.bind({})
 
     @property
@@ -113,14 +121,24 @@ class Program:
         Raises:
             GraphError: on unknown data, a changed shape, NaN, or crossed limits.
         """
-        checked = {}
-        for handle, value in data.items():
-            if self.graph._data.get(getattr(handle, "name", "")) is not handle:
-                raise GraphError(f"data {handle!r} does not belong to this graph")
-            checked[handle] = handle.check(value)
-        self.data = checked
-        for term in self.terms:
-            term.bind(checked)
+        changed = self._binding.take(data)
+        self.data = self._binding.given
+        if not (changed or self._fresh):
+            return
+        try:
+            rebound = [term for term in self.terms if term.rebind(self.data, changed)]
+            if self._fresh or any(isinstance(term.term, Constraint) for term in rebound):
+                self._bind_limits()
+        except GraphError:
+            self._binding.forget()
+            raise
+        self.table.bind(None if self._fresh else changed, self.lower, self.upper)
+        fixes = [fix.value for fix in self.graph.fixes]
+        if self._fresh or any(value in changed for value in fixes if isinstance(value, Data)):
+            self.retraction.bind([np.asarray(self.data.get(v, v.value) if isinstance(v, Data) else v) for v in fixes])
+        self._fresh = False
+
+    def _bind_limits(self) -> None:
         self.lower = _stacked([c.lower for c in self.constraint_terms])
         self.upper = _stacked([c.upper for c in self.constraint_terms])
         crossed = np.flatnonzero(self.lower > self.upper)
@@ -128,13 +146,6 @@ class Program:
             name, index = self.row_name(int(crossed[0]))
             raise GraphError(f"term '{name}': lower exceeds upper in factor {index}", term=name, index=index)
         self.equality = self.lower == self.upper
-        self.table.bind(self.lower, self.upper)
-        self.retraction.bind(
-            [
-                np.asarray(checked.get(fix.value, fix.value.value) if isinstance(fix.value, Data) else fix.value)
-                for fix in self.graph.fixes
-            ]
-        )
 
     def values_from(self, guess: Mapping[Family, ArrayLike]) -> Values:
         """Copy and check a guess, and give fixed variables their values.
@@ -214,12 +225,12 @@ class Program:
     def linearize(self, values: Mapping[Family, Array], search: bool = False) -> Linearization:
         """Everything a backend needs at ``values``; with ``search``, by search Jacobians where a residual has one."""
         table, values = self.table, self.columns.values(values)
-        residual, jacobian = np.empty(table.residuals), np.empty(table.entries)
-        constraints, constraint_jacobian = np.empty(table.constraints), np.empty(table.constraint_entries)
+        residual, jacobian, constraints, constraint_jacobian, gradient, hessian = self._buffers.take()
+        gradient[:], hessian[:] = 0.0, 0.0
         squares, size = np.empty(table.weights), np.empty(len(table.arrays.fields))
-        gradient, hessian = np.zeros(self.columns.width), np.zeros(self.normal.nnz)
         norms: dict[str, float] = {}
         weights: HeldWeights = {}
+        concavity = np.zeros(self.normal.nnz if self.scalar_terms else 0)
         with np.errstate(all="ignore"):
             for term in self.batched:
                 self.rows_of(term, residual, constraints)[:] = term.residual(values)
@@ -247,11 +258,12 @@ class Program:
                 slope, curvature = term.scalar_derivatives(values)
                 columns, factor, a, b, place = self._scalars[term.name]
                 np.add.at(gradient, columns.ravel(), slope.ravel())
-                np.add.at(hessian, place, convexified(curvature)[factor, a, b])
+                convex = convexified(curvature)
+                np.add.at(hessian, place, convex[factor, a, b])
+                np.add.at(concavity, place, (curvature - convex)[factor, a, b])
         norms |= zip(self._names, size.tolist(), strict=True)
-        return Linearization(
-            values, cost, residual, jacobian, constraints, constraint_jacobian, gradient, hessian, norms, weights
-        )
+        found = residual, jacobian, constraints, constraint_jacobian, gradient, hessian
+        return Linearization(values, cost, *found, norms, weights, concavity)
 
     def _weigh(
         self,

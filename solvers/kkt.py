@@ -1,0 +1,279 @@
+"""KKT Gauss-Newton: equality constraints as factors with multiplier variables (ecg2o, section 4.2).
+
+An equality h(x) = 0 becomes a factor of x and of its multipliers with error (h, lambda) and weight [[0, I], [I, 0]];
+its contribution to the linear system is the block A and nothing else:
+
+    [ H  A' ] [ d       ]     [ grad f + A' lambda ]
+    [ A  0  ] [ dlambda ] = - [ h                  ]
+
+The weight is indefinite, so the system is assembled as blocks, never through a square root. It is factorised with
++shift and -shift on its diagonal, so that no order of elimination meets a vanishing pivot, and refined until the shift
+is gone. H is that of Gauss-Newton.
+
+The paper takes every step in full. By default a step has to lower the l1 merit f + price |h| (Nocedal and Wright,
+chapter 18): the cost alone would reject steps that restore feasibility. A full step that is rejected is corrected once
+for the curvature of the constraints before it is shortened; shortened steps damp the next ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from unifg.errors import BackendError
+from unifg.linearization import Evaluation, Linearization
+from unifg.program import Program
+from unifg.solver import Run, Solver
+from unifg.solvers.augmented_lagrangian import largest
+from unifg.solvers.damping import norm
+from unifg.solvers.kkt_system import KktSystem, fill
+from unifg.solvers.least_squares import require_squares
+from unifg.solvers.primal import DIAGONAL_FLOOR
+from unifg.status import Status
+from unifg.typing import Array
+
+SHIFT = 1e-10  # on the diagonal of the scaled system; refined away
+RESIDUAL = 1e-8  # relative, of a system that counts as solved
+ARMIJO = 1e-4
+ROUNDING = 1e-13
+SHORTEST = 1e-6
+MARGIN = 0.3  # share of the violation's price that every step must earn (Nocedal and Wright, eq. 18.36)
+FAILURES = 5  # attempts with growing damping at one step
+FIRST_DAMPING, DAMPING_GROWTH, SMALLEST_DAMPING = 1e-2, 10.0, 1e-9
+DAMPING_DECAY = 0.9  # faster forgetting cycles between overshooting and shortened steps
+FIRST_SLACKNESS = 1e-4
+RETRY_GROWTH = 100.0
+
+
+@dataclass(kw_only=True)
+class KKT(Solver):
+    """Equality constraints by Newton's method on the KKT conditions, with a Gauss-Newton Hessian.
+
+    Attributes:
+        full_steps: take every step in full, as the paper does; no merit function and no damping.
+        second_order_correction: try to repair a full step that the merit function rejects.
+        step_tolerance: the paper's stop rule, on the norm of the step in unknowns and multipliers together (1e-3
+            there). A positive number switches it on; it does not grant CONVERGED.
+    """
+
+    full_steps: bool = False
+    second_order_correction: bool = True
+    step_tolerance: float = 0.0
+
+    def require(self, program: Program) -> None:
+        """Refuse scalar costs and inequalities."""
+        require_squares(program, self.name)
+        require_equalities(program, self.name)
+
+    def workspace(self, program: Program) -> Newton:
+        """Structure of the KKT matrix."""
+        return Newton(program)
+
+    def search_step(self, run: Run, workspace: Newton, lin: Linearization) -> Array | None:
+        """The unknowns' part of the full step."""
+        workspace.begin(self.name)
+        found = workspace.step(lin, run.multipliers, SMALLEST_DAMPING, 0.0)
+        return None if found is None else found[0]
+
+    def iterate(self, run: Run, workspace: Newton) -> Status | None:
+        """Iterate to convergence."""
+        workspace.begin(self.name)
+        merit = Merit(run.program)
+        damping = slackness = 0.0
+        failures = 0
+        while run.status is None:
+            found = workspace.step(run.lin, run.multipliers, damping, slackness)
+            if found is None and self.full_steps:
+                return Status.SINGULAR
+            taken = None if found is None else self._search(run, workspace, merit, *found)
+            if taken is None or slackness:
+                if run.infeasible_stationary():
+                    return Status.LOCALLY_INFEASIBLE
+            if taken is None:
+                failures += 1
+                if failures > FAILURES:
+                    return Status.SINGULAR if found is None else Status.STALLED
+                damping = max(RETRY_GROWTH * damping, FIRST_DAMPING)
+                if found is None:
+                    slackness = max(RETRY_GROWTH * slackness, FIRST_SLACKNESS)
+                continue
+            after, step, change, length, corrected = taken
+            run.accept(
+                after,
+                run.multipliers + change,
+                norm(step),
+                length,
+                multiplier_step=norm(change),
+                **({"damping": damping} if damping else {}),
+                **({"correction": 1} if corrected else {}),
+            )
+            if run.status is None and np.hypot(norm(step), norm(change)) < self.step_tolerance:
+                return Status.STOP_RULE
+            failures = 0
+            damping = _next_damping(damping, length)
+            slackness = 0.1 * slackness if slackness > SMALLEST_DAMPING else 0.0
+        return None
+
+    def _search(
+        self, run: Run, workspace: Newton, merit: Merit, step: Array, change: Array
+    ) -> tuple[Linearization, Array, Array, float, bool] | None:
+        """New linearisation, step and change of multipliers as taken, length, whether corrected; None for no step."""
+        program, lin = run.program, run.lin
+        if self.full_steps:
+            return program.linearize(program.retract(lin.values, step)), step, change, 1.0, False
+        linear = program.constraints.times(lin.constraint_jacobian, step)
+        slope = merit.slope(lin, step, linear)
+        here = merit.value(lin)
+        slack = ROUNDING * max(1.0, abs(here))
+        if not slope <= slack:
+            return None
+        values = program.retract(lin.values, step)
+        trial = program.evaluate(values, lin.weights)
+        if merit.accepts(trial, here, slope, 1.0, slack):
+            return program.linearize(values), step, change, 1.0, False
+        if self.second_order_correction and trial.finite and program.constraints.count:
+            bend = trial.constraints - lin.constraints - linear
+            again = workspace.resolve(lin, run.multipliers, bend)
+            if again is not None:
+                values = program.retract(lin.values, again[0])
+                if merit.accepts(program.evaluate(values, lin.weights), here, slope, 1.0, slack):
+                    return program.linearize(values), *again, 1.0, True
+        length = 0.5
+        while length >= SHORTEST:
+            values = program.retract(lin.values, length * step)
+            if merit.accepts(program.evaluate(values, lin.weights), here, slope, length, slack):
+                return program.linearize(values), length * step, length * change, length, False
+            length *= 0.5
+        return None
+
+
+class Newton:
+    """The KKT system of one prepared graph."""
+
+    def __init__(self, program: Program) -> None:
+        """Analyse the KKT matrix."""
+        self.program = program
+        self._structure(program)
+
+    def begin(self, solver: str) -> None:
+        """Look at the limits of this solve: they may be data.
+
+        Raises:
+            BackendError: when a limit no longer is an equality.
+        """
+        program = self.program
+        if not np.array_equal(program.equality, self.system.equality):
+            require_equalities(program, solver)
+            self._structure(program)
+
+    def step(
+        self, lin: Linearization, multipliers: Array, damping: float, slackness: float
+    ) -> tuple[Array, Array] | None:
+        """Solve for the step.
+
+        Args:
+            lin: where.
+            multipliers: (M,) there.
+            damping: added to the diagonal of H, relative to it; turns the step towards descent.
+            slackness: subtracted from the diagonal of the multipliers' block, relative to the largest A A' / H; lets
+                linearised constraints that contradict each other be met by halves.
+
+        Returns:
+            (n,) tangent step and (M,) change of the multipliers; None when the system is singular.
+        """
+        n = self.program.size
+        fill(self.system.arrays, lin.hessian, lin.constraint_jacobian, self._data)
+        diagonal = self.system.pattern.diagonal
+        curvatures = self._data[diagonal[:n]]
+        curvature = float(curvatures.max(initial=0.0)) or 1.0
+        pull = (largest(lin.constraint_jacobian) or 1.0) ** 2 / curvature
+        self._data[diagonal[:n]] += damping * np.maximum(curvatures, DIAGONAL_FLOOR * curvature)
+        self._data[diagonal[n:]] -= slackness * pull
+        self._added[:n], self._added[n:] = SHIFT * curvature, -SHIFT * pull
+        if not self.system.factorization.factor(self._data, self._added):
+            return None
+        return self.resolve(lin, multipliers, np.zeros(len(multipliers)))
+
+    def resolve(self, lin: Linearization, multipliers: Array, bend: Array) -> tuple[Array, Array] | None:
+        """Solve with the last factorisation, the constraints moved by ``bend`` (M,)."""
+        program, n, rows = self.program, self.program.size, self.system.arrays.rows
+        right = np.empty(n + len(rows))
+        right[:n] = -program.lagrangian_gradient(lin, multipliers)[program.columns.free]
+        right[n:] = program.lower[rows] - (lin.constraints + bend)[rows]
+        found = self.system.factorization.refine(self._data, right)
+        # Constraints by themselves: multipliers that blow up would hide that they contradict each other.
+        rest = self.system.pattern.times(self._data, found) - right
+        size = largest(self._data) * largest(found) + largest(right[:n])
+        reach = largest(lin.constraint_jacobian) * largest(found[:n]) + largest(right[n:])
+        if not (largest(rest[:n]) <= RESIDUAL * size and largest(rest[n:]) <= RESIDUAL * reach):
+            return None
+        change = np.zeros(len(multipliers))
+        change[rows] = found[n:]
+        return found[:n], change
+
+    def _structure(self, program: Program) -> None:
+        self.system = KktSystem(program, program.equality)
+        self._data = np.zeros(self.system.pattern.nnz)
+        self._added = np.zeros(self.system.pattern.size)
+
+
+class Merit:
+    """l1 merit: the cost plus a price per unit of violation."""
+
+    def __init__(self, program: Program) -> None:
+        """Start without a price: the first step that needs one raises it."""
+        self.program = program
+        self.price = 0.0
+
+    def value(self, point: Linearization | Evaluation) -> float:
+        """Merit at a point."""
+        return point.cost + self.price * self._violation(point.constraints)
+
+    def slope(self, lin: Linearization, step: Array, linear: Array) -> float:
+        """Bound of the merit's derivative along a step, after the price was raised to make it one of descent.
+
+        Args:
+            lin: where.
+            step: (n,).
+            linear: (M,) A times the step.
+        """
+        program = self.program
+        descent = float(lin.gradient[program.columns.free] @ step)
+        gain = self._violation(lin.constraints) - self._violation(lin.constraints + linear)
+        if gain > 0.0:
+            curved = float(step @ program.hessian.times(program.hessian_entries(lin), step))
+            needed = (descent + 0.5 * curved) / ((1.0 - MARGIN) * gain)
+            if needed > self.price:
+                self.price = 1.5 * needed
+        return descent - self.price * gain
+
+    def accepts(self, trial: Evaluation, here: float, slope: float, length: float, slack: float) -> bool:
+        """Armijo's condition."""
+        return trial.finite and self.value(trial) <= here + ARMIJO * length * slope + slack
+
+    def _violation(self, constraints: Array) -> float:
+        return float(np.abs(self.program.violation(constraints)).sum())
+
+
+def require_equalities(program: Program, solver: str) -> None:
+    """Raise unless every constraint that is switched on is an equality.
+
+    Raises:
+        BackendError: naming the first inequality.
+    """
+    limited = np.isfinite(program.lower) | np.isfinite(program.upper)
+    rows = np.flatnonzero(limited & ~program.equality)
+    if len(rows):
+        name, index = program.row_name(int(rows[0]))
+        raise BackendError(
+            f"{solver} cannot take the inequality '{name}' (factor {index}): it knows equalities only; use "
+            "InteriorPoint, SQP or AugmentedLagrangian"
+        )
+
+
+def _next_damping(damping: float, length: float) -> float:
+    """A shortened step means curvature that H does not know: damp, and forget it again."""
+    if length < 1.0:
+        return max(DAMPING_GROWTH * damping, FIRST_DAMPING)
+    return DAMPING_DECAY * damping if damping > SMALLEST_DAMPING else 0.0

@@ -1,0 +1,115 @@
+"""Constraints as costs with a growing weight: the baseline (ecg2o, section 3.3).
+
+Every constraint becomes the cost rho/2 |v|^2 of its violation v, which is zero on the permitted side of an inequality.
+Each weight rho of a schedule has its own minimum, where the next one starts; there rho v is the estimate of the
+multipliers, and the violation left is about lambda / rho. A small violation takes a large weight, which makes the
+systems ill-conditioned: `AugmentedLagrangian` needs neither.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from unifg.errors import BackendError
+from unifg.linearization import Linearization
+from unifg.program import Program
+from unifg.solver import Run, Solver
+from unifg.solvers.damping import Damping, damped_step, norm
+from unifg.solvers.least_squares import require_squares
+from unifg.solvers.model import model_step
+from unifg.solvers.primal import Primal
+from unifg.status import Status
+from unifg.typing import Array
+
+ROUNDING = 1e-15  # relative decrease of the objective that is noise
+
+
+@dataclass(kw_only=True)
+class Penalty(Solver):
+    """Equalities and inequalities as quadratic penalties with a schedule of growing weights.
+
+    The multipliers returned are the estimates rho times violation; those of the guess are not used. When the last
+    weight leaves the problem's own KKT conditions unmet, the status is STOP_RULE.
+
+    Attributes:
+        max_iterations: steps over all weights.
+        penalty: first weight rho.
+        penalty_growth: factor from one weight to the next.
+        largest_penalty: the last weight.
+        inner_iterations: steps before the next weight, converged or not.
+        damping: initial Levenberg-Marquardt damping of each weight.
+    """
+
+    max_iterations: int = 300
+    penalty: float = 1.0
+    penalty_growth: float = 10.0
+    largest_penalty: float = 1e10
+    inner_iterations: int = 20
+    damping: float = 1e-6
+
+    def __post_init__(self) -> None:
+        """Refuse schedules that do not grow."""
+        super().__post_init__()
+        if not self.penalty > 0.0:
+            raise BackendError(f"{self.name}: penalty must be positive, found {self.penalty}")
+        if not self.penalty_growth > 1.0:
+            raise BackendError(f"{self.name}: penalty_growth must be above 1, found {self.penalty_growth}")
+
+    def require(self, program: Program) -> None:
+        """Refuse scalar costs: the step is least squares."""
+        require_squares(program, self.name)
+
+    def workspace(self, program: Program) -> Primal:
+        """The factorisation of the normal equations."""
+        return Primal(program)
+
+    def search_step(self, run: Run, workspace: Primal, lin: Linearization) -> Array | None:
+        """A step at the first weight and the initial damping."""
+        none = np.zeros(len(run.multipliers))
+        found = model_step(workspace, lin, none, np.full(len(none), self.penalty), self.damping)
+        return None if found is None else found[0]
+
+    def iterate(self, run: Run, workspace: Primal) -> Status | None:
+        """Minimise for one weight after the other."""
+        none = np.zeros(len(run.multipliers))
+        rho = self.penalty
+        last = max(self.largest_penalty, rho)
+        while True:
+            stalled = self._minimize(run, workspace, none, rho)
+            if run.status is not None:
+                return None
+            if not self._violated(run):  # a heavier weight would not help
+                return Status.STALLED
+            if rho >= last:
+                if run.infeasible_stationary():
+                    return Status.LOCALLY_INFEASIBLE
+                return Status.STALLED if stalled else Status.STOP_RULE
+            rho = min(rho * self.penalty_growth, last)
+
+    def _minimize(self, run: Run, primal: Primal, none: Array, rho: float) -> bool:
+        """Minimise for one weight; returns whether no step helped any more."""
+        penalty = np.full(len(none), rho)
+        damping = Damping(self.damping)
+        for _ in range(self.inner_iterations):
+            gradient = float(np.abs(primal.gradient(run.lin, none, penalty)).max(initial=0.0))
+            if self._violated(run) and gradient <= max(min(1.0, 1.0 / rho), 0.1 * self.tolerance):
+                return False
+            taken = damped_step(primal, run.lin, none, penalty, damping)
+            if taken is None:
+                return True
+            values, step, rejected = taken
+            before = primal.merit(run.lin, none, penalty)
+            lin = run.program.linearize(values)
+            estimate = primal.next_multipliers(lin.constraints, none, penalty)
+            run.accept(lin, estimate, norm(step), 1.0, penalty=rho, damping=damping.value, rejected=rejected)
+            if run.status is not None:
+                return False
+            if before - primal.merit(lin, none, penalty) <= ROUNDING * max(1.0, abs(before)):
+                return True
+        return False
+
+    def _violated(self, run: Run) -> bool:
+        """Whether the constraints as they are ask for a heavier weight."""
+        return max(run.optimality.violation, run.optimality.complementarity) > self.tolerance

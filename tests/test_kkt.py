@@ -1,0 +1,210 @@
+"""The KKT backend: its step against dense algebra, its globalisation, its refusals, the paper's second case study."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from judge import judge
+from problems import STARTS, ecg2o, short_drive, three_variable_qp
+from unifg.models import unicycle
+from unifg.solvers import KKT, SQP
+from unifg.typing import Array
+
+STEPS_OF_REFERENCE = [5, 7, 8, 8, 6, 10]
+"""Full Newton-KKT steps with a Gauss-Newton Hessian until the step is below 1e-3, worked out independently."""
+
+
+def circle(
+    start: tuple[float, float], target: tuple[float, float] = (1.0, 1.0), square: float = 1.0
+) -> tuple[fg.Graph, dict[fg.Family, Array]]:
+    """The point of a circle nearest to a target."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(fg.prior, x, list(target))
+    graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=square, upper=square, name="circle")
+    return graph, {x: np.array([start])}
+
+
+def drive(goal: tuple[float, float, float], count: int = 12) -> tuple[fg.Graph, dict[fg.Family, Array]]:
+    """A unicycle without limits."""
+    graph = fg.Graph()
+    x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
+    graph.fix(x[0], [0.0, 0.0, 0.0])
+    graph.minimize(unicycle.tracking, x[-1], list(goal), sigma=0.1)
+    graph.minimize(fg.prior, u, [0.0, 0.0], sigma=2.0)
+    graph.minimize(unicycle.rate, u[:-1], u[1:], sigma=1.0)
+    graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], 0.2, lower=0.0, upper=0.0, name="dynamics")
+    return graph, {x: np.zeros((count + 1, 3)), u: np.tile([0.1, 0.0], (count, 1))}
+
+
+@pytest.mark.parametrize(
+    "build", [lambda: ecg2o((1.0, 1.0)), lambda: drive((1.0, 0.6, 0.4), 4)], ids=["ecg2o", "drive"]
+)
+def test_one_full_step_is_the_dense_kkt_step(build: Callable[[], tuple[fg.Graph, dict[fg.Family, Array]]]) -> None:
+    graph, guess = build()
+    program = graph.compile()
+    values = program.values_from(guess)
+    rng = np.random.default_rng(3)
+    multipliers = rng.normal(size=program.constraints.count)
+    lin = program.linearize(values)
+    n, m = program.size, program.constraints.count
+    upper = program.normal.matrix(lin.hessian).toarray()
+    hessian = upper + upper.T - np.diag(upper.diagonal())
+    jacobian = program.constraints.matrix(lin.constraint_jacobian).toarray()
+    matrix = np.block([[hessian, jacobian.T], [jacobian, np.zeros((m, m))]])
+    gradient = lin.gradient[program.columns.free] + jacobian.T @ multipliers
+    expected = np.linalg.solve(matrix, -np.concatenate([gradient, lin.constraints - program.lower]))
+    duals = {
+        t.name: multipliers[s].reshape(t.count, t.size)
+        for t, s in zip(program.constraint_terms, program.slices, strict=True)
+    }
+    rows: list[fg.Iteration] = []
+    taken = KKT(full_steps=True, max_iterations=1, keep_values=True)
+    taken.solve(graph, guess, duals=duals, callback=rows.append)
+    reached = rows[1].values
+    assert reached is not None
+    moved = program.retract(values, expected[:n])
+    for family, array in reached.items():
+        np.testing.assert_allclose(array, moved[family], rtol=1e-9, atol=1e-11)
+    assert rows[1].step_norm == pytest.approx(np.linalg.norm(expected[:n]), rel=1e-9)
+    assert rows[1].details["multiplier_step"] == pytest.approx(np.linalg.norm(expected[n:]), rel=1e-8)
+
+
+@pytest.mark.parametrize(("start", "steps"), list(zip(STARTS, STEPS_OF_REFERENCE, strict=True)))
+def test_case_study_2_takes_the_steps_of_the_reference(start: tuple[float, float], steps: int) -> None:
+    graph, guess = ecg2o(start)
+    stopped = KKT(full_steps=True, step_tolerance=1e-3).solve(graph, guess)
+    assert stopped.status is fg.Status.STOP_RULE  # convergence is linear here: the rule is no solution
+    assert stopped.iterations == steps
+    assert np.abs(stopped[graph.families["x"]]).max() < 1e-3
+    for solver in (KKT(), KKT(full_steps=True)):
+        solution = solver.solve(graph, guess, check=True)
+        assert solution.dual("curve")[0, 0] == pytest.approx(-1.0, abs=1e-6)
+        assert solution.iterations <= steps + 4
+
+
+def test_linear_equalities_take_one_step() -> None:
+    graph, guess = three_variable_qp()
+    for solver in (KKT(), KKT(full_steps=True)):
+        assert solver.solve(graph, guess, check=True).iterations == 1
+        paper = KKT(step_tolerance=1e-3, tolerance=1e-15)
+    assert paper.solve(graph, guess).iterations == 2  # the second finds that nothing is left to do
+
+
+def test_started_at_the_answer_takes_no_step() -> None:
+    graph, guess = drive((1.0, 0.6, 0.4))
+    first = KKT().solve(graph, guess, check=True)
+    again = KKT().solve(graph, first)
+    assert again.converged and again.iterations == 0
+    assert again.cost == first.cost
+    without = KKT().solve(graph, first.values)  # the multipliers are found in one step
+    assert without.converged and without.iterations == 1
+
+
+@pytest.mark.parametrize("goal", [(2.0, 0.1, 0.0), (0.0, 2.0, 0.0), (-2.0, 0.3, 3.0)])
+def test_line_search_brings_a_unicycle_from_afar_to_the_optimum(goal: tuple[float, float, float]) -> None:
+    graph, guess = drive(goal)
+    solution = KKT().solve(graph, guess)
+    assert solution.converged, solution.report()
+    assert judge(graph, solution).worst() < 2e-6
+    assert solution.cost == pytest.approx(SQP().solve(graph, guess, check=True).cost, rel=1e-6)
+
+
+def test_feasibility_is_restored_although_the_cost_rises() -> None:
+    """From the unconstrained minimum the plain cost, as a merit, would reject every step towards the circle."""
+    graph, guess = circle((3.0, 3.0), target=(3.0, 3.0))
+    solution = KKT().solve(graph, guess, check=True)
+    assert solution.history[0].cost == 0.0 < solution.history[1].cost
+    np.testing.assert_allclose(solution[graph.families["x"]], 0.5**0.5, atol=1e-6)
+
+
+def test_strong_curvature_needs_the_merit_function() -> None:
+    """On a small circle the Hessian of Gauss-Newton is 30 times too weak: full steps cycle, shortened ones damp."""
+    graph, guess = circle((1.0, 0.5), (0.3, 0.1), 1e-4)
+    assert not KKT(full_steps=True).solve(graph, guess).converged
+    solution = KKT().solve(graph, guess, check=True)
+    assert judge(graph, solution).worst() < 2e-6
+    assert any("damping" in row.details for row in solution.history)
+    assert any(row.step_length < 1.0 for row in solution.history[1:])
+
+
+def test_second_order_correction_repairs_a_full_step() -> None:
+    """Along a circle a full step leaves the constraint: Maratos."""
+    graph, guess = circle((np.cos(2.0), np.sin(2.0)), target=(3.0, 0.0))
+    corrected = KKT().solve(graph, guess, check=True)
+    rows = [row for row in corrected.history if "correction" in row.details]
+    assert rows and all(row.step_length == 1.0 for row in rows)
+    plain = KKT(second_order_correction=False).solve(graph, guess, check=True)
+    assert not any("correction" in row.details for row in plain.history)
+    assert plain.cost == pytest.approx(corrected.cost, rel=1e-9)
+
+
+def test_equality_stated_twice() -> None:
+    graph, guess = circle((0.3, 2.0))
+    x = graph.families["x"]
+    graph.constrain(lambda p: 2.0 * (p**2).sum(axis=1, keepdims=True), x, lower=2.0, upper=2.0, name="again")
+    solution = KKT().solve(graph, guess, check=True)
+    np.testing.assert_allclose(solution[x], 0.5**0.5, atol=1e-6)
+
+
+def test_equalities_that_contradict_each_other_are_no_exception() -> None:
+    graph, guess = circle((0.3, 2.0))
+    x = graph.families["x"]
+    graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=2.0, upper=2.0, name="larger")
+    solution = KKT().solve(graph, guess)
+    assert solution.status in (fg.Status.STALLED, fg.Status.LOCALLY_INFEASIBLE)
+    assert solution.violation > 0.4
+    assert KKT(full_steps=True).solve(graph, guess).status is fg.Status.SINGULAR
+
+
+def test_a_start_where_the_constraint_has_no_slope_is_named() -> None:
+    graph, guess = circle((0.0, 0.0))
+    assert KKT().solve(graph, guess).status is fg.Status.LOCALLY_INFEASIBLE
+
+
+@pytest.mark.parametrize(("scale", "tolerance"), [(1e-3, 1e-12), (1.0, 1e-9), (1e6, 1e-6)])
+def test_scales_of_costs_do_not_matter(scale: float, tolerance: float) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(lambda p: scale * (p - 1.0), x)
+    graph.constrain(lambda p: 1e-3 * (p**2).sum(axis=1, keepdims=True), x, lower=1e-3, upper=1e-3)
+    solution = KKT(tolerance=tolerance).solve(graph, {x: np.array([[0.3, 2.0]])})
+    assert solution.converged, solution.report()
+    np.testing.assert_allclose(solution[x], 0.5**0.5, rtol=1e-4)
+
+
+def test_inequalities_and_scalar_costs_are_refused_by_name() -> None:
+    graph, guess = short_drive()
+    with pytest.raises(fg.BackendError, match="KKT cannot take the inequality 'limits'"):
+        KKT().solve(graph, guess)
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize_scalar(lambda p: p[:, 0] ** 4, x, name="quartic")
+    with pytest.raises(fg.BackendError, match="scalar cost 'quartic'"):
+        KKT().solve(graph, {x: np.ones((1, 1))})
+
+
+def test_limits_that_are_data_are_looked_at_in_every_solve() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    low, high = graph.data("low", np.array([0.5, 0.5])), graph.data("high", np.array([0.5, 0.5]))
+    graph.minimize(fg.prior, x, [1.0, 2.0])
+    graph.bound(x, lower=low, upper=high, name="box")
+    run = KKT().prepare(graph)
+    guess = {x: np.zeros((1, 2))}
+    np.testing.assert_allclose(run.solve(guess)[x], 0.5)
+    with pytest.raises(fg.BackendError, match="inequality 'box'"):
+        run.solve(guess, data={high: np.array([0.5, 0.7])})
+    free = run.solve(guess, data={low: np.array([0.5, -np.inf]), high: np.array([0.5, np.inf])})
+    np.testing.assert_allclose(free[x], [[0.5, 2.0]])
+
+
+def test_search_without_search_jacobians_changes_nothing() -> None:
+    graph, guess = drive((1.0, 0.6, 0.4))
+    solution = KKT(search_iterations=3).solve(graph, guess)  # nothing here has a search Jacobian
+    assert solution.converged
+    assert [row.number for row in solution.history] == list(range(solution.iterations + 1))

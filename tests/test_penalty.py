@@ -1,0 +1,94 @@
+"""The penalty baseline: its schedule, its estimates of the multipliers, and a status that does not flatter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from judge import judge
+from problems import STARTS, active_bounds, ecg2o, ecg2o_inequality, inactive_inequality, short_drive
+from unifg.solvers import AugmentedLagrangian, Penalty
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_case_study_2(start: tuple[float, float]) -> None:
+    graph, guess = ecg2o(start)
+    solution = Penalty().solve(graph, guess, check=True)
+    assert judge(graph, solution).worst() < 2e-6
+    assert solution.dual("curve")[0, 0] == pytest.approx(-1.0, abs=1e-5)
+    # The minimum of a penalised cost violates: by about the multiplier over the weight.
+    last = float(solution.history[-1].details["penalty"])
+    assert solution.violation == pytest.approx(1.0 / last, rel=0.1)
+    assert solution.cost < 1.0
+
+
+def test_weights_follow_the_schedule() -> None:
+    graph, guess = ecg2o((0.5, -0.5))
+    solution = Penalty(penalty=2.0, penalty_growth=5.0).solve(graph, guess, check=True)
+    weights = list(dict.fromkeys(float(row.details["penalty"]) for row in solution.history[1:]))
+    np.testing.assert_allclose(weights, 2.0 * 5.0 ** np.arange(len(weights)))
+    lighter = [row.violation for row in solution.history if row.details.get("penalty") == weights[2]][-1]
+    heavier = [row.violation for row in solution.history if row.details.get("penalty") == weights[3]][-1]
+    assert heavier == pytest.approx(lighter / 5.0, rel=0.2)
+
+
+def test_inequalities_are_one_sided() -> None:
+    graph, guess = inactive_inequality()
+    inside = Penalty().solve(graph, guess, check=True)
+    assert inside[graph.families["x"]][0, 0] == pytest.approx(0.2, abs=1e-9)
+    assert inside.dual("limit")[0, 0] == 0.0
+    graph, guess = active_bounds()
+    box = Penalty().solve(graph, guess, check=True)
+    np.testing.assert_allclose(box.dual("box"), [[2.0, -2.0, 0.0]], atol=1e-5)
+    graph, guess = ecg2o_inequality()
+    both = Penalty().solve(graph, guess, check=True)
+    np.testing.assert_allclose(both[graph.families["x"]], [[5.0**-0.5, 2.0 * 5.0**-0.5]], atol=1e-5)
+
+
+def test_a_light_last_weight_ends_without_the_claim() -> None:
+    graph, guess = ecg2o((0.5, -0.5))
+    solution = Penalty(largest_penalty=100.0).solve(graph, guess)
+    assert solution.status is fg.Status.STOP_RULE
+    assert not solution.converged
+    assert solution.violation == pytest.approx(0.01, rel=0.1)
+    assert solution.worst == ("curve", 0)
+    assert solution.dual("curve")[0, 0] == pytest.approx(-1.0, abs=0.1)
+
+
+def test_agrees_with_the_augmented_lagrangian() -> None:
+    graph, guess = short_drive(disc=False)
+    soft, exact = Penalty().solve(graph, guess, check=True), AugmentedLagrangian().solve(graph, guess, check=True)
+    assert soft.cost == pytest.approx(exact.cost, rel=1e-5)
+    assert soft.iterations > exact.iterations
+    for family in graph.families.values():
+        np.testing.assert_allclose(soft[family], exact[family], atol=1e-4)
+
+
+def test_infeasible_problem_is_named() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [0.0])
+    graph.bound(x, lower=2.0, name="above")
+    graph.constrain(lambda p: p, x, upper=1.0, name="below")
+    solution = Penalty().solve(graph, {x: np.zeros((1, 1))})
+    assert solution.status is fg.Status.LOCALLY_INFEASIBLE, solution.report()
+    assert solution.violation == pytest.approx(0.5, abs=1e-3)
+
+
+def test_limits_of_the_loop() -> None:
+    graph, guess = short_drive()
+    assert Penalty(max_iterations=2).solve(graph, guess).status is fg.Status.ITERATION_LIMIT
+    assert Penalty(time_limit=0.0).solve(graph, guess).status is fg.Status.TIME_LIMIT
+
+
+def test_refusals() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize_scalar(lambda p: p[:, 0] ** 4, x, name="quartic")
+    with pytest.raises(fg.BackendError, match="scalar cost 'quartic'"):
+        Penalty().solve(graph, {x: np.ones((1, 1))})
+    with pytest.raises(fg.BackendError, match="penalty must be positive"):
+        Penalty(penalty=0.0)
+    with pytest.raises(fg.BackendError, match="penalty_growth must be above 1"):
+        Penalty(penalty_growth=1.0)
