@@ -254,7 +254,7 @@ def test_a_map_of_ones_own_needs_start_and_goal(tmp_path: Path) -> None:
         run_navigation(replace(own, start=(1.0, 1.0, 0.0)))
 
 
-# ---------------------------------------------------------------------- route
+# ----------------------------------------------------------------- localiser
 
 
 @functools.cache
