@@ -44,6 +44,31 @@ def _disc_clearance(v: Array, p: Array, table: Array, r: Array, J: Array) -> Non
             _in_body(cosine, sine, scale * x, scale * y, k, J)
 
 
+@compiled
+def _disc_clearance_second(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
+    """Hessian of w' (|x - c| - radius): across the direction to the centre, and along the arc of the pose."""
+    count, cosine, sine = len(w), math.cos(v[2]), math.sin(v[2])
+    for i in range(len(S)):
+        for k in range(len(S)):
+            S[i, k] = 0.0
+    pull_x = pull_y = 0.0
+    for k in range(count):
+        x, y = v[0] - p[2 * k], v[1] - p[2 * k + 1]
+        distance = math.sqrt(x * x + y * y)
+        if distance < NEAR:
+            continue
+        x, y = x / distance, y / distance
+        pull_x += w[k] * x
+        pull_y += w[k] * y
+        scale, ahead, aside = w[k] / distance, cosine * x + sine * y, cosine * y - sine * x
+        S[0, 0] += scale * aside * aside
+        S[0, 1] -= scale * ahead * aside
+        S[1, 1] += scale * ahead * ahead
+    S[0, 2] = 0.5 * (cosine * pull_y - sine * pull_x)
+    S[1, 2] = -0.5 * (cosine * pull_x + sine * pull_y)
+    S[1, 0], S[2, 0], S[2, 1] = S[0, 1], S[0, 2], S[1, 2]
+
+
 def _discs(centre: tuple[int, ...], radius: tuple[int, ...]) -> int:
     if centre != (*radius, 2):
         raise GraphError(
@@ -53,7 +78,9 @@ def _discs(centre: tuple[int, ...], radius: tuple[int, ...]) -> int:
     return centre[0]
 
 
-disc_clearance = residual(Kernel(_disc_clearance, (SE2, 2, 1), _discs, name="disc clearance"))
+disc_clearance = residual(
+    Kernel(_disc_clearance, (SE2, 2, 1), _discs, name="disc clearance", second=_disc_clearance_second)
+)
 """``disc_clearance(x, centre, radius)``: |p - c| - r [m], one column per disc, (n, M).
 
 x: (n, 3) SE(2) poses. centre: (M, 2) shared by all poses or (n, M, 2), one set for each, as for moving discs.
@@ -118,6 +145,7 @@ def shortfall(distance: Residual, margin: float) -> Residual:
     name = f"{distance.name} margin"
     if distance.kernel is not None:
         table = np.concatenate([[margin], distance.kernel.table])
-        return residual(replace(distance.kernel, function=_short(distance.kernel.function), table=table, name=name))
+        short = _short(distance.kernel.function)
+        return residual(replace(distance.kernel, function=short, table=table, name=name, second=None))
     function = _Shortfall(distance, margin)
     return residual(function, function.jacobian, name)

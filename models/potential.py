@@ -77,7 +77,7 @@ def _kernel(distance: Callable[..., None], search: bool) -> Callable[..., None]:
 def _kernels(distance: Kernel, numbers: list[float], name: str) -> tuple[Kernel, Kernel]:
     """The true kernel and the one to search with; both read one table."""
     table = np.concatenate([numbers, distance.table])
-    true = replace(distance, function=_kernel(distance.function, False), table=table, name=name)
+    true = replace(distance, function=_kernel(distance.function, False), table=table, name=name, second=None)
     return true, replace(true, function=_kernel(distance.function, True))
 
 

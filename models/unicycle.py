@@ -126,10 +126,53 @@ def _tracking(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
         world_from_body(v[2], J, 0)
 
 
-dynamics = residual(Kernel(_dynamics, (SE2, CONTROL, SE2, 0), 3, name="dynamics"))
+@compiled
+def bend(heading: float, x: float, y: float, at: int, S: Array) -> None:
+    """Add the Hessian of (x, y)' p along the right perturbation of a pose, whose columns begin at ``at``.
+
+    The position moves by R (v + omega [1]x v / 2) to second order.
+    """
+    cosine, sine = math.cos(heading), math.sin(heading)
+    first, second = 0.5 * (cosine * y - sine * x), -0.5 * (cosine * x + sine * y)
+    S[at, at + 2] += first
+    S[at + 2, at] += first
+    S[at + 1, at + 2] += second
+    S[at + 2, at + 1] += second
+
+
+@compiled
+def _dynamics_second(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
+    """Hessian of w' (x_next - f(x, u))."""
+    dt, x, y = p[0], w[0], w[1]
+    middle = v[2] + 0.5 * dt * v[4]
+    cosine, sine = math.cos(middle), math.sin(middle)
+    for i in range(len(S)):
+        for k in range(len(S)):
+            S[i, k] = 0.0
+    bend(v[2], -x, -y, 0, S)
+    bend(v[7], x, y, 5, S)
+    along, across = dt * v[3] * (cosine * x + sine * y), dt * (cosine * y - sine * x)
+    S[2, 2] += along
+    S[2, 3] -= across
+    S[2, 4] += 0.5 * dt * along
+    S[3, 4] -= 0.5 * dt * across
+    S[4, 4] += 0.25 * dt * dt * along
+    S[3, 2], S[4, 2], S[4, 3] = S[2, 3], S[2, 4], S[3, 4]
+
+
+@compiled
+def _tracking_second(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
+    """Hessian of w' (p - p_ref, theta - theta_ref)."""
+    for i in range(len(S)):
+        for k in range(len(S)):
+            S[i, k] = 0.0
+    bend(v[2], w[0], w[1], 0, S)
+
+
+dynamics = residual(Kernel(_dynamics, (SE2, CONTROL, SE2, 0), 3, name="dynamics", second=_dynamics_second))
 """``dynamics(x, u, x_next, dt)``: x_next - f(x, u), (n, 3) [m, m, rad] (Bazzana eq. 11-14)."""
 
-tracking = residual(Kernel(_tracking, (SE2, (3,)), 3, name="tracking"))
+tracking = residual(Kernel(_tracking, (SE2, (3,)), 3, name="tracking", second=_tracking_second))
 """``tracking(x, reference)``: deviation from a reference pose in world axes, (n, 3) [m, m, rad] (Bazzana eq. 8)."""
 
 _change = difference.on(CONTROL).kernel

@@ -20,13 +20,15 @@ from unifg.program import Program
 from unifg.solver import Run, Solver
 from unifg.solvers.damping import Damping, damped_step, norm
 from unifg.solvers.least_squares import require_squares
+from unifg.solvers.least_violation import settle
 from unifg.solvers.model import model_step
 from unifg.solvers.primal import Primal
 from unifg.status import Status
 from unifg.typing import Array
 
 LARGEST_PENALTY = 1e10
-COLD_PENALTY = 1000.0
+COLD_PENALTY = 10.0  # Birgin and Martinez
+FALL = 0.25  # of the change of multipliers over rho, between outer iterations; else rho grows
 WARM_PENALTY = 100.0
 
 
@@ -143,14 +145,16 @@ class AugmentedLagrangian(Solver):
             if len(run.history) == before:  # nothing moved: the dual step alone is this iteration
                 run.accept(run.lin, after, 0.0, 0.0, outer=outer, penalty=rho)
             if stalled and (change == 0.0 or rho >= LARGEST_PENALTY):
-                return Status.STALLED
+                return settle(run, Status.STALLED)
             if change <= violation_goal:
                 multipliers = after
-                violation_goal = max(violation_goal / rho**0.9, 0.1 * self.tolerance)
+                violation_goal = max(min(violation_goal / rho**0.9, FALL * change), 0.1 * self.tolerance)
                 gradient_goal = max(0.1 * gradient_goal, 0.1 * self.tolerance)
             else:
                 if run.infeasible_stationary():
                     return Status.LOCALLY_INFEASIBLE
+                if rho >= LARGEST_PENALTY:
+                    return settle(run, Status.STALLED)
                 rho = min(rho * self.penalty_growth, LARGEST_PENALTY)
                 gradient_goal, violation_goal = self._goals(run, primal, rho)
             if stalled:

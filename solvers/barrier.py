@@ -1,383 +1,389 @@
 """Newton steps of a primal-dual interior point with elastic inequalities, as compiled functions.
 
-Every finite limit of an inequality row is a *side* c(x) >= 0, with c = g - lower or upper - g. It is relaxed by an
+Every finite limit of an inequality row is a *side* c(x) >= 0, with c = g - lower or upper - g. It has a slack s and an
 elastic variable e with price rho, and both carry a logarithmic barrier:
 
     min  f(x) + sum rho e - mu log s - mu log e     s.t.  c(x) + e - s = 0,   h(x) = 0
 
-For given c the best s and e are known in closed form, so a side contributes a smooth function of x and no constraint;
-its multiplier y lies between 0 and rho and is iterated with the rest (primal-dual). Eliminating s, e and y leaves one
-scalar per side,
+With the multiplier y of a side and z = rho - y, the conditions s y = mu and e z = mu are linearised as they stand
+(primal-dual). Eliminating ds, de and dy leaves one scalar per side,
 
-    (H + J' D J) dx + A' lambda+ = -(grad f - J' y) - J' D r,    A dx = -h,    1/D = s/y + e/(rho - y),
+    (H + J' D J) dx + A' lambda+ = -(grad f - J' y) - J' D r,    A dx = -h,    1/D = s/y + e/z,
+    r = c + mu/z - mu/y,   dy = -D (J dx + r),   ds = mu/y - s - (s/y) dy,   de = mu/z - e + (e/z) dy,
 
-and one factorisation of the KKT matrix per iteration. The filter line search, its constants and the second-order
-correction follow Waechter and Biegler, Math. Program. 106 (2006), sections 2 and 3; the closed form of s and e makes
-a restoration phase for inequalities unnecessary.
+and one factorisation of the KKT matrix per iteration. The filter line search, its constants, the second-order
+correction and the correction of the inertia follow Waechter and Biegler, Math. Program. 106 (2006), sections 2 and 3.
+A row that cannot be satisfied has y = rho and e > 0, so no restoration phase is needed for inequalities.
 """
 
 from __future__ import annotations
 
 import math
 
-from unifg.elimination.fronts import factor
-from unifg.elimination.plan import NEGATIVE
-from unifg.elimination.substitution import solve
 from unifg.jit import compiled
-from unifg.passes import add_constraints, times, transposed_times
+from unifg.solvers.barrier_links import linked, opened, run
 from unifg.solvers.barrier_state import (
+    ACCEPT,
     ACCEPTED,
     AGAIN,
     ALPHA,
     ALPHA_DUAL,
+    ANSWER,
+    BORDER,
     COMPLEMENTARITY,
     CONVERGED,
+    CORRECT,
     CORRECTED,
     COST,
+    DE,
     DELTA,
-    EXACT,
+    DESCENT,
+    DS,
+    DY,
     FAILURES,
     FILTER,
     FILTERED,
+    GAP,
     GAUSS_NEWTON,
     ITERATION,
+    LAST_DELTA,
+    LEAST,
     LIMIT,
     LIMIT_REACHED,
+    MEASURE,
+    MOST,
     MU,
     NOT_FINITE,
     PHI,
+    REST,
+    RESTORE,
     RHO,
-    SINGULAR,
+    SAVED_ALPHA,
+    SAVED_DE,
+    SAVED_DS,
+    SAVED_DUAL,
+    SAVED_DY,
+    SAVED_SLOPE,
+    SCALE,
+    SIDES,
+    SIGN,
     SLOPE,
     STALLED,
     STATIONARITY,
+    STEER,
     STEP,
     TAKEN,
     THETA,
     THETA_LARGE,
     THETA_SMALL,
     TOLERANCE,
+    TRIAL_COST,
     TRIALS,
     TRY,
     VIOLATION,
-    Iterate,
-    Work,
+    E,
+    S,
+    Y,
 )
-from unifg.solvers.kkt_system import KktArrays, fill
-from unifg.table import Terms
-from unifg.typing import Array
+from unifg.table import BOUND, COLUMN, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH
+from unifg.typing import Array, IntArray
 
+OBJECTIVE = 0  # table.COST
 KAPPA = 10.0  # a barrier problem is solved when its error is below KAPPA mu
 ARMIJO = 1e-4
-GAMMA = 1e-5
-HALVINGS = 25
+GAMMA_THETA, GAMMA_PHI = 1e-5, 1e-8
+HALVINGS = 20
 MOST_FAILURES = 8
-FIRST_SHIFT, LARGEST_SHIFT, SHIFT_GROWTH = 1e-4, 1e12, 8.0
-DUAL_SHIFT = 1e-9
+HIGHEST_PRICE = 1e9
+FIRST_SLACK = 1e-2  # smallest slack of a cold start
+WARM_MU = 1e-5  # largest first mu of a start with multipliers: what is active has been found
 
 
 @compiled
-def slacks(c: float, mu: float, rho: float) -> tuple[float, float]:
-    """The s and e with s - e = c that minimise rho e - mu log s - mu log e, without cancellation."""
-    root = math.sqrt(4.0 * mu * mu + rho * rho * c * c)
-    large = (2.0 * mu + rho * abs(c) + root) / (2.0 * rho)
-    small = (2.0 * mu + 4.0 * mu * mu / (root + rho * abs(c))) / (2.0 * rho)
-    return (large, small) if c >= 0.0 else (small, large)
+def _merit(
+    numbers: Array, counts: IntArray, sides: Array, side_row: IntArray, cost: float, constraints: Array, alpha: float
+) -> tuple[float, float]:
+    """Barrier function and violation of the sides, after a step of the slacks."""
+    rho = numbers[RHO]
+    elastic, logarithms, product, theta = 0.0, 0.0, 1.0, 0.0
+    for k in range(counts[SIDES]):
+        s, e = sides[S, k] + alpha * sides[DS, k], sides[E, k] + alpha * sides[DE, k]
+        c = sides[SIGN, k] * (constraints[side_row[k]] - sides[BORDER, k])
+        theta += abs(c + e - s)
+        elastic += e
+        product *= s * e
+        if k & 3 == 3:  # one logarithm for eight factors, each of moderate size
+            logarithms += math.log(product)
+            product = 1.0
+    logarithms += math.log(product)
+    return cost + rho * elastic - numbers[MU] * logarithms, theta
 
 
 @compiled
-def barrier_value(work: Work, cost: float, constraints: Array) -> float:
-    """The barrier function phi at constraint values, with the best slacks."""
-    mu, rho = work.numbers[MU], work.numbers[RHO]
-    total = cost
-    for k in range(len(work.y)):
-        c = work.side_sign[k] * (constraints[work.side_row[k]] - work.side_limit[k])
-        s, e = slacks(c, mu, rho)
-        total += rho * e - mu * (math.log(s) + math.log(e))
-    return total
-
-
-@compiled
-def infeasibility(kkt: KktArrays, lower: Array, constraints: Array) -> float:
+def _infeasibility(rows: IntArray, lower: Array, constraints: Array) -> float:
     """Sum of |h| over the equality rows."""
     total = 0.0
-    for row in kkt.rows:
+    for row in rows:
         total += abs(constraints[row] - lower[row])
     return total
 
 
-@compiled
-def measure(terms: Terms, kkt: KktArrays, work: Work, at: Iterate) -> float:
-    """KKT numbers of the problem, and the error of the barrier problem."""
-    numbers, lower, upper = work.numbers, terms.lower, terms.upper
-    mu, rho = numbers[MU], numbers[RHO]
-    for k in range(len(work.y)):
-        work.multipliers[work.side_row[k]] = 0.0
-    for k in range(len(work.y)):
-        work.multipliers[work.side_row[k]] -= work.side_sign[k] * work.y[k]
-    work.full[:] = at.gradient
-    transposed_times(terms, False, at.constraint_jacobian, work.multipliers, work.full)
-    stationarity = violation = complementarity = size = barrier = 0.0
-    for column in work.free:
-        stationarity = max(stationarity, abs(work.full[column]))
-    for row in range(len(at.constraints)):
-        value, multiplier = at.constraints[row], work.multipliers[row]
+@linked
+def measure(address: int) -> None:
+    """KKT numbers of the problem at the present iterate, and what the error of the barrier problem is made of."""
+    problem, work = opened(address)
+    terms, numbers, sides, multipliers = problem.terms, work.numbers, work.sides, work.multipliers
+    lower, upper, constraints, full = terms.lower, terms.upper, work.constraints, work.full
+    rho = numbers[RHO]
+    gap, least, most = 0.0, math.inf, -math.inf
+    for k in range(work.counts[SIDES]):
+        multipliers[work.side_row[k]] = 0.0
+    for k in range(work.counts[SIDES]):
+        row, y = work.side_row[k], sides[Y, k]
+        multipliers[row] -= sides[SIGN, k] * y
+        sy, ez = sides[S, k] * y, sides[E, k] * (rho - y)
+        least, most = min(least, min(sy, ez)), max(most, max(sy, ez))
+        c = sides[SIGN, k] * (constraints[row] - sides[BORDER, k])
+        gap = max(gap, abs(c + sides[E, k] - sides[S, k]))
+    for k in range(len(full)):
+        full[k] = work.gradient[k]
+    fields, columns, jacobian = terms.fields, terms.columns, work.constraint_jacobian
+    for t in range(len(fields)):
+        term = fields[t]
+        if term[KIND] == OBJECTIVE:
+            continue
+        m, width, row, entry, column = term[ROWS], term[WIDTH], term[ROW], term[ENTRY], term[COLUMN]
+        if term[KIND] == BOUND:
+            for i in range(term[COUNT]):
+                full[columns[column + i]] += multipliers[row + i]
+            continue
+        for _ in range(term[COUNT]):
+            for a in range(m):
+                scale = multipliers[row + a]
+                if scale != 0.0:
+                    for d in range(width):
+                        full[columns[column + d]] += scale * jacobian[entry + d]
+                entry += width
+            row += m
+            column += width
+    stationarity = violation = complementarity = size = 0.0
+    for column in problem.free:
+        if not abs(full[column]) <= stationarity:  # NaN stays
+            stationarity = abs(full[column])
+    for row in range(len(constraints)):
+        value, multiplier = constraints[row], multipliers[row]
         size += abs(multiplier)
-        violation = max(violation, max(value - upper[row], lower[row] - value))
-        if lower[row] != upper[row]:
+        outside = max(value - upper[row], lower[row] - value)
+        if not outside <= violation:
+            violation = outside
+        if lower[row] == upper[row]:
+            gap = max(gap, abs(outside))
+        else:
             limit = upper[row] if multiplier > 0.0 else lower[row]
             slack = abs(value - limit) if math.isfinite(limit) else 1.0
             complementarity = max(complementarity, abs(multiplier) * slack)
-    for k in range(len(work.y)):
-        c = work.side_sign[k] * (at.constraints[work.side_row[k]] - work.side_limit[k])
-        s, e = slacks(c, mu, rho)
-        work.s[k], work.e[k] = s, e
-        barrier = max(barrier, abs(work.y[k] * s - mu), abs((rho - work.y[k]) * e - mu))
-    scale = max(1.0, size / max(1, len(at.constraints)) / 100.0)
-    numbers[COST], numbers[STATIONARITY] = at.cost[0], stationarity / scale
-    numbers[VIOLATION], numbers[COMPLEMENTARITY] = violation, complementarity / scale
-    equality = 0.0
-    for row in kkt.rows:
-        equality = max(equality, abs(at.constraints[row] - lower[row]))
-    return max(stationarity / scale, barrier / scale, equality)
+    scale = max(1.0, size / max(1, len(constraints)) / 100.0)
+    numbers[SCALE], numbers[STATIONARITY], numbers[VIOLATION] = scale, stationarity / scale, violation
+    numbers[COMPLEMENTARITY], numbers[GAP], numbers[LEAST], numbers[MOST] = complementarity / scale, gap, least, most
 
 
 @compiled
-def begin(terms: Terms, kkt: KktArrays, work: Work, at: Iterate, warm: bool) -> None:
-    """Choose mu and the multipliers of the sides; ``warm`` keeps what the multipliers of the rows say."""
-    numbers, rho = work.numbers, work.numbers[RHO]
+def _error(numbers: Array) -> float:
+    """Error of the barrier problem."""
+    centring = max(numbers[MOST] - numbers[MU], numbers[MU] - numbers[LEAST]) / numbers[SCALE]
+    return max(max(numbers[STATIONARITY], numbers[GAP]), centring)
+
+
+@linked
+def begin(address: int) -> None:
+    """Find the sides; choose mu, slacks and multipliers of a start that has been linearised."""
+    problem, work = opened(address)
+    numbers, counts, sides = work.numbers, work.counts, work.sides
+    lower, upper = problem.terms.lower, problem.terms.upper
+    count = 0
+    for row in range(len(lower)):
+        if lower[row] != upper[row]:
+            for which in range(2):
+                limit = lower[row] if which == 0 else upper[row]
+                if math.isfinite(limit):
+                    work.side_row[count] = row
+                    sides[SIGN, count], sides[BORDER, count] = 1.0 - 2.0 * which, limit
+                    count += 1
+    counts[SIDES] = count
+    largest = 0.0
+    for row in range(len(lower)):
+        largest = max(largest, abs(work.multipliers[row]))
+    warm, rho = largest > 0.0, numbers[RHO]
+    if largest > 0.5 * rho:
+        rho = numbers[RHO] = 10.0 * largest
     if warm:
-        for k in range(len(work.y)):
-            suggested = -work.side_sign[k] * work.multipliers[work.side_row[k]]
-            work.y[k] = min(max(suggested, 1e-8), 0.9 * rho)
-        numbers[MU] = 1e-9
-        error = measure(terms, kkt, work, at)
-        error = max(numbers[STATIONARITY], numbers[VIOLATION], numbers[COMPLEMENTARITY])
-        numbers[MU] = min(max(0.1 * error, 0.1 * numbers[TOLERANCE]), 0.1)
+        for k in range(count):
+            c = sides[SIGN, k] * (work.constraints[work.side_row[k]] - sides[BORDER, k])
+            y = min(max(-sides[SIGN, k] * work.multipliers[work.side_row[k]], 0.0), 0.9 * rho)
+            sides[Y, k], sides[S, k], sides[E, k] = y, c, 0.0
+        run(problem.links[MEASURE], (address,))
+        error = max(max(numbers[STATIONARITY], numbers[VIOLATION]), numbers[COMPLEMENTARITY])
+        numbers[MU] = max(min(0.1 * error, WARM_MU), 0.1 * numbers[TOLERANCE])
     mu = numbers[MU]
-    for k in range(len(work.y)):
-        c = work.side_sign[k] * (at.constraints[work.side_row[k]] - work.side_limit[k])
-        s, e = slacks(c, mu, rho)
-        centred = mu / s
-        work.y[k] = min(max(work.y[k], 0.1 * centred), 0.5 * (centred + rho)) if warm else centred
-    theta = infeasibility(kkt, terms.lower, at.constraints)
+    for k in range(count):
+        c = sides[SIGN, k] * (work.constraints[work.side_row[k]] - sides[BORDER, k])
+        if warm:
+            s = max(c, min(mu / max(sides[Y, k], 1e-3 * mu), FIRST_SLACK))
+            y = max(sides[Y, k], mu / s)
+        else:
+            s = max(c, FIRST_SLACK)
+            y = mu / s
+        y = min(y, 0.9 * rho)
+        sides[Y, k], sides[S, k], sides[E, k] = y, s, mu / (rho - y)
+        sides[DS, k] = sides[DE, k] = sides[DY, k] = 0.0
+    theta = _merit(numbers, counts, sides, work.side_row, 0.0, work.constraints, 0.0)[1]
+    theta += _infeasibility(problem.rows, lower, work.constraints)
     numbers[THETA_SMALL], numbers[THETA_LARGE] = 1e-4 * max(1.0, theta), 1e4 * max(1.0, theta)
-    work.counts[FILTERED] = 0
+    counts[FILTERED] = counts[ITERATION] = counts[FAILURES] = 0
+    numbers[DELTA] = numbers[LAST_DELTA] = numbers[STEP] = numbers[TAKEN] = 0.0
+    run(problem.links[MEASURE], (address,))
 
 
-@compiled
-def newton(terms: Terms, kkt: KktArrays, work: Work, at: Iterate) -> int:
-    """Test the iterate, lower mu, find the Newton step and its first trial length."""
+@linked
+def test(address: int) -> None:
+    """Test the iterate; if there is to be a step, lower mu and measure what the line search compares with."""
+    problem, work = opened(address)
     numbers, counts = work.numbers, work.counts
-    error = measure(terms, kkt, work, at)
     if counts[FAILURES] == 0:
-        _record(work)
+        row = work.log[min(counts[ITERATION], len(work.log) - 1)]
+        row[0], row[1], row[2] = numbers[COST], numbers[STATIONARITY], numbers[VIOLATION]
+        row[3], row[4], row[5] = numbers[COMPLEMENTARITY], numbers[STEP], numbers[TAKEN]
+        row[6], row[7], row[8] = numbers[MU], numbers[DELTA], counts[GAUSS_NEWTON]
     tolerance = numbers[TOLERANCE]
-    worst = max(numbers[STATIONARITY], numbers[VIOLATION], numbers[COMPLEMENTARITY])
-    if not math.isfinite(worst) or not math.isfinite(numbers[COST]):
-        return NOT_FINITE
+    worst = max(max(numbers[STATIONARITY], numbers[VIOLATION]), numbers[COMPLEMENTARITY])
+    if not math.isfinite(numbers[STATIONARITY] + numbers[VIOLATION] + numbers[COST]):
+        counts[ANSWER] = NOT_FINITE
+        return
     if worst <= tolerance:
-        return CONVERGED
+        counts[ANSWER] = CONVERGED
+        return
     if counts[ITERATION] >= counts[LIMIT]:
-        return LIMIT_REACHED
+        counts[ANSWER] = LIMIT_REACHED
+        return
     smallest = 0.1 * tolerance
-    while error <= KAPPA * numbers[MU] and numbers[MU] > smallest:
-        numbers[MU] = max(smallest, min(0.2 * numbers[MU], numbers[MU] ** 1.5))
+    while _error(numbers) <= KAPPA * numbers[MU] and numbers[MU] > smallest:
+        lower = min(0.2 * numbers[MU], numbers[MU] ** 1.5)
+        numbers[MU] = lower if lower > tolerance else smallest
         counts[FILTERED] = 0
-        error = measure(terms, kkt, work, at)
-    if error <= KAPPA * numbers[MU] and numbers[VIOLATION] > tolerance and numbers[RHO] < 1e9:
+    if _error(numbers) <= KAPPA * numbers[MU] and numbers[VIOLATION] > tolerance:
+        if numbers[RHO] >= HIGHEST_PRICE:
+            counts[ANSWER] = STALLED
+            return
         numbers[RHO] *= 10.0  # the elastic variables are too cheap
         counts[FILTERED] = 0
         numbers[MU] = min(100.0 * numbers[MU], 0.1)
-        error = measure(terms, kkt, work, at)
-    numbers[THETA] = infeasibility(kkt, terms.lower, at.constraints)
-    numbers[PHI] = barrier_value(work, at.cost[0], at.constraints)
-    if not _direction(terms, kkt, work, at):
-        return SINGULAR
-    _lengths(terms, work, at)
-    counts[TRIALS], counts[CORRECTED] = 0, 0
-    return TRY
+        run(problem.links[MEASURE], (address,))
+    phi, theta = _merit(numbers, counts, work.sides, work.side_row, numbers[COST], work.constraints, 0.0)
+    theta += _infeasibility(problem.rows, problem.terms.lower, work.constraints)
+    numbers[PHI], numbers[THETA] = phi, theta
+    counts[TRIALS], counts[CORRECTED], counts[ANSWER] = 0, 0, TRY
 
 
-@compiled
-def _record(work: Work) -> None:
-    """One row of the history."""
-    numbers, counts = work.numbers, work.counts
-    row = work.log[min(counts[ITERATION], len(work.log) - 1)]
-    row[0], row[1], row[2], row[3] = numbers[COST], numbers[STATIONARITY], numbers[VIOLATION], numbers[COMPLEMENTARITY]
-    row[4], row[5], row[6], row[7] = numbers[STEP], numbers[TAKEN], numbers[MU], numbers[DELTA]
-    row[8] = counts[GAUSS_NEWTON]
-
-
-@compiled
-def _direction(terms: Terms, kkt: KktArrays, work: Work, at: Iterate) -> bool:
-    """Factorise with the right inertia and solve for the Newton step."""
-    numbers, counts = work.numbers, work.counts
-    mu, rho = numbers[MU], numbers[RHO]
-    n, equalities = kkt.size[0], kkt.size[1]
-    work.row_weights[:] = 0.0
-    for row in range(len(work.row_terms)):
-        work.row_terms[row] = 0.0
-    for row in kkt.rows:
-        work.row_terms[row] = work.multipliers[row]
-    for k in range(len(work.y)):
-        row, sign, y = work.side_row[k], work.side_sign[k], work.y[k]
-        weight = 1.0 / (work.s[k] / y + work.e[k] / (rho - y))
-        c = work.s[k] - work.e[k]
-        r = c + mu / (rho - y) - mu / y
-        work.row_weights[row] += weight
-        work.row_terms[row] += sign * (weight * r - y)
-    work.full[:] = at.gradient
-    transposed_times(terms, False, at.constraint_jacobian, work.row_terms, work.full)
-    for k in range(n):
-        work.right[k] = -work.full[work.free[k]]
-    for k in range(equalities):
-        work.right[n + k] = -(at.constraints[kkt.rows[k]] - terms.lower[kkt.rows[k]])
-    exact = counts[EXACT] == 1 and counts[FAILURES] < 2
-    delta = numbers[DELTA] if counts[FAILURES] > 0 else 0.0
-    while True:
-        counts[GAUSS_NEWTON] = 0 if exact else 1
-        work.matrix[:] = at.curvature if exact else at.hessian
-        add_constraints(terms, at.constraint_jacobian, work.row_weights, work.matrix)
-        fill(kkt, work.matrix, at.constraint_jacobian, work.data)
-        largest = 0.0
-        for k in range(n):
-            work.shift[k] = delta
-        for k in range(equalities):
-            work.shift[n + k] = -DUAL_SHIFT
-        if factor(kkt.plan, work.data, work.shift) and kkt.plan.state[NEGATIVE] == equalities:
-            solve(kkt.plan, work.right, work.step)
-            for k in range(n + equalities):
-                largest = max(largest, abs(work.step[k]))
-            if math.isfinite(largest):
-                break
-        if exact:
-            exact = False
-        else:
-            delta = FIRST_SHIFT if delta == 0.0 else delta * SHIFT_GROWTH
-            if delta > LARGEST_SHIFT:
-                return False
-    numbers[DELTA] = delta
-    return True
-
-
-@compiled
-def _lengths(terms: Terms, work: Work, at: Iterate) -> None:
-    """Steps of the multipliers of sides, the slope of the barrier function, and how far the slacks let us go."""
-    numbers = work.numbers
-    mu, rho = numbers[MU], numbers[RHO]
-    n = len(work.free)
-    times(terms, False, at.constraint_jacobian, work.step, work.row_moves)
-    slope = 0.0
-    for k in range(n):
-        slope += at.gradient[work.free[k]] * work.step[k]
-    keep = 1.0 - max(0.99, 1.0 - mu)
-    primal = dual = 1.0
-    for k in range(len(work.y)):
-        s, e, y = work.s[k], work.e[k], work.y[k]
-        move = work.side_sign[k] * work.row_moves[work.side_row[k]]
-        slope -= mu / s * move
-        total = s / y + e / (rho - y)
-        r = s - e + mu / (rho - y) - mu / y
-        dy = -(move + r) / total
-        work.dy[k] = dy
-        ds = mu / y - s - s / y * dy
-        de = mu / (rho - y) - e + e / (rho - y) * dy
-        if ds < 0.0:
-            primal = min(primal, -(1.0 - keep) * s / ds)
-        if de < 0.0:
-            primal = min(primal, -(1.0 - keep) * e / de)
-        if dy < 0.0:
-            dual = min(dual, -(1.0 - keep) * y / dy)
-        elif dy > 0.0:
-            dual = min(dual, (1.0 - keep) * (rho - y) / dy)
-    numbers[SLOPE], numbers[ALPHA], numbers[ALPHA_DUAL] = slope, primal, dual
-
-
-@compiled
-def trial_step(work: Work, out: Array) -> None:
-    """The tangent step to be tried."""
-    alpha = work.numbers[ALPHA]
-    source = work.corrected if work.counts[CORRECTED] == 1 else work.step
-    for k in range(len(out)):
-        out[k] = alpha * source[k]
-
-
-@compiled
-def judge(terms: Terms, kkt: KktArrays, work: Work, at: Iterate, cost: float, constraints: Array) -> int:
+@linked
+def judge(address: int) -> None:
     """Filter test of a trial point: accept it, shorten the step, correct it, or ask for another direction."""
-    numbers, counts = work.numbers, work.counts
-    alpha, theta, phi = numbers[ALPHA], numbers[THETA], numbers[PHI]
-    slope = numbers[SLOPE]
-    finite = math.isfinite(cost)
-    for row in range(len(constraints)):
-        finite = finite and math.isfinite(constraints[row])
-    theta_trial = infeasibility(kkt, terms.lower, constraints) if finite else math.inf
-    phi_trial = barrier_value(work, cost, constraints) if finite else math.inf
+    problem, work = opened(address)
+    numbers, counts, constraints = work.numbers, work.counts, work.trial_constraints
+    alpha, theta, phi, slope = numbers[ALPHA], numbers[THETA], numbers[PHI], numbers[SLOPE]
+    phi_trial, theta_trial = _merit(numbers, counts, work.sides, work.side_row, numbers[TRIAL_COST], constraints, alpha)
+    theta_trial += _infeasibility(problem.rows, problem.terms.lower, constraints)
+    finite = math.isfinite(phi_trial) and math.isfinite(theta_trial)
     slack = 1e-13 * max(1.0, abs(phi))
     switch = slope < 0.0 and alpha * (-slope) ** 2.3 > theta**1.1 and theta <= numbers[THETA_SMALL]
     armijo = phi_trial <= phi + ARMIJO * alpha * slope + slack
     good = finite and theta_trial <= numbers[THETA_LARGE]
     if good:
-        if len(kkt.rows) == 0 or switch:
+        if switch:
             good = armijo
         else:
-            good = theta_trial <= (1.0 - GAMMA) * theta or phi_trial <= phi - GAMMA * theta + slack
+            good = theta_trial <= (1.0 - GAMMA_THETA) * theta or phi_trial <= phi - GAMMA_PHI * theta + slack
             good = good or theta_trial <= 1e-12
     if good:
         for k in range(counts[FILTERED]):
             if theta_trial >= work.filter[k, 0] and phi_trial >= work.filter[k, 1] + slack:
                 good = theta_trial <= 1e-12 and good and armijo
     if good:
-        _accept(terms, kkt, work, switch and armijo)
-        return ACCEPTED
+        counts[DESCENT] = switch and armijo
+        run(problem.links[ACCEPT], (address,))
+        counts[ANSWER] = ACCEPTED
+        return
     counts[TRIALS] += 1
-    if counts[TRIALS] == 1 and finite and theta_trial >= theta and len(kkt.rows) > 0:
-        n = kkt.size[0]
-        for k in range(len(kkt.rows)):
-            row = kkt.rows[k]
-            work.right[n + k] = alpha * work.right[n + k] - (constraints[row] - terms.lower[row])
-        solve(kkt.plan, work.right, work.corrected)
-        counts[CORRECTED] = 1
-        return TRY
-    counts[CORRECTED] = 0
-    numbers[ALPHA] = 0.5 * alpha
+    counts[ANSWER] = TRY
+    if counts[TRIALS] == 1 and finite and theta_trial >= theta:
+        run(problem.links[CORRECT], (address,))
+        return
+    if counts[CORRECTED] == 1:
+        run(problem.links[RESTORE], (address,))
+    numbers[ALPHA] *= 0.5
     if counts[TRIALS] > HALVINGS:
         counts[FAILURES] += 1
         numbers[DELTA] = max(1e-3, 100.0 * numbers[DELTA])
-        return STALLED if counts[FAILURES] > MOST_FAILURES else AGAIN
-    return TRY
+        counts[ANSWER] = STALLED if counts[FAILURES] > MOST_FAILURES else AGAIN
 
 
-@compiled
-def _accept(terms: Terms, kkt: KktArrays, work: Work, descent: bool) -> None:
-    """Move the multipliers and, unless the step was one of descent, remember where it came from."""
-    numbers, counts = work.numbers, work.counts
-    alpha, n = numbers[ALPHA], kkt.size[0]
-    source = work.corrected if counts[CORRECTED] == 1 else work.step
+@linked
+def correct(address: int) -> None:
+    """Solve again for the constraints as the trial found them, and keep the step in case this does not help."""
+    problem, work = opened(address)
+    numbers, counts, sides, constraints = work.numbers, work.counts, work.sides, work.trial_constraints
+    alpha = numbers[ALPHA]
+    for k in range(len(work.step)):
+        work.saved[k] = work.step[k]
+    numbers[SAVED_SLOPE], numbers[SAVED_ALPHA], numbers[SAVED_DUAL] = numbers[SLOPE], alpha, numbers[ALPHA_DUAL]
+    for k in range(counts[SIDES]):
+        sides[SAVED_DY, k], sides[SAVED_DS, k], sides[SAVED_DE, k] = sides[DY, k], sides[DS, k], sides[DE, k]
+        c = sides[SIGN, k] * (constraints[work.side_row[k]] - sides[BORDER, k])
+        s, e = sides[S, k] + alpha * sides[DS, k], sides[E, k] + alpha * sides[DE, k]
+        sides[REST, k] = alpha * sides[REST, k] + c + e - s
+    for row in problem.rows:
+        work.rests[row] = alpha * work.rests[row] + constraints[row] - problem.terms.lower[row]
+    run(problem.links[STEER], (address,))
+    numbers[SLOPE] = numbers[SAVED_SLOPE]
+    counts[CORRECTED] = 1
+
+
+@linked
+def restore(address: int) -> None:
+    """Go back to the step before its correction."""
+    _, work = opened(address)
+    numbers, counts, sides = work.numbers, work.counts, work.sides
+    for k in range(len(work.step)):
+        work.step[k] = work.saved[k]
+    numbers[ALPHA], numbers[ALPHA_DUAL] = numbers[SAVED_ALPHA], numbers[SAVED_DUAL]
+    for k in range(counts[SIDES]):
+        sides[DY, k], sides[DS, k], sides[DE, k] = sides[SAVED_DY, k], sides[SAVED_DS, k], sides[SAVED_DE, k]
+    counts[CORRECTED] = 0
+
+
+@linked
+def accept(address: int) -> None:
+    """Move multipliers and slacks and, unless the step was one of descent, remember where it came from."""
+    problem, work = opened(address)
+    numbers, counts, sides = work.numbers, work.counts, work.sides
+    alpha, dual, n = numbers[ALPHA], numbers[ALPHA_DUAL], len(problem.free)
+    mu, rho = numbers[MU], numbers[RHO]
     total = 0.0
     for k in range(n):
-        total += (alpha * source[k]) ** 2
-    for k in range(len(kkt.rows)):
-        work.multipliers[kkt.rows[k]] += alpha * source[n + k]
-    for k in range(len(work.y)):
-        work.y[k] += numbers[ALPHA_DUAL] * work.dy[k]
-    if not descent and counts[FILTERED] < FILTER:
-        work.filter[counts[FILTERED], 0] = (1.0 - GAMMA) * numbers[THETA]
-        work.filter[counts[FILTERED], 1] = numbers[PHI] - GAMMA * numbers[THETA]
+        total += work.step[k] ** 2
+    for k in range(len(problem.rows)):
+        work.multipliers[problem.rows[k]] += alpha * work.step[n + k]
+    for k in range(counts[SIDES]):
+        s, e = sides[S, k] + alpha * sides[DS, k], sides[E, k] + alpha * sides[DE, k]
+        c = sides[SIGN, k] * (work.trial_constraints[work.side_row[k]] - sides[BORDER, k])
+        s = max(s, c + e)  # a longer slack costs nothing
+        y = sides[Y, k] + dual * sides[DY, k]
+        y = min(max(y, 1e-10 * mu / s), 1e10 * mu / s)  # eq. 16
+        sides[Y, k], sides[S, k], sides[E, k] = min(y, rho - 1e-10 * mu / e), s, e
+        sides[DS, k] = sides[DE, k] = 0.0
+    if counts[DESCENT] == 0 and counts[FILTERED] < FILTER:
+        work.filter[counts[FILTERED], 0] = (1.0 - GAMMA_THETA) * numbers[THETA]
+        work.filter[counts[FILTERED], 1] = numbers[PHI] - GAMMA_PHI * numbers[THETA]
         counts[FILTERED] += 1
-    numbers[STEP], numbers[TAKEN] = math.sqrt(total), alpha
+    numbers[STEP], numbers[TAKEN] = alpha * math.sqrt(total), alpha
     counts[ITERATION] += 1
     counts[FAILURES] = 0
-
-
-@compiled
-def safeguard(work: Work, constraints: Array) -> None:
-    """Keep the multipliers of sides within reach of what the slacks suggest (Waechter and Biegler, eq. 16)."""
-    mu, rho = work.numbers[MU], work.numbers[RHO]
-    for k in range(len(work.y)):
-        c = work.side_sign[k] * (constraints[work.side_row[k]] - work.side_limit[k])
-        s, e = slacks(c, mu, rho)
-        low, high = 1e-10 * mu / s, 1e10 * mu / s
-        work.y[k] = min(max(work.y[k], low), high)
-        work.y[k] = min(work.y[k], rho - 1e-10 * mu / e)

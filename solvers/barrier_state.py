@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from unifg.elimination.plan import Plan
+from unifg.table import Terms
 from unifg.typing import Array, IntArray
 
 # Places in Work.numbers.
@@ -13,24 +15,35 @@ from unifg.typing import Array, IntArray
     MU,
     RHO,
     TOLERANCE,
-    THETA,  # sum of |h| at the present iterate
+    THETA,  # sum of |h| and |c + e - s| at the present iterate
     PHI,  # barrier function there
-    SLOPE,  # its derivative along dx
+    SLOPE,  # its derivative along the step
     ALPHA,  # primal step length under trial
     ALPHA_DUAL,
     THETA_SMALL,
     THETA_LARGE,
-    DELTA,  # last shift of the Hessian's diagonal that was needed
+    DELTA,  # shift of the Hessian's diagonal that the present direction needed
+    LAST_DELTA,  # the last one that was not zero
     COST,
     STATIONARITY,
     VIOLATION,
     COMPLEMENTARITY,
+    GAP,  # largest |h| and |c + e - s|
+    LEAST,  # smallest product of a slack and its multiplier
+    MOST,  # largest
+    SCALE,  # of stationarity and complementarity
     STEP,  # norm of the last step taken
     TAKEN,  # its length
+    TRIAL_COST,
+    SAVED_SLOPE,  # of the step that a correction replaces
+    SAVED_ALPHA,
+    SAVED_DUAL,
     FLOATS,
-) = range(18)
+) = range(27)
 # Places in Work.counts.
 (
+    ANSWER,  # of the last call, one of the words below
+    SIDES,  # how many there are
     ITERATION,
     LIMIT,
     EXACT,  # whether to use second derivatives
@@ -39,25 +52,102 @@ from unifg.typing import Array, IntArray
     CORRECTED,  # whether the trial is a second-order correction
     FAILURES,  # line searches in a row that found nothing
     GAUSS_NEWTON,  # whether the present direction used the Gauss-Newton Hessian
+    DESCENT,  # whether the last trial was accepted because it lowers the barrier function
     INTEGERS,
-) = range(9)
+) = range(12)
+# Rows of Work.sides.
+(
+    SIGN,  # +1 for a lower limit, -1 for an upper one
+    BORDER,  # the limit
+    Y,  # multiplier, between 0 and rho
+    S,  # slack
+    E,  # elastic variable
+    DY,
+    DS,
+    DE,
+    REST,  # c + e - s of the present iterate, with corrections
+    WEIGHT,  # what the side adds to the Hessian
+    SAVED_DY,
+    SAVED_DS,
+    SAVED_DE,
+    SIDE_ROWS,
+) = range(14)
 
 # What a call answers.
 TRY, ACCEPTED, AGAIN, CONVERGED, LIMIT_REACHED, SINGULAR, STALLED, NOT_FINITE = range(8)
+# Places in Problem.links.
+(
+    FACTOR, SOLVE, LINEARIZE, EVALUATE, CURVE, RETRACT, BEGIN, MEASURE, TEST, DIRECT, STEER, ADVANCE, JUDGE, CORRECT,
+    RESTORE, ACCEPT, LOOP, LINKS,
+) = range(18)  # fmt: skip
 
 FILTER = 400  # pairs of theta and phi that are remembered
 
 
-class Iterate(NamedTuple):
-    """The point the next step starts from.
+class Problem(NamedTuple):
+    """What one structure needs and no iteration changes.
 
     Attributes:
-        cost: (1,) objective.
-        residual, jacobian, constraints, constraint_jacobian, gradient, hessian: as in a linearisation.
-        curvature: ``hessian`` with second derivatives, where they are used.
+        links: addresses of compiled functions, by the names above.
+        terms: of the program.
+        plan: elimination of the KKT matrix, whose entries come in the order of ``Work.data``.
+        parts: of the retraction.
+        free: columns that are unknown.
+        scratch: memory of the loops over terms.
+        rows: (E,) equality rows.
+        entries: entries of the constraint Jacobian behind those of the Hessian in ``Work.data``.
+        doubles: (D, 2) places in ``Work.data`` that mean one entry of the matrix: the second is added to the first.
+        unequal: (T,) whether a term has inequality rows.
     """
 
-    cost: Array
+    links: IntArray
+    terms: Terms
+    plan: Plan
+    parts: IntArray
+    free: IntArray
+    scratch: Array
+    rows: IntArray
+    entries: IntArray
+    doubles: IntArray
+    unequal: IntArray
+
+
+class Work(NamedTuple):
+    """What the method remembers.
+
+    Attributes:
+        numbers, counts: scalars, by the names above.
+        sides: (SIDE_ROWS, 2 M) one column for each finite limit of an inequality row.
+        side_row: (2 M,) its row.
+        values, trial: stored values of the present iterate and of a trial.
+        move: (n,) tangent step to the trial.
+        spread: (width,) the same over the full tangent space.
+        full: (width,) gradient of the Lagrangian over the full tangent space.
+        residual, jacobian, constraints, constraint_jacobian, gradient, hessian: as in a linearisation.
+        curvature: ``hessian`` with second derivatives, where they are used.
+        trial_residual, trial_constraints: at a trial.
+        squares, norms: not used, but written.
+        multipliers: (M,) of the rows, positive at an upper limit.
+        rests: (M,) residuals of equality rows, with corrections.
+        row_weights, row_terms: (M,) what the sides of a row add to the Hessian and to the gradient.
+        step: (n + E,) Newton step, unknowns then equality multipliers.
+        saved: (n + E,) the step that a correction replaces.
+        right: (n + E,) right-hand side.
+        shift: (n + E,) what is added to the diagonal.
+        data: Hessian with the sides eliminated, then equality Jacobian.
+        filter: (FILTER, 2) pairs of theta and phi.
+        log: (iterations, 9) history.
+    """
+
+    numbers: Array
+    counts: IntArray
+    sides: Array
+    side_row: IntArray
+    values: Array
+    trial: Array
+    move: Array
+    spread: Array
+    full: Array
     residual: Array
     jacobian: Array
     constraints: Array
@@ -65,70 +155,73 @@ class Iterate(NamedTuple):
     gradient: Array
     hessian: Array
     curvature: Array
-
-
-class Work(NamedTuple):
-    """Everything else the method remembers.
-
-    Attributes:
-        numbers, counts: scalars, by the names above.
-        side_row, side_sign, side_limit: (K,) row, +1 for a lower limit and -1 for an upper one, and the limit.
-        y, dy, s, e: (K,) multipliers, their steps, and slacks.
-        multipliers: (M,) of the rows, positive at an upper limit.
-        step: (n + E,) last Newton step, unknowns then equality multipliers.
-        corrected: (n + E,) its second-order correction.
-        right: (n + E,) right-hand side.
-        shift: (n + E,) what is added to the diagonal.
-        data: entries of the KKT matrix.
-        matrix: entries of the Hessian with the sides eliminated.
-        row_weights, row_terms, row_moves: (M,) workspace.
-        full: workspace over the full tangent space.
-        filter: (FILTER, 2) pairs of theta and phi.
-        free: columns that are unknown.
-        log: (iterations, 9) history.
-    """
-
-    numbers: Array
-    counts: IntArray
-    side_row: IntArray
-    side_sign: Array
-    side_limit: Array
-    y: Array
-    dy: Array
-    s: Array
-    e: Array
+    trial_residual: Array
+    trial_constraints: Array
+    squares: Array
+    norms: Array
     multipliers: Array
+    rests: Array
+    row_weights: Array
+    row_terms: Array
     step: Array
-    corrected: Array
+    saved: Array
     right: Array
     shift: Array
     data: Array
-    matrix: Array
-    row_weights: Array
-    row_terms: Array
-    row_moves: Array
-    full: Array
     filter: Array
-    free: IntArray
     log: Array
 
 
 def empty_work(
-    program_size: int, rows: int, width: int, entries: int, matrix: int, iterations: int
-) -> dict[str, Array]:
-    """Arrays of the right sizes, all zero; the sides come with each solve."""
-    total = program_size
-    return {
-        "step": np.zeros(total),
-        "corrected": np.zeros(total),
-        "right": np.zeros(total),
-        "shift": np.zeros(total),
-        "data": np.zeros(entries),
-        "matrix": np.zeros(matrix),
-        "row_weights": np.zeros(rows),
-        "row_terms": np.zeros(rows),
-        "row_moves": np.zeros(rows),
-        "full": np.zeros(width),
-        "filter": np.zeros((FILTER, 2)),
-        "log": np.zeros((iterations + 2, 9)),
-    }
+    stored: int, width: int, unknowns: int, equalities: int, rows: tuple[int, int], entries: tuple[int, int],
+    normal: int, terms: int, robust: int, iterations: int, data: int,
+) -> Work:  # fmt: skip
+    """Arrays of the right sizes, all zero.
+
+    Args:
+        stored: numbers that store the variables.
+        width: full tangent columns.
+        unknowns: those that are unknown.
+        equalities: equality rows.
+        rows: of costs and of constraints.
+        entries: of their Jacobians.
+        normal: of the Hessian.
+        terms: how many there are.
+        robust: robust factors.
+        iterations: that the history has to hold.
+        data: entries of the KKT matrix.
+    """
+    total, constraints = unknowns + equalities, rows[1]
+    return Work(
+        numbers=np.zeros(FLOATS),
+        counts=np.zeros(INTEGERS, dtype=np.int64),
+        sides=np.zeros((SIDE_ROWS, max(2 * constraints, 1))),
+        side_row=np.zeros(max(2 * constraints, 1), dtype=np.int64),
+        values=np.zeros(stored),
+        trial=np.zeros(stored),
+        move=np.zeros(unknowns),
+        spread=np.zeros(width),
+        full=np.zeros(width),
+        residual=np.zeros(rows[0]),
+        jacobian=np.zeros(entries[0]),
+        constraints=np.zeros(constraints),
+        constraint_jacobian=np.zeros(entries[1]),
+        gradient=np.zeros(width),
+        hessian=np.zeros(normal),
+        curvature=np.zeros(normal),
+        trial_residual=np.zeros(rows[0]),
+        trial_constraints=np.zeros(constraints),
+        squares=np.zeros(robust),
+        norms=np.zeros(terms),
+        multipliers=np.zeros(constraints),
+        rests=np.zeros(constraints),
+        row_weights=np.zeros(constraints),
+        row_terms=np.zeros(constraints),
+        step=np.zeros(total),
+        saved=np.zeros(total),
+        right=np.zeros(total),
+        shift=np.zeros(total),
+        data=np.zeros(data),
+        filter=np.zeros((FILTER, 2)),
+        log=np.zeros((iterations + 2, 9)),
+    )

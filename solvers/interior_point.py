@@ -6,28 +6,26 @@ compiled loop; with batched NumPy terms, or a callback per iteration, the same f
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from unifg import passes
-from unifg.curvature import add_curvature
-from unifg.elimination.threads import one_thread
 from unifg.errors import BackendError
-from unifg.jit import compiled
+from unifg.history import Iteration
 from unifg.linearization import Linearization
 from unifg.program import Program
-from unifg.retraction import retract_parts
 from unifg.second_order import lagrangian_hessian
 from unifg.solver import Run, Solver
-from unifg.solvers import barrier
 from unifg.solvers import barrier_state as state
-from unifg.solvers.barrier_state import Iterate, Work, empty_work
-from unifg.solvers.kkt_system import KktArrays, KktSystem
+from unifg.solvers.barrier_links import memory
+from unifg.solvers.barrier_loop import addresses, call
+from unifg.solvers.barrier_state import Problem, Work, empty_work
+from unifg.solvers.kkt_system import KktSystem, stacked
+from unifg.solvers.least_violation import settle
 from unifg.status import Status
-from unifg.table import Terms
-from unifg.typing import Array, IntArray
+from unifg.table import CONSTRAINT, COUNT, KIND, ROW, ROWS
 
 ENDINGS = {
     state.CONVERGED: Status.CONVERGED,
@@ -36,6 +34,7 @@ ENDINGS = {
     state.STALLED: Status.STALLED,
     state.NOT_FINITE: Status.NOT_FINITE,
 }
+STUCK = (Status.STALLED, Status.SINGULAR)
 
 
 @dataclass(kw_only=True)
@@ -51,7 +50,7 @@ class InteriorPoint(Solver):
 
     max_iterations: int = 300
     hessian: Literal["exact", "gauss-newton"] = "exact"
-    barrier: float = 0.1
+    barrier: float = 0.3
     price: float = 1e3
 
     def __post_init__(self) -> None:
@@ -63,6 +62,10 @@ class InteriorPoint(Solver):
             if not value > 0.0:
                 raise BackendError(f"{self.name}: {name} must be positive, found {value}")
 
+    def runs_alone(self, program: Program) -> bool:
+        """Whether a compiled loop can make the whole solve."""
+        return program.fully_compiled
+
     def workspace(self, program: Program) -> Workspace:
         """Structure of the KKT matrix."""
         return Workspace(program)
@@ -70,52 +73,42 @@ class InteriorPoint(Solver):
     def iterate(self, run: Run, workspace: Workspace) -> Status | None:
         """Iterate to convergence."""
         work = workspace.prepare(run, self)
-        kkt = workspace.system.arrays
-        program = run.program
-        at = workspace.iterate_of(run.lin, work, self)
-        barrier.begin(program.arrays, kkt, work, at, bool(np.any(run.multipliers)))
-        with one_thread():
-            if workspace.compiled and not run.watched:
-                flat = run.values.flat.copy()
-                code = _loop(
-                    program.arrays, program.retraction.parts, program.columns.free, kkt, work, at, flat, program.scratch
-                )
-                values = program.columns.view(flat)
-                lin = program.linearize(values)
-                run.conclude(lin, work.multipliers.copy(), _rows(work))
-                return ENDINGS[code]
-            return self._guided(run, workspace, work, at)
+        if not run.alone:
+            ending = self._guided(run, workspace)
+            return settle(run, ending) if ending in STUCK else ending
+        workspace.call(state.LOOP)
+        lin, iterations = workspace.found(), int(work.counts[state.ITERATION])
+        run.conclude(lin, work.multipliers.copy(), iterations, _history(work, lin.norms, run.seconds))
+        ending = ENDINGS[int(work.counts[state.ANSWER])]
+        return settle(run, ending) if ending in STUCK else ending
 
-    def _guided(self, run: Run, workspace: Workspace, work: Work, at: Iterate) -> Status | None:
+    def _guided(self, run: Run, workspace: Workspace) -> Status | None:
         """The same loop, with every evaluation made by the program and every iterate shown."""
-        program, kkt = run.program, workspace.system.arrays
-        step = np.empty(program.size)
+        program, work = run.program, workspace.work
+        numbers, counts = work.numbers, work.counts
         lin = run.lin
+        workspace.take(lin)
+        workspace.call(state.BEGIN)
         while True:
-            code = barrier.newton(program.arrays, kkt, work, at)
-            if code != state.TRY:
-                return ENDINGS[code]
-            while code == state.TRY:
-                barrier.trial_step(work, step)
-                values = program.retract(lin.values, step)
+            workspace.call(state.TEST)
+            if counts[state.ANSWER] == state.TRY:
+                if self.hessian == "exact":
+                    work.curvature[:] = lagrangian_hessian(program, lin, work.multipliers)
+                workspace.call(state.DIRECT)
+            while counts[state.ANSWER] == state.TRY:
+                values = program.retract(lin.values, numbers[state.ALPHA] * work.step[: program.size])
                 found = program.evaluate(values, lin.weights)
-                code = barrier.judge(program.arrays, kkt, work, at, found.cost, found.constraints)
-            if code == state.STALLED:
-                return Status.STALLED
-            if code == state.AGAIN:
+                numbers[state.TRIAL_COST], work.trial_constraints[:] = found.cost, found.constraints
+                workspace.call(state.JUDGE)
+            if counts[state.ANSWER] == state.AGAIN:
                 continue
+            if counts[state.ANSWER] != state.ACCEPTED:
+                return ENDINGS[int(counts[state.ANSWER])]
             lin = program.linearize(values)
-            at = workspace.iterate_of(lin, work, self)
-            barrier.safeguard(work, at.constraints)
-            barrier.measure(program.arrays, kkt, work, at)
-            numbers = work.numbers
-            run.accept(
-                lin,
-                work.multipliers.copy(),
-                float(numbers[state.STEP]),
-                float(numbers[state.TAKEN]),
-                **_details(numbers[state.MU], numbers[state.DELTA], work.counts[state.GAUSS_NEWTON]),
-            )
+            workspace.take(lin)
+            workspace.call(state.MEASURE)
+            details = _details(numbers[state.MU], numbers[state.DELTA], counts[state.GAUSS_NEWTON])
+            run.accept(lin, work.multipliers.copy(), float(numbers[state.STEP]), float(numbers[state.TAKEN]), **details)
             if run.status is not None:
                 return None
 
@@ -124,80 +117,116 @@ class Workspace:
     """What is kept between solves of one structure."""
 
     def __init__(self, program: Program) -> None:
-        """Analyse the KKT matrix."""
+        """Analyse the KKT matrix and compile."""
         self.program = program
-        self.system = KktSystem(program, program.equality)
-        self.compiled = program.fully_compiled
-        self._numbers = self._arrays(1)
+        self._build(1)
 
-    def _arrays(self, iterations: int) -> dict[str, Array]:
-        program, system = self.program, self.system
-        return empty_work(
-            program.size + int(system.arrays.size[1]),
-            program.constraints.count,
+    def _build(self, iterations: int) -> None:
+        program = self.program
+        self.system = KktSystem(program, program.equality)
+        arrays, table = self.system.arrays, program.table
+        plan, doubles = stacked(arrays)
+        fields = program.arrays.fields
+        unequal = [
+            row[KIND] >= CONSTRAINT and not program.equality[row[ROW] : row[ROW] + row[COUNT] * row[ROWS]].all()
+            for row in fields
+        ]
+        self.work = empty_work(
+            program.columns.stored,
             program.columns.width,
-            system.pattern.nnz,
+            program.size,
+            len(arrays.rows),
+            (table.residuals, table.constraints),
+            (table.entries, table.constraint_entries),
             program.normal.nnz,
+            len(fields),
+            table.weights,
             iterations,
+            len(plan.slots),
         )
+        self.problem = Problem(
+            np.zeros(state.LINKS, dtype=np.int64),
+            program.arrays,
+            plan,
+            program.retraction.parts,
+            program.columns.free,
+            program.scratch,
+            arrays.rows,
+            arrays.entries,
+            doubles,
+            np.array(unequal, dtype=np.int64),
+        )
+        self._describe()
+        self.problem.links[:] = addresses()
+
+    def _describe(self) -> None:
+        """Tell compiled code where the arrays are."""
+        self._words = memory.describe((self.problem, self.work))
+        self._address = self._words.ctypes.data
+
+    def call(self, function: int) -> None:
+        """Run one of the linked functions."""
+        call(self.problem.links[function], self._address)
 
     def prepare(self, run: Run, options: InteriorPoint) -> Work:
-        """Arrays for one solve, with the sides that the present limits have."""
-        program = self.program
-        if not np.array_equal(program.equality, self.system.equality):
-            self.system = KktSystem(program, program.equality)
-            self._numbers = self._arrays(1)
-        if len(self._numbers["log"]) < options.max_iterations + 2:
-            self._numbers["log"] = np.zeros((options.max_iterations + 2, 9))
-        lower, upper = program.lower, program.upper
-        below = np.flatnonzero(np.isfinite(lower) & ~program.equality)
-        above = np.flatnonzero(np.isfinite(upper) & ~program.equality)
-        rows = np.concatenate([below, above])
-        sides = len(rows)
-        numbers = np.zeros(state.FLOATS)
-        numbers[state.MU], numbers[state.RHO] = options.barrier, options.price
-        numbers[state.TOLERANCE] = run.tolerance
-        largest = float(np.abs(run.multipliers).max(initial=0.0))
-        if largest > 0.5 * options.price:
-            numbers[state.RHO] = 10.0 * largest
-        counts = np.zeros(state.INTEGERS, dtype=np.int64)
+        """Set up one solve with the present data."""
+        if not np.array_equal(self.program.equality, self.system.equality):
+            self._build(options.max_iterations)
+        if len(self.work.log) < options.max_iterations + 2:
+            self.work = self.work._replace(log=np.zeros((options.max_iterations + 2, 9)))
+            self._describe()
+        work = self.work
+        numbers, counts = work.numbers, work.counts
+        work.values[:], work.multipliers[:] = run.values.flat, run.multipliers
+        numbers[state.MU], numbers[state.TOLERANCE] = options.barrier, run.tolerance
+        numbers[state.RHO] = options.price
         counts[state.LIMIT], counts[state.EXACT] = options.max_iterations, options.hessian == "exact"
-        return Work(
-            numbers=numbers,
-            counts=counts,
-            side_row=rows,
-            side_sign=np.repeat([1.0, -1.0], [len(below), len(above)]),
-            side_limit=np.concatenate([lower[below], upper[above]]),
-            y=np.zeros(sides),
-            dy=np.zeros(sides),
-            s=np.zeros(sides),
-            e=np.zeros(sides),
-            multipliers=run.multipliers.copy(),
-            free=program.columns.free,
-            **self._numbers,
+        return work
+
+    def found(self) -> Linearization:
+        """The linearisation at which the compiled loop ended."""
+        program, work = self.program, self.work
+        values = program.columns.view(work.values.copy())
+        program.retraction.fix(values)
+        return Linearization(
+            values,
+            float(work.numbers[state.COST]),
+            work.residual.copy(),
+            work.jacobian.copy(),
+            work.constraints.copy(),
+            work.constraint_jacobian.copy(),
+            work.gradient.copy(),
+            work.hessian.copy(),
+            program.norms(work.norms),
         )
 
-    def iterate_of(self, lin: Linearization, work: Work, options: InteriorPoint) -> Iterate:
-        """A linearisation as the compiled functions take it."""
-        curvature = lin.hessian
-        if options.hessian == "exact":
-            curvature = lagrangian_hessian(self.program, lin, work.multipliers)
-        return Iterate(
-            np.array([lin.cost]),
-            lin.residual,
-            lin.jacobian,
-            lin.constraints,
-            lin.constraint_jacobian,
-            lin.gradient.copy(),
-            lin.hessian,
-            curvature,
-        )
+    def take(self, lin: Linearization) -> None:
+        """Copy a linearisation to where the compiled functions look for it."""
+        work = self.work
+        work.numbers[state.COST] = lin.cost
+        work.residual[:], work.jacobian[:] = lin.residual, lin.jacobian
+        work.constraints[:], work.constraint_jacobian[:] = lin.constraints, lin.constraint_jacobian
+        work.gradient[:], work.hessian[:] = lin.gradient, lin.hessian
 
 
-def _rows(work: Work) -> list[tuple[Array, dict[str, float | int | str]]]:
-    """History rows of the compiled loop: the numbers of an iteration and what the backend adds."""
-    count = int(work.counts[state.ITERATION]) + 1
-    return [(row[:6], _details(row[6], row[7], row[8])) for row in work.log[1:count].copy()]
+def _history(work: Work, norms: dict[str, float], seconds: float) -> Callable[[], list[Iteration]]:
+    """Rows of the compiled loop, made when somebody asks for them; nobody took the time of single iterations."""
+    log = work.log[: int(work.counts[state.ITERATION]) + 1].copy()
+
+    def rows() -> list[Iteration]:
+        last = len(log) - 1
+        return [
+            Iteration(
+                number,
+                *map(float, row[:6]),
+                seconds if number else 0.0,
+                norms if number == last else {},
+                _details(*row[6:9]) if number else {},
+            )
+            for number, row in enumerate(log)
+        ]
+
+    return rows
 
 
 def _details(mu: float, delta: float, gauss_newton: float) -> dict[str, float | int | str]:
@@ -208,58 +237,3 @@ def _details(mu: float, delta: float, gauss_newton: float) -> dict[str, float | 
     if gauss_newton:
         details["gauss_newton"] = 1
     return details
-
-
-@compiled
-def _loop(
-    terms: Terms,
-    parts: IntArray,
-    free: IntArray,
-    kkt: KktArrays,
-    work: Work,
-    at: Iterate,
-    values: Array,
-    scratch: Array,
-) -> int:
-    """The whole solve; ``values`` and ``at`` are moved."""
-    step, full, trial = np.empty(len(free)), np.empty(len(terms.unknown)), values.copy()
-    residual, constraints = np.empty_like(at.residual), np.empty_like(at.constraints)
-    norms, squares = np.empty(len(terms.fields)), np.empty(1)
-    exact = work.counts[state.EXACT] == 1
-    while True:
-        code = barrier.newton(terms, kkt, work, at)
-        if code != state.TRY:
-            return code
-        while code == state.TRY:
-            barrier.trial_step(work, step)
-            trial[:] = values
-            full[:] = 0.0
-            retract_parts(parts, free, step, full, values, trial)
-            cost = passes.evaluate(terms, trial, residual, constraints, squares, scratch)
-            code = barrier.judge(terms, kkt, work, at, cost, constraints)
-        if code == state.STALLED:
-            return code
-        if code == state.AGAIN:
-            continue
-        values[:] = trial
-        at.gradient[:] = 0.0
-        at.hessian[:] = 0.0
-        at.cost[0] = passes.linearize(
-            terms,
-            values,
-            False,
-            at.residual,
-            at.jacobian,
-            at.constraints,
-            at.constraint_jacobian,
-            squares,
-            norms,
-            at.gradient,
-            at.hessian,
-            scratch,
-        )
-        barrier.safeguard(work, at.constraints)
-        if exact:
-            barrier.measure(terms, kkt, work, at)
-            at.curvature[:] = at.hessian
-            add_curvature(terms, values, at.residual, work.multipliers, at.curvature)

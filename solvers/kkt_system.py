@@ -81,6 +81,24 @@ class KktSystem:
         )
 
 
+def stacked(arrays: KktArrays) -> tuple[Plan, IntArray]:
+    """The plan for entries that come as those of ``normal``, then those of ``entries``, with no need to be filled in.
+
+    Returns:
+        The plan, and pairs (later, earlier) of stacked entries that mean the same entry of the matrix: only the last
+        of them counts, so the earlier ones must be added to it, pair after pair.
+    """
+    slots = arrays.plan.slots[np.concatenate([arrays.normal, arrays.places])]
+    _, inverse, counts = np.unique(slots, return_inverse=True, return_counts=True)
+    last: dict[int, int] = {}
+    pairs = []
+    for k in np.flatnonzero(counts[inverse] > 1).tolist():
+        if int(slots[k]) in last:
+            pairs.append((k, last[int(slots[k])]))
+        last[int(slots[k])] = k
+    return arrays.plan._replace(slots=slots), np.array(pairs, dtype=np.int64).ravel()
+
+
 @compiled
 def fill(kkt: KktArrays, hessian: Array, constraint_jacobian: Array, data: Array) -> None:
     """Write the entries of the matrix."""

@@ -7,38 +7,55 @@ Whatever route solves it, the answer is measured here, in the problem's own unit
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from unifg.linearization import Linearization
+from unifg.passes import add_constraints
 from unifg.program import Program
+from unifg.second_order import lagrangian_hessian
+from unifg.sparse import Symmetric
 from unifg.typing import Array
 
 
-@dataclass
+@dataclass(frozen=True)
 class QP:
     """Numbers of one subproblem in the program's fixed patterns.
 
+    A Hessian that is positive definite only where the linearised constraints leave freedom comes with ``weights``:
+    with w/2 |A d - b|^2 added for the rows they name, H becomes positive definite, and the solution stays what it is;
+    see :meth:`convex`.
+
     Attributes:
-        program: gives the patterns ``hessian`` (upper triangle of H) and ``constraints`` (A).
+        program: gives the pattern ``constraints`` (A).
+        lin: where the problem was linearised.
+        pattern: of H: ``Program.hessian``, or ``Program.normal`` when H may hold the curvature of constraints.
         hessian: entries of H, upper triangle.
         gradient: (n,) g.
         jacobian: entries of A in evaluation order.
         lower, upper: (M,) limits on A d.
+        damping: what H has on its diagonal beyond the model's own curvature.
+        curved_by: (M,) multipliers whose curvature H contains; None for the Hessian of Gauss-Newton.
+        weights: (M,) w, zero for rows without a square; None when H needs none.
     """
 
     program: Program
+    lin: Linearization
+    pattern: Symmetric
     hessian: Array
     gradient: Array
     jacobian: Array
     lower: Array
     upper: Array
+    damping: float = 0.0
+    curved_by: Array | None = None
+    weights: Array | None = None
 
     def curved(self, step: Array) -> Array:
         """H d."""
-        return self.program.hessian.times(self.hessian, step)
+        return self.pattern.times(self.hessian, step)
 
     def linear(self, step: Array) -> Array:
         """A d."""
@@ -46,7 +63,45 @@ class QP:
 
     def shifted(self, offset: Array) -> QP:
         """The same problem with both limits moved by ``offset``."""
-        return QP(self.program, self.hessian, self.gradient, self.jacobian, self.lower + offset, self.upper + offset)
+        return replace(self, lower=self.lower + offset, upper=self.upper + offset)
+
+    def with_curvature(self, multipliers: Array) -> QP:
+        """The same problem, in the pattern ``Program.normal``, with the Hessian of the Lagrangian (Ta eq. 18).
+
+        Args:
+            multipliers: (M,).
+        """
+        pattern = self.program.normal
+        hessian = lagrangian_hessian(self.program, self.lin, multipliers)
+        hessian[pattern.diagonal] += self.damping
+        return replace(self, pattern=pattern, hessian=hessian, curved_by=multipliers, weights=None)
+
+    def gauss_newton(self) -> QP:
+        """The same problem without the curvature of constraints and residuals."""
+        hessian = _gauss_newton(self.program, self.lin, self.pattern, self.damping)
+        return replace(self, hessian=hessian, curved_by=None, weights=None)
+
+    @property
+    def targets(self) -> Array:
+        """(M,) b: the limit that each row with a weight is expected at, zero elsewhere."""
+        if self.weights is None:
+            return np.zeros(len(self.lower))
+        assert self.curved_by is not None
+        return np.where(self.weights > 0.0, np.where(self.curved_by > 0.0, self.upper, self.lower), 0.0)
+
+    def convex(self) -> QP:
+        """The problem with w/2 |A d - b|^2 added: H + A'WA and g - A'Wb.
+
+        Where A d = b holds, the square and its gradient vanish: step and multipliers are those of this problem. Where
+        a route misses A d = b, or gives it up, the multipliers differ by W (A d - b); see :func:`solve_convex`.
+        """
+        if self.weights is None:
+            return self
+        program = self.program
+        hessian = self.hessian.copy()
+        add_constraints(program.arrays, self.jacobian, self.weights, hessian)
+        pull = program.constraints.transposed_times(self.jacobian, self.weights * self.targets)
+        return replace(self, hessian=hessian, gradient=self.gradient - pull[program.columns.free], weights=None)
 
 
 @dataclass
@@ -100,15 +155,46 @@ def qp_error(qp: QP, step: Array, multipliers: Array) -> float:
     )
 
 
-def subproblem(program: Program, lin: Linearization, damping: float) -> QP:
-    """The quadratic model at ``lin`` with ``damping`` added to the diagonal of H."""
-    hessian = program.hessian_entries(lin)
-    hessian[program.hessian.diagonal] += damping
+def solve_convex(route: Route, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
+    """Let a route that asks for a positive definite H solve ``qp``.
+
+    With y the multipliers of the convex problem, H d + A'W(A d - b) + g + A'y = 0 there, so those of ``qp`` are
+    y + W (A d - b): the same, up to the route's own accuracy in A d = b. The error is that of ``qp``.
+    """
+    if qp.weights is None:
+        return route.solve(qp, multipliers, accuracy)
+    finer = accuracy / max(1.0, float(qp.weights.max()))  # errors in A d = b count W times in the multipliers
+    answer = route.solve(qp.convex(), multipliers, finer)
+    if not np.isfinite(answer.error):
+        return answer
+    dual = answer.multipliers + qp.weights * (qp.linear(answer.step) - qp.targets)
+    return replace(answer, multipliers=dual, error=qp_error(qp, answer.step, dual))
+
+
+def subproblem(program: Program, lin: Linearization, damping: float, pattern: Symmetric | None = None) -> QP:
+    """The quadratic model at ``lin``, with Gauss-Newton's Hessian and ``damping`` on its diagonal.
+
+    Args:
+        program: the compiled graph.
+        lin: where.
+        damping: added to the diagonal of H.
+        pattern: of H, ``program.hessian`` (the default) or ``program.normal``.
+    """
+    pattern = program.hessian if pattern is None else pattern
     return QP(
         program,
-        hessian,
+        lin,
+        pattern,
+        _gauss_newton(program, lin, pattern, damping),
         lin.gradient[program.columns.free],
         lin.constraint_jacobian,
         program.lower - lin.constraints,
         program.upper - lin.constraints,
+        damping,
     )
+
+
+def _gauss_newton(program: Program, lin: Linearization, pattern: Symmetric, damping: float) -> Array:
+    entries = lin.hessian.copy() if pattern is program.normal else program.hessian_entries(lin)
+    entries[pattern.diagonal] += damping
+    return entries

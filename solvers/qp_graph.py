@@ -50,8 +50,10 @@ class GraphRoute:
         below = np.flatnonzero(np.isfinite(qp.lower) & ~equality)
         above = np.flatnonzero(np.isfinite(qp.upper) & ~equality)
         step, dual = np.zeros(program.size), np.where(equality, multipliers, 0.0)
-        hessian = np.zeros(program.normal.nnz)
-        hessian[program.objective_places] = qp.hessian
+        hessian = qp.hessian
+        if qp.pattern is not program.normal:
+            hessian = np.zeros(program.normal.nnz)
+            hessian[program.objective_places] = qp.hessian
         iterations = _minimize(
             program.arrays,
             self._system.arrays,

@@ -42,7 +42,7 @@ class OsqpRoute:
         if self._workspace is None:
             self._workspace = osqp.OSQP()
             self._workspace.setup(
-                P=self.program.hessian.matrix(qp.hessian),
+                P=qp.pattern.matrix(qp.hessian),
                 q=qp.gradient,
                 A=self.program.constraints.matrix(qp.jacobian),
                 l=lower,

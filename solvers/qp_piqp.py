@@ -13,6 +13,7 @@ import scipy.sparse as sp
 
 from unifg.program import Program
 from unifg.solvers.qp import QP, QPAnswer, qp_error
+from unifg.sparse import Symmetric
 from unifg.typing import Array, BoolArray, IntArray
 
 INFINITY = 1e30  # PIQP treats larger limits as absent
@@ -30,6 +31,17 @@ def new_solver() -> piqp.SparseSolver:
     return solver
 
 
+def limited(qp: QP) -> tuple[Array, Array, Array, BoolArray]:
+    """Entries of A, limits and which rows have any; rows without are emptied, which PIQP would do with a complaint."""
+    has = np.isfinite(qp.lower) | np.isfinite(qp.upper)
+    constraints = qp.program.constraints
+    entries = constraints.compress(qp.jacobian)
+    if has.all():
+        return entries, np.maximum(qp.lower, -INFINITY), np.minimum(qp.upper, INFINITY), has
+    lower, upper = np.maximum(qp.lower, -INFINITY), np.minimum(qp.upper, INFINITY)
+    return entries * has[constraints.indices], np.where(has, lower, -1.0), np.where(has, upper, 1.0), has
+
+
 class PiqpRoute:
     """The subproblem itself; equalities are eliminated from the inequalities' pattern.
 
@@ -45,17 +57,17 @@ class PiqpRoute:
         """Remember the pattern; PIQP is set up with the first numbers."""
         self.program = program
         self._solver: piqp.SparseSolver | None = None
-        self._hessian = program.hessian.matrix(np.zeros(program.hessian.nnz))
 
     def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
         """Solve to ``accuracy`` and measure; interior points start cold, so ``multipliers`` are not used."""
         equal = qp.lower == qp.upper
         fresh = self._solver is None or not np.array_equal(equal, self._equal)
         if fresh:
+            self._hessian = qp.pattern.matrix(np.zeros(qp.pattern.nnz))
             self._split(equal)
         assert self._solver is not None
         self._solver.settings.eps_abs = float(np.clip(0.01 * accuracy, TIGHTEST, LOOSEST))
-        entries = self.program.constraints.compress(qp.jacobian)
+        entries, lower, upper, has = limited(qp)
         self._hessian.data[:] = qp.hessian
         self._equalities.data[:] = entries[self._equality_entries]
         self._inequalities.data[:] = entries[self._inequality_entries]
@@ -63,10 +75,10 @@ class PiqpRoute:
             "P": self._hessian,
             "c": qp.gradient,
             "A": self._equalities,
-            "b": qp.lower[equal],
+            "b": lower[equal],
             "G": self._inequalities,
-            "h_l": np.maximum(qp.lower[~equal], -INFINITY),
-            "h_u": np.minimum(qp.upper[~equal], INFINITY),
+            "h_l": lower[~equal],
+            "h_u": upper[~equal],
         }
         if fresh:
             self._solver.setup(**numbers)
@@ -82,6 +94,7 @@ class PiqpRoute:
         step, dual = np.array(result.x), np.zeros(len(equal))
         dual[equal] = result.y
         dual[~equal] = np.asarray(result.z_u) - np.asarray(result.z_l)
+        dual[~has] = 0.0
         return QPAnswer(step, dual, self.name, iterations, qp_error(qp, step, dual))
 
     def _split(self, equal: BoolArray) -> None:
@@ -112,13 +125,18 @@ class ElasticRoute:
     elsewhere it violates the linearised rows least.
     """
 
-    def __init__(self, program: Program) -> None:
-        """Lay out d, and two slacks for every row that may be violated."""
+    def __init__(self, program: Program, hessian: Symmetric) -> None:
+        """Lay out d, and two slacks for every row that may be violated.
+
+        Args:
+            program: the compiled graph.
+            hessian: pattern of H.
+        """
         self.program = program
+        self._entries = hessian.nnz
         n, constraints = program.size, program.constraints
         rows = np.flatnonzero(~program.bound_rows)
         m = len(rows)
-        hessian = program.hessian
         diagonal = np.arange(n, n + 2 * m)
         self._hessian = sp.csc_matrix(
             (
@@ -142,14 +160,14 @@ class ElasticRoute:
     def solve(self, qp: QP, price: float) -> QPAnswer:
         """Solve; the error reported is zero when PIQP converged, infinite otherwise."""
         program, n = self.program, self.program.size
-        self._hessian.data[: program.hessian.nnz] = qp.hessian
-        self._rows.data[: program.constraints.nnz] = program.constraints.compress(qp.jacobian)
+        self._hessian.data[: self._entries] = qp.hessian
+        self._rows.data[: program.constraints.nnz], lower, upper, has = limited(qp)
         numbers = {
             "P": self._hessian,
             "c": np.concatenate([qp.gradient, np.full(self._slacks, price)]),
             "G": self._rows,
-            "h_l": np.maximum(qp.lower, -INFINITY),
-            "h_u": np.minimum(qp.upper, INFINITY),
+            "h_l": lower,
+            "h_u": upper,
             "x_l": np.concatenate([np.full(n, -INFINITY), np.zeros(self._slacks)]),
             "x_u": np.full(n + self._slacks, INFINITY),
         }
@@ -162,6 +180,6 @@ class ElasticRoute:
         status = self._solver.solve()
         result = self._solver.result
         step = np.array(result.x)[:n]
-        dual = np.asarray(result.z_u) - np.asarray(result.z_l)
+        dual = np.where(has, np.asarray(result.z_u) - np.asarray(result.z_l), 0.0)
         solved = status == piqp.PIQP_SOLVED and np.isfinite(step).all() and np.isfinite(dual).all()
         return QPAnswer(step, dual, "elastic", int(result.info.iter), 0.0 if solved else np.inf)

@@ -55,7 +55,7 @@ class QpsolversRoute:
         return QPAnswer(step, dual, self.name, iterations, qp_error(qp, step, dual))
 
     def _full(self, qp: QP) -> sp.csc_matrix:
-        upper = self.program.hessian.matrix(qp.hessian)
+        upper = qp.pattern.matrix(qp.hessian)
         return (upper + sp.triu(upper, 1).T).tocsc()
 
     def _solve(

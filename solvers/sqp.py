@@ -3,20 +3,27 @@
 Each iteration linearises the graph, solves the quadratic subproblem (OSQP first; an interior-point QP when OSQP
 misses its accuracy; an elastic one when the linearised constraints contradict each other) and accepts a step that
 lowers the l1 merit function, with a second-order correction when curvature of the constraints spoils the full
-step. ``max_iterations=1`` is the real-time iteration.
+step. The Hessian is that of Gauss-Newton or of the Lagrangian (:mod:`unifg.solvers.qp_exact`).
+``max_iterations=1`` is the real-time iteration.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
+from unifg.errors import BackendError
 from unifg.linearization import Evaluation, Linearization
 from unifg.program import Program
 from unifg.solver import Run, Solver
 from unifg.solvers.damping import norm
-from unifg.solvers.qp import QP, QPAnswer, Route, subproblem
+from unifg.solvers.kkt import require_equalities
+from unifg.solvers.least_violation import settle
+from unifg.solvers.qp import QP, QPAnswer, Route, solve_convex, subproblem
+from unifg.solvers.qp_elimination import EliminationRoute
+from unifg.solvers.qp_exact import ExactHessian, holds
 from unifg.solvers.qp_graph import GraphRoute
 from unifg.solvers.qp_osqp import OsqpRoute
 from unifg.solvers.qp_piqp import ElasticRoute, PiqpRoute
@@ -30,23 +37,32 @@ ROUNDING = 1e-13
 NOISE = 1e-8
 GOOD_ENOUGH = 1e-5  # QP error that is always accepted from the fallback
 USABLE = 1e-3  # QP error below which a step may still be tried
+FARTHEST = 1e4  # violation that a step may lead to, relative to the start's (Waechter and Biegler 2006, eq. 21)
 FAILURES = 4  # damped attempts at one step before giving up
 MISSES = 2  # in a row within one solve, after which the first route is no longer asked
 FIRST_DAMPING = 1e-3
 DAMPING_GROWTH = 10.0
 DAMPING_DECAY = 0.9  # faster forgetting cycles between overshooting and damped steps
+SECANT_DECAY = 0.3  # of curvature that was seen along an earlier step
+SECANT_MATTERS = 0.5  # of the known curvature; less only slows convergence down
+SHORTEST_SECANT = 1e-7  # below it, differences of gradients are rounding
+EXACT_DECAY = 0.1  # with the exact Hessian nothing is left to cycle about
 SMALLEST_DAMPING = 1e-9  # keeps H positive definite without showing in the step
 
 
 @dataclass(kw_only=True)
 class SQP(Solver):
-    """Equalities, inequalities and general costs by quadratic subproblems with a Gauss-Newton Hessian.
+    """Equalities, inequalities and general costs by quadratic subproblems.
 
     Attributes:
         max_iterations: subproblems before giving up.
+        hessian: "gauss-newton", or "exact": of the Lagrangian with the present multipliers, second derivatives of
+            residuals and constraints included, which converges quadratically where Gauss-Newton is linear. A step for
+            which it has the wrong inertia, or along which the merit does not fall, takes Gauss-Newton's.
         qp: "osqp" (called directly, warm-started), "graph" (an interior point whose systems are eliminated on the
-            graph) or any name qpsolvers knows. A subproblem without inequalities is one linear system: it goes to
-            "graph" whatever is said here.
+            graph), "elimination" (Ta's primal and dual linear graphs, for equalities only; a reference, written to be
+            read) or any name qpsolvers knows. A subproblem without inequalities is one linear system: it goes to
+            "graph" unless "elimination" is asked for.
         fallback: "piqp" (called directly), "graph" or any name qpsolvers knows: repeats a QP which missed its accuracy.
             None leaves inaccurate answers as they are, and infeasible subproblems unsolved.
         qp_iterations: limit for OSQP before the fallback takes over.
@@ -57,6 +73,7 @@ class SQP(Solver):
     """
 
     max_iterations: int = 200
+    hessian: Literal["gauss-newton", "exact"] = "gauss-newton"
     qp: str = "osqp"
     fallback: str | None = "piqp"
     qp_iterations: int = 200
@@ -65,6 +82,17 @@ class SQP(Solver):
     violation_tolerance: float = 1e-4
     full_steps: bool = False
 
+    def __post_init__(self) -> None:
+        """Refuse options that mean nothing."""
+        super().__post_init__()
+        if self.hessian not in ("exact", "gauss-newton"):
+            raise BackendError(f"{self.name}: hessian must be 'exact' or 'gauss-newton', found '{self.hessian}'")
+
+    def require(self, program: Program) -> None:
+        """Refuse inequalities where the linear algebra knows equalities only."""
+        if self.qp == "elimination":
+            require_equalities(program, f"{self.name}(qp='elimination')")
+
     def workspace(self, program: Program) -> Subproblems:
         """QP workspaces."""
         return Subproblems(self, program)
@@ -72,7 +100,8 @@ class SQP(Solver):
     def search_step(self, run: Run, workspace: Subproblems, lin: Linearization) -> Array | None:
         """The full step of the subproblem."""
         workspace.start()
-        answer = workspace.solve(subproblem(run.program, lin, SMALLEST_DAMPING), run.multipliers, self._accuracy(run))
+        qp = subproblem(run.program, lin, SMALLEST_DAMPING, workspace.pattern)
+        answer = workspace.solve(qp, run.multipliers, self._accuracy(run))
         return answer.step if np.isfinite(answer.error) else None
 
     def iterate(self, run: Run, workspace: Subproblems) -> Status | None:
@@ -82,93 +111,149 @@ class SQP(Solver):
         if within is not run.values and not self.full_steps:
             run.begin_at(run.program.linearize(within))
         workspace.start()
-        merit = Merit(run.program, run.multipliers)
-        damping = SMALLEST_DAMPING
+        merit = Merit(run.program, run.multipliers, run.lin)
+        damping, missing = SMALLEST_DAMPING, 0.0
         failures = 0
         while run.status is None:
-            accuracy = self._accuracy(run)
-            qp = subproblem(run.program, run.lin, damping)
-            answer = workspace.solve(qp, run.multipliers, accuracy)
-            if answer.route.startswith("elastic") and run.infeasible_stationary():
+            shift = max(damping, missing)
+            qp = workspace.subproblem(run, self._bounded(run, shift) if failures == 0 else shift)
+            taken = self._attempt(run, workspace, merit, qp)
+            if taken is None and qp.curved_by is not None:
+                qp = qp.gauss_newton()
+                taken = self._attempt(run, workspace, merit, qp)
+            if workspace.elastic_asked and run.infeasible_stationary():
                 return Status.LOCALLY_INFEASIBLE
-            taken = None
-            if np.isfinite(answer.error):
-                merit.raise_prices(answer)
-                taken = self._search(run, workspace, merit, qp, answer, accuracy)
             if taken is None:
                 failures += 1
                 if failures == FAILURES:
-                    return Status.STALLED
+                    return settle(run, Status.STALLED)
                 damping = max(100.0 * damping, 1e-4)
                 continue
             failures = 0
-            after, multipliers, length, corrected = taken
+            answer, after, multipliers, step, length, corrected = taken
+            if qp.curved_by is None:
+                seen = missing_curvature(run.program, qp, run.lin, after, multipliers, step, qp.damping)
+                missing = max(seen, SECANT_DECAY * missing)
+            else:
+                missing = 0.0
             run.accept(
                 after,
                 multipliers,
-                length * norm(answer.step),
+                norm(step),
                 length,
                 qp=answer.route,
                 qp_iterations=answer.iterations,
-                damping=damping,
+                damping=qp.damping,
                 **({"correction": 1} if corrected else {}),
+                **({"hessian": _kind(qp, answer)} if self.hessian == "exact" else {}),
             )
-            if run.status is None and length * norm(answer.step) < self.step_tolerance:
+            if run.status is None and norm(step) < self.step_tolerance:
                 if run.optimality.violation < self.violation_tolerance:
                     return Status.STOP_RULE
             damping = self._next_damping(damping, length)
         return None
 
+    def _attempt(
+        self, run: Run, workspace: Subproblems, merit: Merit, qp: QP
+    ) -> tuple[QPAnswer, Linearization, Array, Array, float, bool] | None:
+        """Solve the subproblem and search along its step; None when there is no answer or no length helps."""
+        accuracy = self._accuracy(run)
+        answer = workspace.solve(qp, run.multipliers, accuracy)
+        if not np.isfinite(answer.error):
+            return None
+        merit.raise_prices(answer)
+        found = self._search(run, workspace, merit, qp, answer, accuracy)
+        return None if found is None else (answer, *found)
+
+    def _bounded(self, run: Run, damping: float) -> float:
+        """With the exact Hessian damping must vanish with the error, or convergence would be linear."""
+        return damping if self.hessian != "exact" else max(min(damping, _size(run)), SMALLEST_DAMPING)
+
     def _accuracy(self, run: Run) -> float:
         """Ask the QP for what the outer iteration can use."""
-        size = max(run.optimality.stationarity, run.optimality.violation, run.optimality.complementarity)
-        return float(np.clip(1e-3 * size, 0.1 * self.tolerance, 1e-4))
+        size = _size(run)
+        share = min(1e-3, size) if self.hessian == "exact" else 1e-3
+        return float(np.clip(share * size, 0.1 * self.tolerance, 1e-4))
 
     def _next_damping(self, damping: float, length: float) -> float:
         """A shortened step means curvature that H does not know: damp, and forget it slowly."""
         if length < 1.0:
             return max(DAMPING_GROWTH * damping, FIRST_DAMPING)
-        return max(DAMPING_DECAY * damping, SMALLEST_DAMPING)
+        return max((EXACT_DECAY if self.hessian == "exact" else DAMPING_DECAY) * damping, SMALLEST_DAMPING)
 
     def _search(
         self, run: Run, workspace: Subproblems, merit: Merit, qp: QP, answer: QPAnswer, accuracy: float
-    ) -> tuple[Linearization, Array, float, bool] | None:
+    ) -> tuple[Linearization, Array, Array, float, bool] | None:
+        """Where to go: linearisation, multipliers, step and its length, and whether it is a correction."""
         program, lin = run.program, run.lin
         values = program.retract(lin.values, answer.step)
         if self.full_steps:
-            return program.linearize(values), answer.multipliers, 1.0, False
+            return program.linearize(values), answer.multipliers, answer.step, 1.0, False
         here = merit.value(lin)
         slope = merit.slope(qp, answer.step, lin)
-        # The QP meets its rows to its own accuracy only; what that costs in merit is noise.
-        slack = ROUNDING * max(1.0, abs(here)) + NOISE * merit.price
+        # The QP meets its conditions to its own accuracy only; what that costs in merit is noise.
+        slack = ROUNDING * max(1.0, abs(here)) + max(NOISE * merit.price, min(answer.error, accuracy))
         if slope > slack:
             return None
         trial = program.evaluate(values, lin.weights)
         if merit.accepts(trial, here, slope, 1.0, slack):
-            return program.linearize(values), answer.multipliers, 1.0, False
+            after = program.linearize(values)
+            if after.finite:  # a residual may have an edge where its derivatives end
+                return after, answer.multipliers, answer.step, 1.0, False
         if self.second_order_correction and trial.finite and program.constraints.count:
             corrected = workspace.correct(qp, answer, trial, lin, accuracy)
             if corrected is not None:
                 bent = program.retract(lin.values, corrected.step)
                 if merit.accepts(program.evaluate(bent, lin.weights), here, slope, 1.0, slack):
-                    return program.linearize(bent), corrected.multipliers, 1.0, True
+                    after = program.linearize(bent)
+                    if after.finite:
+                        return after, corrected.multipliers, corrected.step, 1.0, True
         length = 0.5
         while length >= SHORTEST:
             values = program.retract(lin.values, length * answer.step)
             if merit.accepts(program.evaluate(values, lin.weights), here, slope, length, slack):
-                multipliers = run.multipliers + length * (answer.multipliers - run.multipliers)
-                return program.linearize(values), multipliers, length, False
+                after = program.linearize(values)
+                if after.finite:
+                    multipliers = run.multipliers + length * (answer.multipliers - run.multipliers)
+                    return after, multipliers, length * answer.step, length, False
             length *= 0.5
         return None
+
+
+def missing_curvature(
+    program: Program, qp: QP, before: Linearization, after: Linearization, multipliers: Array, step: Array, shift: float
+) -> float:
+    """Curvature of the Lagrangian along a step, by the secant, that the Hessian lacked; zero when it did not matter.
+
+    A Gauss-Newton Hessian leaves out what constraints and residuals bend. Where that is as much as H itself, full steps
+    swing to and fro across the answer: the error is multiplied by 1 - (true curvature) / (that of the subproblem).
+
+    Args:
+        program: the compiled graph.
+        qp: the subproblem that gave the step, with ``shift`` on its diagonal.
+        before: linearisation at the start of the step.
+        after: linearisation at its end.
+        multipliers: (M,) at its end.
+        step: (n,) tangent step.
+        shift: damping of the subproblem.
+    """
+    squared = float(step @ step)
+    if squared < SHORTEST_SECANT**2:
+        return 0.0
+    change = program.lagrangian_gradient(after, multipliers) - program.lagrangian_gradient(before, multipliers)
+    known = float(step @ qp.curved(step)) / squared - shift
+    missing = float(step @ change[program.columns.free]) / squared - known
+    return missing if missing > SECANT_MATTERS * known else 0.0
 
 
 class Merit:
     """l1 merit: objective plus a price per unit of violation for every row (Powell 1978)."""
 
-    def __init__(self, program: Program, multipliers: Array) -> None:
+    def __init__(self, program: Program, multipliers: Array, start: Linearization) -> None:
         """Start with the prices the multipliers suggest."""
         self.program = program
         self.prices = np.abs(multipliers)
+        self._worst = FARTHEST * max(1.0, self._violation(start.constraints))
 
     @property
     def price(self) -> float:
@@ -191,12 +276,23 @@ class Merit:
         return float(qp.gradient @ step + self.prices @ change)
 
     def accepts(self, trial: Evaluation, here: float, slope: float, length: float, slack: float) -> bool:
-        """Armijo's condition."""
-        return trial.finite and self.value(trial) <= here + ARMIJO * length * slope + slack
+        """Armijo's condition, not too far from the constraints: the merit may be unbounded out there."""
+        if not trial.finite or self._violation(trial.constraints) > self._worst:
+            return False
+        return self.value(trial) <= here + ARMIJO * length * slope + slack
+
+    def _violation(self, constraints: Array) -> float:
+        return float(np.abs(self.program.violation(constraints)).sum())
 
 
 class Subproblems:
-    """The QP routes of one prepared graph and the order they are tried in."""
+    """The QP routes of one prepared graph and the order they are tried in.
+
+    Attributes:
+        program: the compiled graph.
+        pattern: of the Hessians.
+        elastic_asked: whether the last subproblem went to the elastic route.
+    """
 
     def __init__(self, options: SQP, program: Program) -> None:
         """Open the chosen route and its fallback.
@@ -205,36 +301,59 @@ class Subproblems:
             BackendError: when a named solver is not installed.
         """
         self.program = program
-        linear = bool(program.equality.all())
+        self.elastic_asked = False
+        self._exact = ExactHessian(program) if options.hessian == "exact" else None
+        self.pattern = program.hessian if self._exact is None else program.normal
+        linear = bool(program.equality.all()) and options.qp != "elimination"
         self.fallback = None if options.fallback is None else _route(program, options.fallback, 0)
         self.first = _route(program, "graph" if linear else options.qp, options.qp_iterations)
-        self.elastic = None if options.fallback is None else ElasticRoute(program)
+        self.elastic = None if options.fallback is None else ElasticRoute(program, self.pattern)
         self._misses = 0
 
     def start(self) -> None:
-        """Begin a new solve: the first route is trusted again."""
+        """Begin a new solve: the first route is trusted again.
+
+        Raises:
+            BackendError: when new data made inequalities that the first route cannot take.
+        """
         self._misses = 0
+        if isinstance(self.first, EliminationRoute):
+            require_equalities(self.program, "SQP(qp='elimination')")
+
+    def subproblem(self, run: Run, damping: float) -> QP:
+        """The quadratic model at the present iterate."""
+        if self._exact is None:
+            return subproblem(self.program, run.lin, damping, self.pattern)
+        return self._exact.subproblem(run.lin, run.multipliers, damping)
 
     def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
         """Try the first route, then the fallback, then the elastic problem."""
+        self.elastic_asked = False
         enough = max(10.0 * accuracy, GOOD_ENOUGH)
         if self.fallback is None or self.elastic is None:
-            return self.first.solve(qp, multipliers, accuracy)
+            answer = solve_convex(self.first, qp, multipliers, accuracy)
+            return answer if holds(qp, answer, enough) else replace(answer, error=np.inf)
         answers = []
         if self._misses < MISSES:
-            answers.append(self.first.solve(qp, multipliers, accuracy))
+            answers.append(solve_convex(self.first, qp, multipliers, accuracy))
+            if not holds(qp, answers[-1], enough):
+                return replace(answers[-1], error=np.inf)
             if answers[-1].error <= 10.0 * accuracy:
                 self._misses = 0
                 return answers[-1]
             self._misses += 1
         if not any(answer.infeasible for answer in answers):
-            answers.append(self.fallback.solve(qp, multipliers, accuracy))
+            answers.append(solve_convex(self.fallback, qp, multipliers, accuracy))
+            if not holds(qp, answers[-1], enough):
+                return replace(answers[-1], error=np.inf)
             if answers[-1].error <= enough:
                 return answers[-1]
         best = min(answers, key=lambda answer: answer.error)
         if best.error <= USABLE:
             return best
-        return self.elastic.solve(qp, max(10.0 * float(np.abs(multipliers).max(initial=0.0)), 1e3))
+        # Where no step satisfies the rows, nothing says along which steps the curvature of constraints should count.
+        self.elastic_asked = True
+        return self.elastic.solve(qp.gauss_newton(), max(10.0 * float(np.abs(multipliers).max(initial=0.0)), 1e3))
 
     def correct(
         self, qp: QP, answer: QPAnswer, trial: Evaluation, lin: Linearization, accuracy: float
@@ -243,15 +362,29 @@ class Subproblems:
         bend = trial.constraints - lin.constraints - qp.linear(answer.step)
         for route in (self.first, self.fallback):
             if route is not None and route.name == answer.route:
-                corrected = route.solve(qp.shifted(-bend), answer.multipliers, accuracy)
+                corrected = solve_convex(route, qp.shifted(-bend), answer.multipliers, accuracy)
                 return corrected if corrected.error <= USABLE else None
         return None
+
+
+def _size(run: Run) -> float:
+    """The largest KKT number of the present iterate."""
+    return max(run.optimality.stationarity, run.optimality.violation, run.optimality.complementarity)
+
+
+def _kind(qp: QP, answer: QPAnswer) -> str:
+    """Which Hessian a step was found with."""
+    if qp.curved_by is None or answer.route == "elastic":
+        return "gauss-newton"
+    return "exact" if qp.weights is None else "exact, with squares"
 
 
 def _route(program: Program, name: str, osqp_iterations: int) -> Route:
     """The engine, OSQP and PIQP are called directly, everything else through qpsolvers."""
     if name == "graph":
         return GraphRoute(program)
+    if name == "elimination":
+        return EliminationRoute(program)
     if name == "osqp":
         return OsqpRoute(program, osqp_iterations)
     return PiqpRoute(program) if name == "piqp" else QpsolversRoute(program, name)

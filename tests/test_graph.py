@@ -224,6 +224,7 @@ def test_covariance_does_not_depend_on_the_backend() -> None:
     """Interior points leave small multipliers on inactive rows: those rows do not remove variance."""
     graph, guess = short_drive()
     x = graph.families["x"]
-    first = SQP(qp="piqp").solve(graph, guess, check=True).covariance(x[6])
-    second = AugmentedLagrangian().solve(graph, guess, check=True).covariance(x[6])
-    np.testing.assert_allclose(first, second, rtol=1e-3, atol=1e-9)
+    first = SQP(qp="piqp").solve(graph, guess, check=True)
+    nearby = {family: first[family] + 1e-3 for family in guess}  # there are two ways around the disc
+    second = AugmentedLagrangian().solve(graph, nearby, check=True)
+    np.testing.assert_allclose(first.covariance(x[6]), second.covariance(x[6]), rtol=1e-3, atol=1e-9)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numba
 import numpy as np
 import pytest
@@ -54,7 +56,7 @@ def batched(x: Array, y: Array, measured: Array, scale: float) -> Array:
     return scale * np.stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0]], axis=1) - scale * measured
 
 
-def chain(residual: object) -> tuple[fg.Graph, fg.Family, Array]:
+def chain(residual: fg.Residual | Callable[..., Array]) -> tuple[fg.Graph, fg.Family, Array]:
     poses = RNG.normal(size=(6, 3))
     graph = fg.Graph()
     x = graph.variables("x", fg.SE2, 6)

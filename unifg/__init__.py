@@ -21,6 +21,7 @@ from unifg.kkt import Optimality, optimality
 from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Manifold, Product, Rn, wrap_angle
 from unifg.residuals import Residual, residual
 from unifg.robust import DCS, Cauchy, GemanMcClure, Huber, Loss, Reweighted, TruncatedLeastSquares, Tukey
+from unifg.smoothing import FixedLag, Incremental
 from unifg.solution import Guess, Solution
 from unifg.solver import Prepared, Solver
 from unifg.status import Status
@@ -43,11 +44,13 @@ __all__ = [
     "Family",
     "FileFormatError",
     "Finding",
+    "FixedLag",
     "GemanMcClure",
     "Graph",
     "GraphError",
     "Guess",
     "Huber",
+    "Incremental",
     "Iteration",
     "LieGroup",
     "Loss",

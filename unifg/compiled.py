@@ -6,8 +6,9 @@ checks, and messages.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
+from math import prod
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -82,6 +83,7 @@ class CompiledTerm:
         count: factors n.
         size: residual dimension m.
         dims: tangent dimension of each variable argument.
+        data: all data the term reads.
     """
 
     def __init__(self, term: Term) -> None:
@@ -98,6 +100,10 @@ class CompiledTerm:
         self.is_bound = isinstance(term, Constraint) and term.is_bound
         self.kernel, self.search_kernel = (None, None) if isinstance(term, ScalarCost) else _kernels(term.residual)
         self.place: IntArray = np.zeros(0, dtype=np.int64)
+        shaping = [getattr(term, name, None) for name in ("active", "sigma", "information", "lower", "upper")]
+        self._shaping = frozenset(value for value in shaping if isinstance(value, Data))
+        self.data = self._shaping | {argument for argument in term.arguments if isinstance(argument, Data)}
+        self._blocks: dict[int, tuple[int, int]] = {}
         self.bind({})
         if is_compiled(self._function) and not isinstance(term, ScalarCost):
             self.kernel = self._own_kernel()
@@ -122,13 +128,28 @@ class CompiledTerm:
 
     def bind(self, data: Bound) -> None:
         """Take the present value of every data argument."""
-        self._data = data
         self._arguments: list[Any] = [data.get(a, a.value) if isinstance(a, Data) else a for a in self.term.arguments]
         active = self.term.active
         mask = data.get(active, active.value) if isinstance(active, Data) else active
         self.active: BoolArray | None = None if mask is None or mask.all() else mask.astype(bool)
         if hasattr(self, "size"):
             self._bind_parameters(data)
+
+    def rebind(self, data: Bound, changed: Set[Data]) -> bool:
+        """Take changed data; True when more than parameters of the kernel had to be renewed."""
+        mine = self.data & changed
+        if not mine:
+            return False
+        places = [k for k, a in enumerate(self.term.arguments) if isinstance(a, Data) and a in mine]
+        if self.kernel is None or mine & self._shaping or not all(place in self._blocks for place in places):
+            self.bind(data)
+            return True
+        for place in places:
+            handle = self.term.arguments[place]
+            self._arguments[place] = value = data.get(handle, handle.value)
+            first, size = self._blocks[place]
+            self._packed[:, first : first + size] = value.reshape(-1, size)
+        return False
 
     def residual(self, values: Values) -> Array:
         """(n, m) residuals, zero where inactive, not whitened; (n,) for a scalar cost."""
@@ -266,6 +287,11 @@ class CompiledTerm:
         given = {slot: v for slot, (k, v) in enumerate(zip(places, variables, strict=True)) if k not in self._places}
         self._constants = given
         self.parameters = np.concatenate([packed.ravel(), *(array.ravel() for array in given.values())])
+        self._packed = self.parameters[: packed.size].reshape(packed.shape)
+        slots = [k for k, expected in enumerate(kernel.arguments) if isinstance(expected, int | tuple)]
+        sizes = [prod(part.shape[1:]) for part in parameters]
+        starts = np.cumsum([0, *sizes]).tolist()
+        self._blocks = {k: (start, size) for k, start, size in zip(slots, starts, sizes, strict=False) if size}
 
     def _own_kernel(self) -> Kernel:
         """Compile the user's function of one factor for the manifolds and shapes it is used with."""

@@ -1,8 +1,8 @@
 """Second derivatives that Gauss-Newton leaves out: sum of w_a times the Hessian of r_a, for every factor.
 
 The weights w are the multipliers of constraints and the whitened residuals of costs, carried back through the
-whitening. The Hessian is that of t -> r(x Exp(t d)), symmetric, found by differencing the analytic Jacobian along
-every tangent direction of the factor.
+whitening. The Hessian is that of t -> r(x Exp(t)), symmetric; a kernel that does not come with it has its Jacobian
+differenced along every tangent direction.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from unifg.table import (
     POSITION,
     ROW,
     ROWS,
+    SECOND,
     SPREAD,
     STORAGE,
     TABLE,
@@ -53,12 +54,13 @@ def add_curvature(terms: Terms, values: Array, residual: Array, multipliers: Arr
         width = max(width, fields[t, KERNEL_WIDTH])
     v, moved, step = np.empty(storage), np.empty(storage), np.empty(width)
     weights, r, gradient = np.empty(rows), np.empty(rows), np.empty(width)
-    J, second = np.empty(rows * width), np.empty((width, width))
+    J, second = np.empty(rows * width), np.empty(width * width)
     for t in range(len(fields)):
         term = fields[t]
         if term[LEAVES] == 0 or term[ADDRESS] == 0 or (term[KIND] == COST and term[WEIGHT] >= 0):
             continue
-        m = term[ROWS]
+        m, full, table = term[ROWS], term[KERNEL_WIDTH], vector_at(term[TABLE], term[TABLE_SIZE])
+        S = matrix(second, 0, full, full)
         for i in range(term[COUNT]):
             if term[ACTIVE] >= 0 and terms.active[term[ACTIVE] + i] == 0:
                 continue
@@ -74,8 +76,12 @@ def add_curvature(terms: Terms, values: Array, residual: Array, multipliers: Arr
             if largest == 0.0:
                 continue
             gather_variables(term, i, terms.gather, terms.sizes, terms.parameters, values, v)
-            _second(terms, term, i, v, moved, step, weights, r, gradient, J, second)
-            _write(terms, term, i, second, hessian)
+            if term[SECOND] != 0:
+                p = vector(terms.parameters, term[PARAMETER] + i * term[SPREAD], term[PARAMETERS])
+                call_residual(term[SECOND], vector(v, 0, term[STORAGE]), p, table, vector(weights, 0, m), S)
+            else:
+                _second(terms, term, i, v, moved, step, weights, r, gradient, J, S)
+            _write(terms, term, i, S, hessian)
 
 
 @compiled

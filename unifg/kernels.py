@@ -44,6 +44,8 @@ class Kernel:
         table: flat array that all factors share.
         name: for messages.
         linear: whether r is linear in tangent steps, so that it has no second derivatives.
+        second: compiled ``second(v, p, table, w, S)`` that writes the (D, D) Hessian of t -> w' r(x Exp(t)) at
+            t = 0, for solvers that use it; differences of J take its place.
     """
 
     function: Callable[..., None]
@@ -52,6 +54,7 @@ class Kernel:
     table: Array = field(default_factory=lambda: NOTHING)
     name: str = "kernel"
     linear: bool = False
+    second: Callable[..., None] | None = None
 
     def __post_init__(self) -> None:
         """Compiled code reads the table as it lies in memory."""
@@ -63,9 +66,14 @@ class Kernel:
         """Of the machine code; compiles it if need be."""
         return address(self.function, RESIDUAL)
 
+    @cached_property
+    def second_address(self) -> int:
+        """Of the machine code of ``second``, 0 without."""
+        return 0 if self.second is None else address(self.second, RESIDUAL)
+
     def __getstate__(self) -> dict[str, Any]:
-        """Pickle without the address, which means nothing to another process."""
-        return {name: value for name, value in self.__dict__.items() if name != "address"}
+        """Pickle without addresses, which mean nothing to another process."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("address", "second_address")}
 
     @property
     def manifolds(self) -> list[Manifold]:

@@ -12,10 +12,13 @@ Stationarity and complementarity are divided by max(1, mean|lambda| / 100); the 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from unifg import passes
+from unifg.jit import compiled
 from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.typing import Array, BoolArray, IntArray
@@ -50,47 +53,80 @@ def optimality(program: Program, lin: Linearization, multipliers: Array) -> Opti
         lin: linearisation at the point, whose gradient is the true one, robust losses included.
         multipliers: (M,) one per constraint row.
     """
-    finite = lin.finite and bool(np.isfinite(multipliers).all())
-    if not finite:
-        return Optimality(np.inf, np.inf, np.inf, -1, False)
-    gradient = program.lagrangian_gradient(lin, multipliers)[program.columns.free]
-    stationarity = float(np.abs(gradient).max(initial=0.0))
-    if not program.constraints.count:
-        return Optimality(stationarity, 0.0, 0.0, -1, True)
-    scale = max(1.0, float(np.abs(multipliers).mean()) / 100.0)
-    outside = np.abs(program.violation(lin.constraints))
-    worst = int(np.argmax(outside))
-    return Optimality(
-        stationarity / scale,
-        float(outside[worst]),
-        float(complementarity(program, lin.constraints, multipliers).max()) / scale,
-        worst,
-        True,
+    gradient = lin.gradient
+    if program.constraints.count:
+        gradient = gradient.copy()
+        passes.transposed_times(program.arrays, False, lin.constraint_jacobian, multipliers, gradient)
+    measured = _measure(
+        program.columns.free,
+        gradient,
+        lin.gradient,
+        lin.constraints,
+        lin.constraint_jacobian,
+        multipliers,
+        program.lower,
+        program.upper,
     )
+    stationarity, violation, complementarity, worst, finite = measured
+    if not finite or not np.isfinite(lin.cost):
+        return Optimality(np.inf, np.inf, np.inf, -1, False)
+    return Optimality(stationarity, violation, complementarity, worst, True)
 
 
-def complementarity(program: Program, constraints: Array, multipliers: Array) -> Array:
-    """(M,) complementarity error of every row; equalities have none."""
-    limit = np.where(multipliers > 0.0, program.upper, program.lower)
-    slack = np.where(np.isfinite(limit), np.abs(constraints - limit), 1.0)
-    return np.where(program.equality, 0.0, np.abs(multipliers) * slack)
+@compiled
+def _measure(
+    free: IntArray,
+    gradient: Array,
+    slope: Array,
+    constraints: Array,
+    entries: Array,
+    multipliers: Array,
+    lower: Array,
+    upper: Array,
+) -> tuple[float, float, float, int, bool]:
+    """Stationarity, violation, complementarity, worst row, and whether everything is finite."""
+    stationarity, violation, complementarity, size = 0.0, 0.0, 0.0, 0.0
+    worst, count, finite = -1, len(constraints), True
+    for k in range(len(free)):
+        stationarity = max(stationarity, abs(gradient[free[k]]))
+    for k in range(len(slope)):
+        finite = finite and math.isfinite(slope[k])
+    for k in range(len(entries)):
+        finite = finite and math.isfinite(entries[k])
+    for row in range(count):
+        value, multiplier = constraints[row], multipliers[row]
+        finite = finite and math.isfinite(value) and math.isfinite(multiplier)
+        size += abs(multiplier)
+        outside = max(max(value - upper[row], lower[row] - value), 0.0)
+        if worst < 0 or outside > violation:
+            worst, violation = row, outside
+        if lower[row] != upper[row]:
+            limit = upper[row] if multiplier > 0.0 else lower[row]
+            slack = abs(value - limit) if math.isfinite(limit) else 1.0
+            complementarity = max(complementarity, abs(multiplier) * slack)
+    scale = max(1.0, size / max(count, 1) / 100.0)
+    return stationarity / scale, violation, complementarity / scale, worst, finite
 
 
 def infeasible_stationary(program: Program, lin: Linearization, tolerance: float) -> bool:
     """Whether the point is stationary for 1/2 |violation|^2 without being feasible.
 
     Descent directions that satisfied bounds of the unknowns block do not count. The gradient A' v is compared with
-    the size of v and of the rows of A it is made of.
+    the size of v and of the entries of A, if any exceeds one: where A itself vanishes, so does the gradient.
     """
     outside = program.violation(lin.constraints)
     if np.abs(outside).max(initial=0.0) <= tolerance:
         return False
     pull = program.constraints.transposed_times(lin.constraint_jacobian, outside)[program.columns.free]
-    columns, at_lower, at_upper = _walls(program, lin.constraints)
-    blocked = ((pull[columns] > 0.0) & at_lower) | ((pull[columns] < 0.0) & at_upper)
-    pull[columns[blocked]] = 0.0
-    size = np.abs(lin.constraint_jacobian).max(initial=0.0) * np.abs(outside).max()
+    pull[blocked(program, lin.constraints, pull)] = 0.0
+    size = np.abs(lin.constraint_jacobian).max(initial=1.0) * np.abs(outside).max()
     return bool(np.abs(pull).max(initial=0.0) <= 1e-6 * size)
+
+
+def blocked(program: Program, constraints: Array, gradient: Array) -> IntArray:
+    """Unknowns that rest on a bound which descent along ``gradient`` (n,) would leave."""
+    columns, at_lower, at_upper = _walls(program, constraints)
+    return columns[((gradient[columns] > 0.0) & at_lower) | ((gradient[columns] < 0.0) & at_upper)]
 
 
 def _walls(program: Program, constraints: Array) -> tuple[IntArray, BoolArray, BoolArray]:

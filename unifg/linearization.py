@@ -43,9 +43,11 @@ class Linearization:
         constraints: (M,) stacked g.
         constraint_jacobian: entries of A, in the order of ``Program.constraints``.
         gradient: gradient of the objective over the full tangent space.
-        hessian: Gauss-Newton Hessian of the objective, in the order of ``Program.normal``.
+        hessian: Gauss-Newton Hessian of the objective, in the order of ``Program.normal``; scalar costs without their
+            negative curvature.
         norms: each term's residual norm; for constraints the norm of the violation.
         weights: weights of reweighted losses, to be held during the line search.
+        concavity: the negative curvature of scalar costs, in the order of ``Program.normal``; empty without such costs.
     """
 
     values: Values
@@ -58,6 +60,7 @@ class Linearization:
     hessian: Array
     norms: dict[str, float]
     weights: HeldWeights = field(default_factory=dict)
+    concavity: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def finite(self) -> bool:

@@ -85,11 +85,7 @@ class Program:
         self.retraction = Retraction(self.columns, graph.fixes)
         self._names = [term.name for term in stacked]
         self.scratch = np.empty(self.table.scratch)
-        costs, rows = (
-            (self.table.residuals, self.table.entries),
-            (self.table.constraints, self.table.constraint_entries),
-        )
-        self._buffers = Buffers([*costs, *rows, self.columns.width, self.normal.nnz])
+        self._buffers = Buffers([*self.table.sizes, self.columns.width, self.normal.nnz])
         self._binding, self._fresh = Binding(graph._data), True
         self.bind({})
 
@@ -133,9 +129,12 @@ class Program:
             self._binding.forget()
             raise
         self.table.bind(None if self._fresh else changed, self.lower, self.upper)
-        fixes = [fix.value for fix in self.graph.fixes]
-        if self._fresh or any(value in changed for value in fixes if isinstance(value, Data)):
-            self.retraction.bind([np.asarray(self.data.get(v, v.value) if isinstance(v, Data) else v) for v in fixes])
+        for k, fix in enumerate(self.graph.fixes):
+            if not isinstance(fix.value, Data):
+                if self._fresh:
+                    self.retraction.bind(k, np.asarray(fix.value))
+            elif self._fresh or fix.value in changed:
+                self.retraction.bind(k, self.data.get(fix.value, fix.value.value))
         self._fresh = False
 
     def _bind_limits(self) -> None:
@@ -258,10 +257,9 @@ class Program:
                 slope, curvature = term.scalar_derivatives(values)
                 columns, factor, a, b, place = self._scalars[term.name]
                 np.add.at(gradient, columns.ravel(), slope.ravel())
-                convex = convexified(curvature)
-                np.add.at(hessian, place, convex[factor, a, b])
+                np.add.at(hessian, place, (convex := convexified(curvature))[factor, a, b])
                 np.add.at(concavity, place, (curvature - convex)[factor, a, b])
-        norms |= zip(self._names, size.tolist(), strict=True)
+        norms |= self.norms(size)
         found = residual, jacobian, constraints, constraint_jacobian, gradient, hessian
         return Linearization(values, cost, *found, norms, weights, concavity)
 
@@ -286,6 +284,10 @@ class Program:
                 held[term.name] = weights[part]
         passes.weigh(table.arrays, weights, residual, jacobian, gradient, hessian)
         return cost
+
+    def norms(self, sizes: Array) -> dict[str, float]:
+        """Residual norms of the terms by name, as compiled loops leave them."""
+        return dict(zip(self._names, sizes.tolist(), strict=True))
 
     def rows_of(self, term: CompiledTerm, residual: Array, constraints: Array) -> Array:
         """(n, m) rows of a term in the stacked residuals."""

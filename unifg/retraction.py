@@ -62,10 +62,11 @@ class Retraction:
         """Whether every family has a compiled retraction."""
         return not self._python
 
-    def bind(self, values: Sequence[Array]) -> None:
-        """Take the present value of every fix, (storage,) or (n, storage)."""
-        parts = [np.broadcast_to(v, shape).ravel() for v, shape in zip(values, self._sizes, strict=True)]
-        self._values = np.concatenate([np.zeros(0), *parts])
+    def bind(self, which: int, value: Array) -> None:
+        """Take the present value of one fix."""
+        count, storage = self._sizes[which]
+        start = sum(a * b for a, b in self._sizes[:which])
+        self._values[start : start + count * storage].reshape(count, storage)[:] = value
 
     def fix(self, values: Values) -> None:
         """Write the values of fixed variables."""

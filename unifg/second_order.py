@@ -23,7 +23,7 @@ def lagrangian_hessian(program: Program, lin: Linearization, multipliers: Array)
         lin: where.
         multipliers: (M,).
     """
-    entries = lin.hessian.copy()
+    entries = lin.hessian + lin.concavity if len(lin.concavity) else lin.hessian.copy()
     add_curvature(program.arrays, lin.values.flat, lin.residual, multipliers, entries)
     for term in program.batched:
         _add(program, term, lin, multipliers, entries)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -41,7 +41,6 @@ class Solution:
         cost: objective, with its 1/2.
         stationarity, violation, complementarity: KKT numbers, see :mod:`unifg.kkt`.
         iterations: number of iterations taken.
-        history: one row per iteration, row 0 being the start.
         seconds: wall-clock time of the solve.
         solver: name of the backend.
     """
@@ -53,7 +52,8 @@ class Solution:
         multipliers: Array,
         status: Status,
         measured: Optimality,
-        history: list[Iteration],
+        history: list[Iteration] | Callable[[], list[Iteration]],
+        iterations: int,
         seconds: float,
         solver: str,
     ) -> None:
@@ -64,17 +64,27 @@ class Solution:
         self._data = dict(program.data)
         self._equality = program.equality
         self._lower, self._upper = program.lower, program.upper
-        self._reaction = program.lagrangian_gradient(linearization, multipliers)
         self.status = status
         self.cost = linearization.cost
         self.stationarity = measured.stationarity
         self.violation = measured.violation
         self.complementarity = measured.complementarity
         self._worst_row = measured.worst_row
-        self.history = history
-        self.iterations = history[-1].number if history else 0
+        self._history = history
+        self.iterations = iterations
         self.seconds = seconds
         self.solver = solver
+
+    @property
+    def history(self) -> list[Iteration]:
+        """One row per iteration, row 0 being the start."""
+        if callable(self._history):
+            self._history = self._history()
+        return self._history
+
+    @history.setter
+    def history(self, rows: list[Iteration]) -> None:
+        self._history = rows
 
     @property
     def converged(self) -> bool:
@@ -119,7 +129,8 @@ class Solution:
         if name in multipliers:
             return multipliers[name]
         if name in self._program.columns.fixed:
-            return -self._reaction[self._program.columns.fixed[name]]
+            reaction = -self._program.lagrangian_gradient(self._lin, self._multipliers)
+            return reaction[self._program.columns.fixed[name]]
         known = ", ".join([*multipliers, *self._program.columns.fixed]) or "none"
         raise GraphError(f"no constraint, bound or fix is called '{name}' (there are: {known})", term=name)
 

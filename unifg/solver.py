@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -102,6 +102,10 @@ class Solver(ABC):
     def require(self, program: Program) -> None:  # noqa: B027 - most backends take everything
         """Raise BackendError when the backend cannot take this class of problem."""
 
+    def runs_alone(self, program: Program) -> bool:
+        """Whether :meth:`iterate` evaluates the start itself and ends with :meth:`Run.conclude` when nobody watches."""
+        return False
+
     @abstractmethod
     def workspace(self, program: Program) -> Any:
         """What the backend keeps between solves of one structure."""
@@ -122,16 +126,19 @@ class Run:
 
     Attributes:
         program: the compiled graph with its data bound.
-        lin: linearisation at the present iterate.
+        values: at the present iterate.
+        lin: linearisation there.
         multipliers: (M,) present multipliers.
         optimality: KKT numbers of both.
         status: None while the solve goes on.
         history: rows so far.
+        iterations: so far.
+        alone: whether nobody looks before the end; there is no linearisation then until :meth:`conclude`.
         tolerance: of the KKT test.
     """
 
     def __init__(self, solver: Solver, program: Program, values: Values, multipliers: Array, callback: Callback | None):
-        """Linearise at the start and test it."""
+        """Linearise at the start and test it, unless the backend does."""
         self._solver = solver
         self._callback = callback
         self._started = time.perf_counter()
@@ -140,14 +147,14 @@ class Run:
         self.history: list[Iteration] = []
         self.status: Status | None = None
         self._best: tuple[float, float] | None = None
+        self._recall: Callable[[], list[Iteration]] | None = None
+        self.iterations = 0
         if solver.verbose:
             logger.info(HEADER)
-        self.accept(program.linearize(values), multipliers, 0.0, 0.0)
-
-    @property
-    def values(self) -> Values:
-        """Values at the present iterate."""
-        return self.lin.values
+        self.values, self.multipliers = values, multipliers
+        self.alone = not (self.watched or solver.search_iterations) and solver.runs_alone(program)
+        if not self.alone:
+            self.accept(program.linearize(values), multipliers, 0.0, 0.0)
 
     @property
     def seconds(self) -> float:
@@ -163,10 +170,10 @@ class Run:
         **details: float | int | str,
     ) -> None:
         """Make ``lin`` the present iterate: measure it, record a row, decide whether to go on."""
-        self.lin, self.multipliers = lin, multipliers
-        self.optimality = optimality(self.program, lin, multipliers)
+        self._move(lin, multipliers)
+        self.iterations = len(self.history)
         row = Iteration(
-            len(self.history),
+            self.iterations,
             lin.cost,
             self.optimality.stationarity,
             self.optimality.violation,
@@ -193,33 +200,33 @@ class Run:
         return bool(self._callback or solver.verbose or solver.keep_values or np.isfinite(solver.time_limit))
 
     def conclude(
-        self, lin: Linearization, multipliers: Array, rows: Sequence[tuple[Array, Mapping[str, float | int | str]]]
+        self, lin: Linearization, multipliers: Array, iterations: int, history: Callable[[], list[Iteration]]
     ) -> None:
-        """Make ``lin`` the last iterate of a loop that ran without Python, and record its iterations.
+        """Make ``lin`` the last iterate of a solve that ran alone.
 
         Args:
             lin: linearisation at the last iterate.
             multipliers: (M,) there.
-            rows: per iteration its cost, stationarity, violation, complementarity, step norm and step length, and what
-                the backend adds.
+            iterations: how many there were.
+            history: makes their rows when somebody asks for them.
         """
-        for (cost, stationarity, violation, complementarity, step, length), details in rows[:-1]:
-            kkt = float(stationarity), float(violation), float(complementarity)
-            self.history.append(
-                Iteration(
-                    len(self.history), float(cost), *kkt, float(step), float(length), self.seconds, {}, dict(details)
-                )
-            )
-        if rows:
-            last, details = rows[-1]
-            self.accept(lin, multipliers, float(last[4]), float(last[5]), **details)
-        else:
-            self.lin, self.multipliers = lin, multipliers
+        start, carried = self.values, self.multipliers
+        self._move(lin, multipliers)
+        if not self.optimality.passes(self.tolerance):  # the start may be better
+            self._move(self.program.linearize(start), carried)
+            self._keep_best()
+            self._move(lin, multipliers)
+        self._keep_best()
+        self.iterations, self._recall = iterations, history
+        self.status = self._decide()
+
+    def _move(self, lin: Linearization, multipliers: Array) -> None:
+        self.lin, self.values, self.multipliers = lin, lin.values, multipliers
+        self.optimality = optimality(self.program, lin, multipliers)
 
     def begin_at(self, lin: Linearization) -> None:
         """Move the start, as onto the bounds, without spending an iteration."""
-        self.lin = lin
-        self.optimality = optimality(self.program, lin, self.multipliers)
+        self._move(lin, self.multipliers)
         self._keep_best()
         self.status = self._decide()
 
@@ -248,8 +255,8 @@ class Run:
         if status is Status.STALLED and self.infeasible_stationary():
             status = Status.LOCALLY_INFEASIBLE
         if status not in (Status.CONVERGED, Status.LOCALLY_INFEASIBLE):
-            self.lin, self.multipliers = self._best_lin, self._best_multipliers
-        measured = optimality(self.program, self.lin, self.multipliers)
+            self._move(self._best_lin, self._best_multipliers)
+        measured = self.optimality
         if measured.passes(self.tolerance):
             status = Status.CONVERGED
         elif status.converged:
@@ -260,7 +267,8 @@ class Run:
             self.multipliers,
             status,
             measured,
-            self.history,
+            self._recall or self.history,
+            self.iterations,
             self.seconds,
             self._solver.name,
         )
@@ -272,7 +280,7 @@ class Run:
             return Status.CONVERGED
         if self.lin.cost < UNBOUNDED_COST:
             return Status.UNBOUNDED
-        if len(self.history) > self._solver.max_iterations:
+        if self.iterations >= self._solver.max_iterations:
             return Status.ITERATION_LIMIT
         if self.seconds > self._solver.time_limit:
             return Status.TIME_LIMIT
@@ -301,6 +309,9 @@ class Prepared:
         self.solver = solver
         self.program = program
         self._workspace: Any = None
+        self._constraints = {
+            t.name: (t, rows) for t, rows in zip(program.constraint_terms, program.slices, strict=True)
+        }
 
     def solve(
         self,
@@ -328,7 +339,11 @@ class Prepared:
                 run.search(self._workspace)
                 reason = self.solver.iterate(run, self._workspace)
             except KeyboardInterrupt:
+                if run.alone:
+                    raise  # there is nothing to return
                 run.status = Status.INTERRUPTED
+            if run.alone and not run.iterations:
+                self._refuse_not_finite(run)
         solution = run.finish(reason)
         if check and not solution.converged:
             raise NotConverged(solution)
@@ -340,7 +355,7 @@ class Prepared:
 
     def _multipliers(self, duals: Mapping[str, ArrayLike]) -> Array:
         result = np.zeros(self.program.constraints.count)
-        terms = {t.name: (t, s) for t, s in zip(self.program.constraint_terms, self.program.slices, strict=True)}
+        terms = self._constraints
         for name, value in duals.items():
             if name not in terms:
                 known = ", ".join(terms) or "none"
@@ -354,9 +369,10 @@ class Prepared:
                     f"multipliers of '{name}' have shape {array.shape}, expected {(term.count, term.size)}",
                     term=name,
                 )
-            if not np.isfinite(array).all():
-                raise GraphError(f"multipliers of '{name}' are not finite", term=name)
             result[rows] = array.ravel()
+        if not np.isfinite(result).all():
+            name = self.program.row_name(int(np.flatnonzero(~np.isfinite(result))[0]))[0]
+            raise GraphError(f"multipliers of '{name}' are not finite", term=name)
         return result
 
     def _refuse_not_finite(self, run: Run) -> None:

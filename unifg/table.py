@@ -6,7 +6,7 @@ entries of the Jacobian, columns, and the places of J'J in the matrix of the nor
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ from unifg.retraction import retractions
 from unifg.sparse import Symmetric
 from unifg.terms import Constraint, Cost
 from unifg.typing import Array, IntArray
+from unifg.variables import Data
 
 (
     KIND,  # COST, CONSTRAINT or BOUND
@@ -47,8 +48,9 @@ from unifg.typing import Array, IntArray
     POSITION,  # first place in Terms.positions
     LEAF,  # first row of Terms.leaves
     LEAVES,  # parts of the variables that move on their own; 0: linear, or without a compiled retraction
+    SECOND,  # address of the kernel's second derivatives; 0: to be differenced
     FIELDS,
-) = range(28)
+) = range(29)
 
 COST, CONSTRAINT, BOUND = 0, 1, 2
 
@@ -135,10 +137,10 @@ class Table:
             starts["positions"] += count * (width * (width + 1) // 2)
             starts["parameters"] += term.parameters.size
             starts["whiteners"] += term.whitener.size
-            self.scratch = max(self.scratch, sum(layout.sizes) + m * layout.kernel_width, width)
+            self.scratch = max(self.scratch, sum(layout.sizes) + m * layout.kernel_width)
             row[PARAMETERS], row[SPREAD], row[WHITEN] = term.parameter_count, term.parameter_spread, term.whitening
             if term.kernel is not None:
-                row[ADDRESS] = term.kernel.address
+                row[ADDRESS], row[SECOND] = term.kernel.address, term.kernel.second_address
                 row[TABLE], row[TABLE_SIZE] = term.kernel.table.ctypes.data, term.kernel.table.size
             if term.search_kernel is not None:
                 row[SEARCH] = term.search_kernel.address
@@ -176,11 +178,18 @@ class Table:
         )
         locate(fields, self.arrays.columns, self.arrays.unknown, normal.indptr, normal.indices, self.arrays.positions)
 
-    def bind(self, lower: Array, upper: Array) -> None:
-        """Copy limits and everything the terms have bound to their data."""
+    @property
+    def sizes(self) -> tuple[int, int, int, int]:
+        """Lengths of the stacked residual, its Jacobian, the stacked constraints and theirs."""
+        return self.residuals, self.entries, self.constraints, self.constraint_entries
+
+    def bind(self, changed: Set[Data] | None, lower: Array, upper: Array) -> None:
+        """Copy limits and everything that terms with changed data have bound; None for all terms."""
         arrays = self.arrays
         arrays.lower[:], arrays.upper[:] = lower, upper
         for row, term, start in zip(arrays.fields, self._terms, self._active_starts, strict=False):
+            if changed is not None and term.data.isdisjoint(changed):
+                continue
             arrays.parameters[row[PARAMETER] : row[PARAMETER] + term.parameters.size] = term.parameters
             arrays.whiteners[row[WHITENER] : row[WHITENER] + term.whitener.size] = term.whitener.ravel()
             row[ACTIVE] = -1

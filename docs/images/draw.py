@@ -31,7 +31,7 @@ from unifg.scenarios.episode import EpisodeLog  # noqa: E402
 from unifg.scenarios.navigation import NavigationSettings, run_navigation  # noqa: E402
 from unifg.scenarios.palette import css  # noqa: E402
 from unifg.solvers import GaussNewton  # noqa: E402
-from unifg.typing import Array  # noqa: E402
+from unifg.typing import Array, IntArray  # noqa: E402
 
 Point = tuple[float, float]
 COST, HARD, GIVEN = "#ffffff", "#222222", "#d9d9d9"
@@ -347,8 +347,9 @@ def bayes_tree() -> Any:
         if below >= 0:
             right.plot([at[0], place[below][0]], [at[1], place[below][1]], color="#9a9a9a", lw=1.2, zorder=1)
         label = ",".join(map(str, sorted(members)))
+        ink = "white" if s < 0.6 * len(tree) else "black"
         right.annotate(
-            label, at, ha="center", va="center", fontsize=7.5, zorder=2, color="white" if s < 0.6 * len(tree) else "black",
+            label, at, ha="center", va="center", fontsize=7.5, zorder=2, color=ink,
             bbox={"boxstyle": "round,pad=0.25", "fc": colours[s], "ec": "black", "lw": 0.5},
         )  # fmt: skip
     left.set_title("Pose graph: loop closures tie the streets together")
@@ -362,7 +363,7 @@ def bayes_tree() -> Any:
     return figure
 
 
-def _places(parent: Array) -> dict[int, Point]:
+def _places(parent: IntArray) -> dict[int, Point]:
     """Where to draw the nodes of a tree: leaves side by side, parents above the middle of their children."""
     children: dict[int, list[int]] = {s: [] for s in range(-1, len(parent))}
     for s in range(len(parent)):

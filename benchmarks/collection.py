@@ -1,0 +1,237 @@
+"""Every backend on a collection of small problems with known answers; IPOPT beside them.
+
+    python -m benchmarks.collection
+
+The problems are those of the tests: Hock and Schittkowski's, least squares, degenerate and infeasible ones, and
+problems on Lie groups. A backend takes what its class allows. What it returns is judged by `tests/judge.py`, which
+shares no code with the solvers. Writes docs/collection.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any, TypeAlias
+
+import numpy as np
+
+import unifg as fg
+from benchmarks.report import CHECKOUT, OUT, code_digest, machine, put_results, table
+from unifg.solvers import (
+    KKT,
+    SQP,
+    AugmentedLagrangian,
+    DogLeg,
+    GaussNewton,
+    InteriorPoint,
+    LevenbergMarquardt,
+    Penalty,
+)
+
+sys.path.insert(0, str(CHECKOUT / "tests"))
+
+from hock_schittkowski import SMALL, Case
+from hock_schittkowski_later import LATER
+from judge import judge
+from lie_problems import LIE, LieCase
+from small_problems import DEGENERATE, INFEASIBLE, SQUARES
+
+Problem: TypeAlias = Case | LieCase
+
+GROUPS: dict[str, list[Problem]] = {
+    "Hock and Schittkowski": [*SMALL, *LATER],
+    "sums of squares": [*SQUARES],
+    "degenerate": [*DEGENERATE],
+    "Lie groups": [case for case in LIE if case.feasible],
+    "infeasible": [*INFEASIBLE, *(case for case in LIE if not case.feasible)],
+}
+CASES: dict[str, Problem] = {case.name: case for group in GROUPS.values() for case in group}
+BACKENDS: dict[str, fg.Solver] = {
+    "GaussNewton": GaussNewton(),
+    "LevenbergMarquardt": LevenbergMarquardt(),
+    "DogLeg": DogLeg(),
+    "KKT": KKT(),
+    "Penalty": Penalty(),
+    "AugmentedLagrangian": AugmentedLagrangian(),
+    "SQP": SQP(),
+    "SQP, exact": SQP(hessian="exact"),
+    "InteriorPoint": InteriorPoint(),
+}
+PEER = "IPOPT"
+
+OPTIMUM, OTHER, INFEASIBLE_POINT = "optimum", "other", "infeasible"
+RIGHT = (OPTIMUM, OTHER, INFEASIBLE_POINT)
+SAME_COST = 1e-5  # relative to max(1, |cost|)
+UNQUALIFIED_COST = 1e-2
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a backend made of a problem.
+
+    Attributes:
+        verdict: "optimum" (the known one), "other" (a KKT point listed with the problem), "infeasible" (said so, and
+            there is no answer), else the status, or "unknown point" for a KKT point nobody has listed and "disproved"
+            for a claim that the judge rejects.
+        iterations: spent.
+        cost: at the end.
+    """
+
+    verdict: str
+    iterations: int
+    cost: float
+
+    @property
+    def right(self) -> bool:
+        """Whether the backend did what can be asked of it."""
+        return self.verdict in RIGHT
+
+
+def attempt(name: str, backend: fg.Solver) -> Outcome | None:
+    """Solve a problem by its name from its start and judge the answer; None when the backend refuses its class."""
+    case = CASES[name]
+    graph, guess = case.build()
+    try:
+        run = backend.prepare(graph)
+    except fg.BackendError:
+        return None
+    solution = run.solve(guess)
+    return Outcome(verdict(case, graph, solution), solution.iterations, solution.cost)
+
+
+def verdict(case: Problem, graph: fg.Graph, solution: fg.Solution) -> str:
+    """Name what a solution is."""
+    if solution.status is fg.Status.LOCALLY_INFEASIBLE and not case.feasible:
+        return INFEASIBLE_POINT
+    if not solution.converged:
+        return solution.status.name.lower().replace("_", " ")
+    if judge(graph, solution).worst() > case.judged:
+        return "disproved"
+    return _point(case, solution.cost)
+
+
+def _point(case: Problem, cost: float) -> str:
+    accuracy = SAME_COST if case.qualified else UNQUALIFIED_COST
+    for known, word in ((case.best, OPTIMUM), *((other, OTHER) for other in case.others)):
+        if abs(cost - known) <= accuracy * max(1.0, abs(known)):
+            return word
+    return "unknown point"
+
+
+def ipopt(case: Case) -> Outcome:
+    """The same formulas, solved by IPOPT with exact derivatives from CasADi; not judged, only compared."""
+    import casadi as ca
+
+    ca.GlobalOptions.setNumpyMode(-1)
+    x = ca.SX.sym("x", len(case.start))
+    parts = ca.vertsplit(x)
+    cost, rows, upper = ca.SX(0), [], []
+    if case.squares is not None:
+        cost += sum(row * row for row in case.squares(*parts))
+    if case.cost is not None:
+        cost += case.cost(*parts)
+    for formula, limit in ((case.equal, 0.0), (case.least, np.inf)):
+        if formula is not None:
+            found = formula(*parts)
+            rows += found
+            upper += [limit] * len(found)
+    quiet: dict[str, Any] = {
+        "print_time": False,
+        "show_eval_warnings": False,
+        "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-8},
+    }
+    solver = ca.nlpsol("ipopt", "ipopt", {"x": x, "f": cost, "g": ca.vertcat(*rows) if rows else ca.SX(0, 1)}, quiet)
+    size = len(case.start)
+    result = solver(
+        x0=case.start,
+        lbx=np.broadcast_to(np.asarray(case.lower, dtype=float), size),
+        ubx=np.broadcast_to(np.asarray(case.upper, dtype=float), size),
+        lbg=np.zeros(len(rows)),
+        ubg=np.array(upper),
+    )
+    stats, value = solver.stats(), float(result["f"])
+    status = str(stats["return_status"])
+    if status == "Infeasible_Problem_Detected" and not case.feasible:
+        return Outcome(INFEASIBLE_POINT, int(stats["iter_count"]), value)
+    word = _point(case, value) if stats["success"] else status.replace("_", " ").lower()
+    return Outcome(word, int(stats["iter_count"]), value)
+
+
+def measure() -> dict[str, dict[str, Outcome]]:
+    """Outcomes by backend and problem; refused problems are left out."""
+    results: dict[str, dict[str, Outcome]] = {}
+    for name, backend in BACKENDS.items():
+        found = {case: attempt(case, backend) for case in CASES}
+        results[name] = {case: outcome for case, outcome in found.items() if outcome is not None}
+    if find_spec("casadi") is not None:
+        results[PEER] = {name: ipopt(case) for name, case in CASES.items() if isinstance(case, Case)}
+    return results
+
+
+def render(results: dict[str, dict[str, Outcome]]) -> str:
+    """The page."""
+    notes = (
+        f"{machine('unifg', 'numpy', 'scipy', 'casadi')} State of the code: `{code_digest()}`. Default options, one "
+        "solve from the standard start of each problem."
+    )
+    parts = [notes, _summary(results), "## What is not solved", _failures(results)]
+    for title, cases in GROUPS.items():
+        parts += [f"## Iterations: {title}", _iterations(results, cases)]
+    return "\n\n".join(parts)
+
+
+def _summary(results: dict[str, dict[str, Outcome]]) -> str:
+    lines = []
+    for name, outcomes in results.items():
+        count = Counter(outcome.verdict for outcome in outcomes.values())
+        right = sum(count[word] for word in RIGHT)
+        share = f"{100.0 * right / len(outcomes):.1f} %"
+        lines.append(
+            (name, str(len(outcomes)), *(str(count[word]) for word in RIGHT), str(len(outcomes) - right), share)
+        )
+    head = ("backend", "takes", "known optimum", "other KKT point", "infeasible, says so", "not solved", "right")
+    return table(head, lines)
+
+
+def _failures(results: dict[str, dict[str, Outcome]]) -> str:
+    lines = []
+    for name, outcomes in results.items():
+        wrong: dict[str, list[str]] = {}
+        for case, outcome in outcomes.items():
+            if not outcome.right:
+                wrong.setdefault(outcome.verdict, []).append(case)
+        lines += [(name, word, ", ".join(cases)) for word, cases in wrong.items()]
+    return table(("backend", "ended with", "problems"), lines, text=3)
+
+
+def _iterations(results: dict[str, dict[str, Outcome]], cases: list[Problem]) -> str:
+    names = [name for name, outcomes in results.items() if any(case.name in outcomes for case in cases)]
+    lines = [(case.name, *(_cell(results[name].get(case.name)) for name in names)) for case in cases]
+    return table(("problem", *names), lines)
+
+
+def _cell(outcome: Outcome | None) -> str:
+    if outcome is None:
+        return "-"
+    mark = {OPTIMUM: "", OTHER: "*", INFEASIBLE_POINT: ""}.get(outcome.verdict, " (no)")
+    return f"{outcome.iterations}{mark}"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Solve everything and write the tables."""
+    argparse.ArgumentParser(prog="python -m benchmarks.collection", description=__doc__.split("\n")[0]).parse_args(
+        arguments
+    )
+    text = render(measure())
+    OUT.mkdir(parents=True, exist_ok=True)
+    (OUT / "collection.md").write_text(text + "\n", encoding="utf-8", newline="\n")
+    print(text)
+    put_results(CHECKOUT / "docs" / "collection.md", "A collection of small problems", text)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

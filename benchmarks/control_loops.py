@@ -1,0 +1,127 @@
+"""The control cases in closed loop: a hundred steps, converged and with one iteration a step."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from importlib.util import find_spec
+
+import numpy as np
+
+import unifg as fg
+from benchmarks.closed_loop import WARM_IPOPT, Driver, Loop
+from benchmarks.control_problems import Problem, Quadrotor, Unicycle
+from benchmarks.report import table
+from unifg.solvers import SQP, InteriorPoint
+from unifg.typing import Array
+
+STEPS = 100
+TOLERANCE = 1e-4
+SINGLE = ("ipm, 1 iteration", "sqp, 1 iteration")
+
+
+class Ours:
+    """A backend of ours, warm-started with its own shifted answers."""
+
+    def __init__(self, solver: fg.Solver, problem: Problem) -> None:
+        """Prepare the graph; the first answer of a one-iteration driver is a converged one, as of every other."""
+        self._stated = problem.formulation()
+        self._first = type(solver)(tolerance=TOLERANCE).prepare(self._stated.graph)
+        self._run = solver.prepare(self._stated.graph)
+        self._last: fg.Solution | None = None
+
+    def control(self, pose: Array, index: int) -> tuple[Array, float, int, str]:
+        """First control, processor time of the solve [ms], iterations, and the status in words."""
+        x, u = self._stated.x, self._stated.u
+        start = self._stated.guess if self._last is None else self._last.shifted(x, u, by=1)
+        data = self._stated.data(pose, index)
+        run = self._first if self._last is None else self._run
+        begin = time.thread_time()
+        solution = run.solve(start, data=data)
+        elapsed = 1e3 * (time.thread_time() - begin)
+        self._last = solution
+        return solution[u][0], elapsed, solution.iterations, solution.status.name.lower().replace("_", " ")
+
+
+def cases() -> list[Problem]:
+    """Those the targets speak of, and the long horizon of the quadrotor."""
+    problems: list[Problem] = [Unicycle(i, b, 50) for i in ("straight", "behind") for b in (False, True)]
+    return (
+        problems
+        + [Quadrotor(i, b, 20) for i in ("figure8", "goto") for b in (False, True)]
+        + [Quadrotor("figure8", b, 50) for b in (False, True)]
+    )
+
+
+def drivers(problem: Problem) -> dict[str, Driver]:
+    """Ours, and casadi's where it is installed."""
+    found: dict[str, Driver] = {
+        "ipm": Ours(InteriorPoint(tolerance=TOLERANCE), problem),
+        "ipm, 1 iteration": Ours(InteriorPoint(tolerance=TOLERANCE, max_iterations=1), problem),
+        "sqp": Ours(SQP(tolerance=TOLERANCE), problem),
+        "sqp, 1 iteration": Ours(SQP(tolerance=TOLERANCE, max_iterations=1), problem),
+    }
+    if find_spec("casadi") is not None:
+        from benchmarks.control_peers import warm
+
+        found["ipopt"] = warm(problem, "ipopt", tol=TOLERANCE, mu_init=1e-3, **WARM_IPOPT)
+        found["fatrop"] = warm(problem, "fatrop", tol=TOLERANCE, mu_init=1e-3)
+    return found
+
+
+def drive(problem: Problem) -> dict[str, Loop]:
+    """Drive every robot one step in turn: a slow moment of the machine meets all of them."""
+    who = drivers(problem)
+    loops, states = {name: Loop() for name in who}, dict.fromkeys(who, problem.start)
+    controls: dict[str, Array] = {}
+    for index in range(STEPS + 1):
+        for name, driver in who.items():
+            loop = loops[name]
+            if index:
+                loop.cost += problem.stage_cost(states[name], controls[name], index - 1)
+                states[name] = problem.plant(states[name], controls[name], index - 1)
+                for *centre, radius in problem.discs:
+                    distance = float(np.linalg.norm(states[name][: len(centre)] - centre))
+                    loop.penetration = max(loop.penetration, radius - distance)
+            controls[name], elapsed, iterations, status = driver.control(states[name], index)
+            if status != "converged" and name not in SINGLE:
+                loop.failures[status] += 1
+            if index:  # the cold solve is no step of the loop
+                loop.times.append(elapsed)
+                loop.iterations.append(iterations)
+    return loops
+
+
+def render(results: Mapping[Problem, Mapping[str, Loop]]) -> str:
+    """A table and what it means."""
+    head = (
+        "closed loop", "solver", "median [ms]", "p99 [ms]", "iterations, median", "iterations, most", "failures",
+        "cost", "penetration [mm]", "times ipopt", "times fatrop",
+    )  # fmt: skip
+    lines = []
+    for problem, loops in results.items():
+        for name, loop in loops.items():
+            median = float(np.median(loop.times))
+            ratios = [
+                f"{median / float(np.median(loops[peer].times)):.2f}"
+                if peer in loops and name not in ("ipopt", "fatrop")
+                else "-"
+                for peer in ("ipopt", "fatrop")
+            ]
+            failures = ", ".join(f"{count} {status}" for status, count in loop.failures.items())
+            depth = f"{1e3 * loop.penetration:.4f}" if np.isfinite(loop.penetration) else "-"
+            lines.append(
+                (
+                    f"{problem.robot} {problem.name}", name, f"{median:.3f}", f"{np.percentile(loop.times, 99):.3f}",
+                    f"{np.median(loop.iterations):.0f}", str(max(loop.iterations)), failures or "0",
+                    f"{loop.cost:.4f}", depth, *ratios,
+                )
+            )  # fmt: skip
+    notes = (
+        f"{STEPS} steps, tolerance {TOLERANCE:.0e}, interleaved; the time is the processor time of the solve call, "
+        "after a cold solve that is not counted. Warm start: values and multipliers moved by one stage, the last ones "
+        "repeated (fatrop takes no multipliers). Where nothing can be hit the plant is disturbed. Cost: sum of the "
+        "stage costs of the states and controls that happened. Penetration: deepest state of the plant in an obstacle, "
+        "negative is a clearance. One iteration: the solver is stopped after a single one in every step, converged or not."
+    )
+    return "\n\n".join([table(head, lines, text=2), notes])

@@ -1,0 +1,88 @@
+"""Where the time of an interior-point iteration goes, piece by piece."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from benchmarks.control_problems import Problem, Quadrotor, Unicycle
+from benchmarks.report import table
+from unifg import passes
+from unifg.curvature import add_curvature
+from unifg.elimination.fronts import factor
+from unifg.elimination.substitution import solve
+from unifg.jit import compiled
+from unifg.solvers import InteriorPoint
+from unifg.solvers import barrier_state as state
+from unifg.solvers.barrier_links import run
+
+REPEATS, ROUNDS = 500, 7
+
+
+@compiled
+def _many(function: int, address: int, count: int) -> None:
+    """Run a linked function again and again."""
+    for _ in range(count):
+        run(function, (address,))
+
+
+def measure(problem: Problem) -> dict[str, float]:
+    """Microseconds of every piece, the least of several rounds of processor time."""
+    stated = problem.formulation()
+    prepared = InteriorPoint(tolerance=1e-4).prepare(stated.graph)
+    solution = prepared.solve(stated.guess)
+    workspace, program = prepared._workspace, prepared.program
+    links, work = workspace.problem.links, workspace.work
+    pieces: dict[str, float] = {}
+    for name, function in (("assemble, factorise, solve", state.DIRECT), ("solve again", state.STEER),
+                           ("trial: move and evaluate", state.ADVANCE), ("KKT numbers", state.MEASURE)):  # fmt: skip
+        _many(links[function], workspace._address, 3)
+        pieces[name] = _least(lambda f=links[function]: _many(f, workspace._address, REPEATS)) / REPEATS
+    lin = program.linearize(solution.values)
+    entries, norms = lin.hessian.copy(), np.empty(len(program.arrays.fields))
+    squares, gradient = np.empty(0), lin.gradient.copy()
+    calls: dict[str, Callable[[], object]] = {
+        "linearise *": lambda: passes.linearize(
+            program.arrays, lin.values.flat, False, lin.residual, lin.jacobian, lin.constraints,
+            lin.constraint_jacobian, squares, norms, gradient, entries, program.scratch,
+        ),
+        "second derivatives *": lambda: add_curvature(
+            program.arrays, lin.values.flat, lin.residual, work.multipliers, entries
+        ),
+        "factorise *": lambda: factor(workspace.problem.plan, work.data, work.shift),
+        "solve *": lambda: solve(workspace.problem.plan, work.right, work.step),
+    }  # fmt: skip
+    for name, call in calls.items():
+        call()
+        pieces[name] = _least(lambda c=call: [c() for _ in range(100)]) / 100
+    cold = _least(lambda: [prepared.solve(stated.guess) for _ in range(10)]) / 10
+    pieces["cold solve, all"], pieces["cold solve, iterations"] = cold, float(solution.iterations)
+    still = _least(lambda: [prepared.solve(solution) for _ in range(20)]) / 20
+    pieces["solve that needs no iteration"] = still
+    return pieces
+
+
+def _least(call: Callable[[], object]) -> float:
+    """Processor time in microseconds, the least of several rounds."""
+    least = np.inf
+    for _ in range(ROUNDS):
+        begin = time.thread_time()
+        call()
+        least = min(least, time.thread_time() - begin)
+    return 1e6 * least
+
+
+def render() -> str:
+    """A table and what it means."""
+    cases: list[Problem] = [Unicycle("straight", False, 50), Unicycle("straight", True, 50)]
+    cases += [Quadrotor("figure8", False, 20), Quadrotor("figure8", True, 20)]
+    found = {f"{problem.robot} {problem.name}": measure(problem) for problem in cases}
+    rows = [[name, *(f"{pieces[name]:.1f}" for pieces in found.values())] for name in next(iter(found.values()))]
+    notes = (
+        "Microseconds of processor time, least of several rounds. Pieces marked * are called from Python here, which "
+        "adds 2 to 4 to each; inside the loop they are not. A solve that needs no iteration is what data, checks, the "
+        "final judgement and the answer cost."
+    )
+    return "\n\n".join([table(["piece", *found], rows), notes])

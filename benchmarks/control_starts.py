@@ -1,0 +1,104 @@
+"""Random starts: every control case with obstacles from thirty perturbed guesses."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+import unifg as fg
+from benchmarks import quadrotor_fixture as quadrotor
+from benchmarks.control_problems import Problem, problems
+from benchmarks.report import table
+from unifg.lie import wrap_angle
+from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
+from unifg.typing import Array
+
+STARTS = 30
+SEED = 7
+SPREAD = {  # standard deviations of states (tangent) and controls
+    "unicycle": (np.array([0.3, 0.3, 0.5]), np.array([0.3, 0.3])),
+    "quadrotor": (np.repeat([0.3, 0.3, 0.5], 3), np.array([0.5, 0.5, 0.5, 1.0])),
+}
+SOLVERS: dict[str, fg.Solver] = {
+    "ipm": InteriorPoint(tolerance=1e-4),
+    "sqp": SQP(tolerance=1e-4),
+    "alm": AugmentedLagrangian(tolerance=1e-4),
+}
+
+
+def starts(problem: Problem, count: int = STARTS) -> Iterator[tuple[Array, Array]]:
+    """Perturbed cold guesses: states and controls, every one by itself."""
+    rng = np.random.default_rng(SEED)
+    states, controls = problem.guess()
+    manifold: fg.Manifold = quadrotor.STATE if problem.robot == "quadrotor" else fg.SE2
+    if problem.robot == "unicycle":
+        states[:, 2] = wrap_angle(states[:, 2])
+    of_states, of_controls = SPREAD[problem.robot]
+    for _ in range(count):
+        moved = manifold.retract(states, of_states * rng.standard_normal((len(states), len(of_states))))
+        yield moved, controls + of_controls * rng.standard_normal(controls.shape)
+
+
+@dataclass
+class Tally:
+    """What one solver made of the starts of one case.
+
+    Attributes:
+        statuses: how often each.
+        iterations: of every start.
+        costs: of the converged ones, relative to the listed optimum.
+    """
+
+    statuses: Counter[str] = field(default_factory=Counter)
+    iterations: list[int] = field(default_factory=list)
+    costs: list[float] = field(default_factory=list)
+
+
+def measure(problem: Problem, count: int = STARTS) -> dict[str, Tally]:
+    """Solve from every start with every solver."""
+    stated = problem.formulation()
+    runs = {name: solver.prepare(stated.graph) for name, solver in SOLVERS.items()}
+    tallies = {name: Tally() for name in runs}
+    for states, controls in starts(problem, count):
+        for name, run in runs.items():
+            solution = run.solve({stated.x: states, stated.u: controls})
+            tally = tallies[name]
+            tally.statuses[solution.status.name.lower().replace("_", " ")] += 1
+            tally.iterations.append(solution.iterations)
+            if solution.converged:
+                tally.costs.append(solution.cost / problem.optima[0])
+    return tallies
+
+
+def blocked() -> list[Problem]:
+    """The twelve cases with obstacles."""
+    return [problem for problem in problems() if problem.blocked]
+
+
+def render(results: dict[Problem, dict[str, Tally]], count: int) -> str:
+    """A table and what it means."""
+    lines = []
+    for name in SOLVERS:
+        mine = {problem: tallies[name] for problem, tallies in results.items()}
+        solved = sum(tally.statuses["converged"] for tally in mine.values())
+        lines.append((name, "all", f"{solved} / {count * len(mine)}", "---", "---", "---"))
+        for problem, tally in mine.items():
+            others = ", ".join(f"{n} {status}" for status, n in tally.statuses.items() if status != "converged")
+            best = f"{min(tally.costs):.3f} to {max(tally.costs):.3f}" if tally.costs else "-"
+            lines.append(
+                (
+                    name, f"{problem.robot} {problem.name}", f"{tally.statuses['converged']} / {count}", others or "-",
+                    f"{np.median(tally.iterations):.0f}, {max(tally.iterations)}", best,
+                )
+            )  # fmt: skip
+    head = ("solver", "case", "converged", "other endings", "iterations, median and most", "cost / listed optimum")
+    notes = (
+        f"{count} guesses for each case: the cold guess with every state moved by a normal tangent step (unicycle "
+        f"0.3 m, 0.5 rad; quadrotor 0.3 m, 0.3 rad, 0.5 m/s) and every control by 0.3, or 0.5 rad/s and 1 m/s^2; seed "
+        f"{SEED}. Tolerance 1e-4. A cost above the listed optimum is another local optimum: it passes some obstacle on "
+        "the other side."
+    )
+    return "\n\n".join([table(head, lines, text=2), notes])

@@ -1,0 +1,228 @@
+"""Newton directions of the interior point: eliminate the sides, factorise with the right inertia, solve.
+
+The formulas are derived in :mod:`unifg.solvers.barrier`.
+"""
+
+from __future__ import annotations
+
+import math
+
+from unifg.elimination.plan import NEGATIVE
+from unifg.jit import compiled
+from unifg.solvers.barrier_links import holds, linked, opened, run
+from unifg.solvers.barrier_state import (
+    ALPHA,
+    ALPHA_DUAL,
+    ANSWER,
+    BORDER,
+    DE,
+    DELTA,
+    DS,
+    DY,
+    EXACT,
+    FACTOR,
+    FAILURES,
+    GAUSS_NEWTON,
+    LAST_DELTA,
+    MU,
+    REST,
+    RHO,
+    SIDES,
+    SIGN,
+    SINGULAR,
+    SLOPE,
+    SOLVE,
+    STEER,
+    TRY,
+    WEIGHT,
+    E,
+    S,
+    Y,
+)
+from unifg.table import BOUND, COLUMN, COUNT, ENTRY, KIND, POSITION, ROW, ROWS, WIDTH, Terms
+from unifg.typing import Array, IntArray
+
+FIRST_SHIFT, LARGEST_SHIFT, FIRST_GROWTH, SHIFT_GROWTH, SHIFT_DECAY = 1e-4, 1e20, 100.0, 8.0, 3.0
+DUAL_SHIFT = 1e-9
+LEAST_SHARE = 0.2  # of the second derivatives, before they are left out
+
+
+@compiled
+def _condense(terms: Terms, unequal: IntArray, weights: Array, jacobian: Array, data: Array) -> None:
+    """Add A' diag(row_weights) A of the rows with sides to the Hessian at the head of ``data``."""
+    fields, positions = terms.fields, terms.positions
+    for t in range(len(fields)):
+        term = fields[t]
+        if unequal[t] == 0:
+            continue
+        m, width, row, at = term[ROWS], term[WIDTH], term[ROW], term[POSITION]
+        if term[KIND] == BOUND:
+            for i in range(term[COUNT]):
+                where = positions[at + i]
+                if where >= 0:
+                    data[where] += weights[row + i]
+            continue
+        entry, pairs = term[ENTRY], width * (width + 1) // 2
+        for _ in range(term[COUNT]):
+            for a in range(m):
+                w = weights[row + a]
+                if w != 0.0:
+                    place = at
+                    for d in range(width):
+                        scaled = w * jacobian[entry + d]
+                        for e in range(d + 1):
+                            where = positions[place + e]
+                            if where >= 0:
+                                data[where] += scaled * jacobian[entry + e]
+                            elif where != -1:
+                                data[-2 - where] += 2.0 * scaled * jacobian[entry + e]
+                        place += d + 1
+                entry += width
+            row += m
+            at += pairs
+
+
+@compiled
+def _pull(terms: Terms, unequal: IntArray, scales: Array, jacobian: Array, right: Array) -> None:
+    """Subtract A' row_terms of the rows with sides from the right-hand side."""
+    fields, columns, unknowns = terms.fields, terms.columns, terms.unknown
+    for t in range(len(fields)):
+        term = fields[t]
+        if unequal[t] == 0:
+            continue
+        m, width, row, entry, column = term[ROWS], term[WIDTH], term[ROW], term[ENTRY], term[COLUMN]
+        for _ in range(term[COUNT]):
+            for a in range(m):
+                scale = scales[row + a]
+                if scale != 0.0:
+                    for d in range(width):
+                        unknown = unknowns[columns[column + d]]
+                        if unknown >= 0:
+                            right[unknown] -= scale * jacobian[entry + d]
+                entry += width
+            row += m
+            column += width
+
+
+@compiled
+def _moves(terms: Terms, unequal: IntArray, step: Array, jacobian: Array, out: Array) -> None:
+    """A dx of the rows with sides."""
+    fields, columns, unknowns = terms.fields, terms.columns, terms.unknown
+    for t in range(len(fields)):
+        term = fields[t]
+        if unequal[t] == 0:
+            continue
+        m, width, row, entry, column = term[ROWS], term[WIDTH], term[ROW], term[ENTRY], term[COLUMN]
+        for _ in range(term[COUNT]):
+            for a in range(m):
+                total = 0.0
+                for d in range(width):
+                    unknown = unknowns[columns[column + d]]
+                    if unknown >= 0:
+                        total += jacobian[entry + d] * step[unknown]
+                out[row + a] = total
+                entry += width
+            row += m
+            column += width
+
+
+@linked
+def direct(address: int) -> None:
+    """Factorise with the right inertia and find the Newton step and how far it may be taken."""
+    problem, work = opened(address)
+    numbers, counts, sides, data = work.numbers, work.counts, work.sides, work.data
+    rho = numbers[RHO]
+    n, equalities, normal = len(problem.free), len(problem.rows), len(work.hessian)
+    for row in range(len(work.row_weights)):
+        work.row_weights[row] = 0.0
+    for k in range(counts[SIDES]):
+        row, y = work.side_row[k], sides[Y, k]
+        weight = 1.0 / (sides[S, k] / y + sides[E, k] / (rho - y))
+        sides[WEIGHT, k] = weight
+        work.row_weights[row] += weight
+        sides[REST, k] = sides[SIGN, k] * (work.constraints[row] - sides[BORDER, k]) + sides[E, k] - sides[S, k]
+    for row in problem.rows:
+        work.rests[row] = work.constraints[row] - problem.terms.lower[row]
+    share = 1.0 if counts[EXACT] == 1 and counts[FAILURES] < 2 else 0.0  # of the second derivatives
+    for k in range(normal):
+        data[k] = work.curvature[k] if share > 0.0 else work.hessian[k]
+    for k in range(len(problem.entries)):
+        data[normal + k] = work.constraint_jacobian[problem.entries[k]]
+    _condense(problem.terms, problem.unequal, work.row_weights, work.constraint_jacobian, data)
+    for k in range(len(problem.doubles) // 2):
+        data[problem.doubles[2 * k]] += data[problem.doubles[2 * k + 1]]
+    for k in range(equalities):
+        work.shift[n + k] = -DUAL_SHIFT
+    delta = numbers[DELTA] if counts[FAILURES] > 0 else 0.0
+    counts[ANSWER] = TRY
+    while True:
+        counts[GAUSS_NEWTON] = 1 if share == 0.0 else 0
+        for k in range(n):
+            work.shift[k] = delta
+        factorised = holds(problem.links[FACTOR], (problem.plan, data, work.shift))
+        if factorised and problem.plan.state[NEGATIVE] == equalities:
+            run(problem.links[STEER], (address,))
+            largest = 0.0
+            for k in range(n + equalities):
+                largest = max(largest, abs(work.step[k]))
+            if math.isfinite(largest):
+                break
+        if share > 0.0:
+            less = 0.5 * share if share > LEAST_SHARE else 0.0
+            for k in range(normal):
+                data[k] += (less - share) * (work.curvature[k] - work.hessian[k])
+            share = less
+            continue
+        if delta == 0.0:
+            last = numbers[LAST_DELTA]
+            delta = FIRST_SHIFT if last == 0.0 else max(1e-12, last / SHIFT_DECAY)
+        else:
+            delta *= FIRST_GROWTH if numbers[LAST_DELTA] == 0.0 else SHIFT_GROWTH
+        if delta > LARGEST_SHIFT:
+            counts[ANSWER] = SINGULAR
+            return
+    numbers[DELTA] = delta
+    if delta > 0.0:
+        numbers[LAST_DELTA] = delta
+
+
+@linked
+def steer(address: int) -> None:
+    """Solve for the residuals in ``rests`` and REST: the step, those of the sides, the slope, and both lengths."""
+    problem, work = opened(address)
+    numbers, counts, sides, right = work.numbers, work.counts, work.sides, work.right
+    mu, rho = numbers[MU], numbers[RHO]
+    n = len(problem.free)
+    for row in range(len(work.row_terms)):
+        work.row_terms[row] = 0.0
+    for k in range(counts[SIDES]):
+        y = sides[Y, k]
+        r = sides[REST, k] + sides[S, k] - sides[E, k] + mu / (rho - y) - mu / y
+        work.row_terms[work.side_row[k]] += sides[SIGN, k] * sides[WEIGHT, k] * r
+    for k in range(n):
+        right[k] = -work.full[problem.free[k]]
+    _pull(problem.terms, problem.unequal, work.row_terms, work.constraint_jacobian, right)
+    for k in range(len(problem.rows)):
+        right[n + k] = -work.rests[problem.rows[k]]
+    run(problem.links[SOLVE], (problem.plan, right, work.step))
+    _moves(problem.terms, problem.unequal, work.step, work.constraint_jacobian, work.row_terms)
+    slope = 0.0
+    for k in range(n):
+        slope += work.gradient[problem.free[k]] * work.step[k]
+    limit = max(0.99, 1.0 - mu)
+    primal = dual = 0.0  # inverse step lengths
+    for k in range(counts[SIDES]):
+        s, e, y = sides[S, k], sides[E, k], sides[Y, k]
+        z = rho - y
+        move = sides[SIGN, k] * work.row_terms[work.side_row[k]]
+        r = sides[REST, k] + s - e + mu / z - mu / y
+        dy = -(move + r) * sides[WEIGHT, k]
+        ds = mu / y - s - s / y * dy
+        de = mu / z - e + e / z * dy
+        sides[DY, k], sides[DS, k], sides[DE, k] = dy, ds, de
+        slope += rho * de - mu * (ds / s + de / e)
+        primal = max(primal, max(-ds / s, -de / e))
+        dual = max(dual, max(-dy / y, dy / z))
+    numbers[SLOPE] = slope
+    numbers[ALPHA] = min(1.0, limit / primal) if primal > 0.0 else 1.0
+    numbers[ALPHA_DUAL] = min(1.0, limit / dual) if dual > 0.0 else 1.0

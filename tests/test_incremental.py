@@ -1,0 +1,334 @@
+"""Incremental smoothing gives what a batch solve of the same factors gives, and says so when it cannot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import unifg as fg
+from dense import Batch, drive, one_by_one
+from unifg.errors import GraphError
+from unifg.files.g2o import read_g2o
+from unifg.smoothing import Incremental
+from unifg.smoothing.factors import robust_code
+from unifg.smoothing.fields import LISTS_END, NUMBERS_END, empty_state
+from unifg.smoothing.linear import robust_value, robust_weight
+from unifg.smoothing.memory import give_list, give_numbers, take_list, take_numbers
+from unifg.smoothing.ordering import arrange
+from unifg.typing import Array
+
+
+@pytest.mark.parametrize("group", [fg.SE2, fg.SE3, fg.SO3], ids=lambda g: g.name)
+@pytest.mark.parametrize("seed", range(3))
+def test_every_update_is_a_batch_step(group: Any, seed: int) -> None:
+    """Thresholds zero: after each update the estimates are those of a Gauss-Newton step over everything."""
+    rng = np.random.default_rng(seed)
+    smoother = Incremental(relinearize=0.0, wildfire=0.0)
+    x = smoother.variables("x", group)
+    batch = Batch([group])
+    for k, statements in enumerate(drive(group, rng, 25)):
+        for statement in statements:
+            smoother.minimize(statement[0], *[x[i] for i in statement[1]], *statement[2], sigma=statement[3])
+            batch.minimize(*statement)
+        start = group.identity() if k == 0 else group.compose(smoother.estimate(x[-1])[0], group.random(rng))
+        smoother.update({x: start})
+        batch.add(start)
+        batch.step()
+        assert np.abs(group.local(batch.stack(), smoother.estimate(x))).max() < 1e-8
+    for _ in range(20):
+        smoother.update()
+    for _ in range(20):
+        batch.step()
+    assert np.abs(group.local(batch.stack(), smoother.estimate(x))).max() < 1e-8
+    assert smoother.cost == pytest.approx(batch.cost(), rel=1e-9)
+    covariance = np.linalg.inv(batch.hessian()[0])
+    np.testing.assert_allclose(smoother.covariance(x), covariance, rtol=1e-7, atol=1e-9 * covariance.max())
+    chosen = [17, 3, 8]
+    columns = (np.array(chosen)[:, None] * group.dim + np.arange(group.dim)).ravel()
+    np.testing.assert_allclose(
+        smoother.covariance(x[17], x[[3, 8]]), covariance[np.ix_(columns, columns)], rtol=1e-7, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("group", [fg.SE2, fg.SE3], ids=lambda g: g.name)
+@pytest.mark.parametrize("seed", range(4))
+def test_some_points_move_and_others_stay(group: Any, seed: int) -> None:
+    """With a threshold the estimates solve the linear problem of the factors at the points the smoother reports."""
+    rng = np.random.default_rng(seed)
+    smoother = Incremental(relinearize=0.05, wildfire=0.0)
+    x = smoother.variables("x", group)
+    batch = Batch([group])
+    moved = stayed = 0
+    for k, statements in enumerate(drive(group, rng, 50)):
+        for function, variables, parameters, sigma in statements:
+            smoother.minimize(function, *[x[i] for i in variables], *parameters, sigma=sigma)
+            batch.minimize(function, variables, parameters, sigma)
+        noise = group.exp(0.1 * rng.standard_normal(group.dim))
+        start = group.identity() if k == 0 else group.compose(smoother.estimate(x[-1])[0], noise)
+        effort = smoother.update({x: start})
+        moved += effort.relinearized
+        stayed += effort.eliminated < k + 1
+        batch.values = [start] * (k + 1)
+        batch.values = list(smoother.linearization_point(x))
+        batch.step()
+        assert np.abs(group.local(batch.stack(), smoother.estimate(x))).max() < 1e-8
+    assert moved > 10 and stayed > 10  # or the test has shown nothing
+
+
+def test_wildfire_leaves_small_changes_alone() -> None:
+    rng = np.random.default_rng(0)
+    estimates, work = [], []
+    for wildfire in (0.0, 1e-3):
+        smoother = Incremental(relinearize=0.05, wildfire=wildfire)
+        x = smoother.variables("x", fg.SE2)
+        efforts = []
+        for statements in drive(fg.SE2, np.random.default_rng(7), 80):
+            for function, variables, parameters, sigma in statements:
+                smoother.minimize(function, *[x[i] for i in variables], *parameters, sigma=sigma)
+            efforts.append(smoother.update({x: fg.SE2.random(rng) if len(x) == 0 else smoother.estimate(x[-1])[0]}))
+        estimates.append(smoother.estimate(x))
+        work.append(sum(effort.substituted for effort in efforts))
+    assert work[1] < 0.8 * work[0]
+    assert 0.0 < np.abs(fg.SE2.local(*estimates)).max() < 0.02
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def seen_at(pose: Array, point: Array, measured: Array, r: Array) -> None:
+    """A point seen from a pose, in the frame of the pose."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    dx, dy = point[0] - pose[0], point[1] - pose[1]
+    r[0] = c * dx + s * dy - measured[0]
+    r[1] = c * dy - s * dx - measured[1]
+
+
+def test_landmarks_of_another_dimension_and_a_residual_of_the_users_own() -> None:
+    """Against SciPy's least squares over plain vectors, with landmarks that appear when they are first seen."""
+    rng = np.random.default_rng(3)
+    landmarks, poses = rng.uniform(-3, 3, (6, 2)), 12
+    look = fg.residual(seen_at, rows=2)
+    smoother = Incremental(relinearize=1e-6, wildfire=0.0)
+    x, points = smoother.variables("x", fg.SE2), smoother.variables("l", fg.Rn(2))
+    known: list[int] = []
+    drives, looks = [], []
+    truth = fg.SE2.identity()
+    for k in range(poses):
+        guess = truth
+        if k:
+            step = fg.SE2.exp(np.array([0.5, 0.0, 0.4]))
+            truth = fg.SE2.compose(truth, step)
+            measured = fg.SE2.compose(step, fg.SE2.exp(0.05 * rng.standard_normal(3)))
+            smoother.minimize(fg.between, x[k - 1], x[k], measured, sigma=0.05)
+            drives.append(measured)
+            guess = fg.SE2.compose(smoother.estimate(x[-1])[0], measured)
+        else:
+            smoother.minimize(fg.prior, x[0], truth, sigma=0.01)
+        which = rng.choice(6, size=2, replace=False)
+        body = fg.SE2.act(fg.SE2.inverse(truth), landmarks[which]) + 0.02 * rng.standard_normal((2, 2))
+        new = [j for j in which.tolist() if j not in known]
+        known += new
+        members = [known.index(j) for j in which.tolist()]
+        smoother.minimize(look, x[k], points[members], body, sigma=0.02)  # one pose, two landmarks
+        looks += [(k, member, seen) for member, seen in zip(members, body, strict=True)]
+        smoother.update({x: guess, points: landmarks[new] + 0.3} if new else {x: guess}, iterations=2)
+    smoother.update(iterations=10)
+
+    def residual(unknowns: Array) -> Array:
+        at, seen_points = unknowns[: 3 * poses].reshape(-1, 3), unknowns[3 * poses :].reshape(-1, 2)
+        parts = [fg.SE2.local(fg.SE2.identity(), at[0]) / 0.01]
+        for k, measured in enumerate(drives):
+            parts.append(fg.SE2.local(measured, fg.SE2.between(at[k], at[k + 1])) / 0.05)
+        for k, member, seen in looks:
+            parts.append((fg.SE2.act(fg.SE2.inverse(at[k]), seen_points[member]) - seen) / 0.02)
+        return np.concatenate(parts)
+
+    start = np.concatenate([smoother.estimate(x).ravel(), smoother.estimate(points).ravel()])
+    best = least_squares(residual, start + 0.02 * rng.standard_normal(len(start)), xtol=1e-14, ftol=1e-14, gtol=1e-12)
+    np.testing.assert_allclose(start, best.x, atol=1e-5)
+    assert smoother.cost == pytest.approx(best.cost, rel=1e-7)
+
+
+def test_products_move_part_by_part() -> None:
+    state = fg.Product(pose=fg.SE2, velocity=fg.Rn(2))
+    smoother = Incremental(relinearize=0.0, wildfire=0.0)
+    s = smoother.variables("s", state)
+
+    @numba.njit  # type: ignore[untyped-decorator]
+    def at(value: Array, goal: Array, r: Array) -> None:
+        for k in range(5):
+            r[k] = value[k] - goal[k]
+
+    goal = np.array([1.0, 2.0, 0.5, -1.0, 3.0])
+    smoother.minimize(fg.residual(at, rows=5), s[0], goal, sigma=0.1)
+    smoother.update({s: np.zeros(5)}, iterations=8)
+    np.testing.assert_allclose(smoother.estimate(s)[0], goal, atol=1e-7)
+    np.testing.assert_allclose(smoother.estimate(s.velocity)[0], goal[3:], atol=1e-7)
+    assert smoother.covariance(s.velocity) == pytest.approx(0.01 * np.eye(2))
+
+
+@pytest.mark.parametrize("loss", [fg.Huber(1.0), fg.Cauchy(1.0), fg.Tukey(3.0), fg.GemanMcClure(2.0), fg.DCS(2.0)])
+def test_compiled_losses_are_those_of_the_batch_solvers(loss: Any) -> None:
+    squared = np.linspace(0.0, 30.0, 50)
+    code, parameter = robust_code(loss, "any")
+    np.testing.assert_allclose([robust_weight(code, parameter, s) for s in squared], loss.weight(squared), rtol=1e-14)
+    np.testing.assert_allclose([robust_value(code, parameter, s) for s in squared], loss.value(squared), rtol=1e-14)
+
+
+def test_a_robust_loss_disarms_a_wrong_loop_closure() -> None:
+    errors = []
+    for robust in (None, fg.Cauchy(1.0)):
+        smoother = Incremental(relinearize=0.0, wildfire=0.0)
+        x = smoother.variables("x", fg.SE2)
+        smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.01)
+        for k in range(1, 10):
+            smoother.minimize(fg.between, x[k - 1], x[k], [1.0, 0.0, 0.0], sigma=0.1)
+        smoother.minimize(fg.between, x[0], x[9], [0.0, 4.0, 0.0], sigma=0.1, robust=robust)
+        smoother.update({x: np.arange(10)[:, None] * [1.0, 0.0, 0.0]}, iterations=20)
+        errors.append(np.abs(smoother.estimate(x[9])[0] - [9.0, 0.0, 0.0]).max())
+    assert errors[0] > 1.0 and errors[1] < 0.1
+
+
+def test_what_is_missing_is_named_and_may_be_added_later() -> None:
+    smoother = Incremental()
+    x = smoother.variables("x", fg.SE2)
+    smoother.minimize(fg.between, x[0], x[1], [1.0, 0.0, 0.0], sigma=0.1)
+    with pytest.raises(GraphError, match=r"x\[1\] has no value"):
+        smoother.update({x: np.zeros(3)})
+    with pytest.raises(GraphError, match="is not determined by its factors") as caught:
+        smoother.update({x: np.zeros((2, 3))})
+    assert caught.value.family == "x" and caught.value.index in (0, 1)
+    with pytest.raises(GraphError, match="last update failed"):
+        smoother.covariance(x[0])
+    smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.1)
+    smoother.minimize(fg.between, x[1], x[2], [1.0, 0.0, 0.0], sigma=0.1)
+    smoother.update({x: [2.0, 0.0, 0.0]})
+    np.testing.assert_allclose(smoother.estimate(x), [[0, 0, 0], [1, 0, 0], [2, 0, 0]], atol=1e-9)
+    assert len(smoother) == 3
+
+
+def test_refusals_name_term_and_family() -> None:
+    smoother, other = Incremental(), Incremental()
+    x, y = smoother.variables("x", fg.SE2), other.variables("y", fg.SE2)
+    v = smoother.variables("v", fg.Rn(2))
+    with pytest.raises(GraphError, match="no compiled residual"):
+        smoother.minimize(lambda pose: pose, x[0], sigma=1.0)
+    with pytest.raises(GraphError, match="belongs to another graph"):
+        smoother.minimize(fg.prior, y[0], np.zeros(3), sigma=1.0)
+    with pytest.raises(GraphError, match="variable on SE2"):
+        smoother.minimize(fg.between, x[0], v[0], np.zeros(3), sigma=1.0)
+    with pytest.raises(GraphError, match="twice in one factor"):
+        smoother.minimize(fg.between, x[1], x[1], np.zeros(3), sigma=1.0)
+    with pytest.raises(GraphError, match="not finite"):
+        smoother.minimize(fg.prior, x[0], [np.nan, 0.0, 0.0], sigma=1.0)
+    with pytest.raises(GraphError, match="negative eigenvalue"):
+        smoother.minimize(fg.prior, x[0], np.zeros(3), information=np.diag([1.0, 1.0, -1.0]))
+    with pytest.raises(GraphError, match="sigma must be positive"):
+        smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.0)
+    with pytest.raises(GraphError, match="not both"):
+        smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=1.0, information=np.eye(3))
+    with pytest.raises(GraphError, match="number of factors is unclear"):
+        smoother.minimize(fg.between, x[[0, 1]], x[[1, 2, 3]], np.zeros(3), sigma=1.0)
+    with pytest.raises(GraphError, match="exists already"):
+        smoother.variables("x", fg.SE3)
+    with pytest.raises(GraphError, match=r"x\[0\].*not on SE2"):
+        smoother.update({x: [0.0, np.inf, 0.0]})
+    with pytest.raises(GraphError, match=r"have shape \(2,\)"):
+        smoother.update({x: [0.0, 0.0]})
+    with pytest.raises(GraphError, match="not a family of this smoother"):
+        smoother.update({y: np.zeros(3)})
+    with pytest.raises(GraphError, match="has no value yet"):
+        smoother.estimate(x[0])
+    with pytest.raises(GraphError, match="must not be negative"):
+        Incremental(relinearize=-1.0)
+    assert len(x) == 0 and len(smoother) == 0
+
+
+def test_singular_information_and_whole_batches() -> None:
+    """A bearing alone, and all factors of a chain in one statement."""
+    smoother = Incremental(relinearize=0.0, wildfire=0.0)
+    x = smoother.variables("x", fg.SE2)
+    n = 30
+    poses = fg.SE2.random(np.random.default_rng(0), (n,))
+    smoother.minimize(fg.prior, x[0], poses[0], information=np.eye(3))
+    smoother.minimize(
+        fg.between, x[np.arange(n - 1)], x[np.arange(1, n)], fg.SE2.between(poses[:-1], poses[1:]), sigma=0.1
+    )
+    smoother.minimize(fg.prior, x[n - 1], poses[-1], information=np.diag([0.0, 0.0, 4.0]))
+    smoother.update({x: fg.SE2.retract(poses, 0.1 * np.random.default_rng(1).standard_normal((n, 3)))}, iterations=10)
+    assert np.abs(fg.SE2.local(poses, smoother.estimate(x))).max() < 1e-9
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_cliques_hold_what_they_must(seed: int) -> None:
+    """Any order: every element lies in the clique of its first variable, every separator in the parent's clique."""
+    rng = np.random.default_rng(seed)
+    n, chronological = int(rng.integers(1, 40)), seed % 3 == 0
+    elements = [
+        rng.choice(n, size=min(n, int(rng.integers(1, 5))), replace=False) for _ in range(int(rng.integers(1, 90)))
+    ]
+    weight = rng.integers(1, 7, n)
+    pool = np.concatenate(elements)
+    pointer = np.cumsum([0, *map(len, elements)])
+    given_order = rng.permutation(n) if chronological else np.zeros(0, dtype=np.int64)
+    last = int(rng.integers(n))
+    order, first, separator, bounds, parent, home = arrange(weight, last, given_order, pool, pointer)
+    assert sorted(order) == list(range(n)) and first[-1] == n
+    if chronological:
+        assert list(order) == list(given_order) and (np.diff(first) == 1).all()
+    else:
+        assert order[-1] == last and first[-1] - first[-2] == 1
+    place = np.argsort(order)
+    cliques = [set(order[first[k] : first[k + 1]]) for k in range(len(parent))]
+    separators = [list(separator[bounds[k] : bounds[k + 1]]) for k in range(len(parent))]
+    for e, element in enumerate(elements):
+        assert element[np.argmin(place[element])] in cliques[home[e]]
+        assert set(element) <= cliques[home[e]] | set(separators[home[e]])
+    for k, members in enumerate(separators):
+        assert (np.diff(place[members]) > 0).all() if len(members) else parent[k] == -1
+        if members:
+            assert members[0] in cliques[parent[k]] and parent[k] > k
+            assert set(members) <= cliques[parent[k]] | set(separators[parent[k]])
+
+
+def test_blocks_of_memory_never_overlap() -> None:
+    rng = np.random.default_rng(0)
+    state = empty_state()
+    for take, give, array, end in (
+        (take_numbers, give_numbers, state.numbers, NUMBERS_END),
+        (take_list, give_list, state.lists, LISTS_END),
+    ):
+        held: dict[int, int] = {}
+        for _ in range(2000):
+            if held and (rng.random() < 0.5 or state.counters[end] > len(array) - 600):
+                at = int(rng.choice(list(held)))
+                length = held.pop(at)
+                assert (array[at : at + length] == at).all()
+                give(state, length, at)
+            else:
+                length = int(rng.integers(1, 120))
+                at = take(state, length)
+                array[at : at + length] = at
+                held[at] = length
+        for at, length in held.items():
+            assert (array[at : at + length] == at).all()
+
+
+@pytest.mark.data
+def test_manhattan_3500_pose_by_pose(shared_data: Path) -> None:
+    """The optimum of the batch problem, 1/2 chi2 = 68.9574391, is reached on the way, not afterwards."""
+    graph = read_g2o(shared_data / "pose_graphs" / "M3500.g2o.gz")
+    smoother = Incremental(relinearize=0.01)
+    x = smoother.variables("x", fg.SE2)
+    for k, (pose, edges) in enumerate(one_by_one(graph)):
+        smoother.minimize(fg.prior, x[0], pose, sigma=1e-3) if k == 0 else smoother.minimize(
+            fg.between, x[edges.first], x[edges.second], edges.measured, information=edges.information
+        )
+        smoother.update({x: pose if k == 0 else fg.SE2.compose(smoother.estimate(x[-1])[0], pose)})
+    assert smoother.cost == pytest.approx(68.9574391, rel=1e-4)
+    assert len(smoother) == len(graph.edges) + 1
+    smoother.update(iterations=2)
+    assert smoother.cost == pytest.approx(68.9574391, rel=1e-5)

@@ -1,0 +1,105 @@
+"""The interior point's two ways of running, and what data change between solves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from benchmarks.control_problems import Unicycle
+from problems import short_drive
+from unifg.solvers import SQP, InteriorPoint
+
+
+def test_a_watched_solve_takes_the_same_steps() -> None:
+    """A callback moves the loop from compiled code to Python; nothing else may change."""
+    stated = Unicycle("straight", True, 20).formulation()
+    rows: list[fg.Iteration] = []
+    solver = InteriorPoint(tolerance=1e-6)
+    alone = solver.solve(stated.graph, stated.guess)
+    watched = solver.solve(stated.graph, stated.guess, callback=rows.append)  # type: ignore[arg-type]
+    assert alone.iterations == watched.iterations == rows[-1].number
+    assert alone.cost == pytest.approx(watched.cost, rel=1e-9)
+    for mine, other in zip(alone.history, watched.history, strict=True):
+        assert mine.number == other.number
+        assert mine.cost == pytest.approx(other.cost, rel=1e-6)
+        assert mine.step_length == pytest.approx(other.step_length, rel=1e-6)
+    assert alone.history[-1].terms.keys() == watched.history[-1].terms.keys()
+
+
+def test_the_same_variable_twice_in_an_equality() -> None:
+    """Both columns of a factor mean one entry of the KKT matrix."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 2)
+    graph.minimize(fg.prior, x, [3.0])
+    graph.constrain(fg.difference, x[[0, 0]], x[[0, 1]], lower=0.0, upper=0.0, name="equal")
+    graph.bound(x, upper=2.0)
+    solution = InteriorPoint().solve(graph, {x: np.array([[0.0], [5.0]])})
+    assert solution.converged, solution.report()
+    np.testing.assert_allclose(solution[x], 2.0, atol=1e-6)
+
+
+def test_a_bad_start_is_named() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(lambda p: np.sqrt(p - 1.0), x, name="root")
+    with pytest.raises(fg.GraphError, match="root"):
+        InteriorPoint().solve(graph, {x: np.array([[0.0]])})
+
+
+def test_limits_given_as_data_may_become_equalities() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 3)
+    low = graph.data("low", np.full((3, 1), -1.0), each=True)
+    graph.minimize(fg.prior, x, [5.0])
+    graph.bound(x, lower=low, upper=1.0)
+    run = InteriorPoint(tolerance=1e-8).prepare(graph)
+    start = {x: np.zeros((3, 1))}
+    np.testing.assert_allclose(run.solve(start)[x], 1.0, atol=1e-6)
+    held = run.solve(start, data={low: np.array([[1.0], [-1.0], [-1.0]])})
+    assert held.converged, held.report()
+    np.testing.assert_allclose(held[x], 1.0, atol=1e-6)
+    np.testing.assert_allclose(run.solve(start)[x], 1.0, atol=1e-6)
+
+
+def test_data_return_to_their_defaults() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 3)
+    goal = graph.data("goal", [1.0, 2.0])
+    weight = graph.data("weight", 1.0)
+    start = graph.data("start", [0.0, 0.0])
+    graph.fix(x[0], start)
+    graph.minimize(fg.prior, x[2], goal, sigma=weight, name="goal")
+    graph.minimize(fg.difference, x[:-1], x[1:], sigma=1.0, name="smooth")
+    run = SQP().prepare(graph)
+    guess = {x: np.zeros((3, 2))}
+    first = run.solve(guess)[x]
+    given = np.array([3.0, -1.0])
+    moved = run.solve(guess, data={goal: given})[x]
+    assert np.abs(moved - first).max() > 0.1
+    given[:] = 7.0  # a caller may reuse an array
+    np.testing.assert_allclose(run.solve(guess, data={goal: [3.0, -1.0]})[x], moved, atol=1e-9)
+    assert np.abs(run.solve(guess, data={goal: given})[x] - moved).max() > 0.1
+    assert np.abs(run.solve(guess, data={weight: 0.1})[x] - first).max() > 0.1
+    np.testing.assert_allclose(run.solve(guess, data={start: [1.0, 1.0]})[x][0], 1.0)
+    np.testing.assert_allclose(run.solve(guess)[x], first, atol=1e-9)
+
+
+def test_refused_data_leave_nothing_behind() -> None:
+    graph, guess = short_drive()
+    x = graph.families["x"]
+    width = graph.data("width", 1.0)
+    graph.minimize(fg.prior, x[0], [0.0, 0.0, 0.0], sigma=width, name="anchor")
+    run = InteriorPoint().prepare(graph)
+    expected = run.solve(guess, check=True).cost
+    with pytest.raises(fg.GraphError):
+        run.solve(guess, data={width: -1.0})
+    assert run.solve(guess, check=True).cost == pytest.approx(expected, rel=1e-9)
+
+
+def test_iteration_limit_returns_the_better_of_start_and_end() -> None:
+    graph, guess = short_drive()
+    solution = InteriorPoint(max_iterations=1).solve(graph, guess)
+    assert solution.status is fg.Status.ITERATION_LIMIT
+    assert solution.iterations == 1
+    assert [row.number for row in solution.history] == [0, 1]

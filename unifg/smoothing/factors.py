@@ -1,0 +1,314 @@
+"""From what a user states to the numbers compiled code reads: types of factors, whitening, robust losses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import isfinite, sqrt
+from typing import Any
+
+import numpy as np
+
+from unifg.calls import RETRACTION, address
+from unifg.errors import GraphError
+from unifg.factors import prior
+from unifg.graph import AnyResidual, complete
+from unifg.jit import compiled, is_compiled
+from unifg.kernels import Kernel, side_by_side
+from unifg.lie import Manifold, Product, Rn
+from unifg.lie.lookup import functions_of
+from unifg.per_factor import per_factor
+from unifg.residuals import Residual
+from unifg.robust import DCS, Cauchy, GemanMcClure, Huber, Loss, Tukey
+from unifg.smoothing.families import GrowingFamily
+from unifg.smoothing.fields import SLOTS_MAX
+from unifg.smoothing.linear import CAUCHY, DCS_LOSS, GEMAN_MCCLURE, HUBER, PART, QUADRATIC, TUKEY
+from unifg.typing import Array, ArrayLike, BoolArray, IntArray
+from unifg.variables import as_selection, is_variable
+from unifg.whitening import DIAGONAL, FULL, reciprocals, square_roots
+
+
+@dataclass(eq=False)
+class Staged:
+    """Factors that wait for the next update.
+
+    Attributes:
+        kind: number of their type.
+        families: of their variables, in order.
+        members: (n,) for each family, or one number where all factors share it.
+        data: (n, numbers) parameters, whitener, parameter of the loss.
+        name: for messages.
+    """
+
+    kind: int
+    families: list[GrowingFamily]
+    members: list[IntArray | int]
+    data: Array
+    name: str
+
+    def keep(self, wanted: BoolArray) -> None:
+        """Leave out the others."""
+        self.members = [m if isinstance(m, int) else m[wanted] for m in self.members]
+        self.data = self.data[wanted]
+
+
+class Types:
+    """The types of factors of one smoother: a kernel, how it is whitened, its loss.
+
+    Attributes:
+        fields: one row of integers for each type, as in :mod:`unifg.smoothing.fields`.
+        scratch: numbers that any of them needs while it is evaluated.
+    """
+
+    def __init__(self) -> None:
+        """Know none."""
+        self.fields: list[list[int]] = []
+        self.scratch = 8
+        self._numbers: dict[tuple[Any, ...], int] = {}
+        self._kernels: dict[tuple[Any, ...], Kernel] = {}
+
+    def stage(
+        self,
+        function: AnyResidual,
+        arguments: tuple[Any, ...],
+        sigma: ArrayLike | None,
+        information: ArrayLike | None,
+        robust: Loss | None,
+    ) -> Staged:
+        """Check a statement and lay out its numbers.
+
+        Raises:
+            GraphError: naming the term and what does not fit.
+        """
+        wrapped = complete(function, arguments)
+        name = wrapped.name
+        if sigma is not None and information is not None:
+            raise GraphError(f"term '{name}': give sigma or information, not both", term=name)
+        kernel = self._kernel(wrapped, arguments)
+        if len(arguments) != len(kernel.arguments):
+            raise GraphError(
+                f"term '{name}': {kernel.name} takes {len(kernel.arguments)} arguments, found {len(arguments)}",
+                term=name,
+            )
+        families: list[GrowingFamily] = []
+        chosen: list[IntArray] = []
+        filled = []
+        for place, (argument, expected) in enumerate(zip(arguments, kernel.arguments, strict=True)):
+            if isinstance(expected, int | tuple):
+                if is_variable(argument):
+                    raise GraphError(f"term '{name}': argument {place} is a parameter, not a variable", term=name)
+                filled.append(argument)
+                continue
+            if not is_variable(argument):
+                raise GraphError(
+                    f"term '{name}': argument {place} is a variable on {expected.name}, found a constant: give it a "
+                    "member and a prior",
+                    term=name,
+                )
+            selection = as_selection(argument)
+            if selection.component is not None or selection.manifold != expected:
+                raise GraphError(
+                    f"term '{name}': argument {place} is a whole variable on {expected.name}, found {selection!r} on "
+                    f"{selection.manifold.name}",
+                    term=name,
+                    family=selection.family.name,
+                )
+            if not isinstance(selection.family, GrowingFamily):
+                raise GraphError(
+                    f"term '{name}': family '{selection.family.name}' belongs to another graph",
+                    term=name,
+                    family=selection.family.name,
+                )
+            families.append(selection.family)
+            chosen.append(selection.indices)
+            filled.append(np.empty((1, expected.storage)))
+        count = max(len(indices) for indices in chosen)
+        if any(len(indices) not in (1, count) for indices in chosen):
+            lengths = [len(indices) for indices in chosen]
+            raise GraphError(f"term '{name}': the number of factors is unclear: selections of {lengths}", term=name)
+        members: list[IntArray | int] = [int(c[0]) if len(c) == 1 else c for c in chosen]
+        for k, (family, other) in enumerate(zip(families, members, strict=True)):
+            for before in range(k):
+                if families[before] is family and np.any(members[before] == other):
+                    raise GraphError(
+                        f"term '{name}': the same member of '{family.name}' twice in one factor", term=name
+                    )
+        try:
+            _, parameters, rows = kernel.split(filled, count)
+        except GraphError as error:
+            raise GraphError(f"term '{name}': {error}", term=name) from None
+        if rows > 1 and count == 1:
+            raise GraphError(f"term '{name}': its parameters speak of {rows} factors, its variables of one", term=name)
+        shapes = [parameter.shape[1:] for parameter in parameters]
+        size = kernel.size(shapes)
+        whitening, whitener = 0, np.zeros((1, 0))
+        if sigma is not None:
+            whitening, whitener = DIAGONAL, reciprocals(name, np.asarray(sigma, dtype=np.float64), count, size)
+        elif information is not None:
+            given = np.array(information, dtype=np.float64, ndmin=3, order="C")
+            whitener = np.empty((len(given), size * size))
+            if given.shape[1:] != (size, size) or len(given) not in (1, count) or not upper_roots(given, whitener):
+                roots = square_roots(name, np.asarray(information, dtype=np.float64), count, size)
+                whitener = roots.reshape(len(roots), size * size)
+            whitening = FULL
+        loss, scale = robust_code(robust, name)
+        data = side_by_side([*parameters, whitener, np.array([[scale]])], count)
+        if not isfinite(data.sum()):
+            index = int(np.argwhere(~np.isfinite(data))[0, 0])
+            raise GraphError(f"term '{name}': a parameter of factor {index} is not finite", term=name, index=index)
+        key = (id(kernel), tuple(shapes), whitening, loss)
+        kind = self._numbers.get(key)
+        if kind is None:
+            kind = self._numbers[key] = self._add(kernel, size, data.shape[1], whitener.shape[1], whitening, loss)
+        return Staged(kind, families, members, data, name)
+
+    def _add(self, kernel: Kernel, size: int, numbers: int, whitener: int, whitening: int, loss: int) -> int:
+        """Describe a new type; the kernel is kept, because compiled code knows only where it stands."""
+        manifolds = kernel.manifolds
+        if len(manifolds) > SLOTS_MAX:
+            raise GraphError(f"{kernel.name}: {len(manifolds)} variables in one factor, at most {SLOTS_MAX} here")
+        width = sum(manifold.dim for manifold in manifolds)
+        parameters = numbers - whitener - 1
+        self._kernels[(id(kernel),)] = kernel
+        self.scratch = max(self.scratch, sum(manifold.storage for manifold in manifolds) + size * (1 + width) + 8)
+        self.fields.append(
+            [
+                kernel.address,
+                size,
+                len(manifolds),
+                width,
+                parameters,
+                kernel.table.ctypes.data,
+                kernel.table.size,
+                whitening,
+                loss,
+                numbers,
+            ]
+        )
+        return len(self.fields) - 1
+
+    def _kernel(self, wrapped: Residual, arguments: tuple[Any, ...]) -> Kernel:
+        """The residual of one factor in compiled form."""
+        if wrapped.kernel is not None:
+            return wrapped.kernel
+        if not is_compiled(wrapped.function):
+            raise GraphError(
+                f"term '{wrapped.name}' has no compiled residual: a smoother calls its factors from compiled code. "
+                "Write the residual of one factor with numba.njit and pass fg.residual(function, rows=m)",
+                term=wrapped.name,
+            )
+        kinds: list[Manifold | int] = []
+        shapes = []
+        for argument in arguments:
+            if is_variable(argument):
+                kinds.append(as_selection(argument).manifold)
+                continue
+            shape = np.shape(argument)
+            shapes.append(shape[1:] if len(shape) > 1 else shape)
+            kinds.append(len(shapes[-1]))
+        key = (id(wrapped.function), id(wrapped.jacobian), tuple(kinds), tuple(shapes))
+        if key not in self._kernels:
+            self._kernels[key] = per_factor(
+                wrapped.function, wrapped.jacobian, wrapped.rows, kinds, shapes, wrapped.name
+            )
+        return self._kernels[key]
+
+
+@compiled
+def upper_roots(information: Array, out: Array) -> bool:
+    """Upper triangular W with W'W of (n, m, m) matrices into (n, m m); False unless all are positive definite."""
+    count, m = len(information), information.shape[1]
+    for k in range(count):
+        for i in range(m):
+            for j in range(m):
+                a, b = information[k, i, j], information[k, j, i]
+                if not abs(a - b) <= 1e-9 * abs(b):
+                    return False
+                out[k, i * m + j] = a if j >= i else 0.0
+        for i in range(m):
+            pivot = out[k, i * m + i]
+            if not 1e-13 * information[k, i, i] < pivot < np.inf:
+                return False
+            root = sqrt(pivot)
+            for j in range(i, m):
+                out[k, i * m + j] /= root
+            for a in range(i + 1, m):
+                for b in range(a, m):
+                    out[k, a * m + b] -= out[k, i * m + a] * out[k, i * m + b]
+    return True
+
+
+def robust_code(loss: Loss | None, name: str) -> tuple[int, float]:
+    """Number of a loss and its parameter.
+
+    Raises:
+        GraphError: for losses without a compiled form.
+    """
+    match loss:
+        case None:
+            return QUADRATIC, 0.0
+        case Huber():
+            return HUBER, loss.threshold**2
+        case Cauchy():
+            return CAUCHY, loss.scale**2
+        case Tukey():
+            return TUKEY, loss.threshold**2
+        case GemanMcClure():
+            return GEMAN_MCCLURE, loss.mu * loss.scale**2
+        case DCS():
+            return DCS_LOSS, loss.phi
+    raise GraphError(
+        f"term '{name}': {type(loss).__name__} has no compiled form; a smoother takes Huber, Cauchy, Tukey, "
+        "GemanMcClure and DCS",
+        term=name,
+    )
+
+
+class Kinds:
+    """The retractions of a smoother's manifolds, as numbers compiled code reads."""
+
+    def __init__(self) -> None:
+        """Know none."""
+        self.fields: list[int] = []
+        self._known: list[tuple[Manifold, int]] = []
+        self._kept: list[Any] = []  # addresses are good for as long as the functions live
+
+    def of(self, manifold: Manifold, family: str) -> int:
+        """Where a manifold stands.
+
+        Raises:
+            GraphError: when it has no compiled retraction.
+        """
+        for known, place in self._known:
+            if known == manifold:
+                return place
+        parts: list[int] = []
+        for leaf, storage, tangent in leaves(manifold, 0, 0):
+            where = deviation = 0
+            if not isinstance(leaf, Rn):
+                functions = functions_of(leaf)
+                if functions is None:
+                    raise GraphError(
+                        f"family '{family}': {leaf.name} has no compiled retraction; a smoother takes SO2, SE2, SO3, "
+                        "SE3, Rn and their products",
+                        family=family,
+                    )
+                self._kept.append(functions.retract)
+                kernel = prior.on(leaf).kernel
+                assert kernel is not None
+                self._kept.append(kernel)
+                where, deviation = address(functions.retract, RETRACTION), kernel.address
+            parts += [where, deviation, storage, leaf.storage, tangent, leaf.dim]
+        place = len(self.fields)
+        self.fields += [len(parts) // PART, *parts]
+        self._known.append((manifold, place))
+        return place
+
+
+def leaves(manifold: Manifold, storage: int, tangent: int) -> Iterator[tuple[Manifold, int, int]]:
+    """The components of products, down to manifolds that are none, and where each begins."""
+    if not isinstance(manifold, Product):
+        yield manifold, storage, tangent
+        return
+    for part in manifold.components.values():
+        yield from leaves(part.manifold, storage + part.storage.start, tangent + part.tangent.start)

@@ -1,0 +1,360 @@
+"""What incremental and fixed-lag smoothing share: families, statements, updates, and what may be asked afterwards."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import isfinite
+from typing import Any, NamedTuple, TypeVar, cast
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.graph import AnyResidual
+from unifg.lie import Manifold
+from unifg.robust import Loss
+from unifg.smoothing.factors import Kinds, Staged, Types
+from unifg.smoothing.families import GrowingFamily
+from unifg.smoothing.fields import (
+    CLIQUE_END,
+    FACTOR_END,
+    FAILED,
+    FAMILY,
+    LARGEST,
+    MADE_ELIMINATED,
+    MEMBER,
+    SCRATCH,
+    UPDATES,
+    USED,
+    VARIABLE_END,
+    empty_state,
+)
+from unifg.smoothing.queries import add_factors, add_variables, estimates, joint_covariance, total_cost
+from unifg.smoothing.update import update_tree
+from unifg.typing import Array, ArrayLike, BoolArray, IntArray
+from unifg.variables import Selection, Variable, as_selection
+
+T = TypeVar("T", Array, IntArray)
+
+
+class Effort(NamedTuple):
+    """What one update did.
+
+    Attributes:
+        eliminated: variables eliminated anew.
+        relinearized: variables moved to a new linearisation point.
+        substituted: variables given a new step.
+        linearized: factors linearised.
+        marginalized: variables dropped.
+        largest: rows of the largest clique that was made.
+    """
+
+    eliminated: int
+    relinearized: int
+    substituted: int
+    linearized: int
+    marginalized: int
+    largest: int
+
+
+class Smoother:
+    """Base of :class:`Incremental` and :class:`FixedLag`.
+
+    Attributes:
+        families: by name.
+        relinearize: largest entry of a variable's step before its linearisation point follows its estimate.
+        every: linearisation points are looked at in every so many updates.
+        wildfire: change of a step that is passed on to parts of the graph that were not eliminated anew.
+    """
+
+    _chronological = False
+
+    def __init__(self, relinearize: float, every: int, wildfire: float) -> None:
+        """Start empty."""
+        for name, value in (("relinearize", relinearize), ("wildfire", wildfire)):
+            if not value >= 0.0:
+                raise GraphError(f"{type(self).__name__}: {name} must not be negative, found {value}")
+        if every < 1:
+            raise GraphError(f"{type(self).__name__}: every must be at least 1, found {every}")
+        self.families: dict[str, GrowingFamily] = {}
+        self.relinearize = relinearize
+        self.every = every
+        self.wildfire = wildfire
+        self._types = Types()
+        self._kinds = Kinds()
+        self._staged: list[Staged] = []
+        self._state = empty_state()
+        self._order: list[GrowingFamily] = []
+        self._written = 0  # types of factors that compiled code knows
+
+    def variables(self, name: str, manifold: Manifold, *, keep: bool = False) -> GrowingFamily:
+        """Add a family of unknowns, empty at first.
+
+        Args:
+            name: unique within the smoother.
+            manifold: SO2, SE2, SO3, SE3, Rn or a product of them.
+            keep: members never leave a fixed lag.
+
+        Raises:
+            GraphError: when the name is taken, or the manifold has no compiled retraction.
+        """
+        if name in self.families:
+            raise GraphError(f"family '{name}' exists already: choose another name", family=name)
+        kind = self._kinds.of(manifold, name)
+        self._types.scratch = max(self._types.scratch, manifold.storage + manifold.dim * (2 * manifold.dim + 1) + 8)
+        family = GrowingFamily(name, manifold, len(self._order), kind, keep)
+        self._state = self._state._replace(kinds=np.array(self._kinds.fields, dtype=np.int64))
+        self.families[name] = family
+        self._order.append(family)
+        return family
+
+    def minimize(
+        self,
+        function: AnyResidual,
+        *arguments: Any,
+        sigma: ArrayLike | None = None,
+        information: ArrayLike | None = None,
+        robust: Loss | None = None,
+    ) -> None:
+        """State factors 1/2 |r|^2 weighted by the information matrix; they count from the next update on.
+
+        Args:
+            function: ``fg.prior``, ``fg.between``, or any residual in compiled form.
+            *arguments: members (which may get their values in the next update) and parameters; arrays of members
+                state one factor for each.
+            sigma: standard deviations, scalar, (m,) or (n, m), in the residual's units.
+            information: (m, m) or (n, m, m) symmetric positive semi-definite.
+            robust: Huber, Cauchy, Tukey, GemanMcClure or DCS loss; its weight is found when a factor is linearised.
+
+        Raises:
+            GraphError: when arguments do not fit, or the residual has no compiled form.
+        """
+        staged = self._types.stage(function, arguments, sigma, information, robust)
+        for family in staged.families:
+            if self.families.get(family.name) is not family:
+                raise GraphError(
+                    f"term '{staged.name}': family '{family.name}' belongs to another graph",
+                    term=staged.name,
+                    family=family.name,
+                )
+        self._staged.append(staged)
+
+    def estimate(self, variable: Variable) -> Array:
+        """(n, storage) estimates of a family or selection.
+
+        Raises:
+            GraphError: when a member has no value, or was marginalised.
+        """
+        return self._values(variable, False)
+
+    def linearization_point(self, variable: Variable) -> Array:
+        """(n, storage) points at which the factors of a family or selection are linear now."""
+        return self._values(variable, True)
+
+    def _values(self, variable: Variable, points: bool) -> Array:
+        selection = as_selection(variable)
+        rows = self._rows(selection)
+        storage = selection.family.manifold.storage
+        flat = np.empty(len(rows) * storage)
+        estimates(self._state, rows, points, flat)
+        out = flat.reshape(len(rows), storage)
+        return out if selection.component is None else out[:, selection.storage]
+
+    def covariance(self, *variables: Variable) -> Array:
+        """Joint covariance (D, D) of all selected members, in their tangent spaces and the order given.
+
+        It is that of the linear problem at the present linearisation points, conditioned on nothing else.
+
+        Raises:
+            GraphError: when a member has no value, or was marginalised.
+        """
+        selections = [as_selection(variable) for variable in variables]
+        rows = np.concatenate([self._rows(selection) for selection in selections])
+        self._require_solved()
+        result: Array = joint_covariance(self._state, rows)
+        if all(selection.component is None for selection in selections):
+            return result
+        kept: list[IntArray] = []
+        at = 0
+        for selection in selections:
+            for _ in range(len(selection)):
+                kept.append(at + np.arange(selection.tangent.start, selection.tangent.stop))
+                at += selection.family.manifold.dim
+        columns = np.concatenate(kept)
+        return result[np.ix_(columns, columns)]
+
+    @property
+    def cost(self) -> float:
+        """Sum of 1/2 rho(|W r|^2) over all factors at the estimates; half of what is often called chi2."""
+        return float(total_cost(self._state))
+
+    def __len__(self) -> int:
+        """Number of factors that count."""
+        return int(self._state.factors[: self._state.counters[FACTOR_END], USED].sum())
+
+    def _update(self, values: Mapping[GrowingFamily, ArrayLike] | None, time: float | None, iterations: int) -> None:
+        """Take in new members and staged factors, then bring everything up to date."""
+        new = [self._checked(family, value) for family, value in values.items()] if values else []
+        if self._staged:
+            self._admit({family: len(array) for family, array in new})
+            self._staged = [item for item in self._staged if len(item.data)]
+        self._reserve(sum(len(array) for _, array in new), sum(len(item.data) for item in self._staged))
+        for family, array in new:
+            out = np.empty(len(array), dtype=np.int64)
+            stamps = self._stamps(family, len(array), time)
+            numbers = add_variables(
+                self._state, family.kind, family.manifold.dim, family.number, family.count, array, stamps, out
+            )
+            self._move(self._state.lists, numbers)
+            family.grow(out)
+        for item in self._staged:
+            lists, numbers = add_factors(self._state, item.kind, _touched(item), item.data)
+            self._move(lists, numbers)
+        self._staged.clear()
+        for _ in range(iterations):
+            self._solve()
+
+    def _effort(self) -> Effort:
+        return Effort(*self._state.counters[MADE_ELIMINATED : LARGEST + 1].tolist())
+
+    def _stamps(self, family: GrowingFamily, count: int, time: float | None) -> Array:
+        """Ages of new members; they matter only where the order is chronological."""
+        return np.zeros(count)
+
+    def _late(self, item: Staged, gone: BoolArray) -> None:
+        """Factors with a variable that was marginalised: (n,) which of them."""
+        self._staged.remove(item)
+        for family, members in zip(item.families, item.members, strict=True):
+            if (family.rows(np.atleast_1d(members)) == -1).any():
+                self._rows(family[members], item.name)
+
+    def _solve(self) -> None:
+        """One pass over the tree."""
+        state = self._state
+        now = self.relinearize if (state.counters[UPDATES] + 1) % self.every == 0 else np.inf
+        failed, lists, numbers = update_tree(state, now, self.relinearize, self.wildfire, self._chronological)
+        self._move(lists, numbers)
+        if failed >= 0:
+            family = self._order[int(state.variables[failed, FAMILY])]
+            member = int(state.variables[failed, MEMBER])
+            raise GraphError(
+                f"{family.name}[{member}] is not determined by its factors: it, or something it is tied to, needs a "
+                "prior or another measurement. The factors are kept; add what is missing and update again",
+                family=family.name,
+                index=member,
+            )
+
+    def _checked(self, family: GrowingFamily, value: ArrayLike) -> tuple[GrowingFamily, Array]:
+        """Values of new members as (n, storage)."""
+        if self.families.get(getattr(family, "name", "")) is not family:
+            raise GraphError(f"update: {family!r} is not a family of this smoother")
+        array = np.array(value, dtype=np.float64, ndmin=2, order="C")
+        storage = family.manifold.storage
+        if array.ndim != 2 or array.shape[1] != storage:
+            raise GraphError(
+                f"update: values of family '{family.name}' have shape {np.shape(value)}, expected ({storage},) or "
+                f"(n, {storage})",
+                family=family.name,
+            )
+        if family.finite and isfinite(array.sum()):
+            return family, array  # NumPy is slow at the few numbers of one pose
+        valid = np.atleast_1d(family.manifold.is_valid(array))
+        if not valid.all():
+            index = family.count + int(np.flatnonzero(~valid)[0])
+            raise GraphError(
+                f"update: the value of {family.name}[{index}] is not on {family.manifold.name}: "
+                f"{array[index - family.count]}",
+                family=family.name,
+                index=index,
+            )
+        return family, array
+
+    def _admit(self, new: Mapping[GrowingFamily, int]) -> None:
+        """Check that all variables of staged factors have values, or get them now."""
+        for item in list(self._staged):
+            gone = False
+            for family, members in zip(item.families, item.members, strict=True):
+                row = family.row(members) if isinstance(members, int) else int(family.rows(members).min())
+                if row >= 0:
+                    continue
+                largest = members if isinstance(members, int) else int(members.max())
+                if largest >= family.count + new.get(family, 0):
+                    raise GraphError(
+                        f"term '{item.name}': {family.name}[{largest}] has no value: give it one in this update",
+                        term=item.name,
+                        family=family.name,
+                        index=largest,
+                    )
+                gone = gone or row == -1 or not isinstance(members, int)
+            if gone:
+                left = np.zeros(len(item.data), dtype=bool)
+                for family, members in zip(item.families, item.members, strict=True):
+                    left |= family.rows(np.atleast_1d(members)) == -1
+                if left.any():
+                    self._late(item, left)
+
+    def _reserve(self, variables: int, factors: int) -> None:
+        """Make the tables long enough; arenas grow by themselves."""
+        state = self._state
+        counters = state.counters
+        ends = counters[: CLIQUE_END + 1].tolist()
+        grown: dict[str, Any] = {}
+        if ends[VARIABLE_END] + variables > len(state.variables):
+            grown["variables"] = longer(state.variables, ends[VARIABLE_END] + variables)
+            grown["stamps"] = longer(state.stamps, ends[VARIABLE_END] + variables)
+        if ends[FACTOR_END] + factors > len(state.factors):
+            grown["factors"] = longer(state.factors, ends[FACTOR_END] + factors)
+        if ends[CLIQUE_END] + ends[VARIABLE_END] + variables + 1 > len(state.cliques):
+            grown["cliques"] = longer(state.cliques, ends[CLIQUE_END] + ends[VARIABLE_END] + variables + 1)
+        if len(self._types.fields) > len(state.types):
+            grown["types"] = longer(state.types, len(self._types.fields))
+        if grown:
+            self._state = state = state._replace(**grown)
+        if self._written < len(self._types.fields):
+            self._written = len(self._types.fields)
+            state.types[: self._written] = self._types.fields
+        counters[SCRATCH] = self._types.scratch
+
+    def _move(self, lists: IntArray, numbers: Array) -> None:
+        """Keep the arenas, which may have grown."""
+        if lists is not self._state.lists or numbers is not self._state.numbers:
+            self._state = self._state._replace(lists=lists, numbers=numbers)
+
+    def _rows(self, selection: Selection, term: str = "") -> IntArray:
+        """Rows of the selected members.
+
+        Raises:
+            GraphError: when one has no value or was marginalised.
+        """
+        family = selection.family
+        if not isinstance(family, GrowingFamily) or self.families.get(family.name) is not family:
+            raise GraphError(f"family '{family.name}' belongs to another graph", family=family.name)
+        rows = family.rows(selection.indices)
+        if len(rows) and rows.min() < 0:
+            k = int(np.argmin(rows))
+            member = int(selection.indices[k])
+            what = "has no value yet" if rows[k] == -2 else "was marginalised"
+            where = f"term '{term}': " if term else ""
+            raise GraphError(
+                f"{where}{family.name}[{member}] {what}", term=term or None, family=family.name, index=member
+            )
+        return rows
+
+    def _require_solved(self) -> None:
+        if self._state.counters[FAILED] >= 0:
+            raise GraphError("the last update failed: state what is missing and update again")
+
+
+def _touched(item: Staged) -> IntArray:
+    """(n, slots) rows of the variables of staged factors."""
+    pairs = zip(item.families, item.members, strict=True)
+    if len(item.data) == 1:
+        return np.array([[f.row(m if isinstance(m, int) else int(m[0])) for f, m in pairs]])
+    columns = [np.broadcast_to(f.row(m) if isinstance(m, int) else f.rows(m), (len(item.data),)) for f, m in pairs]
+    return np.stack(columns, axis=1).astype(np.int64)
+
+
+def longer(table: T, rows: int) -> T:
+    """The same table with twice the rows needed."""
+    result = np.zeros((2 * rows, *table.shape[1:]), dtype=table.dtype)
+    result[: len(table)] = table
+    return cast(T, result)
