@@ -43,6 +43,10 @@ types: $(VENV)/ready-dev
 bench: $(VENV)/ready-bench
 	$(BIN)/python -m benchmarks.reference_problems
 	$(BIN)/python -m benchmarks.obstacle_fields
+	$(BIN)/python -m benchmarks.incremental
+	$(BIN)/python -m benchmarks.collection
+	$(BIN)/python -m benchmarks.ecg2o
+	$(BIN)/python -m benchmarks.control_cases
 	$(BIN)/python -m benchmarks.navigation
 	$(BIN)/python -m benchmarks.navigation --coupling joint
 	$(BIN)/python -m benchmarks.coupling
