@@ -122,6 +122,6 @@ def render(results: Mapping[Problem, Mapping[str, Loop]]) -> str:
         "after a cold solve that is not counted. Warm start: values and multipliers moved by one stage, the last ones "
         "repeated (fatrop takes no multipliers). Where nothing can be hit the plant is disturbed. Cost: sum of the "
         "stage costs of the states and controls that happened. Penetration: deepest state of the plant in an obstacle, "
-        "negative is a clearance. One iteration: the solver is stopped after a single one in every step, converged or not."
+        "negative is a clearance. One iteration: the solver is stopped after a single one in every step."
     )
     return "\n\n".join([table(head, lines, text=2), notes])

@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 
 from unifg.jit import compiled
-from unifg.solvers.barrier_links import linked, opened, run
+from unifg.solvers.barrier_links import linked, parts, run
 from unifg.solvers.barrier_state import (
     ACCEPT,
     ACCEPTED,
@@ -30,6 +30,7 @@ from unifg.solvers.barrier_state import (
     ALPHA_DUAL,
     ANSWER,
     BORDER,
+    COLD,
     COMPLEMENTARITY,
     CONVERGED,
     CORRECT,
@@ -131,23 +132,24 @@ def _infeasibility(rows: IntArray, lower: Array, constraints: Array) -> float:
 @linked
 def measure(address: int) -> None:
     """KKT numbers of the problem at the present iterate, and what the error of the barrier problem is made of."""
-    problem, work = opened(address)
-    terms, numbers, sides, multipliers = problem.terms, work.numbers, work.sides, work.multipliers
-    lower, upper, constraints, full = terms.lower, terms.upper, work.constraints, work.full
+    constraint_jacobian, constraints, counts, free = parts(address, "constraint_jacobian constraints counts free")
+    full, gradient, multipliers, numbers, side_row = parts(address, "full gradient multipliers numbers side_row")
+    sides, terms = parts(address, "sides terms")
+    lower, upper, constraints, full = terms.lower, terms.upper, constraints, full
     rho = numbers[RHO]
     gap, least, most = 0.0, math.inf, -math.inf
-    for k in range(work.counts[SIDES]):
-        multipliers[work.side_row[k]] = 0.0
-    for k in range(work.counts[SIDES]):
-        row, y = work.side_row[k], sides[Y, k]
+    for k in range(counts[SIDES]):
+        multipliers[side_row[k]] = 0.0
+    for k in range(counts[SIDES]):
+        row, y = side_row[k], sides[Y, k]
         multipliers[row] -= sides[SIGN, k] * y
         sy, ez = sides[S, k] * y, sides[E, k] * (rho - y)
         least, most = min(least, min(sy, ez)), max(most, max(sy, ez))
         c = sides[SIGN, k] * (constraints[row] - sides[BORDER, k])
         gap = max(gap, abs(c + sides[E, k] - sides[S, k]))
     for k in range(len(full)):
-        full[k] = work.gradient[k]
-    fields, columns, jacobian = terms.fields, terms.columns, work.constraint_jacobian
+        full[k] = gradient[k]
+    fields, columns, jacobian = terms.fields, terms.columns, constraint_jacobian
     for t in range(len(fields)):
         term = fields[t]
         if term[KIND] == OBJECTIVE:
@@ -167,7 +169,7 @@ def measure(address: int) -> None:
             row += m
             column += width
     stationarity = violation = complementarity = size = 0.0
-    for column in problem.free:
+    for column in free:
         if not abs(full[column]) <= stationarity:  # NaN stays
             stationarity = abs(full[column])
     for row in range(len(constraints)):
@@ -191,42 +193,44 @@ def measure(address: int) -> None:
 def _error(numbers: Array) -> float:
     """Error of the barrier problem."""
     centring = max(numbers[MOST] - numbers[MU], numbers[MU] - numbers[LEAST]) / numbers[SCALE]
-    return max(max(numbers[STATIONARITY], numbers[GAP]), centring)
+    error: float = max(max(numbers[STATIONARITY], numbers[GAP]), centring)
+    return error
 
 
 @linked
 def begin(address: int) -> None:
     """Find the sides; choose mu, slacks and multipliers of a start that has been linearised."""
-    problem, work = opened(address)
-    numbers, counts, sides = work.numbers, work.counts, work.sides
-    lower, upper = problem.terms.lower, problem.terms.upper
+    constraints, counts, links, multipliers, numbers = parts(address, "constraints counts links multipliers numbers")
+    rows, side_row, sides, terms = parts(address, "rows side_row sides terms")
+    lower, upper = terms.lower, terms.upper
     count = 0
     for row in range(len(lower)):
         if lower[row] != upper[row]:
             for which in range(2):
                 limit = lower[row] if which == 0 else upper[row]
                 if math.isfinite(limit):
-                    work.side_row[count] = row
+                    side_row[count] = row
                     sides[SIGN, count], sides[BORDER, count] = 1.0 - 2.0 * which, limit
                     count += 1
     counts[SIDES] = count
     largest = 0.0
     for row in range(len(lower)):
-        largest = max(largest, abs(work.multipliers[row]))
+        largest = max(largest, abs(multipliers[row]))
     warm, rho = largest > 0.0, numbers[RHO]
+    counts[COLD] = 0 if warm else 1
     if largest > 0.5 * rho:
         rho = numbers[RHO] = 10.0 * largest
     if warm:
         for k in range(count):
-            c = sides[SIGN, k] * (work.constraints[work.side_row[k]] - sides[BORDER, k])
-            y = min(max(-sides[SIGN, k] * work.multipliers[work.side_row[k]], 0.0), 0.9 * rho)
+            c = sides[SIGN, k] * (constraints[side_row[k]] - sides[BORDER, k])
+            y = min(max(-sides[SIGN, k] * multipliers[side_row[k]], 0.0), 0.9 * rho)
             sides[Y, k], sides[S, k], sides[E, k] = y, c, 0.0
-        run(problem.links[MEASURE], (address,))
+        run(links[MEASURE], (address,))
         error = max(max(numbers[STATIONARITY], numbers[VIOLATION]), numbers[COMPLEMENTARITY])
         numbers[MU] = max(min(0.1 * error, WARM_MU), 0.1 * numbers[TOLERANCE])
     mu = numbers[MU]
     for k in range(count):
-        c = sides[SIGN, k] * (work.constraints[work.side_row[k]] - sides[BORDER, k])
+        c = sides[SIGN, k] * (constraints[side_row[k]] - sides[BORDER, k])
         if warm:
             s = max(c, min(mu / max(sides[Y, k], 1e-3 * mu), FIRST_SLACK))
             y = max(sides[Y, k], mu / s)
@@ -236,21 +240,21 @@ def begin(address: int) -> None:
         y = min(y, 0.9 * rho)
         sides[Y, k], sides[S, k], sides[E, k] = y, s, mu / (rho - y)
         sides[DS, k] = sides[DE, k] = sides[DY, k] = 0.0
-    theta = _merit(numbers, counts, sides, work.side_row, 0.0, work.constraints, 0.0)[1]
-    theta += _infeasibility(problem.rows, lower, work.constraints)
+    theta = _merit(numbers, counts, sides, side_row, 0.0, constraints, 0.0)[1]
+    theta += _infeasibility(rows, lower, constraints)
     numbers[THETA_SMALL], numbers[THETA_LARGE] = 1e-4 * max(1.0, theta), 1e4 * max(1.0, theta)
     counts[FILTERED] = counts[ITERATION] = counts[FAILURES] = 0
     numbers[DELTA] = numbers[LAST_DELTA] = numbers[STEP] = numbers[TAKEN] = 0.0
-    run(problem.links[MEASURE], (address,))
+    run(links[MEASURE], (address,))
 
 
 @linked
 def test(address: int) -> None:
     """Test the iterate; if there is to be a step, lower mu and measure what the line search compares with."""
-    problem, work = opened(address)
-    numbers, counts = work.numbers, work.counts
+    constraints, counts, links, log, numbers, rows = parts(address, "constraints counts links log numbers rows")
+    side_row, sides, terms = parts(address, "side_row sides terms")
     if counts[FAILURES] == 0:
-        row = work.log[min(counts[ITERATION], len(work.log) - 1)]
+        row = log[min(counts[ITERATION], len(log) - 1)]
         row[0], row[1], row[2] = numbers[COST], numbers[STATIONARITY], numbers[VIOLATION]
         row[3], row[4], row[5] = numbers[COMPLEMENTARITY], numbers[STEP], numbers[TAKEN]
         row[6], row[7], row[8] = numbers[MU], numbers[DELTA], counts[GAUSS_NEWTON]
@@ -277,9 +281,9 @@ def test(address: int) -> None:
         numbers[RHO] *= 10.0  # the elastic variables are too cheap
         counts[FILTERED] = 0
         numbers[MU] = min(100.0 * numbers[MU], 0.1)
-        run(problem.links[MEASURE], (address,))
-    phi, theta = _merit(numbers, counts, work.sides, work.side_row, numbers[COST], work.constraints, 0.0)
-    theta += _infeasibility(problem.rows, problem.terms.lower, work.constraints)
+        run(links[MEASURE], (address,))
+    phi, theta = _merit(numbers, counts, sides, side_row, numbers[COST], constraints, 0.0)
+    theta += _infeasibility(rows, terms.lower, constraints)
     numbers[PHI], numbers[THETA] = phi, theta
     counts[TRIALS], counts[CORRECTED], counts[ANSWER] = 0, 0, TRY
 
@@ -287,11 +291,12 @@ def test(address: int) -> None:
 @linked
 def judge(address: int) -> None:
     """Filter test of a trial point: accept it, shorten the step, correct it, or ask for another direction."""
-    problem, work = opened(address)
-    numbers, counts, constraints = work.numbers, work.counts, work.trial_constraints
+    counts, filter, links, numbers, rows, side_row = parts(address, "counts filter links numbers rows side_row")
+    sides, terms, trial_constraints = parts(address, "sides terms trial_constraints")
+    constraints = trial_constraints
     alpha, theta, phi, slope = numbers[ALPHA], numbers[THETA], numbers[PHI], numbers[SLOPE]
-    phi_trial, theta_trial = _merit(numbers, counts, work.sides, work.side_row, numbers[TRIAL_COST], constraints, alpha)
-    theta_trial += _infeasibility(problem.rows, problem.terms.lower, constraints)
+    phi_trial, theta_trial = _merit(numbers, counts, sides, side_row, numbers[TRIAL_COST], constraints, alpha)
+    theta_trial += _infeasibility(rows, terms.lower, constraints)
     finite = math.isfinite(phi_trial) and math.isfinite(theta_trial)
     slack = 1e-13 * max(1.0, abs(phi))
     switch = slope < 0.0 and alpha * (-slope) ** 2.3 > theta**1.1 and theta <= numbers[THETA_SMALL]
@@ -305,20 +310,20 @@ def judge(address: int) -> None:
             good = good or theta_trial <= 1e-12
     if good:
         for k in range(counts[FILTERED]):
-            if theta_trial >= work.filter[k, 0] and phi_trial >= work.filter[k, 1] + slack:
+            if theta_trial >= filter[k, 0] and phi_trial >= filter[k, 1] + slack:
                 good = theta_trial <= 1e-12 and good and armijo
     if good:
         counts[DESCENT] = switch and armijo
-        run(problem.links[ACCEPT], (address,))
+        run(links[ACCEPT], (address,))
         counts[ANSWER] = ACCEPTED
         return
     counts[TRIALS] += 1
     counts[ANSWER] = TRY
     if counts[TRIALS] == 1 and finite and theta_trial >= theta:
-        run(problem.links[CORRECT], (address,))
+        run(links[CORRECT], (address,))
         return
     if counts[CORRECTED] == 1:
-        run(problem.links[RESTORE], (address,))
+        run(links[RESTORE], (address,))
     numbers[ALPHA] *= 0.5
     if counts[TRIALS] > HALVINGS:
         counts[FAILURES] += 1
@@ -329,20 +334,21 @@ def judge(address: int) -> None:
 @linked
 def correct(address: int) -> None:
     """Solve again for the constraints as the trial found them, and keep the step in case this does not help."""
-    problem, work = opened(address)
-    numbers, counts, sides, constraints = work.numbers, work.counts, work.sides, work.trial_constraints
+    counts, links, numbers, rests, rows, saved = parts(address, "counts links numbers rests rows saved")
+    side_row, sides, step, terms, trial_constraints = parts(address, "side_row sides step terms trial_constraints")
+    constraints = trial_constraints
     alpha = numbers[ALPHA]
-    for k in range(len(work.step)):
-        work.saved[k] = work.step[k]
+    for k in range(len(step)):
+        saved[k] = step[k]
     numbers[SAVED_SLOPE], numbers[SAVED_ALPHA], numbers[SAVED_DUAL] = numbers[SLOPE], alpha, numbers[ALPHA_DUAL]
     for k in range(counts[SIDES]):
         sides[SAVED_DY, k], sides[SAVED_DS, k], sides[SAVED_DE, k] = sides[DY, k], sides[DS, k], sides[DE, k]
-        c = sides[SIGN, k] * (constraints[work.side_row[k]] - sides[BORDER, k])
+        c = sides[SIGN, k] * (constraints[side_row[k]] - sides[BORDER, k])
         s, e = sides[S, k] + alpha * sides[DS, k], sides[E, k] + alpha * sides[DE, k]
         sides[REST, k] = alpha * sides[REST, k] + c + e - s
-    for row in problem.rows:
-        work.rests[row] = alpha * work.rests[row] + constraints[row] - problem.terms.lower[row]
-    run(problem.links[STEER], (address,))
+    for row in rows:
+        rests[row] = alpha * rests[row] + constraints[row] - terms.lower[row]
+    run(links[STEER], (address,))
     numbers[SLOPE] = numbers[SAVED_SLOPE]
     counts[CORRECTED] = 1
 
@@ -350,10 +356,9 @@ def correct(address: int) -> None:
 @linked
 def restore(address: int) -> None:
     """Go back to the step before its correction."""
-    _, work = opened(address)
-    numbers, counts, sides = work.numbers, work.counts, work.sides
-    for k in range(len(work.step)):
-        work.step[k] = work.saved[k]
+    counts, numbers, saved, sides, step = parts(address, "counts numbers saved sides step")
+    for k in range(len(step)):
+        step[k] = saved[k]
     numbers[ALPHA], numbers[ALPHA_DUAL] = numbers[SAVED_ALPHA], numbers[SAVED_DUAL]
     for k in range(counts[SIDES]):
         sides[DY, k], sides[DS, k], sides[DE, k] = sides[SAVED_DY, k], sides[SAVED_DS, k], sides[SAVED_DE, k]
@@ -363,26 +368,26 @@ def restore(address: int) -> None:
 @linked
 def accept(address: int) -> None:
     """Move multipliers and slacks and, unless the step was one of descent, remember where it came from."""
-    problem, work = opened(address)
-    numbers, counts, sides = work.numbers, work.counts, work.sides
-    alpha, dual, n = numbers[ALPHA], numbers[ALPHA_DUAL], len(problem.free)
+    counts, filter, free, multipliers, numbers, rows = parts(address, "counts filter free multipliers numbers rows")
+    side_row, sides, step, trial_constraints = parts(address, "side_row sides step trial_constraints")
+    alpha, dual, n = numbers[ALPHA], numbers[ALPHA_DUAL], len(free)
     mu, rho = numbers[MU], numbers[RHO]
     total = 0.0
     for k in range(n):
-        total += work.step[k] ** 2
-    for k in range(len(problem.rows)):
-        work.multipliers[problem.rows[k]] += alpha * work.step[n + k]
+        total += step[k] ** 2
+    for k in range(len(rows)):
+        multipliers[rows[k]] += alpha * step[n + k]
     for k in range(counts[SIDES]):
         s, e = sides[S, k] + alpha * sides[DS, k], sides[E, k] + alpha * sides[DE, k]
-        c = sides[SIGN, k] * (work.trial_constraints[work.side_row[k]] - sides[BORDER, k])
+        c = sides[SIGN, k] * (trial_constraints[side_row[k]] - sides[BORDER, k])
         s = max(s, c + e)  # a longer slack costs nothing
         y = sides[Y, k] + dual * sides[DY, k]
         y = min(max(y, 1e-10 * mu / s), 1e10 * mu / s)  # eq. 16
         sides[Y, k], sides[S, k], sides[E, k] = min(y, rho - 1e-10 * mu / e), s, e
         sides[DS, k] = sides[DE, k] = 0.0
     if counts[DESCENT] == 0 and counts[FILTERED] < FILTER:
-        work.filter[counts[FILTERED], 0] = (1.0 - GAMMA_THETA) * numbers[THETA]
-        work.filter[counts[FILTERED], 1] = numbers[PHI] - GAMMA_PHI * numbers[THETA]
+        filter[counts[FILTERED], 0] = (1.0 - GAMMA_THETA) * numbers[THETA]
+        filter[counts[FILTERED], 1] = numbers[PHI] - GAMMA_PHI * numbers[THETA]
         counts[FILTERED] += 1
     numbers[STEP], numbers[TAKEN] = alpha * math.sqrt(total), alpha
     counts[ITERATION] += 1

@@ -9,12 +9,13 @@ import math
 
 from unifg.elimination.plan import NEGATIVE
 from unifg.jit import compiled
-from unifg.solvers.barrier_links import holds, linked, opened, run
+from unifg.solvers.barrier_links import holds, linked, parts, run
 from unifg.solvers.barrier_state import (
     ALPHA,
     ALPHA_DUAL,
     ANSWER,
     BORDER,
+    COLD,
     DE,
     DELTA,
     DS,
@@ -23,6 +24,7 @@ from unifg.solvers.barrier_state import (
     FACTOR,
     FAILURES,
     GAUSS_NEWTON,
+    ITERATION,
     LAST_DELTA,
     MU,
     REST,
@@ -33,6 +35,7 @@ from unifg.solvers.barrier_state import (
     SLOPE,
     SOLVE,
     STEER,
+    TAKEN,
     TRY,
     WEIGHT,
     E,
@@ -44,6 +47,7 @@ from unifg.typing import Array, IntArray
 
 FIRST_SHIFT, LARGEST_SHIFT, FIRST_GROWTH, SHIFT_GROWTH, SHIFT_DECAY = 1e-4, 1e20, 100.0, 8.0, 3.0
 DUAL_SHIFT = 1e-9
+SHORT = 0.1  # length of a step
 LEAST_SHARE = 0.2  # of the second derivatives, before they are left out
 
 
@@ -129,48 +133,54 @@ def _moves(terms: Terms, unequal: IntArray, step: Array, jacobian: Array, out: A
 @linked
 def direct(address: int) -> None:
     """Factorise with the right inertia and find the Newton step and how far it may be taken."""
-    problem, work = opened(address)
-    numbers, counts, sides, data = work.numbers, work.counts, work.sides, work.data
+    constraint_jacobian, constraints, counts = parts(address, "constraint_jacobian constraints counts")
+    curvature, data, doubles, entries, free, hessian = parts(address, "curvature data doubles entries free hessian")
+    links, numbers, plan, rests, row_weights, rows = parts(address, "links numbers plan rests row_weights rows")
+    shift, side_row, sides, step, terms, unequal = parts(address, "shift side_row sides step terms unequal")
     rho = numbers[RHO]
-    n, equalities, normal = len(problem.free), len(problem.rows), len(work.hessian)
-    for row in range(len(work.row_weights)):
-        work.row_weights[row] = 0.0
+    n, equalities, normal = len(free), len(rows), len(hessian)
+    for row in range(len(row_weights)):
+        row_weights[row] = 0.0
     for k in range(counts[SIDES]):
-        row, y = work.side_row[k], sides[Y, k]
+        row, y = side_row[k], sides[Y, k]
         weight = 1.0 / (sides[S, k] / y + sides[E, k] / (rho - y))
         sides[WEIGHT, k] = weight
-        work.row_weights[row] += weight
-        sides[REST, k] = sides[SIGN, k] * (work.constraints[row] - sides[BORDER, k]) + sides[E, k] - sides[S, k]
-    for row in problem.rows:
-        work.rests[row] = work.constraints[row] - problem.terms.lower[row]
-    share = 1.0 if counts[EXACT] == 1 and counts[FAILURES] < 2 else 0.0  # of the second derivatives
+        row_weights[row] += weight
+        sides[REST, k] = sides[SIGN, k] * (constraints[row] - sides[BORDER, k]) + sides[E, k] - sides[S, k]
+    for row in rows:
+        rests[row] = constraints[row] - terms.lower[row]
+    # Second derivatives need multipliers, and those of a cold start mean little.
+    exact = counts[EXACT] == 1 and counts[FAILURES] < 2 and (counts[ITERATION] > 0 or counts[COLD] == 0)
+    share = 1.0 if exact else 0.0  # of the second derivatives
     for k in range(normal):
-        data[k] = work.curvature[k] if share > 0.0 else work.hessian[k]
-    for k in range(len(problem.entries)):
-        data[normal + k] = work.constraint_jacobian[problem.entries[k]]
-    _condense(problem.terms, problem.unequal, work.row_weights, work.constraint_jacobian, data)
-    for k in range(len(problem.doubles) // 2):
-        data[problem.doubles[2 * k]] += data[problem.doubles[2 * k + 1]]
+        data[k] = curvature[k] if share > 0.0 else hessian[k]
+    for k in range(len(entries)):
+        data[normal + k] = constraint_jacobian[entries[k]]
+    _condense(terms, unequal, row_weights, constraint_jacobian, data)
+    for k in range(len(doubles) // 2):
+        data[doubles[2 * k]] += data[doubles[2 * k + 1]]
     for k in range(equalities):
-        work.shift[n + k] = -DUAL_SHIFT
+        shift[n + k] = -DUAL_SHIFT
     delta = numbers[DELTA] if counts[FAILURES] > 0 else 0.0
+    # Less of the second derivatives may mean less curvature, and a step that was cut very short had too little.
+    blend = numbers[TAKEN] > SHORT or counts[ITERATION] == 0
     counts[ANSWER] = TRY
     while True:
         counts[GAUSS_NEWTON] = 1 if share == 0.0 else 0
         for k in range(n):
-            work.shift[k] = delta
-        factorised = holds(problem.links[FACTOR], (problem.plan, data, work.shift))
-        if factorised and problem.plan.state[NEGATIVE] == equalities:
-            run(problem.links[STEER], (address,))
+            shift[k] = delta
+        factorised = holds(links[FACTOR], (plan, data, shift))
+        if factorised and plan.state[NEGATIVE] == equalities:
+            run(links[STEER], (address,))
             largest = 0.0
             for k in range(n + equalities):
-                largest = max(largest, abs(work.step[k]))
+                largest = max(largest, abs(step[k]))
             if math.isfinite(largest):
                 break
-        if share > 0.0:
+        if share > 0.0 and blend:
             less = 0.5 * share if share > LEAST_SHARE else 0.0
             for k in range(normal):
-                data[k] += (less - share) * (work.curvature[k] - work.hessian[k])
+                data[k] += (less - share) * (curvature[k] - hessian[k])
             share = less
             continue
         if delta == 0.0:
@@ -189,32 +199,34 @@ def direct(address: int) -> None:
 @linked
 def steer(address: int) -> None:
     """Solve for the residuals in ``rests`` and REST: the step, those of the sides, the slope, and both lengths."""
-    problem, work = opened(address)
-    numbers, counts, sides, right = work.numbers, work.counts, work.sides, work.right
+    constraint_jacobian, counts, free, full = parts(address, "constraint_jacobian counts free full")
+    gradient, links, numbers, plan, rests, right = parts(address, "gradient links numbers plan rests right")
+    row_terms, rows, side_row, sides, step = parts(address, "row_terms rows side_row sides step")
+    terms, unequal = parts(address, "terms unequal")
     mu, rho = numbers[MU], numbers[RHO]
-    n = len(problem.free)
-    for row in range(len(work.row_terms)):
-        work.row_terms[row] = 0.0
+    n = len(free)
+    for row in range(len(row_terms)):
+        row_terms[row] = 0.0
     for k in range(counts[SIDES]):
         y = sides[Y, k]
         r = sides[REST, k] + sides[S, k] - sides[E, k] + mu / (rho - y) - mu / y
-        work.row_terms[work.side_row[k]] += sides[SIGN, k] * sides[WEIGHT, k] * r
+        row_terms[side_row[k]] += sides[SIGN, k] * sides[WEIGHT, k] * r
     for k in range(n):
-        right[k] = -work.full[problem.free[k]]
-    _pull(problem.terms, problem.unequal, work.row_terms, work.constraint_jacobian, right)
-    for k in range(len(problem.rows)):
-        right[n + k] = -work.rests[problem.rows[k]]
-    run(problem.links[SOLVE], (problem.plan, right, work.step))
-    _moves(problem.terms, problem.unequal, work.step, work.constraint_jacobian, work.row_terms)
+        right[k] = -full[free[k]]
+    _pull(terms, unequal, row_terms, constraint_jacobian, right)
+    for k in range(len(rows)):
+        right[n + k] = -rests[rows[k]]
+    run(links[SOLVE], (plan, right, step))
+    _moves(terms, unequal, step, constraint_jacobian, row_terms)
     slope = 0.0
     for k in range(n):
-        slope += work.gradient[problem.free[k]] * work.step[k]
+        slope += gradient[free[k]] * step[k]
     limit = max(0.99, 1.0 - mu)
     primal = dual = 0.0  # inverse step lengths
     for k in range(counts[SIDES]):
         s, e, y = sides[S, k], sides[E, k], sides[Y, k]
         z = rho - y
-        move = sides[SIGN, k] * work.row_terms[work.side_row[k]]
+        move = sides[SIGN, k] * row_terms[side_row[k]]
         r = sides[REST, k] + s - e + mu / z - mu / y
         dy = -(move + r) * sides[WEIGHT, k]
         ds = mu / y - s - s / y * dy

@@ -12,6 +12,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 from numba import typeof, types
+from numba.core import cgutils
 from numba.core.datamodel import default_manager
 
 from unifg.calls import _primitive
@@ -128,11 +129,18 @@ memory = Memory()
 
 
 @_primitive
-def opened(typing: Any, where: Any) -> Any:
-    """The tuple that is described at an address."""
-    kind = memory.kind
+def parts(typing: Any, where: Any, names: Any) -> Any:
+    """Some of the arrays, or tuples of arrays, that are described at an address, by their names with blanks between."""
+    tuples = memory.kind.types
+    places = []
+    for name in names.literal_value.split():
+        first = next(k for k, kind in enumerate(tuples) if name in kind.fields)
+        places.append((first, tuples[first].fields.index(name)))
+    kinds = types.Tuple([tuples[first].types[second] for first, second in places])
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        return builder.load(builder.inttoptr(values[0], context.get_value_type(kind).as_pointer()))
+        pointer = builder.inttoptr(values[0], context.get_value_type(memory.kind).as_pointer())
+        found = [builder.load(cgutils.gep_inbounds(builder, pointer, 0, *place)) for place in places]
+        return context.make_tuple(builder, kinds, found)
 
-    return kind(types.int64), generate
+    return kinds(types.int64, names), generate

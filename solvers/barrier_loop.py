@@ -13,7 +13,7 @@ from unifg.elimination.substitution import solve
 from unifg.jit import compiled
 from unifg.retraction import retract_parts
 from unifg.solvers import barrier, barrier_direction
-from unifg.solvers.barrier_links import ADDRESS, NOTHING, NUMBER, TRUTH, link, linked, memory, number, opened, run
+from unifg.solvers.barrier_links import ADDRESS, NOTHING, NUMBER, TRUTH, link, linked, memory, number, parts, run
 from unifg.solvers.barrier_state import (
     ACCEPT,
     ACCEPTED,
@@ -22,6 +22,7 @@ from unifg.solvers.barrier_state import (
     ALPHA,
     ANSWER,
     BEGIN,
+    COLD,
     CORRECT,
     COST,
     CURVE,
@@ -29,6 +30,7 @@ from unifg.solvers.barrier_state import (
     EVALUATE,
     EXACT,
     FACTOR,
+    ITERATION,
     JUDGE,
     LINEARIZE,
     LINKS,
@@ -70,51 +72,56 @@ def fill(target: Array, number: float) -> None:
 @linked
 def advance(address: int) -> None:
     """Move to the trial and evaluate it."""
-    problem, work = opened(address)
-    alpha, free = work.numbers[ALPHA], problem.free
+    free, links, move, numbers, retraction = parts(address, "free links move numbers retraction")
+    scratch, spread, squares, step, terms, trial = parts(address, "scratch spread squares step terms trial")
+    trial_constraints, trial_residual, values = parts(address, "trial_constraints trial_residual values")
+    alpha = numbers[ALPHA]
     for k in range(len(free)):
-        work.move[k] = alpha * work.step[k]
-    copy(work.values, work.trial)
-    fill(work.spread, 0.0)
-    run(problem.links[RETRACT], (problem.parts, free, work.move, work.spread, work.values, work.trial))
-    work.numbers[TRIAL_COST] = number(
-        problem.links[EVALUATE],
-        (problem.terms, work.trial, work.trial_residual, work.trial_constraints, work.squares, problem.scratch),
+        move[k] = alpha * step[k]
+    copy(values, trial)
+    fill(spread, 0.0)
+    run(links[RETRACT], (retraction, free, move, spread, values, trial))
+    numbers[TRIAL_COST] = number(
+        links[EVALUATE],
+        (terms, trial, trial_residual, trial_constraints, squares, scratch),
     )
 
 
 @linked
 def loop(address: int) -> None:
     """Iterate from ``work.values``, which is moved, to one of the endings."""
-    problem, work = opened(address)
-    links, numbers, counts = problem.links, work.numbers, work.counts
+    constraint_jacobian, constraints, counts = parts(address, "constraint_jacobian constraints counts")
+    curvature, gradient, hessian, jacobian, links = parts(address, "curvature gradient hessian jacobian links")
+    multipliers, norms, numbers, residual, scratch = parts(address, "multipliers norms numbers residual scratch")
+    squares, terms, trial, values = parts(address, "squares terms trial values")
     started = False
     while True:
-        fill(work.gradient, 0.0)
-        fill(work.hessian, 0.0)
+        fill(gradient, 0.0)
+        fill(hessian, 0.0)
         numbers[COST] = number(
             links[LINEARIZE],
             (
-                problem.terms,
-                work.values,
+                terms,
+                values,
                 False,
-                work.residual,
-                work.jacobian,
-                work.constraints,
-                work.constraint_jacobian,
-                work.squares,
-                work.norms,
-                work.gradient,
-                work.hessian,
-                problem.scratch,
+                residual,
+                jacobian,
+                constraints,
+                constraint_jacobian,
+                squares,
+                norms,
+                gradient,
+                hessian,
+                scratch,
             ),
         )
         run(links[MEASURE if started else BEGIN], (address,))
         started = True
         run(links[TEST], (address,))
-        if counts[EXACT] == 1 and counts[ANSWER] == TRY:
-            copy(work.hessian, work.curvature)
-            run(links[CURVE], (problem.terms, work.values, work.residual, work.multipliers, work.curvature))
+        wanted = counts[EXACT] == 1 and (counts[ITERATION] > 0 or counts[COLD] == 0)
+        if wanted and counts[ANSWER] == TRY:
+            copy(hessian, curvature)
+            run(links[CURVE], (terms, values, residual, multipliers, curvature))
         while counts[ANSWER] == TRY:
             run(links[DIRECT], (address,))
             while counts[ANSWER] == TRY:
@@ -124,7 +131,7 @@ def loop(address: int) -> None:
                 run(links[TEST], (address,))
         if counts[ANSWER] != ACCEPTED:
             return
-        copy(work.trial, work.values)
+        copy(trial, values)
 
 
 @cache
@@ -143,9 +150,9 @@ def addresses() -> IntArray:
     links[EVALUATE] = link(passes.evaluate, NUMBER, terms, values, residual, constraints, kinds["squares"], scratch)
     links[CURVE] = link(add_curvature, NOTHING, terms, values, residual, constraints, kinds["hessian"])
     links[RETRACT] = link(
-        retract_parts, NOTHING, kinds["parts"], kinds["free"], vector, kinds["spread"], values, values
+        retract_parts, NOTHING, kinds["retraction"], kinds["free"], vector, kinds["spread"], values, values
     )
-    parts = {
+    functions = {
         BEGIN: barrier.begin,
         MEASURE: barrier.measure,
         TEST: barrier.test,
@@ -158,6 +165,6 @@ def addresses() -> IntArray:
         ADVANCE: advance,
         LOOP: loop,
     }
-    for place, function in parts.items():
+    for place, function in functions.items():
         links[place] = link(function, NOTHING, ADDRESS)
     return links

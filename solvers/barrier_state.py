@@ -52,9 +52,10 @@ from unifg.typing import Array, IntArray
     CORRECTED,  # whether the trial is a second-order correction
     FAILURES,  # line searches in a row that found nothing
     GAUSS_NEWTON,  # whether the present direction used the Gauss-Newton Hessian
+    COLD,  # whether the start had no multipliers
     DESCENT,  # whether the last trial was accepted because it lowers the barrier function
     INTEGERS,
-) = range(12)
+) = range(13)
 # Rows of Work.sides.
 (
     SIGN,  # +1 for a lower limit, -1 for an upper one
@@ -91,7 +92,7 @@ class Problem(NamedTuple):
         links: addresses of compiled functions, by the names above.
         terms: of the program.
         plan: elimination of the KKT matrix, whose entries come in the order of ``Work.data``.
-        parts: of the retraction.
+        retraction: its parts.
         free: columns that are unknown.
         scratch: memory of the loops over terms.
         rows: (E,) equality rows.
@@ -103,7 +104,7 @@ class Problem(NamedTuple):
     links: IntArray
     terms: Terms
     plan: Plan
-    parts: IntArray
+    retraction: IntArray
     free: IntArray
     scratch: Array
     rows: IntArray

@@ -214,17 +214,14 @@ def _history(work: Work, norms: dict[str, float], seconds: float) -> Callable[[]
     log = work.log[: int(work.counts[state.ITERATION]) + 1].copy()
 
     def rows() -> list[Iteration]:
-        last = len(log) - 1
-        return [
-            Iteration(
-                number,
-                *map(float, row[:6]),
-                seconds if number else 0.0,
-                norms if number == last else {},
-                _details(*row[6:9]) if number else {},
-            )
-            for number, row in enumerate(log)
-        ]
+        last, made = len(log) - 1, []
+        for number, row in enumerate(log.tolist()):
+            cost, stationarity, violation, complementarity, step, length, *details = row
+            kkt = stationarity, violation, complementarity
+            taken, terms = (seconds, _details(*details)) if number else (0.0, {})
+            own = norms if number == last else {}
+            made.append(Iteration(number, cost, *kkt, step, length, taken, own, terms))
+        return made
 
     return rows
 

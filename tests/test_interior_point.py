@@ -17,7 +17,7 @@ def test_a_watched_solve_takes_the_same_steps() -> None:
     rows: list[fg.Iteration] = []
     solver = InteriorPoint(tolerance=1e-6)
     alone = solver.solve(stated.graph, stated.guess)
-    watched = solver.solve(stated.graph, stated.guess, callback=rows.append)  # type: ignore[arg-type]
+    watched = solver.solve(stated.graph, stated.guess, callback=rows.append)
     assert alone.iterations == watched.iterations == rows[-1].number
     assert alone.cost == pytest.approx(watched.cost, rel=1e-9)
     for mine, other in zip(alone.history, watched.history, strict=True):

@@ -75,13 +75,13 @@ def add_curvature(terms: Terms, values: Array, residual: Array, multipliers: Arr
                 largest = max(largest, abs(weights[a]))
             if largest == 0.0:
                 continue
+            p = vector(terms.parameters, term[PARAMETER] + i * term[SPREAD], term[PARAMETERS])
             gather_variables(term, i, terms.gather, terms.sizes, terms.parameters, values, v)
             if term[SECOND] != 0:
-                p = vector(terms.parameters, term[PARAMETER] + i * term[SPREAD], term[PARAMETERS])
                 call_residual(term[SECOND], vector(v, 0, term[STORAGE]), p, table, vector(weights, 0, m), S)
             else:
-                _second(terms, term, i, v, moved, step, weights, r, gradient, J, S)
-            _write(terms, term, i, S, hessian)
+                _second(terms.leaves, term, p, table, v, moved, step, weights, r, gradient, J, S)
+            _write(terms.sizes, terms.positions, term, i, S, hessian)
 
 
 @compiled
@@ -104,9 +104,10 @@ def carry_back(term: IntArray, i: int, whiteners: Array, residual: Array, out: A
 
 @compiled
 def _second(
-    terms: Terms,
+    leaves: IntArray,
     term: IntArray,
-    i: int,
+    p: Array,
+    table: Array,
     v: Array,
     moved: Array,
     step: Array,
@@ -118,8 +119,6 @@ def _second(
 ) -> None:
     """Derivative of J' w along every tangent direction of one factor, row by row."""
     m, width, storage = term[ROWS], term[KERNEL_WIDTH], term[STORAGE]
-    p = vector(terms.parameters, term[PARAMETER] + i * term[SPREAD], term[PARAMETERS])
-    table = vector_at(term[TABLE], term[TABLE_SIZE])
     call_residual(term[ADDRESS], vector(v, 0, storage), p, table, vector(r, 0, m), matrix(J, 0, m, width))
     for d in range(width):
         gradient[d] = 0.0
@@ -128,7 +127,7 @@ def _second(
     for k in range(storage):
         moved[k] = v[k]
     for leaf in range(term[LEAF], term[LEAF] + term[LEAVES]):
-        where, start, size, dim, column = terms.leaves[leaf]
+        where, start, size, dim, column = leaves[leaf]
         for c in range(dim):
             for k in range(dim):
                 step[k] = STEP if k == c else 0.0
@@ -148,15 +147,15 @@ def _second(
 
 
 @compiled
-def _write(terms: Terms, term: IntArray, i: int, second: Array, hessian: Array) -> None:
+def _write(sizes: IntArray, positions: IntArray, term: IntArray, i: int, second: Array, hessian: Array) -> None:
     """Add the symmetric part to the entries of the factor's pairs of columns."""
     width, keep = term[WIDTH], term[KEEP]
     at = term[POSITION] + i * (width * (width + 1) // 2)
     for d in range(width):
-        row = d if keep < 0 else terms.sizes[keep + d]
+        row = d if keep < 0 else sizes[keep + d]
         for e in range(d + 1):
-            column = e if keep < 0 else terms.sizes[keep + e]
-            where = terms.positions[at]
+            column = e if keep < 0 else sizes[keep + e]
+            where = positions[at]
             at += 1
             if where >= 0:
                 hessian[where] += 0.5 * (second[row, column] + second[column, row])
