@@ -47,7 +47,7 @@ from unifg.typing import Array, IntArray
 
 FIRST_SHIFT, LARGEST_SHIFT, FIRST_GROWTH, SHIFT_GROWTH, SHIFT_DECAY = 1e-4, 1e20, 100.0, 8.0, 3.0
 DUAL_SHIFT = 1e-9
-SHORT = 0.1  # length of a step
+SHORT = 0.01  # length of a step
 LEAST_SHARE = 0.2  # of the second derivatives, before they are left out
 
 

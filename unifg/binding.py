@@ -25,7 +25,7 @@ class Binding:
         self.given: dict[Data, Array] = {}
 
     def take(self, data: Mapping[Data, ArrayLike]) -> set[Data]:
-        """Take new values and say which data are not what they were.
+        """Take new values and say which data may not be what they were.
 
         Raises:
             GraphError: on unknown data, a changed shape, or NaN.
@@ -36,12 +36,13 @@ class Binding:
         changed = set()
         self.given = {}
         for handle in self._known.values():
-            value, before = data.get(handle, handle.value), self._present.get(handle)
-            if before is None or not _same(value, before):
+            value, before = data.get(handle), self._present.get(handle)
+            if value is not None:
                 changed.add(handle)
-                before = self._present[handle] = handle.check(value).copy()
-            if handle in data:
-                self.given[handle] = before
+                self.given[handle] = self._present[handle] = _checked(handle, value)
+            elif before is None or before.tobytes() != handle.value.tobytes():
+                changed.add(handle)
+                self._present[handle] = handle.check(handle.value).copy()
         return changed
 
     def forget(self) -> None:
@@ -49,8 +50,12 @@ class Binding:
         self._present.clear()
 
 
-def _same(value: ArrayLike, before: Array) -> bool:
-    """Whether a value is what it was, to the last bit; False when that takes a closer look."""
-    if not isinstance(value, np.ndarray) or value.dtype != before.dtype or value.shape != before.shape:
-        return False
-    return bool(value.tobytes() == before.tobytes())
+def _checked(handle: Data, value: ArrayLike) -> Array:
+    """A copy of a new value."""
+    if isinstance(value, np.ndarray) and value.dtype == np.float64 and value.shape == handle.value.shape:
+        copy = value.copy()
+        flat = copy.reshape(-1)
+        squares = flat @ flat
+        if handle.value.dtype == np.float64 and squares == squares:  # no NaN: squares are not negative
+            return copy
+    return handle.check(value).copy()

@@ -86,6 +86,9 @@ class CompiledTerm:
         data: all data the term reads.
     """
 
+    parameters: Array
+    _packed: Array
+
     def __init__(self, term: Term) -> None:
         """Find the residual's dimension by one evaluation at identity elements."""
         self.term = term
@@ -137,8 +140,7 @@ class CompiledTerm:
 
     def rebind(self, data: Bound, changed: Set[Data]) -> bool:
         """Take changed data; True when more than parameters of the kernel had to be renewed."""
-        mine = self.data & changed
-        if not mine:
+        if not (mine := self.data & changed):
             return False
         places = [k for k, a in enumerate(self.term.arguments) if isinstance(a, Data) and a in mine]
         if self.kernel is None or mine & self._shaping or not all(place in self._blocks for place in places):
@@ -150,6 +152,12 @@ class CompiledTerm:
             first, size = self._blocks[place]
             self._packed[:, first : first + size] = value.reshape(-1, size)
         return False
+
+    def settle(self, parameters: Array) -> None:
+        """Keep the parameters where the compiled loops read them."""
+        self.parameters = parameters
+        if self.kernel is not None:
+            self._packed = parameters[: self._packed.size].reshape(self._packed.shape)
 
     def residual(self, values: Values) -> Array:
         """(n, m) residuals, zero where inactive, not whitened; (n,) for a scalar cost."""
@@ -268,7 +276,7 @@ class CompiledTerm:
         if isinstance(term, Constraint):
             self.lower = self._limit(resolve(term.lower, data), "lower", -np.inf)
             self.upper = self._limit(resolve(term.upper, data), "upper", np.inf)
-        self.parameters: Array = np.zeros(0)
+        self.parameters = self._packed = np.zeros(0)
         self.parameter_count = self.parameter_spread = 0
         if self.kernel is not None:
             self._pack(self.kernel)

@@ -24,6 +24,7 @@ from unifg.linearization import Evaluation, HeldWeights, Linearization
 from unifg.retraction import Retraction
 from unifg.rows import Rows
 from unifg.sparse import Symmetric
+from unifg.start import Start
 from unifg.table import ENTRY, ROW, WIDTH, Table, Terms
 from unifg.terms import Constraint, Cost, ScalarCost
 from unifg.touched import require_touched, term_columns
@@ -83,6 +84,7 @@ class Program:
         self._scalar_blocks()
         self._hessian: tuple[Symmetric, IntArray] | None = None
         self.retraction = Retraction(self.columns, graph.fixes)
+        self._start = Start(graph, self.columns, self.retraction)
         self._names = [term.name for term in stacked]
         self.scratch = np.empty(self.table.scratch)
         self._buffers = Buffers([*self.table.sizes, self.columns.width, self.normal.nnz])
@@ -123,12 +125,14 @@ class Program:
             return
         try:
             rebound = [term for term in self.terms if term.rebind(self.data, changed)]
-            if self._fresh or any(isinstance(term.term, Constraint) for term in rebound):
+            limits = self._fresh or any(isinstance(term.term, Constraint) for term in rebound)
+            if limits:
                 self._bind_limits()
         except GraphError:
             self._binding.forget()
             raise
-        self.table.bind(None if self._fresh else changed, self.lower, self.upper)
+        if limits or rebound:
+            self.table.bind(self.terms if self._fresh else rebound, self.lower, self.upper)
         for k, fix in enumerate(self.graph.fixes):
             if not isinstance(fix.value, Data):
                 if self._fresh:
@@ -152,38 +156,7 @@ class Program:
         Raises:
             GraphError: naming the family and index of what is missing, misshapen, NaN or off its manifold.
         """
-        for family in guess:
-            if not isinstance(family, Family) or self.graph.families.get(family.name) is not family:
-                raise GraphError(f"the guess contains {family!r}, which is no family of this graph")
-        values = Values(self.columns, np.empty(self.columns.stored))
-        for family in self.families:
-            shape = (family.count, family.manifold.storage)
-            if family not in guess:
-                if not self.columns.all_fixed(family):
-                    raise GraphError(
-                        f"the guess has no values for family '{family.name}': give an array of shape {shape}",
-                        family=family.name,
-                    )
-                values[family][:] = family.manifold.identity()
-                continue
-            array = np.asarray(guess[family], dtype=np.float64)
-            if array.shape != shape:
-                raise GraphError(
-                    f"the guess for family '{family.name}' has shape {array.shape}, expected {shape}",
-                    family=family.name,
-                )
-            values[family][:] = array
-        self.retraction.fix(values)
-        for family, array in values.items():
-            valid = family.manifold.is_valid(array)
-            if not valid.all():
-                index = int(np.flatnonzero(~valid)[0])
-                raise GraphError(
-                    f"the guess for {family.name}[{index}] is not on {family.manifold.name}: {array[index]}",
-                    family=family.name,
-                    index=index,
-                )
-        return values
+        return self._start(guess)
 
     def retract(self, values: Values, step: Array) -> Values:
         """Move the unknowns by a tangent step; fixed variables stay."""

@@ -31,11 +31,11 @@ class Retraction:
         self._kept = []  # addresses are good for as long as the functions live
         parts = []
         for family in columns.families:
-            leaves = list(_leaves(family.manifold, 0, 0))
-            if any(_compiled_retraction(leaf) is None for leaf, _, _ in leaves):
+            parts_of = list(leaves(family.manifold, 0, 0))
+            if any(_compiled_retraction(leaf) is None for leaf, _, _ in parts_of):
                 self._python.append(family)
                 continue
-            for leaf, storage, tangent in leaves:
+            for leaf, storage, tangent in parts_of:
                 function = _compiled_retraction(leaf)
                 self._kept.append(function)
                 where = ADDITION if function == ADDITION else address(function, RETRACTION)  # type: ignore[arg-type]
@@ -94,7 +94,7 @@ def retractions(manifolds: Sequence[Manifold]) -> list[list[int]]:
     parts: list[list[int]] = []
     storage = tangent = 0
     for manifold in manifolds:
-        for leaf, stored, moved in _leaves(manifold, storage, tangent):
+        for leaf, stored, moved in leaves(manifold, storage, tangent):
             function = _compiled_retraction(leaf)
             if function is None:
                 return []
@@ -104,13 +104,13 @@ def retractions(manifolds: Sequence[Manifold]) -> list[list[int]]:
     return parts
 
 
-def _leaves(manifold: Manifold, storage: int, tangent: int) -> Iterator[tuple[Manifold, int, int]]:
+def leaves(manifold: Manifold, storage: int, tangent: int) -> Iterator[tuple[Manifold, int, int]]:
     """The components of products, down to manifolds that are none, and where each begins."""
     if not isinstance(manifold, Product):
         yield manifold, storage, tangent
         return
     for part in manifold.components.values():
-        yield from _leaves(part.manifold, storage + part.storage.start, tangent + part.tangent.start)
+        yield from leaves(part.manifold, storage + part.storage.start, tangent + part.tangent.start)
 
 
 def _compiled_retraction(manifold: Manifold) -> object:

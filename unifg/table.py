@@ -6,7 +6,7 @@ entries of the Jacobian, columns, and the places of J'J in the matrix of the nor
 
 from __future__ import annotations
 
-from collections.abc import Sequence, Set
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,6 @@ from unifg.retraction import retractions
 from unifg.sparse import Symmetric
 from unifg.terms import Constraint, Cost
 from unifg.typing import Array, IntArray
-from unifg.variables import Data
 
 (
     KIND,  # COST, CONSTRAINT or BOUND
@@ -183,14 +182,16 @@ class Table:
         """Lengths of the stacked residual, its Jacobian, the stacked constraints and theirs."""
         return self.residuals, self.entries, self.constraints, self.constraint_entries
 
-    def bind(self, changed: Set[Data] | None, lower: Array, upper: Array) -> None:
-        """Copy limits and everything that terms with changed data have bound; None for all terms."""
+    def bind(self, rebound: Sequence[CompiledTerm], lower: Array, upper: Array) -> None:
+        """Copy limits and everything that some terms have bound; their parameters live here from then on."""
         arrays = self.arrays
         arrays.lower[:], arrays.upper[:] = lower, upper
         for row, term, start in zip(arrays.fields, self._terms, self._active_starts, strict=False):
-            if changed is not None and term.data.isdisjoint(changed):
+            if term not in rebound:
                 continue
-            arrays.parameters[row[PARAMETER] : row[PARAMETER] + term.parameters.size] = term.parameters
+            parameters = arrays.parameters[row[PARAMETER] : row[PARAMETER] + term.parameters.size]
+            parameters[:] = term.parameters
+            term.settle(parameters)
             arrays.whiteners[row[WHITENER] : row[WHITENER] + term.whitener.size] = term.whitener.ravel()
             row[ACTIVE] = -1
             if term.active is not None and not term.is_bound:
