@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks import closed_loop
 from benchmarks.control_problems import EFFORT, STAGE, TERMINAL, Problem, Quadrotor, Unicycle
-from benchmarks.quadrotor_fixture import GRAVITY
+from unifg.models.quadrotor import GRAVITY
 from unifg.typing import Array
 
 

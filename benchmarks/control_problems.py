@@ -16,11 +16,12 @@ import numpy as np
 
 import unifg as fg
 from benchmarks import closed_loop, reference_problems
-from benchmarks import quadrotor_fixture as quadrotor
+from unifg.models import avoidance, quadrotor
 from unifg.typing import Array
 
 STAGE, TERMINAL = np.repeat([20.0, 2.0, 2.0], 3), np.repeat([100.0, 10.0, 10.0], 3)
 EFFORT = np.array([0.1, 0.1, 0.1, 0.05])
+UNIT_MASS = quadrotor.Parameters()  # the thrust of the problems is per mass; neither drag nor wind
 SPHERES = {  # x, y, z, radius [m]
     "figure8": (
         (0.55, 0.60, 1.35, 0.35), (1.95, 0.40, 1.65, 0.35), (1.55, -1.00, 1.40, 0.35), (-0.55, 0.35, 1.65, 0.35),
@@ -143,7 +144,7 @@ class Quadrotor:
 
     def plant(self, state: Array, control: Array, index: int) -> Array:
         """(10,) state after closed-loop step ``index``; disturbed only where no sphere can be hit."""
-        moved = quadrotor.step(state, control, self.dt)
+        moved: Array = quadrotor.step(state[None], control[None], self.dt, UNIT_MASS)[0]
         if self.blocked:
             return moved
         s = np.arange(9)
@@ -191,11 +192,13 @@ class QuadrotorGraph:
                 graph.minimize(fg.prior, getattr(chosen, part), data, sigma=sigma, name=name)
         self._cruise = graph.data("cruise", controls, each=True)
         graph.minimize(fg.prior, u, self._cruise, sigma=EFFORT**-0.5, name="effort")
-        graph.constrain(quadrotor.dynamics, x[:-1], u, x[1:], problem.dt, lower=0.0, upper=0.0, name="dynamics")
+        motion = x[:-1], u, x[1:], UNIT_MASS.packed, problem.dt
+        graph.constrain(quadrotor.dynamics, *motion, lower=0.0, upper=0.0, name="dynamics")
         graph.bound(u, lower=problem.lower, upper=problem.upper, name="limits")
         if problem.blocked:
             spheres = problem.discs
-            graph.constrain(quadrotor.clearance, x[1:].p, spheres[:, :3], spheres[:, 3], lower=0.0, name="spheres")
+            away = x[1:].p, spheres[:, :3], spheres[:, 3]
+            graph.constrain(avoidance.sphere_clearance, *away, lower=0.0, name="spheres")
         first, efforts = problem.guess()
         self.guess = fg.Guess({x: first, u: efforts})
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 import unifg as fg
-from benchmarks import quadrotor_fixture as quadrotor
 from benchmarks.control_problems import Problem, problems
 from benchmarks.report import table
 from unifg.lie import wrap_angle
+from unifg.models import quadrotor
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
 

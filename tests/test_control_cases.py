@@ -7,9 +7,9 @@ import pytest
 
 import unifg as fg
 from benchmarks import control_loops, control_starts
-from benchmarks import quadrotor_fixture as quadrotor
 from benchmarks.control_problems import Problem, Quadrotor, Unicycle, problems
 from judge import judge
+from unifg.models import quadrotor
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 
 # A minimum that is not listed; IPOPT stays when it is started there (docs/reference-problems.md).
@@ -86,26 +86,3 @@ def test_one_iteration_a_step_is_an_option() -> None:
         cost += problem.stage_cost(state, control, index) if index < 100 else 0.0
         state = problem.plant(state, control, index)
     assert cost == pytest.approx(3285.17, rel=2e-3)  # that of solvers which converge in every step
-
-
-def test_quadrotor_defect_and_its_derivatives() -> None:
-    rng = np.random.default_rng(0)
-    problem = Quadrotor("goto", False, 20)
-    attitude = fg.SO3.exp(rng.standard_normal((1, 3)))[0]
-    state = np.concatenate([rng.standard_normal(3), attitude, rng.standard_normal(3)])
-    control = np.array([1.0, -2.0, 0.5, 12.0])
-    reached = quadrotor.step(state, control, problem.dt)
-    kernel = quadrotor.dynamics.kernel
-    assert kernel is not None
-    np.testing.assert_allclose(kernel(state[None], control[None], reached[None], problem.dt), 0.0, atol=1e-14)
-    after = quadrotor.STATE.retract(reached[None], 0.1 * rng.standard_normal((1, 9)))
-
-    def moved(d: np.ndarray) -> np.ndarray:
-        x = quadrotor.STATE.retract(state[None], d[None, :9])
-        y = quadrotor.STATE.retract(after, d[None, 13:])
-        return np.asarray(kernel(x, control[None] + d[None, 9:13], y, problem.dt)[0])
-
-    step = 1e-6
-    expected = np.stack([(moved(step * e) - moved(-step * e)) / (2.0 * step) for e in np.eye(22)], axis=1)
-    blocks = kernel.jacobian(state[None], control[None], after, problem.dt)
-    np.testing.assert_allclose(np.concatenate(blocks, axis=2)[0], expected, atol=1e-8)

@@ -1,0 +1,150 @@
+"""What a quadrotor sees and feels: landmarks on the ground plane, its height, and which way is up.
+
+Bearing and range are those of a sensor that is kept level: both are measured in the ground plane, the bearing from
+the heading psi, the direction of R e1 seen from above. The heading is undefined where R e1 is vertical, and of no use
+near it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from unifg.calls import local_matrix
+from unifg.jit import compiled
+from unifg.kernels import Kernel
+from unifg.lie import SO3, Rn
+from unifg.lie.scalar import so3
+from unifg.lie.scalar.so2 import wrap
+from unifg.models.quadrotor import STATE
+from unifg.residuals import residual
+from unifg.typing import Array, ArrayLike
+
+__all__ = ["bearing_range", "height", "observe", "tilt"]
+
+
+@compiled
+def _bearing_range(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """Write bearing and range of v = (state, landmark), less those measured."""
+    R = local_matrix(3, 3)
+    so3.write_matrix(v[3], v[4], v[5], v[6], R, 0)
+    dx, dy = v[10] - v[0], v[11] - v[1]
+    length = math.hypot(dx, dy)
+    r[0] = wrap(math.atan2(dy, dx) - math.atan2(R[1, 0], R[0, 0]) - p[0])
+    r[1] = length - p[1]
+    if len(J):
+        for i in range(2):
+            for k in range(11):
+                J[i, k] = 0.0
+        x, y = dx / length, dy / length
+        J[0, 0], J[0, 1], J[0, 9], J[0, 10] = y / length, -x / length, -y / length, x / length
+        J[1, 0], J[1, 1], J[1, 9], J[1, 10] = -x, -y, x, y
+        per = 1.0 / (R[0, 0] * R[0, 0] + R[1, 0] * R[1, 0])
+        J[0, 4] = per * (R[0, 0] * R[1, 2] - R[1, 0] * R[0, 2])
+        J[0, 5] = -per * (R[0, 0] * R[1, 1] - R[1, 0] * R[0, 1])
+
+
+@compiled
+def _bearing_range_second(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
+    """Hessian of w' (bearing, range).
+
+    The heading is atan2(b, a) of (a, b) = (R_00, R_10). A turn t changes them by -t_2 R_i2 + t_3 R_i1 and, to second
+    order, by (t_1 R_i. t - R_i0 t't) / 2; the latter cancels but for its first term.
+    """
+    R = local_matrix(3, 3)
+    so3.write_matrix(v[3], v[4], v[5], v[6], R, 0)
+    for i in range(11):
+        for k in range(11):
+            S[i, k] = 0.0
+    dx, dy = v[10] - v[0], v[11] - v[1]
+    square = dx * dx + dy * dy
+    turn, pull = w[0] / (square * square), w[1] / (square * math.sqrt(square))
+    xx = 2.0 * turn * dx * dy + pull * dy * dy
+    xy = turn * (dy * dy - dx * dx) - pull * dx * dy
+    yy = -2.0 * turn * dx * dy + pull * dx * dx
+    for i in range(2):
+        for k in range(2):
+            entry = xx if i + k == 0 else (xy if i + k == 1 else yy)
+            S[i, k] = S[9 + i, 9 + k] = entry
+            S[i, 9 + k] = S[9 + i, k] = -entry
+    a, b = R[0, 0], R[1, 0]
+    per = -w[0] / (a * a + b * b)
+    m1, m2 = a * R[1, 1] - b * R[0, 1], a * R[1, 2] - b * R[0, 2]
+    n1, n2 = a * R[0, 1] + b * R[1, 1], a * R[0, 2] + b * R[1, 2]
+    S[3, 4] = S[4, 3] = 0.5 * per * m1
+    S[3, 5] = S[5, 3] = 0.5 * per * m2
+    # (a, b) moves by n along itself and m across, both as (0, -[2], [1]): the angle by -2 n m to second order.
+    twice = -2.0 * per / (a * a + b * b)
+    S[4, 4] = twice * m2 * n2
+    S[5, 5] = twice * m1 * n1
+    S[4, 5] = S[5, 4] = -0.5 * twice * (m2 * n1 + m1 * n2)
+
+
+bearing_range = residual(
+    Kernel(_bearing_range, (STATE, Rn(2), (2,)), 2, name="landmark bearing and range", second=_bearing_range_second)
+)
+"""``bearing_range(x, l, z)``: bearing [rad], wrapped, and range [m], less z (2,) or (n, 2): (n, 2).
+
+x: quadrotor states. l: (n, 2) landmarks on the ground plane. Not finite where x stands on l.
+"""
+
+
+@compiled
+def _height(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    r[0] = v[2] - p[0]
+    if len(J):
+        J[0, 0], J[0, 1], J[0, 2] = 0.0, 0.0, 1.0
+
+
+height = residual(Kernel(_height, (Rn(3), 0), 1, name="height", linear=True))
+"""``height(p, z)``: p_z - z [m], (n, 1), for positions (n, 3), as ``x.p``, and z a number or (n,)."""
+
+
+@compiled
+def _tilt(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """R' e3 is the last row of R; a turn t changes it by q x t."""
+    w, x, y, z = v[0], v[1], v[2], v[3]
+    q0, q1, q2 = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+    r[0], r[1], r[2] = q0 - p[0], q1 - p[1], q2 - p[2]
+    if len(J):
+        J[0, 0], J[0, 1], J[0, 2] = 0.0, -q2, q1
+        J[1, 0], J[1, 1], J[1, 2] = q2, 0.0, -q0
+        J[2, 0], J[2, 1], J[2, 2] = -q1, q0, 0.0
+
+
+@compiled
+def _tilt_second(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
+    """Of w . t x (t x q) / 2."""
+    a, x, y, z = v[0], v[1], v[2], v[3]
+    q0, q1, q2 = 2.0 * (x * z - a * y), 2.0 * (y * z + a * x), 1.0 - 2.0 * (x * x + y * y)
+    inner = w[0] * q0 + w[1] * q1 + w[2] * q2
+    S[0, 0], S[1, 1], S[2, 2] = w[0] * q0 - inner, w[1] * q1 - inner, w[2] * q2 - inner
+    S[0, 1] = S[1, 0] = 0.5 * (w[0] * q1 + w[1] * q0)
+    S[0, 2] = S[2, 0] = 0.5 * (w[0] * q2 + w[2] * q0)
+    S[1, 2] = S[2, 1] = 0.5 * (w[1] * q2 + w[2] * q1)
+
+
+tilt = residual(Kernel(_tilt, (SO3, (3,)), 3, name="tilt", second=_tilt_second))
+"""``tilt(R, z)``: R' e3 - z, (n, 3): the vertical as the body sees it, less z (3,) or (n, 3); takes ``x.R``.
+
+With z = (0, 0, 1) it is Ta's cost that keeps the vehicle level: 1/2 |r|^2 = 1 - cos(tilt), whatever the heading.
+"""
+
+
+def observe(x: ArrayLike, l: ArrayLike) -> Array:  # noqa: E741
+    """Measure landmarks without noise.
+
+    Args:
+        x: (10,) state.
+        l: (M, 2) landmarks [m].
+
+    Returns:
+        (M, 2) bearings [rad] in [-pi, pi) and ranges [m].
+
+    Raises:
+        GraphError: on another shape.
+    """
+    landmarks = np.asarray(l, dtype=np.float64)
+    state = np.asarray(x, dtype=np.float64)
+    return bearing_range(state, landmarks, np.zeros(2)) if landmarks.shape[:1] != (0,) else np.empty((0, 2))

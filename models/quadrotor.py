@@ -1,0 +1,277 @@
+"""A quadrotor: its state, its parameters and its dynamics (Ta et al. 2014, section V).
+
+State x = {p, R, v}: position [m] and velocity [m/s] in the world, z up, and attitude R = world_R_body. Control
+u = (omega, T): body rates [rad/s], which a fast inner loop holds, and thrust [N] along the third axis of the body.
+With process noise w = (w_omega, w_a) and static parameters rho = (mass, drag, wind, updraft), in the Lie algebra of
+the product group R3 x SO(3) x R3,
+
+    F(x, u, w, rho) = [ v,  omega + w_omega,  (T/m) R e3 - g e3 - R diag(drag) R' v / m + (wind, updraft) + w_a ]
+
+The dynamics of a graph are the implicit trapezoid on that group (Ta III-B). The rate is held over a step, so that
+the logarithm of the turn is parallel to it, dexp_inv leaves it alone, and the full and the simplified trapezoid have
+the same solutions; the rows are those of the simplified one. The attitude they lead to, R Exp(h omega), is exact.
+
+Log(Exp(-h omega) R' R+) would vanish in the same places. Ta's row is linear in the rate, and its second derivatives are
+exact wherever it is evaluated and not only where it vanishes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from unifg.kernels import Kernel
+from unifg.lie import SO3, Product, Rn
+from unifg.models import quadrotor_dynamics, quadrotor_flight, quadrotor_second
+from unifg.models.quadrotor_dynamics import GRAVITY
+from unifg.models.quadrotor_field import field
+from unifg.residuals import residual
+from unifg.typing import Array, ArrayLike
+
+__all__ = [
+    "CONTROL",
+    "DRAG",
+    "GRAVITY",
+    "MASS",
+    "NOISE",
+    "STATE",
+    "UPDRAFT",
+    "WIND",
+    "Parameters",
+    "disturbed_dynamics",
+    "dynamics",
+    "field",
+    "fly",
+    "hover",
+    "hover_attitude",
+    "rollout",
+    "step",
+]
+
+STATE = Product(p=Rn(3), R=SO3, v=Rn(3))
+"""Storage (p, quaternion wxyz, v), 10 numbers; tangent (p, rotation vector, v), 9."""
+
+CONTROL = Rn(4)
+"""Body rates [rad/s], 3, and thrust [N]."""
+
+NOISE = Rn(6)
+"""Noise of the rates [rad/s], 3, and acceleration in the world [m/s^2], 3."""
+
+MASS = Rn(1)
+"""Mass [kg]. Mass and thrust gain are one parameter: T/m is all that either does."""
+
+DRAG = Rn(3)
+"""Drag along the axes of the body, D >= 0 [kg/s]."""
+
+WIND = Rn(2)
+"""What the wind adds to the horizontal acceleration [m/s^2]."""
+
+UPDRAFT = Rn(1)
+"""What the wind adds to the vertical acceleration [m/s^2]. At hover it cannot be told from the mass: fix one."""
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """What does not change in a flight.
+
+    Attributes:
+        mass: [kg].
+        drag: along the axes of the body [kg/s].
+        wind: horizontal acceleration in the world [m/s^2].
+        updraft: vertical acceleration [m/s^2].
+
+    Raises:
+        ValueError: on a mass that is not positive, a negative drag, a wrong length, or what is not finite.
+    """
+
+    mass: float = 1.0
+    drag: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    wind: tuple[float, float] = (0.0, 0.0)
+    updraft: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot fly."""
+        drag, wind = tuple(float(d) for d in self.drag), tuple(float(a) for a in self.wind)
+        if len(drag) != 3 or len(wind) != 2:
+            raise ValueError(
+                f"a quadrotor has 3 drag coefficients and 2 of the wind, found {len(drag)} and {len(wind)}"
+            )
+        object.__setattr__(self, "mass", float(self.mass))
+        object.__setattr__(self, "drag", drag)
+        object.__setattr__(self, "wind", wind)
+        object.__setattr__(self, "updraft", float(self.updraft))
+        if not np.isfinite(self.packed).all():
+            raise ValueError(f"a quadrotor's parameters must be finite, found {self}")
+        if self.mass <= 0.0:
+            raise ValueError(f"a quadrotor's mass must be positive, found {self.mass:g} kg")
+        if min(drag) < 0.0:
+            raise ValueError(f"a quadrotor's drag must not be negative, found {drag} kg/s")
+
+    @property
+    def packed(self) -> Array:
+        """(7,) mass, drag, wind, updraft: what :data:`dynamics` takes."""
+        return np.array([self.mass, *self.drag, *self.wind, self.updraft])
+
+    @classmethod
+    def unpacked(cls, packed: ArrayLike) -> Parameters:
+        """From (7,) numbers in the order of :attr:`packed`.
+
+        Raises:
+            ValueError: on another shape, or on numbers the constructor refuses.
+        """
+        numbers = np.asarray(packed, dtype=np.float64)
+        if numbers.shape != (7,):
+            raise ValueError(f"a quadrotor has 7 parameters, found shape {numbers.shape}")
+        mass, *rest = numbers.tolist()
+        return cls(mass, (rest[0], rest[1], rest[2]), (rest[3], rest[4]), rest[5])
+
+
+def step(x: ArrayLike, u: ArrayLike, dt: ArrayLike, parameters: Parameters) -> Array:
+    """Solve one step of :data:`dynamics`, without noise.
+
+    Args:
+        x: states, (n, 10) or one (1, 10).
+        u: controls, (n, 4) or one (1, 4).
+        dt: length of the step [s], one or (n,).
+        parameters: of the vehicle.
+
+    Returns:
+        (n, 10) next states.
+
+    Raises:
+        ValueError: on another shape.
+    """
+    x, u = _rows(x, 10, "states"), _rows(u, 4, "controls")
+    moved = np.empty((max(len(x), len(u)), 10))
+    quadrotor_dynamics.advance_all(_spread(x, moved), _spread(u, moved), _samples(dt, moved), parameters.packed, moved)
+    return moved
+
+
+def rollout(start: ArrayLike, u: ArrayLike, dt: ArrayLike, parameters: Parameters) -> Array:
+    """States reached from ``start`` (10,) under controls (n, 4), step after step: (n + 1, 10).
+
+    Raises:
+        ValueError: on another shape.
+    """
+    start, u = _single(start, 10, "state"), _rows(u, 4, "controls")
+    states = np.empty((len(u) + 1, 10))
+    states[0] = start
+    rest = states[1:]
+    quadrotor_dynamics.advance_all(states[:-1], _spread(u, rest), _samples(dt, rest), parameters.packed, rest)
+    return states
+
+
+def fly(
+    state: ArrayLike,
+    u: ArrayLike,
+    dt: float,
+    parameters: Parameters,
+    noise: ArrayLike | None = None,
+    substeps: int = 10,
+) -> Array:
+    """Integrate with RK-MK4 what :func:`step` approximates: where the vehicle is after ``dt`` seconds.
+
+    The rate is held, so that all stages of the attitude are parallel and R Exp(t omega) is exact; what is left is
+    the classical Runge-Kutta method of order four for position and velocity.
+
+    Args:
+        state: (10,).
+        u: (4,) held control.
+        dt: [s].
+        parameters: of the vehicle.
+        noise: (6,) held noise of the rates [rad/s] and accelerations [m/s^2]; None for none.
+        substeps: equal steps that ``dt`` is cut into.
+
+    Returns:
+        (10,) state.
+
+    Raises:
+        ValueError: on another shape, or no substep.
+    """
+    state, u = _single(state, 10, "state"), _single(u, 4, "control")
+    disturbance = np.zeros(6) if noise is None else _single(noise, 6, "noise")
+    if substeps < 1:
+        raise ValueError(f"fly needs at least one substep, found {substeps}")
+    reached = state.copy()
+    quadrotor_flight.integrate(reached, u, disturbance, parameters.packed, float(dt) / substeps, substeps)
+    return reached
+
+
+def hover(parameters: Parameters) -> Array:
+    """(4,) control that keeps the vehicle in place at :func:`hover_attitude`: no rate, T = m |g e3 - wind|."""
+    return np.array([0.0, 0.0, 0.0, parameters.mass * math.hypot(*_lift(parameters))])
+
+
+def hover_attitude(parameters: Parameters) -> Array:
+    """(4,) quaternion that leans into the wind by the shortest turn from level; level without wind.
+
+    Raises:
+        ValueError: when the updraft carries the vehicle, so that no thrust T > 0 at all holds it.
+    """
+    x, y, z = _lift(parameters)
+    length = math.hypot(x, y, z)
+    if z <= 0.0:
+        raise ValueError(f"an updraft of {parameters.updraft:g} m/s^2 carries the vehicle: it cannot hover")
+    return SO3.from_quaternion_wxyz(np.array([length + z, -y, x, 0.0]) / math.hypot(length + z, x, y))
+
+
+def _lift(parameters: Parameters) -> tuple[float, float, float]:
+    """Acceleration that the thrust has to give at hover."""
+    return -parameters.wind[0], -parameters.wind[1], GRAVITY - parameters.updraft
+
+
+def _single(given: ArrayLike, size: int, what: str) -> Array:
+    """One row, contiguous."""
+    array = np.ascontiguousarray(given, dtype=np.float64)
+    if array.shape != (size,):
+        raise ValueError(f"a quadrotor's {what} has shape ({size},), found {array.shape}")
+    return array
+
+
+def _rows(given: ArrayLike, size: int, what: str) -> Array:
+    array = np.asarray(given, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != size:
+        raise ValueError(f"a quadrotor's {what} have shape (n, {size}), found {array.shape}")
+    return array
+
+
+def _spread(part: Array, moved: Array) -> Array:
+    """One contiguous row per result."""
+    return np.ascontiguousarray(np.broadcast_to(part, (len(moved), part.shape[1])))
+
+
+def _samples(dt: ArrayLike, moved: Array) -> Array:
+    """One sampling time per result."""
+    return np.ascontiguousarray(np.broadcast_to(np.asarray(dt, dtype=np.float64), len(moved)))
+
+
+dynamics = residual(
+    Kernel(
+        quadrotor_dynamics.dynamics,
+        (STATE, CONTROL, STATE, (7,), 0),
+        9,
+        name="quadrotor dynamics",
+        second=quadrotor_second.dynamics,
+    )
+)
+"""``dynamics(x, u, x_next, parameters, dt)``: defects of position [m], attitude [rad] and velocity [m/s], (n, 9).
+
+parameters: (7,) or (n, 7), as :attr:`Parameters.packed` gives them; constants or data. No noise.
+"""
+
+disturbed_dynamics = residual(
+    Kernel(
+        quadrotor_dynamics.disturbed_dynamics,
+        (STATE, CONTROL, NOISE, MASS, DRAG, WIND, UPDRAFT, STATE, 0),
+        9,
+        name="disturbed quadrotor dynamics",
+        second=quadrotor_second.disturbed_dynamics,
+    )
+)
+"""``disturbed_dynamics(x, u, w, mass, drag, wind, updraft, x_next, dt)``: the same defects, (n, 9).
+
+Every argument but dt may be a family, a selection or a constant. The Jacobian has a pole at mass zero: bound a mass
+that is estimated.
+"""

@@ -1,0 +1,106 @@
+"""What the quadrotor senses: bearings and ranges in the ground plane, height, and the vertical."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.errors import GraphError
+from unifg.models import landmarks
+from unifg.models.quadrotor import STATE
+from unifg.solvers import LevenbergMarquardt
+from unifg.typing import Array
+
+MARKS = np.array([[4.0, 1.0], [-2.0, 3.0], [1.0, -5.0], [6.0, 6.0]])
+
+
+def state(position: tuple[float, float, float], roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> Array:
+    return STATE.pack(p=np.array(position), R=fg.SO3.from_rpy(roll, pitch, yaw), v=np.zeros(3))
+
+
+def test_bearing_and_range_by_hand() -> None:
+    seen = landmarks.observe(state((1.0, 2.0, 7.0)), [[2.0, 2.0], [1.0, 5.0], [-3.0, 2.0], [4.0, 6.0]])
+    expected = [[0.0, 1.0], [np.pi / 2, 3.0], [-np.pi, 4.0], [np.arctan2(4.0, 3.0), 5.0]]  # pi is written -pi
+    np.testing.assert_allclose(seen, expected, atol=1e-15)
+
+
+def test_the_bearing_is_measured_from_the_heading() -> None:
+    """Roll, pitch and height do not change what is seen; a turn about the vertical does."""
+    level = landmarks.observe(state((1.0, 0.0, 2.0)), MARKS)
+    banked = landmarks.observe(state((1.0, 0.0, 9.0), 0.7, -0.9, 0.0), MARKS)
+    np.testing.assert_allclose(banked, level, atol=1e-14)
+    turned = landmarks.observe(state((1.0, 0.0, 2.0), 0.7, -0.9, 0.4), MARKS)
+    np.testing.assert_allclose(turned[:, 1], level[:, 1], atol=1e-14)
+    np.testing.assert_allclose(fg.wrap_angle(turned[:, 0] - level[:, 0]), -0.4, atol=1e-14)
+
+
+def test_bearings_are_wrapped() -> None:
+    x, behind = state((0.0, 0.0, 1.0)), np.array([[-1.0, 0.01]])
+    residual = landmarks.bearing_range(x, behind, np.array([-np.pi + 0.01, 1.0]))
+    np.testing.assert_allclose(residual[0, 0], -0.02, atol=1e-5)
+
+
+def test_nothing_to_see() -> None:
+    assert landmarks.observe(state((0.0, 0.0, 1.0)), np.zeros((0, 2))).shape == (0, 2)
+
+
+def test_the_vertical_tells_roll_and_pitch_but_no_heading() -> None:
+    up = np.array([0.0, 0.0, 1.0])
+    for yaw in (0.0, 1.0, 3.0):
+        attitude = fg.SO3.from_rpy(0.2, -0.3, yaw)
+        seen = landmarks.tilt(attitude, np.zeros(3))[0]
+        np.testing.assert_allclose(seen, fg.SO3.to_matrix(attitude).T @ up, atol=1e-15)
+        np.testing.assert_allclose(seen, landmarks.tilt(fg.SO3.from_rpy(0.2, -0.3, 0.0), np.zeros(3))[0], atol=1e-15)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, 1.5, np.pi])
+def test_the_cost_of_a_tilt(angle: float) -> None:
+    """1 - cos of the angle to the vertical: upside down is the worst and no second optimum."""
+    residual = landmarks.tilt(fg.SO3.exp(angle * np.array([0.6, -0.8, 0.0])), np.array([0.0, 0.0, 1.0]))[0]
+    assert 0.5 * residual @ residual == pytest.approx(1.0 - np.cos(angle), abs=1e-14)
+
+
+def test_a_state_is_found_by_what_it_senses() -> None:
+    rng = np.random.default_rng(4)
+    truth = state((0.5, -0.3, 2.0), 0.2, -0.1, 0.8)
+    graph = fg.Graph()
+    x = graph.variables("x", STATE, 1)
+    seen = landmarks.observe(truth, MARKS)
+    here = x[np.zeros(len(MARKS), dtype=int)]
+    graph.minimize(landmarks.bearing_range, here, MARKS, seen, sigma=[0.01, 0.05])
+    graph.minimize(landmarks.height, x.p, 2.0, sigma=0.03)
+    graph.minimize(landmarks.tilt, x.R, landmarks.tilt(truth[3:7], np.zeros(3))[0], sigma=0.01)
+    graph.minimize(fg.prior, x.v, [0.0, 0.0, 0.0], sigma=1.0)
+    start = STATE.retract(
+        truth[None], np.concatenate([rng.normal(size=3), 0.3 * rng.normal(size=3), np.zeros(3)])[None]
+    )
+    solution = LevenbergMarquardt().solve(graph, {x: start})
+    assert solution.converged, solution.report()
+    np.testing.assert_allclose(STATE.local(truth, solution[x][0]), 0.0, atol=1e-7)
+
+
+def test_a_landmark_is_found_where_it_was_seen() -> None:
+    """Landmarks are variables too: three states see one place."""
+    states = np.stack([state((0.0, 0.0, 1.0)), state((1.0, 2.0, 1.5), 0.2, 0.1, 1.0), state((3.0, 0.0, 1.0), yaw=2.0)])
+    graph = fg.Graph()
+    place = graph.variables("landmark", fg.Rn(2), 1)
+    seen = np.concatenate([landmarks.observe(x, MARKS[:1]) for x in states])
+    graph.minimize(landmarks.bearing_range, states, place[np.zeros(3, dtype=int)], seen, sigma=[0.01, 0.05])
+    solution = LevenbergMarquardt().solve(graph, {place: np.array([[3.0, 0.5]])})
+    np.testing.assert_allclose(solution[place], MARKS[:1], atol=1e-7)
+
+
+def test_wrong_shapes_are_refused() -> None:
+    with pytest.raises(GraphError, match="argument 1 has shape"):
+        landmarks.observe(state((0.0, 0.0, 0.0)), np.zeros((3, 3)))
+    with pytest.raises(GraphError, match="argument 0 has shape"):
+        landmarks.observe(np.zeros(9), MARKS)
+    with pytest.raises(GraphError, match="argument 1 has shape"):
+        landmarks.tilt(fg.SO3.identity(), np.zeros(2))
+
+
+def test_what_is_not_a_number_stays_so() -> None:
+    x = state((0.0, 0.0, 1.0))
+    x[0] = np.nan
+    assert np.isnan(landmarks.observe(x, MARKS)).all()
