@@ -135,7 +135,8 @@ def test_wheel_holds_the_packages_and_nothing_else(source: Path, wheel: Path) ->
         "unifg",
         f"unifg-{config()['project']['version']}.dist-info",
     }
-    folders = {f"unifg/{side}": source / side for side in SIDES}
+    outer = [path.parent for side in SIDES for path in (source / side).rglob("__init__.py")]
+    folders = {f"unifg/{folder.relative_to(source).as_posix()}": folder for folder in outer}
     inner = [path.parent for path in (source / "unifg").rglob("__init__.py")]
     folders |= {folder.relative_to(source).as_posix(): folder for folder in inner if folder.name not in SIDES}
     expected = {f"{name}/{path.name}" for name, folder in folders.items() for path in folder.glob("*.py")}
