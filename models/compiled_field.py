@@ -1,10 +1,11 @@
-"""Vector fields F(x, u) on a group, compiled with Numba: for one state at a time, and for batches."""
+"""Vector fields F(x, u, ...) on a group, compiled with Numba: for one state at a time, and for batches."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from types import ModuleType
 
 import numpy as np
@@ -19,51 +20,77 @@ from unifg.typing import Array
 class CompiledField:
     """A field for one state at a time, compiled with Numba; called with arrays it is a batched field.
 
+    What drives the field beside the state, its inputs, may come from several families of variables: controls,
+    disturbances, parameters to be estimated. Compiled code sees them side by side in one vector u.
+
     Attributes:
-        function: ``F(x, u, out)`` writes the (dim,) velocity in the body frame at a state (storage,) under a
-            control (controls,).
+        function: ``F(x, u, out)`` writes the (dim,) velocity in the body frame at a state (storage,) under the inputs
+            (controls,).
         dim: of the group [-].
-        controls: length of a control [-].
+        inputs: length of the control, or of every input in the order in which they lie in u: ``(4, 6, 1)`` for a
+            field F(x, u, w, m) [-].
         derivative: ``dF(x, u, by_x, by_u)`` writes the derivatives (dim, dim) along the right perturbation of x and
             (dim, controls) along u. None: by differences.
     """
 
     function: Callable[[Array, Array, Array], None]
     dim: int
-    controls: int
+    inputs: int | tuple[int, ...]
     derivative: Callable[[Array, Array, Array, Array], None] | None = None
 
-    def __call__(self, x: Array, u: Array) -> Array:
-        """(n, dim) velocities of states (n, storage) and controls (n, controls).
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Of the inputs, in order."""
+        return (self.inputs,) if isinstance(self.inputs, int) else self.inputs
+
+    @property
+    def controls(self) -> int:
+        """Length of u: of all inputs side by side."""
+        return sum(self.lengths)
+
+    def __call__(self, x: Array, *inputs: Array) -> Array:
+        """(n, dim) velocities of states (n, storage) and one (n, length) array per input.
+
+        Arguments with a single row are shared by all.
 
         Raises:
-            ValueError: when the controls have another length.
+            ValueError: when there are fewer or more inputs, or one has another length.
         """
-        x, u = self._rows(x, u)
+        x, u = self._rows(x, inputs)
         velocity = np.empty((len(u), self.dim))
         _velocities(self.function)(x, u, velocity)
         return velocity
 
-    def jacobian(self, x: Array, u: Array) -> list[Array]:
-        """(n, dim, dim) and (n, dim, controls) derivatives.
+    def jacobian(self, x: Array, *inputs: Array) -> list[Array]:
+        """(n, dim, dim) derivatives along x, and (n, dim, length) along every input.
 
         Raises:
-            ValueError: when the field has none, or the controls have another length.
+            ValueError: when the field has none, or the inputs do not fit.
         """
         if self.derivative is None:
             raise ValueError("this compiled field has no derivative: give CompiledField(..., derivative=)")
-        x, u = self._rows(x, u)
+        x, u = self._rows(x, inputs)
         by_x, by_u = np.empty((len(u), self.dim, self.dim)), np.empty((len(u), self.dim, self.controls))
         _derivatives(self.derivative)(x, u, by_x, by_u)
-        return [by_x, by_u]
+        ends = np.cumsum((0, *self.lengths))
+        return [by_x, *(by_u[:, :, start:end] for start, end in pairwise(ends))]
 
-    def _rows(self, x: Array, u: Array) -> tuple[Array, Array]:
-        """Contiguous, as many rows in both."""
-        if np.ndim(u) != 2 or u.shape[1] != self.controls:
-            raise ValueError(f"controls have shape {np.shape(u)}, expected (n, {self.controls})")
-        count = max(len(x), len(u))
-        parts = [np.broadcast_to(np.asarray(a, dtype=np.float64), (count, a.shape[1])) for a in (x, u)]
-        return np.ascontiguousarray(parts[0]), np.ascontiguousarray(parts[1])
+    def _rows(self, x: Array, inputs: Sequence[Array]) -> tuple[Array, Array]:
+        """States and inputs side by side: contiguous, as many rows in both."""
+        if len(inputs) != len(self.lengths):
+            raise ValueError(f"this compiled field takes {len(self.lengths)} inputs, found {len(inputs)}")
+        for place, (given, length) in enumerate(zip(inputs, self.lengths, strict=True)):
+            if np.ndim(given) != 2 or given.shape[1] != length:
+                what = "controls have" if len(inputs) == 1 else f"input {place} has"
+                raise ValueError(f"{what} shape {np.shape(given)}, expected (n, {length})")
+        count = max(len(part) for part in (x, *inputs))
+        u = np.empty((count, self.controls))
+        at = 0
+        for given, length in zip(inputs, self.lengths, strict=True):
+            u[:, at : at + length] = given
+            at += length
+        states = np.broadcast_to(np.asarray(x, dtype=np.float64), (count, x.shape[1]))
+        return np.ascontiguousarray(states), u
 
 
 @cache

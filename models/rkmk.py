@@ -1,211 +1,226 @@
-"""The implicit trapezoid on a Lie group (Ta et al. 2014, section III).
+"""Runge-Kutta-Munthe-Kaas integrators: a motion on a Lie group as conditions on (x_i, u_i, x_{i+1}).
 
-The state obeys x' = x hat(F(x, u)), F in the Lie algebra and trivialised on the left (eq. 9). In the exponential
-coordinates x(t) = x_i Exp(xi(t)) (eq. 10) this is a differential equation in a vector space,
+The state obeys x' = x hat(F(x, u, ...)), F in the Lie algebra and trivialised on the left (Ta et al. 2014, eq. 9). In
+the exponential coordinates x(t) = x_i Exp(xi(t)) (eq. 10) this is a differential equation in a vector space,
 
     xi' = dexp_inv(xi) F(x_i Exp(xi), u),   xi(0) = 0                                             (eq. 15, 17)
 
 with Exp(xi)^-1 Exp(xi + d) = Exp(dexp(xi) d): Ta's dexp is the *right* Jacobian and its inverse is
 I + ad/2 + ad^2/12 - ...; the formula he cites, (4.5) on page 84 of his [12], trivialises on the right and has -ad/2.
-The trapezoid rule with the control held over the step, and eq. 16 for xi, give the two residuals
+Any Runge-Kutta method applied to it gives a step that stays on the group. With the inputs u held, and eq. 16 for xi,
+the defect of a step is xi - h Phi, xi = Log(x_i^-1 x_{i+1}):
 
-    full:        xi - h/2 (F(x_i, u) + dexp_inv(xi) F(x_{i+1}, u))      with xi = Log(x_i^-1 x_{i+1})
-    simplified:  xi - h/2 (F(x_i, u) + F(x_{i+1}, u))
+    explicit Euler         Phi = F(x_i, u)
+    implicit Euler         Phi = F(x_{i+1}, u)
+    implicit midpoint      Phi = F(x_i Exp(xi/2), u)
+    full trapezoid         Phi = 1/2 (F(x_i, u) + dexp_inv(xi) F(x_{i+1}, u))                     (Ta, III-B)
+    simplified trapezoid   Phi = 1/2 (F(x_i, u) + F(x_{i+1}, u))                                  (Ta, III-B)
+    rk4                    the classical tableau of four stages, k = dexp_inv(sigma) F(x_i Exp(sigma), u)
+    hermite-simpson        the trapezoid's two velocities and a third between them, by the rule of Simpson
 
-Both are of second order: dropping dexp_inv changes the step by h^3/8 [F, F'] to leading order, as small as the
-trapezoid's own error. Both are exact where F does not depend on the state.
+dexp_inv drops out of implicit Euler and of the midpoint rule: their single stage stands at sigma = c h k on the line
+of its own velocity k = dexp_inv(sigma) F, and dexp(sigma) k = k because ad(k) k = 0; hence k = F.
+
+The simplified trapezoid changes the step of the full one by h^3/8 [F, F'] to leading order, as small as the
+trapezoid's own error: both are of second order. All methods are exact where F does not depend on the state.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import cache
-from types import ModuleType
+from collections.abc import Sequence
 from typing import Literal, TypeAlias
 
 import numpy as np
 
-from unifg.calls import local_matrix, local_vector, vector
-from unifg.differentiation import FIRST_STEP, jacobian
+from unifg.errors import UnifgError
 from unifg.jit import compiled
-from unifg.kernels import Kernel
+from unifg.kernels import Argument, Kernel
 from unifg.lie import LieGroup, Rn
-from unifg.lie.lookup import functions_of
+from unifg.lie.lookup import bend_of, functions_of
 from unifg.lie.scalar import rn as scalar_rn
-from unifg.models.compiled_field import CompiledField, differences
+from unifg.models.compiled_field import CompiledField
+from unifg.models.rkmk_batch import Field, FieldJacobian, StepDefect
+from unifg.models.rkmk_kernel import rollout_kernel, step_kernel
+from unifg.models.tableau import METHODS, Tableau
 from unifg.residuals import Residual, residual
-from unifg.typing import Array
+from unifg.typing import Array, ArrayLike
 
-Field: TypeAlias = Callable[[Array, Array], Array]
-FieldJacobian: TypeAlias = Callable[[Array, Array], Sequence[Array]]
 Form: TypeAlias = Literal["full", "simplified"]
+Method: TypeAlias = (
+    Literal[
+        "explicit euler",
+        "implicit euler",
+        "implicit midpoint",
+        "full trapezoid",
+        "simplified trapezoid",
+        "rk4",
+        "hermite-simpson",
+    ]
+    | Tableau
+)
+ROOM = 4  # kernels are compiled for multiples of so many stages
+NEWTON_STEPS = 30
+ENOUGH = 1e-13  # of the last Newton step, relative to the state: what rounding leaves
 
 
-class _Trapezoid:
-    def __init__(self, group: LieGroup, field: Field, form: Form, derivative: FieldJacobian | None) -> None:
-        self.group = group
-        self.field = field
-        self.full = form == "full"
-        self.derivative = derivative
+def integrator(
+    group: LieGroup, field: Field, method: Method = "full trapezoid", jacobian: FieldJacobian | None = None
+) -> Residual:
+    """``integrator(group, F)(x, u, x_next, h)``: defect xi - h Phi of one step, (n, dim).
 
-    def __call__(self, x: Array, u: Array, x_next: Array, step: float) -> Array:
-        tangent = self.group.local(x, x_next)
-        ahead = self.field(x_next, u)
-        if self.full:
-            ahead = _times(self.group.right_jacobian_inverse(tangent), ahead)
-        return tangent - 0.5 * step * (self.field(x, u) + ahead)
-
-    def jacobian(self, x: Array, u: Array, x_next: Array, step: float) -> list[Array]:
-        group = self.group
-        tangent = group.local(x, x_next)
-        inverse = group.right_jacobian_inverse(tangent)
-        by_next = inverse  # Log(x^-1 x_next Exp(d)) = xi + dexp_inv(xi) d
-        by_before = -inverse @ group.adjoint(group.between(x_next, x))
-        field_x, field_u = self._field_derivatives(x, u)
-        next_x, next_u = self._field_derivatives(x_next, u)
-        half = 0.5 * step
-        if not self.full:
-            return [by_before - half * field_x, -half * (field_u + next_u), by_next - half * next_x]
-        bend = self._bend(tangent, self.field(x_next, u))
-        return [
-            by_before - half * (field_x + bend @ by_before),
-            -half * (field_u + inverse @ next_u),
-            by_next - half * (bend @ by_next + inverse @ next_x),
-        ]
-
-    def _field_derivatives(self, x: Array, u: Array) -> Sequence[Array]:
-        if self.derivative is not None:
-            return self.derivative(x, u)
-        return jacobian(self.field, [x, u], [self.group, Rn(u.shape[1])])
-
-    def _bend(self, tangent: Array, velocity: Array) -> Array:
-        """(n, dim, dim) derivative of dexp_inv(xi) v along xi, by central differences of the closed form."""
-        columns = []
-        for direction in FIRST_STEP * np.eye(self.group.dim):
-            ahead = self.group.right_jacobian_inverse(tangent + direction)
-            behind = self.group.right_jacobian_inverse(tangent - direction)
-            columns.append(_times(ahead - behind, velocity) / (2.0 * FIRST_STEP))
-        return np.stack(columns, axis=-1)
-
-
-def _times(matrices: Array, vectors: Array) -> Array:
-    """(n, d) products of (n, d, d) matrices and (n, d) vectors."""
-    product: Array = np.einsum("nij,nj->ni", matrices, vectors)
-    return product
-
-
-def trapezoid(group: LieGroup, field: Field, form: Form = "full", jacobian: FieldJacobian | None = None) -> Residual:
-    """``trapezoid(group, F)(x, u, x_next, h)``: defect of one implicit step, (n, dim).
-
-    Use it with ``constrain(..., lower=0, upper=0)`` or, soft, with ``minimize``.
+    Use it with ``constrain(..., lower=0, upper=0)`` or, soft, with ``minimize``. A field of several inputs,
+    F(x, u, w, m), makes ``(x, u, w, m, x_next, h)``; each input is a variable on ``Rn`` (a family of length 1 is shared
+    by all steps), or data. The step h [s] is one number or one for each factor; a duration to be found is an input:
+    F(x, u, T) = T f(x, u), with h in parts of T.
 
     Args:
         group: of the states x and x_next, (n, storage).
-        field: F(x, u), velocities in the body frame, (n, dim), for states (n, storage) and controls (n, k). A
+        field: F(x, u, ...), velocities in the body frame, (n, dim), for states (n, storage) and inputs (n, k). A
             :class:`CompiledField` makes the residual a kernel, where the group has compiled functions too.
+        method: its name, or a :class:`Tableau` of your own.
+        jacobian: (n, dim, dim) and, for each input, (n, dim, k) derivatives of F along the right perturbation of x and
+            along the input; by differences when absent. A compiled field brings its own.
+
+    Raises:
+        ValueError: on an unknown method, or a compiled field whose dimension is not that of the group.
+    """
+    tableau = _tableau(method)
+    if isinstance(field, CompiledField):
+        if field.dim != group.dim:
+            raise ValueError(f"{tableau.name}: the field has {field.dim} velocities, {group.name} takes {group.dim}")
+        functions, bend = scalar_rn if isinstance(group, Rn) else functions_of(group), bend_of(group)
+        if functions is not None and bend is not None and jacobian in (None, field.jacobian):
+            kernel = step_kernel(functions, bend, field, group.storage, ROOM * -(-tableau.stages // ROOM))
+            arguments: tuple[Argument, ...] = (group, *(Rn(length) for length in field.lengths), group, 0)
+            return residual(Kernel(kernel, arguments, group.dim, tableau.rows, tableau.name))
+        jacobian = jacobian or (field.jacobian if field.derivative is not None else None)
+    function = StepDefect(group, field, tableau, jacobian)
+    return residual(function, function.jacobian, tableau.name)
+
+
+def trapezoid(group: LieGroup, field: Field, form: Form = "full", jacobian: FieldJacobian | None = None) -> Residual:
+    """``trapezoid(group, F)(x, u, x_next, h)``: :func:`integrator` with one of Ta's two trapezoids.
+
+    Args:
+        group: as there.
+        field: as there.
         form: "full" with dexp_inv, "simplified" without; both of second order in the step h [s].
-        jacobian: (n, dim, dim) and (n, dim, k) derivatives of F along the right perturbation of x and along u;
-            by differences when absent. A compiled field brings its own.
+        jacobian: as there.
 
     Raises:
         ValueError: on an unknown form, or a compiled field whose dimension is not that of the group.
     """
-    if form not in ("full", "simplified"):
-        raise ValueError(f"trapezoid: form must be 'full' or 'simplified', found {form!r}")
-    name = f"{form} trapezoid"
-    if isinstance(field, CompiledField):
-        if field.dim != group.dim:
-            raise ValueError(f"trapezoid: the field has {field.dim} velocities, {group.name} takes {group.dim}")
-        functions = scalar_rn if isinstance(group, Rn) else functions_of(group)
-        if functions is not None and jacobian in (None, field.jacobian):
-            kernel = _kernel(functions, field, group.storage, form == "full")
-            return residual(Kernel(kernel, (group, Rn(field.controls), group, 0), group.dim, name=name))
-        jacobian = jacobian or (field.jacobian if field.derivative is not None else None)
-    function = _Trapezoid(group, field, form, jacobian)
-    return residual(function, function.jacobian, name)
+    if form == "full":
+        return integrator(group, field, "full trapezoid", jacobian)
+    if form == "simplified":
+        return integrator(group, field, "simplified trapezoid", jacobian)
+    raise ValueError(f"trapezoid: form must be 'full' or 'simplified', found {form!r}")
 
 
-# ---------------------------------------------------------------- compiled
+def _tableau(method: Method) -> Tableau:
+    if isinstance(method, Tableau):
+        return method
+    try:
+        return METHODS[method]
+    except KeyError:
+        known = ", ".join(f"'{name}'" for name in METHODS)
+        raise ValueError(f"method must be a Tableau or one of {known}; found {method!r}") from None
 
 
-@compiled
-def _add_product(first: Array, second: Array, scale: float, out: Array, column: int) -> None:
-    """Add ``scale`` times a product to the columns of ``out`` from ``column`` on."""
-    for i in range(len(out)):
-        for j in range(len(second)):
-            factor = scale * first[i, j]
-            for k in range(second.shape[1]):
-                out[i, column + k] += factor * second[j, k]
+# ---------------------------------------------------------------- simulation
 
 
-@cache
-def _kernel(functions: ModuleType, field: CompiledField, storage: int, full: bool) -> Callable[..., None]:
-    """Write the defect of a step, ``xi - h/2 (F + W F')``, and its derivatives; W is dexp_inv(xi) or I."""
-    local, between, adjoint = functions.local, functions.between, functions.adjoint
-    inverse_jacobian, unit = functions.right_jacobian_inverse, scalar_rn.unit
-    velocity, dim, controls, step = field.function, field.dim, field.controls, FIRST_STEP
-    derivative = field.derivative or differences(field, functions, storage)
+def advance(group: LieGroup, field: Field, x: Array, *inputs: Array, h: ArrayLike, method: Method = "rk4") -> Array:
+    """One step of every state, (n, storage): the x_next at which the defect of :func:`integrator` vanishes.
 
-    @compiled
-    def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-        x, u, after = vector(v, 0, storage), vector(v, storage, controls), vector(v, storage + controls, storage)
-        tangent, here, ahead = local_vector(dim), local_vector(dim), local_vector(dim)
-        weight = local_matrix(dim, dim)
-        half = 0.5 * p[0]
-        local(x, after, tangent)
-        velocity(x, u, here)
-        velocity(after, u, ahead)
-        if full:
-            inverse_jacobian(tangent, weight)
-        else:
-            unit(weight)
-        for i in range(dim):
-            total = here[i]
-            for j in range(dim):
-                total += weight[i, j] * ahead[j]
-            r[i] = tangent[i] - half * total
-        if len(J) == 0:
-            return
+    Explicit methods take it directly, implicit ones by Newton's method from a step of explicit Euler.
 
-        by_x, by_u, inverse = local_matrix(dim, dim), local_matrix(dim, controls), local_matrix(dim, dim)
-        by_tangent, by_next, transport = local_matrix(dim, dim), local_matrix(dim, dim), local_matrix(dim, dim)
-        unit(by_tangent)
-        if full:  # the derivative of W F' along xi, by differences of the closed form
-            for d in range(dim):
-                held = tangent[d]
-                tangent[d] = held + step
-                inverse_jacobian(tangent, by_x)
-                tangent[d] = held - step
-                inverse_jacobian(tangent, inverse)
-                tangent[d] = held
-                for i in range(dim):
-                    bend = 0.0
-                    for j in range(dim):
-                        bend += (by_x[i, j] - inverse[i, j]) * ahead[j]
-                    by_tangent[i, d] -= half * bend / (2.0 * step)
-        inverse_jacobian(tangent, inverse)
-        pose = local_vector(storage)
-        between(after, x, pose)
-        adjoint(pose, transport)
-        for i in range(dim):
-            for k in range(dim):
-                by_next[i, k] = 0.0
-            for k in range(2 * dim + controls):
-                J[i, k] = 0.0
-        _add_product(by_tangent, inverse, 1.0, by_next, 0)  # Log(x^-1 x_next Exp(d)) = xi + dexp_inv(xi) d
-        _add_product(by_next, transport, -1.0, J, 0)
-        derivative(after, u, by_x, by_u)
-        _add_product(weight, by_u, -half, J, dim)
-        _add_product(weight, by_x, -half, J, dim + controls)
-        derivative(x, u, by_x, by_u)
-        for i in range(dim):
-            for k in range(dim):
-                J[i, k] -= half * by_x[i, k]
-                J[i, dim + controls + k] += by_next[i, k]
-            for k in range(controls):
-                J[i, dim + k] -= half * by_u[i, k]
+    Args:
+        group: of the states.
+        field: F(x, u, ...).
+        x: states (n, storage).
+        inputs: (n, k) or (1, k) each, held over the step.
+        h: step [s], one or (n,).
+        method: as for :func:`integrator`.
 
-    return kernel
+    Raises:
+        UnifgError: when Newton's method does not converge: the step is too long.
+        ValueError: on an unknown method, or a field or inputs that do not fit.
+    """
+    return _advance(group, integrator(group, field, method), _tableau(method), x, inputs, h)
+
+
+def rollout(
+    group: LieGroup,
+    field: Field,
+    start: ArrayLike,
+    *inputs: ArrayLike,
+    h: float,
+    method: Method = "rk4",
+    count: int | None = None,
+    substeps: int = 1,
+) -> Array:
+    """States reached from ``start`` under inputs, (n + 1, storage).
+
+    Args:
+        group: of the states.
+        field: F(x, u, ...).
+        start: (storage,).
+        inputs: (n, k) each, held over a step; (k,) or (1, k) when held over all of them.
+        h: step [s].
+        method: as for :func:`integrator`.
+        count: n, needed only when no input tells it.
+        substeps: steps of the method, of length h / substeps, for each row of the inputs.
+
+    Raises:
+        UnifgError: when Newton's method does not converge in a step of an implicit method.
+        ValueError: on an unknown method, or a field or inputs that do not fit.
+    """
+    tableau, defect = _tableau(method), integrator(group, field, method)
+    parts = [np.atleast_2d(np.asarray(part, dtype=np.float64)) for part in inputs]
+    count = max([len(part) for part in parts], default=1) if count is None else count
+    parts = [np.broadcast_to(part, (count, part.shape[1])) for part in parts]
+    states = np.empty((count + 1, group.storage))
+    states[0] = start
+    functions = scalar_rn if isinstance(group, Rn) else functions_of(group)
+    if isinstance(field, CompiledField) and tableau.explicit and functions is not None and defect.kernel is not None:
+        u = np.concatenate([*parts, np.empty((count, 0))], axis=1)
+        if u.shape[1] != field.controls:
+            raise ValueError(f"the inputs have {u.shape[1]} numbers, the field takes {field.controls}")
+        loop = rollout_kernel(defect.kernel.function, functions, group.storage, group.dim)
+        loop(states[0].copy(), h / substeps, defect.kernel.table, u, substeps, states)
+        return states
+    for n in range(count):
+        x, held = states[n : n + 1], [part[n : n + 1] for part in parts]
+        for _ in range(substeps):
+            x = _advance(group, defect, tableau, x, held, h / substeps)
+        states[n + 1] = x[0]
+    return states
+
+
+def _advance(
+    group: LieGroup, defect: Residual, tableau: Tableau, x: Array, inputs: Sequence[Array], h: ArrayLike
+) -> Array:
+    """Solve for the end of the step; from x to itself an explicit defect is -h Phi."""
+    count = max(len(part) for part in (x, *inputs))
+    x = np.array(np.broadcast_to(x, (count, x.shape[1])), dtype=np.float64)
+    if tableau.explicit:
+        return group.retract(x, -defect(x, *inputs, x, h))
+    assert defect.jacobian is not None
+    after, value = x, defect(x, *inputs, x, h)
+    for _ in range(NEWTON_STEPS):
+        move = np.linalg.solve(defect.jacobian(x, *inputs, after, h)[-1], value[:, :, None])[:, :, 0]
+        after = group.retract(after, -move)
+        value = defect(x, *inputs, after, h)
+        if np.abs(move).max() <= ENOUGH * (1.0 + np.abs(x).max()):
+            return after
+    raise UnifgError(
+        f"{tableau.name}: Newton's method found no end of a step of {np.max(h):g} s, the defect is "
+        f"{np.abs(value).max():.1e}; take shorter steps"
+    )
+
+
+# ---------------------------------------------------------------- the unicycle
 
 
 @compiled

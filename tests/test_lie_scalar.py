@@ -15,12 +15,22 @@ from numpy.random import Generator
 
 from groups import PI
 from unifg.errors import UnifgError
-from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Rn
+from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Product, Rn
 from unifg.lie.batch import over_one, over_two
-from unifg.lie.scalar import rn, se2, se3, series, so2, so3
+from unifg.lie.lookup import bend_of, functions_of
+from unifg.lie.scalar import bend, rn, se2, se3, series, so2, so3
 from unifg.typing import Array
 
 PAIRS: list[tuple[LieGroup, ModuleType]] = [(Rn(3), rn), (SO2, so2), (SE2, se2), (SO3, so3), (SE3, se3)]
+PARTS: list[LieGroup] = [
+    Product(p=Rn(3), R=SO3, v=Rn(3)),
+    Product(turn=SO2),
+    Product(inner=Product(x=SE2, y=Rn(1)), outer=Product(deep=Product(z=SE3), r=SO2)),
+]
+for composite in PARTS:
+    found = functions_of(composite)
+    assert found is not None
+    PAIRS.append((composite, found))
 EVERY = pytest.mark.parametrize(("group", "functions"), PAIRS, ids=[str(group) for group, _ in PAIRS])
 ROUNDING = 4e-16  # a call of its own and one inside a loop may fuse products and sums differently
 
@@ -45,6 +55,9 @@ NAMES += ["right_jacobian", "right_jacobian_inverse", "left_jacobian", "left_jac
 @EVERY
 @pytest.mark.parametrize("name", NAMES)
 def test_one_element_and_a_batch_agree(group: LieGroup, functions: ModuleType, name: str, rng: Generator) -> None:
+    if isinstance(group, Product) and name in ("act", "matrix") and len(group.components) > 1:
+        assert not hasattr(functions, name)  # nothing compiled moves points by a product
+        return
     given = arguments(group, name, rng)
     expected = getattr(group, name)(*given)
     function = getattr(functions, name)
@@ -62,6 +75,8 @@ def test_one_element_and_a_batch_agree(group: LieGroup, functions: ModuleType, n
 def test_a_result_may_take_the_place_of_an_argument(
     group: LieGroup, functions: ModuleType, name: str, rng: Generator
 ) -> None:
+    if isinstance(group, Product) and name == "act":
+        return
     given = arguments(group, name, rng)
     function = getattr(functions, name)
     for position in range(len(given)):
@@ -71,6 +86,27 @@ def test_a_result_may_take_the_place_of_an_argument(
         if one[position].shape == out.shape:
             function(*one, one[position])
             np.testing.assert_array_equal(one[position], out)
+
+
+class Unknown(type(SO2)):  # type: ignore[misc]
+    """A group that has batched methods only."""
+
+
+def test_functions_of_products() -> None:
+    assert functions_of(Product(a=SE2, b=Rn(2))) is functions_of(Product(a=SE2, b=Rn(2)))
+    assert functions_of(Product(a=SO2, b=Rn(1))) is not functions_of(Product(a=Rn(1), b=SO2))
+    assert functions_of(Unknown()) is None and functions_of(Product(a=SE2, b=Product(c=Unknown()))) is None
+    assert functions_of(SE3) is se3 and functions_of(Rn(2)) is None
+    assert bend_of(Product(a=SE2, b=Unknown())) is None and bend_of(SE3) is bend.se3 and bend_of(Rn(2)) is bend.none
+
+
+def test_products_of_the_same_parts_in_another_order_are_not_confused() -> None:
+    """They have callees of the same names, which is what the cache on disk goes by."""
+    for group in (Product(a=SO2, b=Rn(1)), Product(a=Rn(1), b=SO2)):
+        functions, out = functions_of(group), np.empty(2)
+        assert functions is not None
+        functions.retract(np.array([3.0, 3.0]), np.array([1.0, 1.0]), out)
+        np.testing.assert_array_equal(out, group.retract([3.0, 3.0], [1.0, 1.0]))
 
 
 # -- batches --
@@ -170,6 +206,10 @@ def test_functions_of_an_angle(theta: float) -> None:
         assert abs(value - desired) * weight < 1e-15
         if t < series.SERIES_BELOW:
             assert value == pytest.approx(desired, rel=1e-15, abs=0.0)
+    value, desired = bend.k_curve(t, g, series.k_slope(t, g)), total(slope(slope(K)), square)
+    assert abs(value - desired) * (1.0 if t < series.SERIES_BELOW else theta**4) < 1e-14
+    if t < series.SERIES_BELOW:
+        assert value == pytest.approx(desired, rel=2e-14, abs=0.0)
 
 
 def test_halves(rng: Generator) -> None:

@@ -17,6 +17,7 @@ from unifg.errors import BackendError, FileFormatError, GraphError, NotConverged
 from unifg.factors import ManifoldResidual, between, difference, prior
 from unifg.graph import Graph
 from unifg.history import Iteration
+from unifg.joint_prior import joint_prior
 from unifg.kkt import Optimality, optimality
 from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Manifold, Product, Rn, wrap_angle
 from unifg.residuals import Residual, residual
@@ -74,6 +75,7 @@ __all__ = [
     "UnifgError",
     "between",
     "difference",
+    "joint_prior",
     "optimality",
     "prior",
     "residual",

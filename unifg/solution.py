@@ -13,7 +13,7 @@ from unifg.errors import GraphError
 from unifg.history import HEADER, Iteration, line
 from unifg.kkt import Optimality
 from unifg.linearization import Linearization
-from unifg.marginal import information, marginal_prior
+from unifg.marginal import Variables, information, marginal_prior
 from unifg.program import Program
 from unifg.status import Status
 from unifg.typing import Array, BoolArray, IntArray
@@ -187,12 +187,14 @@ class Solution:
         columns = np.concatenate([self._program.columns.of(as_selection(v)).ravel() for v in variables])
         return information(self._program, self._lin, terms, columns)[0]
 
-    def marginal_prior(self, terms: Sequence[str], remove: Variable, keep: Variable) -> tuple[Array, Array]:
-        """Reference and information of a prior that replaces variables leaving a window.
+    def marginal_prior(self, terms: Sequence[str], remove: Variables, keep: Variables) -> tuple[Array, Array]:
+        """Reference (1, S) and information (D, D) of a prior that replaces variables leaving a window.
 
-        Only the named costs that touch ``remove`` are marginalised, at this solution's linearisation point.
+        Only the named costs and equality constraints that touch ``remove`` are marginalised, at this solution's
+        linearisation point. ``keep`` is one selection, for ``fg.prior``, or several, for ``fg.joint_prior``; details
+        and errors in :func:`unifg.marginal.marginal_prior`.
         """
-        return marginal_prior(self._program, self._lin, terms, remove, keep)
+        return marginal_prior(self._program, self._lin, terms, remove, keep, self._equality)
 
     def report(self) -> str:
         """The status sentence with the numbers behind it."""

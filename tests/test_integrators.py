@@ -1,0 +1,200 @@
+"""Every integrator on every group: order, exactness, derivatives."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import cast
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from moving import FLYER, Carried, compiled_carried, drag_and_thrust, with_held_rate
+from unifg.differentiation import jacobian
+from unifg.lie.lookup import bend_of
+from unifg.models import rkmk
+from unifg.models.rkmk import Method
+from unifg.models.rkmk_batch import StepDefect
+from unifg.models.tableau import METHODS, Tableau
+from unifg.typing import Array
+
+RNG = np.random.default_rng(3)
+GROUPS: list[fg.LieGroup] = [fg.SE2, fg.SO3, fg.SE3, fg.Product(X=fg.SE3, p=fg.Rn(2), R=fg.SO3)]
+NAMES = cast(list[Method], list(METHODS))
+HEUN = Tableau("heun", 2, (0.5, 0.5), ((), (1.0,)))
+EVERY_GROUP = pytest.mark.parametrize("group", GROUPS, ids=lambda g: g.name)
+EVERY_METHOD = pytest.mark.parametrize("method", NAMES)
+
+
+# ---------------------------------------------------------------- the methods
+
+
+@EVERY_METHOD
+@EVERY_GROUP
+def test_order_of_convergence(group: fg.LieGroup, method: Method) -> None:
+    """Against the exact motion, at steps that halve."""
+    field, order = compiled_carried(group, True), METHODS[cast(str, method)].order
+    rng = np.random.default_rng(5)
+    x, u, w = group.random(rng), rng.uniform(-0.9, 0.9, group.dim), rng.uniform(-0.9, 0.9, group.dim)
+    exact = Carried(group).after(x[None], u[None], w[None], 0.3)[0]
+    errors = []
+    for steps in (8, 16, 32):
+        states = rkmk.rollout(group, field, x, u, w, h=0.3 / steps, method=method, count=steps)
+        errors.append(float(np.linalg.norm(group.local(exact, states[-1]))))
+    orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+    assert abs(orders[-1] - order) < 0.06, (orders, errors)
+    assert abs(orders[-1] - order) <= abs(orders[0] - order) + 0.01
+
+
+FLIGHT = (
+    FLYER.pack(p=[0, 0, 0], R=fg.SO3.exp([0.3, -0.2, 0.5]), v=[1.0, 0.5, -0.3]),
+    np.array([0.6, -0.4, 0.8, 9.0]),
+)
+
+
+@cache
+def flown() -> Array:
+    end: Array = rkmk.rollout(FLYER, drag_and_thrust, *FLIGHT, h=0.4, count=1, substeps=512)[-1]
+    return end
+
+
+@EVERY_METHOD
+def test_order_on_position_attitude_velocity(method: Method) -> None:
+    """The state of a flying robot, against rk4 at a sixteenth of the finest step."""
+    order, errors = METHODS[cast(str, method)].order, []
+    for steps in (8, 16, 32):
+        states = rkmk.rollout(FLYER, drag_and_thrust, *FLIGHT, h=0.4, method=method, count=1, substeps=steps)
+        errors.append(float(np.linalg.norm(FLYER.local(flown(), states[-1]))))
+    orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+    assert abs(orders[-1] - order) < 0.06, (orders, errors)
+
+
+@pytest.mark.parametrize("group", [*GROUPS, fg.SO2, fg.Rn(3)], ids=lambda g: g.name)
+@pytest.mark.parametrize("method", [*NAMES, HEUN], ids=str)
+def test_exact_where_the_field_does_not_depend_on_the_state(group: fg.LieGroup, method: Method) -> None:
+    x, u, h = group.random(RNG, (50,)), RNG.normal(size=(50, group.dim)), 0.4
+    defect = rkmk.integrator(group, lambda x, u: u, method)
+    assert np.abs(defect(x, u, group.retract(x, h * u), h)).max() < 1e-14
+    np.testing.assert_allclose(
+        rkmk.advance(group, lambda x, u: u, x, u, h=h, method=method), group.retract(x, h * u), atol=1e-13
+    )
+
+
+@EVERY_GROUP
+def test_dexp_inv_drops_out_of_single_stages(group: fg.LieGroup) -> None:
+    """Implicit Euler and the midpoint rule written with dexp_inv have the same solution; the trapezoid has not."""
+    field, x = Carried(group), group.random(RNG, (4,))
+    u, w = RNG.normal(size=(2, 4, group.dim))
+
+    def gap(name: str) -> float:
+        bent = Tableau("bent", 1, METHODS[name].weights, METHODS[name].matrix, METHODS[name].ends)
+        ends = [rkmk.advance(group, field, x, u, w, h=0.2, method=m) for m in (METHODS[name], bent)]
+        return float(np.abs(group.local(*ends)).max())
+
+    assert gap("implicit euler") < 1e-13 and gap("implicit midpoint") < 1e-13
+    assert gap("simplified trapezoid") > 1e-5
+
+
+def test_a_held_body_rate_makes_the_trapezoids_one() -> None:
+    """For {p, R, v} with R' = R hat(omega), omega held: xi = h omega there, and dexp_inv(xi) omega = omega."""
+    x, u, h = FLYER.random(RNG, (20,)), RNG.normal(size=(20, 4)), 0.3
+    full, simplified = (
+        rkmk.advance(FLYER, with_held_rate, x, u, h=h, method=m) for m in ("full trapezoid", "simplified trapezoid")
+    )
+    assert np.abs(FLYER.local(full, simplified)).max() < 1e-13
+    rotations = [x[:, 3:7], full[:, 3:7]]
+    np.testing.assert_allclose(fg.SO3.local(*rotations), h * u[:, :3], atol=1e-13)
+    full, simplified = (
+        rkmk.advance(FLYER, drag_and_thrust, x, u, h=h, method=m) for m in ("full trapezoid", "simplified trapezoid")
+    )
+    assert np.abs(FLYER.local(full, simplified)).max() > 1e-5
+
+
+@pytest.mark.parametrize("method", ["explicit euler", "rk4"])
+@pytest.mark.parametrize("group", [fg.SO3, fg.SE3, GROUPS[3]], ids=lambda g: g.name)
+def test_a_long_way_stays_on_the_group(group: fg.LieGroup, method: Method) -> None:
+    field, turns = compiled_carried(group, True), 50_000
+    u, w = np.full(group.dim, 0.3), np.linspace(-0.5, 0.5, group.dim)
+    states = rkmk.rollout(group, field, group.random(RNG), u, w, h=0.05, method=method, count=turns)
+    assert states.shape == (turns + 1, group.storage)
+    for part, at in {"SO3": [("q", 0)], "SE3": [("q", 3)]}.get(group.name, [("X", 3), ("R", 9)]):
+        norms = np.linalg.norm(states[:, at : at + 4], axis=1)
+        assert np.abs(norms - 1.0).max() < 5e-15, part
+    rotations = fg.SO3.matrix(states[:, -4:] if group.name != "SE3" else states[:, 3:])
+    assert np.abs(np.einsum("nji,njk->nik", rotations, rotations) - np.eye(3)).max() < 2e-14
+
+
+# ---------------------------------------------------------------- derivatives
+
+
+def step_of(group: fg.LieGroup, count: int = 6) -> tuple[list[Array], list[fg.Manifold]]:
+    x = group.random(RNG, (count,))
+    u, w = RNG.normal(size=(2, count, group.dim))
+    after = group.retract(x, 0.6 * RNG.normal(size=(count, group.dim)))
+    return [x, u, w, after], [group, fg.Rn(group.dim), fg.Rn(group.dim), group]
+
+
+@pytest.mark.parametrize("method", [*NAMES, HEUN], ids=str)
+@EVERY_GROUP
+def test_jacobians(group: fg.LieGroup, method: Method) -> None:
+    """In NumPy and compiled, with and without the derivatives of F: against differences of the defect."""
+    points, manifolds = step_of(group)
+    field = Carried(group)
+    cases = {
+        "batched, differences": rkmk.integrator(group, field, method),
+        "batched": rkmk.integrator(group, field, method, field.derivative),
+        "compiled, differences": rkmk.integrator(group, compiled_carried(group, False), method),
+        "compiled": rkmk.integrator(group, compiled_carried(group, True), method),
+    }
+    exact = cases["batched"]
+    numerical = jacobian(lambda *p: exact(*p, 0.3), points, manifolds)
+    assert exact.jacobian is not None
+    blocks = exact.jacobian(*points, 0.3)
+    for case, defect in cases.items():
+        assert (defect.kernel is not None) == case.startswith("compiled")
+        assert defect.jacobian is not None
+        np.testing.assert_allclose(defect(*points, 0.3), exact(*points, 0.3), atol=1e-14 * 30, err_msg=case)
+        for block, found, reference in zip(defect.jacobian(*points, 0.3), blocks, numerical, strict=True):
+            np.testing.assert_allclose(block, reference, atol=1e-8, err_msg=case)
+            np.testing.assert_allclose(block, found, atol=1e-9 if "differences" in case else 1e-11, err_msg=case)
+
+
+@pytest.mark.parametrize("group", [*GROUPS, fg.SO2, fg.Rn(2)], ids=lambda g: g.name)
+def test_the_bend_of_dexp_inv(group: fg.LieGroup) -> None:
+    """In closed form, against differences of fourth order; on both sides of where series take over."""
+    bend = bend_of(group)
+    assert bend is not None
+    differences = StepDefect(group, Carried(group), METHODS["rk4"], None)
+    for length in (0.0, 1e-3, 0.49, 0.51, 1.0, 3.0):
+        tangent, velocity, found = RNG.normal(size=group.dim), RNG.normal(size=group.dim), np.empty((group.dim,) * 2)
+        if group in (fg.SE2, fg.SO3, fg.SE3):
+            turn = tangent[2:] if group == fg.SE2 else tangent[-3:]
+            turn *= length / np.linalg.norm(turn)
+        bend(tangent, velocity, found)
+        np.testing.assert_allclose(found, differences._bend(tangent[None], velocity[None])[0], atol=2e-12)
+
+
+def test_the_bend_is_in_the_algebra_over_dual_numbers() -> None:
+    """se(3) is so(3) over dual numbers, so dexp_inv there holds the derivative of dexp_inv here."""
+    bend, found = bend_of(fg.SO3), np.empty((3, 3))
+    assert bend is not None
+    for length in (0.0, 1e-3, 1.0, 3.0):
+        omega, velocity = length * np.array([0.6, -0.64, 0.48]), RNG.normal(size=3)
+        bend(omega, velocity, found)
+        blocks = [fg.SE3.right_jacobian_inverse([*direction, *omega])[:3, 3:] for direction in np.eye(3)]
+        np.testing.assert_allclose(found, np.stack([block @ velocity for block in blocks], axis=1), atol=2e-15)
+
+
+def test_steps_may_differ_and_inputs_be_shared() -> None:
+    group, field = fg.SE3, Carried(fg.SE3)
+    (x, u, w, after), _ = step_of(group)
+    h = RNG.uniform(0.1, 0.4, len(x))
+    for defect in (rkmk.integrator(group, field, "rk4"), rkmk.integrator(group, compiled_carried(group, True), "rk4")):
+        assert defect.jacobian is not None
+        together, blocks = defect(x, u, w[:1], after, h), defect.jacobian(x, u, w[:1], after, h)
+        for i in range(len(x)):
+            one = [part[i : i + 1] for part in (x, u)]
+            alone = defect(*one, w[:1], after[i : i + 1], float(h[i]))
+            np.testing.assert_allclose(together[i], alone[0], atol=1e-15)
+            for block, single in zip(blocks, defect.jacobian(*one, w[:1], after[i : i + 1], float(h[i])), strict=True):
+                np.testing.assert_allclose(block[i], single[0], atol=1e-14)
