@@ -1,0 +1,399 @@
+"""Pictures and numbers of flights: what is in the files, read back without a browser."""
+
+import base64
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from unifg.errors import ScenarioError
+from unifg.lie import SO3
+from unifg.scenarios.palette import css
+from unifg.scenarios.quadrotor import drone, results
+from unifg.scenarios.quadrotor.flight_log import FlightLog, FlightRecorder
+from unifg.scenarios.quadrotor.layouts import Layout
+from unifg.scenarios.quadrotor.metrics import flight_metrics, landmark_errors
+from unifg.scenarios.quadrotor.plots import moments, overview, plot_moment, write_overview
+from unifg.scenarios.quadrotor.plots_control import control
+from unifg.scenarios.quadrotor.plots_estimates import estimates
+from unifg.scenarios.quadrotor.results import summary, write_results
+from unifg.scenarios.quadrotor.scene import first_sights, frame_ticks, record_scene, scene_html
+from unifg.scenarios.recorder import viewer_script
+
+umsgpack = pytest.importorskip("umsgpack")
+
+DT, HORIZON = 0.05, 20
+OFFSET = np.array([0.03, 0.0, 0.04])  # of the believed position [m]
+SHIFT = np.array([0.06, 0.08])  # of the believed landmarks [m]
+Tracks = dict[str, dict[str, list[tuple[int, Any]]]]
+
+
+def layout() -> Layout:
+    cylinders = [[3.0, 1.0, 0.4], [6.0, -1.0, 0.5], [9.5, 2.0, 0.3]]
+    walls = [[[0.0, 3.0], [12.0, 3.0]], [[0.0, -3.0], [12.0, -3.0]]]
+    start, target = np.array([[0.5, 0.0, 1.5], [11.5, 0.0, 1.5]])
+    size = np.array([[0.0, -3.0], [12.0, 3.0]])
+    return Layout(start, target, np.array(cylinders), np.array(walls), size, "made up 7")
+
+
+def flight(ticks: int = 24, *, estimated: bool = True, movers: int = 1, reached: bool = True) -> FlightLog:
+    """A swerve to the target that leans into its turns; constant errors of known size; cylinder 2 is never seen."""
+    things, settings = layout(), {"scenario": "quadrotor-mpc", "solver": "ipm", "coupling": "sequential", "seed": 7}
+    limits = {"rate_limits": [4.0, 4.0, 2.0], "thrust_limits": [2.0, 20.0]}
+    true = np.array([1.0, 0.1, 0.1, 0.2, 0.3, -0.1, 0.0])
+    recorder = FlightRecorder(things, {**settings, "controller": limits}, DT, true)
+    share = np.linspace(0.0, 1.0, max(ticks, 2))
+
+    def place(s: float) -> list[float]:
+        return [0.5 + 11.0 * s, math.sin(2.0 * math.pi * s), 1.5 + 0.3 * math.sin(math.pi * s)]
+
+    way = np.array([place(float(s)) for s in share])
+    for k in range(ticks):
+        lean = SO3.exp(np.array([0.3 * math.cos(2.0 * math.pi * share[k]), 0.1, 0.2]))
+        truth = np.concatenate([way[k], lean, [2.0, 0.0, 0.0]])
+        believed = truth + np.concatenate([OFFSET, np.zeros(7)]) if estimated else truth
+        ids = np.array([] if not estimated else [0] if k < 10 else [0, 1], dtype=np.intp)
+        covariance = np.diag([0.04, 0.01]) / (1.0 + k)
+        mass = 1.05 - 0.05 * min(1.0, 2.0 * share[k])
+        ahead = np.array([place(float(share[k] + 0.15 * j / HORIZON)) for j in range(HORIZON + 1)])
+        recorder.add(
+            truth=truth,
+            believed=believed,
+            believed_sigma=np.full(9, 0.025) if estimated else np.zeros(9),
+            control=[0.1, -0.2, 0.0, 9.81 + 0.1 * k],
+            plan=ahead,
+            past=way[max(0, k - 9) : k + 1] + OFFSET if estimated else np.zeros((0, 3)),
+            landmarks=(
+                ids,
+                things.cylinders[ids, :2] + SHIFT,
+                np.tile(covariance, (len(ids), 1, 1)),
+                [0.4, 0.5][: len(ids)],
+            ),
+            parameters=np.concatenate([[mass], true[1:]]) if estimated else true,
+            parameters_sigma=np.array([0.02, 0.1, 0.1, 0.1, 0.1, 0.1, 0.0]) if estimated else np.zeros(7),
+            seen=ids,
+            movers=[[8.0 + 0.01 * k, -2.0, 0.4]] * movers,
+            estimate_ms=5.0 if estimated else 0.0,
+            plan_ms=7.0 + k if estimated else 0.0,
+            status="converged",
+            clearance=1.0 + 0.01 * (k - 12) ** 2,
+            emergency=estimated and k in (5, 6),
+        )
+    return recorder.finish(collisions=0, reached=reached)
+
+
+@pytest.fixture(scope="module")
+def log() -> FlightLog:
+    return flight()
+
+
+@pytest.fixture(scope="module")
+def page(log: FlightLog) -> str:
+    return scene_html(log)
+
+
+def _around(page: str) -> str:
+    script = viewer_script()
+    assert page.count(script) == 1
+    return page.replace(script, "")
+
+
+def _commands(page: str) -> list[dict[str, Any]]:
+    found = re.search(r"^const COMMANDS = (\[.*?\]);$", page, re.DOTALL | re.MULTILINE)
+    assert found
+    return [umsgpack.unpackb(base64.b64decode(text)) for text in json.loads(found.group(1))]
+
+
+def _tracks(commands: list[dict[str, Any]]) -> Tracks:
+    """Path to property to keys (frame, value)."""
+    tracks: Tracks = {}
+    for animation in commands[-1]["animations"]:
+        for track in animation["clip"]["tracks"]:
+            keys = [(key["time"], key["value"]) for key in track["keys"]]
+            tracks.setdefault(animation["path"].removeprefix("/meshcat/"), {})[track["name"]] = keys
+    return tracks
+
+
+def _objects(commands: list[dict[str, Any]]) -> set[str]:
+    return {c["path"].removeprefix("/meshcat/") for c in commands if c["type"] == "set_object"}
+
+
+def _vertices(commands: list[dict[str, Any]], path: str) -> Any:
+    for command in commands:
+        if command["type"] == "set_object" and command["path"] == f"/meshcat/{path}":
+            position = command["object"]["geometries"][0]["data"]["attributes"]["position"]
+            return np.frombuffer(position["array"].data, dtype=np.float32).reshape(-1, 3)
+    pytest.fail(f"no object {path}")
+
+
+def _shown(keys: list[tuple[int, bool]], tick: int) -> bool:
+    return keys[max(index for index, (frame, _) in enumerate(keys) if frame <= tick)][1]
+
+
+def test_page_loads_nothing_from_outside_and_says_what_it_shows(page: str) -> None:
+    around = _around(page)
+    assert re.findall(r"(?:https?:)?//[\w.-]+\.\w+", re.sub(r'"[A-Za-z0-9+/=\s]{40,}"', "", around)) == []
+    for word in (" src=", "href=", "@import", "url(", "fetch(", "import(", "WebSocket", ".connect("):
+        assert word not in around
+    assert "default-src 'none'" in around and "@@" not in around
+    text = re.sub(r"<[^>]+>", " ", around)
+    for words in (
+        "quadrotor-mpc, made up 7",
+        "target reached, no collision",
+        "ipm (sequential)",
+        "reach of the sensor",
+    ):
+        assert words in text
+
+
+def test_failure_and_foreign_names_in_the_page(log: FlightLog) -> None:
+    named = replace(log, layout=replace(log.layout, name="</script><b>x"), reached=False, collisions=2)
+    around = _around(scene_html(named))
+    assert "0.0 m short of the target, 2 collisions" in around and 'class="bad"' in around
+    assert "</script><b>" not in around and "&lt;/script&gt;&lt;b&gt;x" in around
+
+
+def test_same_log_same_page(page: str, log: FlightLog, tmp_path: Path) -> None:
+    log.save(tmp_path / "flight.npz")
+    assert scene_html(FlightLog.load(tmp_path / "flight.npz")) == page
+
+
+def test_animation_moves_things_that_exist_and_ends_together(page: str, log: FlightLog) -> None:
+    commands = _commands(page)
+    kinds = [command["type"] for command in commands]
+    assert kinds.count("set_animation") == 1 and kinds[-1] == "set_animation"
+    objects = _objects(commands)
+    for path, properties in _tracks(commands).items():
+        assert any(name == path or name.startswith(path + "/") for name in objects), path
+        for name, keys in properties.items():
+            frames = [frame for frame, _ in keys]
+            assert frames == sorted(set(frames)), (path, name)
+            if name == ".visible":  # the viewer holds the first key backwards
+                assert frames[0] == 0 and frames[-1] == log.ticks - 1, path
+
+
+def test_drone_flies_and_leans_as_the_truth(page: str, log: FlightLog) -> None:
+    tracks = _tracks(_commands(page))
+    places = np.array([value for _, value in tracks["drone"][".position"]])
+    turns = np.array([value for _, value in tracks["drone"][".quaternion"]])
+    np.testing.assert_allclose(places, log.truth[:, :3])
+    np.testing.assert_allclose(turns[:, [3, 0, 1, 2]], log.truth[:, 3:7])  # three.js puts w last
+    plumb = np.array([value for _, value in tracks["shadow/plumb"][".scale"]])
+    np.testing.assert_allclose(plumb[:, 2], log.truth[:, 2])
+    reach = np.array([value for _, value in tracks["sensor"][".position"]])
+    np.testing.assert_allclose(reach[:, :2], log.truth[:, :2])
+
+
+def test_cylinders_are_faint_until_seen(page: str, log: FlightLog) -> None:
+    assert first_sights(log) == [0, 10, None]
+    commands = _commands(page)
+    objects, tracks = _objects(commands), _tracks(commands)
+    assert "cylinders/0/unseen" not in objects and "cylinders/0/seen" not in tracks
+    assert "cylinders/2/seen/body" not in objects and "cylinders/2/unseen" not in tracks
+    for tick in range(log.ticks):
+        assert _shown(tracks["cylinders/1/unseen"][".visible"], tick) is (tick < 10)
+        assert _shown(tracks["cylinders/1/seen"][".visible"], tick) is (tick >= 10)
+    faint = next(c for c in commands if c.get("path") == "/meshcat/cylinders/2/unseen")["object"]["materials"][0]
+    assert faint["transparent"] is True and faint["opacity"] < 0.5
+
+
+def test_ellipses_have_two_sigmas_and_appear_with_their_landmark(page: str, log: FlightLog) -> None:
+    tracks = _tracks(_commands(page))
+    scales = dict(tracks["landmarks/1/ellipse"][".scale"])
+    for tick in (10, log.ticks - 1):
+        row = log.landmarks[tick]
+        np.testing.assert_allclose(scales[tick][:2], 2.0 * np.sqrt(np.diag(row.covariances[1])))
+    assert not _shown(tracks["landmarks/1"][".visible"], 9) and _shown(tracks["landmarks/1"][".visible"], 10)
+    np.testing.assert_allclose(tracks["landmarks/1"][".position"][0][1][:2], log.layout.cylinders[1, :2] + SHIFT)
+
+
+def test_a_landmark_that_stands_still_does_not_creep(log: FlightLog) -> None:
+    still = [log.landmarks[0]] * 20
+    moved = log.landmarks[0]._replace(means=log.landmarks[0].means + 0.5)
+    jumping = replace(log, landmarks=still + [moved] * (log.ticks - 20))
+    commands = record_scene(jumping).commands
+    assert commands[-1]["type"] == "set_animation"
+    keys = dict(_tracks(commands)["landmarks/0"][".position"])
+    assert sorted(keys) == [0, 19, 20] and keys[19] == keys[0] != keys[20]  # else it would drift there for 20 ticks
+
+
+def test_horizon_and_past_of_every_frame_are_those_of_the_log(page: str, log: FlightLog) -> None:
+    commands = _commands(page)
+    tracks = _tracks(commands)
+    for tick in range(1, log.ticks):
+        for name, way in (("horizon", log.plans[tick]), ("past", log.pasts[tick])):
+            middle = _vertices(commands, f"frames/{tick}/{name}").reshape(-1, 3, 3).mean(axis=1)
+            np.testing.assert_allclose(middle[[0, -1]], way[[0, -1]], atol=1e-6)
+        shown = [_shown(tracks[f"frames/{tick}"][".visible"], moment) for moment in range(log.ticks)]
+        assert shown == [moment == tick for moment in range(log.ticks)]
+
+
+def test_a_flight_without_estimate_is_shown_without_it() -> None:
+    plain = flight(estimated=False, movers=0)
+    page = scene_html(plain)
+    objects, text = _objects(_commands(page)), _around(page)
+    families = {path.split("/")[0] for path in objects}
+    assert not families & {"sensor", "landmarks", "movers"}
+    assert not any(path.endswith(("unseen", "past", "truth")) for path in objects)
+    assert {f"cylinders/{k}/seen/body" for k in range(3)} <= objects and "frames/0/horizon" in objects
+    for words in ("reach of the sensor", "position error", "estimate + plan", "not seen yet"):
+        assert words not in re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)
+    data = json.loads(re.search(r"^const DATA = (.*);$", text, re.MULTILINE).group(1))  # type: ignore[union-attr]
+    assert data["rows"]["mass"] is None and data["rows"]["error"] is None and data["rows"]["planMs"] is None
+
+
+def test_long_flights_are_thinned_and_small() -> None:
+    long = flight(400)
+    assert frame_ticks(long).tolist() == list(range(400))
+    assert len(scene_html(long)) < 6e6
+    ticks = frame_ticks(flight(1001))
+    assert ticks[:3].tolist() == [0, 3, 6] and ticks[-1] == 1000 and len(ticks) <= 401
+
+
+def test_odd_flights_are_drawn_too(log: FlightLog) -> None:
+    single = flight(1)
+    assert _commands(scene_html(single))[-1]["type"] == "set_animation"
+    overview(single)
+    estimates(single)
+    control(single)
+    lost = replace(log, plans=np.full_like(log.plans, np.nan), clearance=np.full(log.ticks, np.inf))
+    assert not any("horizon" in path for path in _objects(_commands(scene_html(lost))))
+    overview(lost)
+    control(lost)
+    empty = flight(0)
+    for draw in (record_scene, overview, estimates, control, flight_metrics):
+        with pytest.raises(ScenarioError, match="no tick"):
+            draw(empty)
+
+
+def test_drone_fits_its_radius() -> None:
+    for part in (drone.rotors(0.25, front=True), drone.rotors(0.25, front=False), drone.arms(0.25), drone.body(0.25)):
+        vertices, faces = part
+        assert np.hypot(vertices[:, 0], vertices[:, 1]).max() <= 0.25 + 1e-9
+        assert faces.min() == 0 and faces.max() == len(vertices) - 1
+    rotors = [drone.rotors(0.25, front=front)[0] for front in (True, False)]
+    assert np.hypot(*rotors[0].T[:2]).max() == pytest.approx(0.25, rel=0.01)
+    assert rotors[0][:, 0].min() > 0.0 > rotors[1][:, 0].max()
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_tube_keeps_its_radius_in_every_direction(axis: int) -> None:
+    line = np.zeros((5, 3))
+    line[:, axis] = [0.0, 1.0, 1.0, 2.0, 3.0]  # two points coincide
+    vertices, faces = drone.tube(line, 0.1, sides=4)
+    apart = vertices.reshape(5, 4, 3) - line[:, None]
+    np.testing.assert_allclose(np.linalg.norm(apart, axis=2), 0.1)
+    np.testing.assert_allclose(apart[..., axis], 0.0, atol=1e-12)
+    assert len(faces) == 2 * 4 * 4 and faces.max() == 19
+
+
+def test_box_looks_outwards() -> None:
+    vertices, faces = drone.box([1.0, 2.0, 3.0], [0.2, 0.4, 0.6])
+    np.testing.assert_allclose(np.ptp(vertices, axis=0), [0.2, 0.4, 0.6])
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.sum(normals * (corners.mean(axis=1) - [1.0, 2.0, 3.0]), axis=1) > 0.0).all()
+
+
+def test_ellipse_axes_and_thinning() -> None:
+    turn = np.array([[math.cos(0.4), -math.sin(0.4)], [math.sin(0.4), math.cos(0.4)]])
+    long, short, direction = drone.ellipse_axes(turn @ np.diag([0.09, 0.01]) @ turn.T, 2.0)
+    assert (long, short) == pytest.approx((0.6, 0.2))
+    assert math.tan(direction) == pytest.approx(math.tan(0.4))
+    line = np.column_stack([np.arange(100.0), np.zeros(100), np.zeros(100)])
+    assert drone.thin(line, 4)[:, 0].tolist() == [0.0, 33.0, 66.0, 99.0]
+    assert len(drone.thin(np.zeros((50, 3)), 4)) == 1
+
+
+def test_metrics_are_those_of_the_made_up_errors(log: FlightLog) -> None:
+    metrics = flight_metrics(log)
+    assert metrics["succeeded"] and metrics["ticks"] == 24 and metrics["time_to_goal_s"] == pytest.approx(23 * DT)
+    position, attitude = metrics["position_error_m"], metrics["attitude_error_rad"]
+    assert position is not None and attitude is not None
+    assert position == pytest.approx({"rms": 0.05, "max": 0.05}) and attitude["max"] == pytest.approx(0.0, abs=1e-7)
+    assert metrics["coverage"] is not None and metrics["parameter_error"] is not None
+    assert metrics["coverage"]["position"] == pytest.approx(1.0)  # 3 and 4 cm are within twice 2.5 cm
+    assert metrics["coverage"]["mass"] == pytest.approx(np.mean(np.abs(log.parameters[:, 0] - 1.0) <= 0.04))
+    assert "updraft" not in metrics["coverage"] and "updraft" not in metrics["parameter_error"]
+    assert metrics["parameter_error_5s"] is None and metrics["mass_error_relative"] == pytest.approx(0.0, abs=1e-12)
+    wrong = np.flatnonzero(np.abs(log.parameters[:, 0] - 1.0) >= 0.01)
+    assert metrics["mass_known_s"] == pytest.approx((wrong[-1] + 1) * DT)
+    landmarks = metrics["landmark_error_m"]
+    assert landmarks is not None and landmarks == pytest.approx({"rms": 0.1, "max": 0.1})
+    assert metrics["min_clearance_m"] == pytest.approx(1.0) and metrics["emergency_ticks"] == 2
+    assert metrics["tick_ms"]["max"] == pytest.approx(5.0 + 7.0 + 23.0) and metrics["statuses"] == {"converged": 24}
+    assert metrics["path_length_m"] == pytest.approx(np.linalg.norm(np.diff(log.truth[:, :3], axis=0), axis=1).sum())
+
+
+def test_metrics_at_five_seconds_and_without_an_estimate() -> None:
+    metrics = flight_metrics(flight(121))
+    assert metrics["parameter_error_5s"] is not None and metrics["mass_error_relative_5s"] is not None
+    assert metrics["mass_error_relative_5s"] == pytest.approx(0.0, abs=1e-12)
+    longer = flight(301)
+    early = flight_metrics(longer)["mass_error_relative_5s"]
+    assert early == pytest.approx(0.05 * (1.0 - 2.0 * 100 / 300))  # tick 100 of 300, the mass is right from 150 on
+    plain = flight_metrics(flight(estimated=False, reached=False))
+    for key in ("position_error_m", "coverage", "parameter_error", "mass_error_relative", "time_to_goal_s"):
+        assert plain[key] is None
+
+
+def test_landmarks_far_from_everything_are_not_counted(log: FlightLog) -> None:
+    row = log.landmarks[-1]
+    stray = row._replace(means=np.array([[5.0, 0.9], row.means[1]]))
+    assert len(landmark_errors(replace(log, landmarks=[*log.landmarks[:-1], stray]))) == 1
+
+
+def test_overview_draws_the_moments_it_names(log: FlightLog, tmp_path: Path) -> None:
+    from matplotlib.colors import to_hex
+
+    assert moments(log).tolist() == [0, 5, 9, 14, 18, 23] and moments(flight(3)).tolist() == [0, 1, 2]
+    figure = overview(log)
+    times = [ax.get_title(loc="left")[:3] for ax in figure.axes]
+    assert times == "0.0 0.2 0.5 0.7 0.9 1.2".split()
+    legend = {text.get_text() for box in figure.legends for text in box.get_texts()}
+    assert {"estimated past", "predicted future", "reach of the sensor", "cylinder seen by then"} <= legend
+    first, second = (write_overview(tmp_path / name, log, dpi=50).read_bytes() for name in ("a.png", "b.png"))
+    assert first == second
+    ax = plot_moment(log, 12)
+    filled = [to_hex(patch.get_facecolor()) for patch in ax.patches if patch.get_fill()]
+    assert filled.count(css("fixed")) == 2  # cylinders 0 and 1 by then
+    assert "stored plan" in plot_moment(log, 5).get_title()
+
+
+def test_estimates_and_controls_show_what_there_is(log: FlightLog) -> None:
+    figure = estimates(log)
+    titles = [ax.get_title(loc="left") for ax in figure.axes if ax.get_title(loc="left")]
+    assert len(titles) == 6 + 9 and titles[0].startswith("Mass, ends +0.0 %")
+    assert "Position error, z, 4.0 cm rms; 100 % within 2\u03c3" in titles
+    with pytest.raises(ScenarioError, match="nobody estimated"):
+        estimates(flight(estimated=False))
+    panels = [ax for part in control(log).subfigs for ax in part.axes]
+    assert len(panels) == 8
+    lines = {float(np.asarray(line.get_ydata())[0]) for line in panels[3].get_lines()}
+    assert {2.0, 20.0} <= lines  # limits of the thrust
+    assert len([ax for part in control(flight(estimated=False)).subfigs for ax in part.axes]) == 7
+
+
+def test_results_leave_files_that_can_be_read_again(log: FlightLog, tmp_path: Path) -> None:
+    written = write_results(tmp_path, log)
+    names = ["scene.html", "overview.png", "estimates.png", "control.png", "metrics.json", "flight.npz"]
+    assert [path.name for path in written] == names and all(path.stat().st_size > 0 for path in written)
+    assert json.loads((tmp_path / "metrics.json").read_text())["position_error_m"]["rms"] == pytest.approx(0.05)
+    assert flight_metrics(FlightLog.load(tmp_path / "flight.npz")) == flight_metrics(log)
+    table = summary(log)
+    assert "reached after 1.15 s" in table and "ipm, sequential, 7" in table and "mass error" in table
+
+
+def test_results_of_a_flight_without_estimate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("write_overview", "write_control", "write_scene"):
+        monkeypatch.setattr(results, name, lambda path, log: path)
+    plain = flight(estimated=False)
+    names = [path.name for path in write_results(tmp_path, plain, {"own": 1})]
+    assert names == ["scene.html", "overview.png", "control.png", "metrics.json", "flight.npz"]
+    assert json.loads((tmp_path / "metrics.json").read_text()) == {"own": 1}
+    assert "position error" not in summary(plain) and "mass error" not in summary(plain)
