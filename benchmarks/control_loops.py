@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 
 import numpy as np
@@ -13,7 +13,7 @@ import unifg as fg
 from benchmarks.closed_loop import WARM_IPOPT, Driver, Loop
 from benchmarks.control_problems import Problem, Quadrotor, Unicycle
 from benchmarks.report import table
-from unifg.solvers import SQP, InteriorPoint
+from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
 
 STEPS = 100
@@ -24,17 +24,26 @@ SINGLE = ("ipm, 1 iteration", "sqp, 1 iteration")
 class Ours:
     """A backend of ours, warm-started with its own shifted answers."""
 
-    def __init__(self, solver: fg.Solver, problem: Problem) -> None:
-        """Prepare the graph; the first answer of a one-iteration driver is a converged one, as of every other."""
+    def __init__(self, solver: fg.Solver, problem: Problem, penalties: bool = True) -> None:
+        """Prepare the graph; the first answer of a one-iteration driver is a converged one, as of every other.
+
+        Args:
+            solver: ours.
+            problem: one of :func:`cases`.
+            penalties: whether those of an augmented Lagrangian go from step to step, as multipliers do.
+        """
         self._stated = problem.formulation()
         self._first = type(solver)(tolerance=TOLERANCE).prepare(self._stated.graph)
         self._run = solver.prepare(self._stated.graph)
         self._last: fg.Solution | None = None
+        self._penalties = penalties
 
     def control(self, pose: Array, index: int) -> tuple[Array, float, int, str]:
         """First control, processor time of the solve [ms], iterations, and the status in words."""
         x, u = self._stated.x, self._stated.u
         start = self._stated.guess if self._last is None else self._last.shifted(x, u, by=1)
+        if not self._penalties:
+            start = replace(start, penalties={})
         data = self._stated.data(pose, index)
         run = self._first if self._last is None else self._run
         begin = time.thread_time()
@@ -80,6 +89,8 @@ def drivers(problem: Problem) -> dict[str, tuple[Driver, Callable[[], float]]]:
         "ipm, 1 iteration": Ours(InteriorPoint(tolerance=TOLERANCE, max_iterations=1), problem),
         "sqp": Ours(SQP(tolerance=TOLERANCE), problem),
         "sqp, 1 iteration": Ours(SQP(tolerance=TOLERANCE, max_iterations=1), problem),
+        "alm": Ours(AugmentedLagrangian(tolerance=TOLERANCE), problem),
+        "alm, new penalties": Ours(AugmentedLagrangian(tolerance=TOLERANCE), problem, penalties=False),
     }
     found: dict[str, tuple[Driver, Callable[[], float]]] = {name: (o, o.again) for name, o in ours.items()}
     if find_spec("casadi") is not None:
@@ -117,7 +128,7 @@ def drive(problem: Problem) -> dict[str, Drive]:
 def render(results: Mapping[Problem, Mapping[str, Drive]]) -> str:
     """A table and what it means."""
     head = (
-        "closed loop", "solver", "median [ms]", "p99 [ms]", "iterations, median", "iterations, most", "failures",
+        "closed loop", "solver", "median [ms]", "p99 [ms]", "iterations, median", "mean", "most", "failures",
         "cost", "penetration [mm]", "times ipopt", "times fatrop", "repeated [ms]", "times fatrop, repeated",
     )  # fmt: skip
     lines = []
@@ -138,16 +149,18 @@ def render(results: Mapping[Problem, Mapping[str, Drive]]) -> str:
             lines.append(
                 (
                     f"{problem.robot} {problem.name}", name, f"{median:.3f}", f"{np.percentile(loop.times, 99):.3f}",
-                    f"{np.median(loop.iterations):.0f}", str(max(loop.iterations)), failures or "0",
+                    f"{np.median(loop.iterations):.0f}", f"{np.mean(loop.iterations):.1f}",
+                    str(max(loop.iterations)), failures or "0",
                     f"{loop.cost:.4f}", depth, *ratios, f"{repeated:.3f}", again,
                 )
             )  # fmt: skip
     notes = (
         f"{STEPS} steps, tolerance {TOLERANCE:.0e}, interleaved; the time is the processor time of the solve call, "
         "after a cold solve that is not counted. Warm start: values and multipliers moved by one stage, the last ones "
-        "repeated (fatrop takes no multipliers). Where nothing can be hit the plant is disturbed. Cost: sum of the "
-        "stage costs of the states and controls that happened. Penetration: deepest state of the plant in an obstacle, "
-        "negative is a clearance. Repeated: the same solve once more, at once; the first time the other solvers have "
-        "just used the caches. One iteration: the solver is stopped after a single one in every step."
+        "repeated (fatrop takes no multipliers); the augmented Lagrangian's penalties too, unless it chooses new ones. "
+        "Where nothing can be hit the plant is disturbed. Cost: sum of the stage costs of the states and controls that "
+        "happened. Penetration: deepest state of the plant in an obstacle, negative is a clearance. Repeated: the same "
+        "solve once more, at once; the first time the other solvers have just used the caches. One iteration: the "
+        "solver is stopped after a single one in every step."
     )
     return "\n\n".join([table(head, lines, text=2), notes])

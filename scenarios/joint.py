@@ -69,7 +69,7 @@ class JointController(Controller):
         run, guess = self._beginning(pose, reference)
         values = {**guess.values, self._terms.past: self._terms.poses(self.window)}
         values[self._x] = np.concatenate([pose[None], guess.values[self._x][1:]])
-        solution = run.solve(fg.Guess(values, guess.multipliers), data=data)
+        solution = run.solve(fg.Guess(values, guess.multipliers, guess.penalties), data=data)
         plan = self._judge(solution, pose, reference, tracks)
         if plan.emergency or plan.status not in SETTLED:
             self._smoother.accept(self.window, self._registered)

@@ -7,6 +7,7 @@ from unifg.solvers.graduated_non_convexity import GraduatedNonConvexity
 from unifg.solvers.interior_point import InteriorPoint
 from unifg.solvers.kkt import KKT
 from unifg.solvers.levenberg_marquardt import LevenbergMarquardt
+from unifg.solvers.linearized_graph import LinearGraphs
 from unifg.solvers.penalty import Penalty
 from unifg.solvers.sqp import SQP
 
@@ -19,5 +20,6 @@ __all__ = [
     "GraduatedNonConvexity",
     "InteriorPoint",
     "LevenbergMarquardt",
+    "LinearGraphs",
     "Penalty",
 ]

@@ -18,9 +18,9 @@ from unifg.errors import BackendError
 from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.solver import Run, Solver
-from unifg.solvers.damping import Damping, damped_step, norm
+from unifg.solvers.damping import Damping, damped_step, largest, norm
 from unifg.solvers.least_squares import require_squares
-from unifg.solvers.least_violation import settle
+from unifg.solvers.least_violation import leave, settle
 from unifg.solvers.model import model_step
 from unifg.solvers.primal import Primal
 from unifg.status import Status
@@ -30,6 +30,8 @@ LARGEST_PENALTY = 1e10
 COLD_PENALTY = 10.0  # Birgin and Martinez
 FALL = 0.25  # of the change of multipliers over rho, between outer iterations; else rho grows
 WARM_PENALTY = 100.0
+LONGEST, SHORTEST = 2.0, 0.5  # rows of the constraint Jacobian whose length lies between are left as stated
+LARGEST_SCALE = 1e4  # a row that hardly moves at the start says little about its scale
 
 
 @dataclass(kw_only=True)
@@ -38,8 +40,11 @@ class AugmentedLagrangian(Solver):
 
     Attributes:
         max_iterations: primal steps over all outer iterations.
-        penalty: initial rho; None balances cost and violation at the start (Birgin and Martinez 2014).
+        penalty: initial rho; None takes that of the guess, if it comes from a solve, and else balances cost and
+            violation at the start (Birgin and Martinez 2014).
         penalty_growth: factor on rho when the violation did not fall enough.
+        scaling: weigh the penalty of each constraint by the inverse square of its gradient's length at the start, so
+            that one rho suits metres and kilometres; not in the schedule "bazzana".
         schedule: "bcl" or "bazzana".
         step_tolerance, violation_tolerance: Bazzana's stop rule (section VII-D, 1e-4 there): the step's norm
             and the largest violation. A positive step_tolerance switches it on; it does not grant CONVERGED.
@@ -50,6 +55,7 @@ class AugmentedLagrangian(Solver):
     max_iterations: int = 300
     penalty: float | None = None
     penalty_growth: float = 10.0
+    scaling: bool = True
     schedule: Literal["bcl", "bazzana"] = "bcl"
     step_tolerance: float = 0.0
     violation_tolerance: float = 1e-4
@@ -74,20 +80,20 @@ class AugmentedLagrangian(Solver):
 
     def search_step(self, run: Run, workspace: Primal, lin: Linearization) -> Array | None:
         """The primal step at the initial damping, with the penalty that suits the present iterate."""
-        penalty = np.full(len(run.multipliers), self._initial_penalty(run))
-        found = model_step(workspace, lin, run.multipliers, penalty, self.damping)
+        rho, weights = self._first_penalties(run)
+        found = model_step(workspace, lin, run.multipliers, rho * weights, self.damping)
         return None if found is None else found[0]
 
     def iterate(self, run: Run, workspace: Primal) -> Status | None:
         """Alternate primal and dual steps."""
-        rho = self._initial_penalty(run)
+        rho, weights = self._first_penalties(run)
         if self.schedule == "bazzana":
-            return self._literal(run, workspace, rho)
-        return self._tightening(run, workspace, rho)
+            return self._literal(run, workspace, rho, weights)
+        return self._tightening(run, workspace, rho, weights)
 
-    def _literal(self, run: Run, primal: Primal, rho: float) -> Status | None:
+    def _literal(self, run: Run, primal: Primal, rho: float, weights: Array) -> Status | None:
         """One Gauss-Newton step, one dual step, constant rho."""
-        penalty = np.full(run.program.constraints.count, rho)
+        run.penalties = penalty = rho * weights
         while run.status is None:
             lin, multipliers = run.lin, run.multipliers
             step = primal.direction(
@@ -102,15 +108,19 @@ class AugmentedLagrangian(Solver):
                 return Status.STOP_RULE
         return None
 
-    def _tightening(self, run: Run, primal: Primal, rho: float) -> Status | None:
+    def _tightening(self, run: Run, primal: Primal, rho: float, weights: Array) -> Status | None:
         """Solve each subproblem only as accurately as its multipliers deserve."""
         multipliers = run.multipliers
         damping = Damping(self.damping)
-        gradient_goal, violation_goal = self._goals(run, primal, rho)
+        scale = np.sqrt(weights)
+        # Goals are for scaled violations, the KKT test and the last resort for those as stated.
+        heaviest = LARGEST_PENALTY / min(1.0, float(weights.min(initial=1.0)))
+        least = 0.1 * self.tolerance * min(1.0, float(scale.min(initial=1.0)))
+        gradient_goal, violation_goal = self._goals(run, primal, rho, weights)
         outer = 0
         while run.status is None:
             outer += 1
-            penalty = np.full(len(multipliers), rho)
+            run.penalties = penalty = rho * weights
             before = len(run.history)
             stalled = False
             while (
@@ -141,45 +151,63 @@ class AugmentedLagrangian(Solver):
                 if norm(step) < self.step_tolerance:
                     break  # too short to be of use: what violation remains is for the multipliers to remove
             after = primal.next_multipliers(run.lin.constraints, multipliers, penalty)
-            change = largest((after - multipliers) / penalty)
+            change = largest(scale * (after - multipliers) / penalty)
             if len(run.history) == before:  # nothing moved: the dual step alone is this iteration
                 run.accept(run.lin, after, 0.0, 0.0, outer=outer, penalty=rho)
-            if stalled and (change == 0.0 or rho >= LARGEST_PENALTY):
+            if stalled and (change == 0.0 or rho >= heaviest):
                 return settle(run, Status.STALLED)
             if change <= violation_goal:
                 multipliers = after
-                violation_goal = max(min(violation_goal / rho**0.9, FALL * change), 0.1 * self.tolerance)
+                violation_goal = max(min(violation_goal / rho**0.9, FALL * change), least)
                 gradient_goal = max(0.1 * gradient_goal, 0.1 * self.tolerance)
             else:
-                if run.infeasible_stationary():
-                    return Status.LOCALLY_INFEASIBLE
-                if rho >= LARGEST_PENALTY:
+                if run.infeasible_stationary() and (ending := leave(run)) is not None:
+                    return ending
+                if rho >= heaviest:
                     return settle(run, Status.STALLED)
-                rho = min(rho * self.penalty_growth, LARGEST_PENALTY)
-                gradient_goal, violation_goal = self._goals(run, primal, rho)
+                rho = min(rho * self.penalty_growth, heaviest)
+                gradient_goal, violation_goal = self._goals(run, primal, rho, weights)
             if stalled:
                 damping = Damping(self.damping)
         return None
 
-    def _initial_penalty(self, run: Run) -> float:
+    def _first_penalties(self, run: Run) -> tuple[float, Array]:
+        """Initial rho, and (M,) weights of the rows: their penalties are rho times them."""
+        scale = self._scale(run)
+        weights = scale**2
         if self.penalty is not None:
-            return self.penalty
-        outside = float((run.program.violation(run.lin.constraints) ** 2).sum())
-        balance = COLD_PENALTY * max(1.0, abs(run.lin.cost)) / max(1.0, 0.5 * outside)
+            return self.penalty, weights
         # With large multipliers the curvature of the constraints can outweigh a small penalty.
-        curvature = WARM_PENALTY * largest(run.multipliers)
-        return float(np.clip(max(balance, curvature), 1e-3, 1e6))
+        least = WARM_PENALTY * largest(run.multipliers / scale)
+        given = run.penalties > 0.0
+        if given.any():
+            rho = float(np.median((run.penalties / weights)[given]))
+            weights = np.where(given, run.penalties / rho, weights)
+        else:
+            outside = float(np.square(scale * run.program.violation(run.lin.constraints)).sum())
+            rho = COLD_PENALTY * max(1.0, abs(run.lin.cost)) / max(1.0, 0.5 * outside)
+        return float(np.clip(max(rho, least), 1e-3, 1e6)), weights
 
-    def _goals(self, run: Run, primal: Primal, rho: float) -> tuple[float, float]:
-        """First accuracy of the subproblem's gradient, and the violation that earns a dual step."""
-        penalty = np.full(len(run.multipliers), rho)
-        size = largest(primal.gradient(run.lin, run.multipliers, penalty))
+    def _scale(self, run: Run) -> Array:
+        """(M,) factors that make constraints in different units alike, by the length of their gradients at the start.
+
+        The largest entry of the gradient counts, over all factors of a term: one of them may be flat by chance.
+        """
+        program, rows = run.program, run.program.constraints
+        if not self.scaling or self.schedule == "bazzana":
+            return np.ones(rows.count)
+        length = np.zeros(rows.count)
+        np.maximum.at(length, rows.free_rows, np.abs(run.lin.constraint_jacobian[rows.free]))
+        for term, part in zip(program.constraint_terms, program.slices, strict=True):
+            length[part] = np.tile(length[part].reshape(-1, term.size).max(axis=0), term.count)
+        length[length == 0.0] = 1.0
+        wanted = np.clip(length, SHORTEST, LONGEST) / length
+        return np.clip(wanted, 1.0 / LARGEST_SCALE, LARGEST_SCALE)
+
+    def _goals(self, run: Run, primal: Primal, rho: float, weights: Array) -> tuple[float, float]:
+        """First accuracy of the subproblem's gradient, and the scaled violation that earns a dual step."""
+        size = largest(primal.gradient(run.lin, run.multipliers, rho * weights))
         return max(min(0.1 * size, 1.0), 0.1 * self.tolerance), float(max(rho**-0.1, 0.1 * self.tolerance))
 
     def _stop_rule(self, run: Run, step_norm: float) -> bool:
         return step_norm < self.step_tolerance and run.optimality.violation < self.violation_tolerance
-
-
-def largest(vector: Array) -> float:
-    """Infinity norm."""
-    return float(np.abs(vector).max(initial=0.0))

@@ -69,5 +69,13 @@ def damped_step(
 
 
 def norm(step: Array) -> float:
-    """Euclidean norm, without waking the threads of a BLAS."""
+    """Euclidean norm, without waking the threads of a BLAS, and of steps whose squares overflow too."""
+    size = largest(step)
+    if not 1e-100 < size < 1e100:
+        return size if not 0.0 < size < np.inf else size * norm(step / size)
     return float(np.sqrt(np.square(step).sum()))
+
+
+def largest(vector: Array) -> float:
+    """Infinity norm."""
+    return float(np.abs(vector).max(initial=0.0))

@@ -104,9 +104,9 @@ class Path:
         newton = primal.direction(lin.hessian, gradient)
         if newton is None:
             return None
-        curved = float((gradient * program.normal.times(lin.hessian, gradient)).sum())
-        length = float((gradient * gradient).sum()) / max(curved, 1e-300)
-        return cls(program, lin.hessian, gradient, newton, -length * gradient)
+        downhill = gradient / (norm(gradient) or 1.0)
+        curvature = float((downhill * program.normal.times(lin.hessian, downhill)).sum())
+        return cls(program, lin.hessian, gradient, newton, -gradient / max(curvature, 1e-300))
 
     def step(self, radius: float) -> Array:
         """The point of the path at ``radius``, or its end."""
@@ -114,11 +114,12 @@ class Path:
             return self.newton
         if norm(self.cauchy) >= radius:
             return self.cauchy * (radius / norm(self.cauchy))
-        leg = self.newton - self.cauchy
-        a, b = float((leg * leg).sum()), float((self.cauchy * leg).sum())
-        c = norm(self.cauchy) ** 2 - radius**2
+        size = norm(self.newton)  # whose square may overflow
+        begin, leg = self.cauchy / size, (self.newton - self.cauchy) / size
+        a, b = float((leg * leg).sum()), float((begin * leg).sum())
+        c = norm(begin) ** 2 - (radius / size) ** 2
         fraction = -c / (b + np.sqrt(b * b - a * c))  # the positive root, without cancellation
-        step: Array = self.cauchy + fraction * leg
+        step: Array = size * (begin + fraction * leg)
         return step
 
     def decrease(self, step: Array) -> float:

@@ -25,10 +25,10 @@ from unifg.errors import BackendError
 from unifg.linearization import Evaluation, Linearization
 from unifg.program import Program
 from unifg.solver import Run, Solver
-from unifg.solvers.augmented_lagrangian import largest
-from unifg.solvers.damping import norm
+from unifg.solvers.damping import largest, norm
 from unifg.solvers.kkt_system import KktSystem, fill
 from unifg.solvers.least_squares import require_squares
+from unifg.solvers.least_violation import leave, settle
 from unifg.solvers.primal import DIAGONAL_FLOOR
 from unifg.status import Status
 from unifg.typing import Array
@@ -40,7 +40,7 @@ ROUNDING = 1e-13
 SHORTEST = 1e-6
 MARGIN = 0.3  # share of the violation's price that every step must earn (Nocedal and Wright, eq. 18.36)
 FAILURES = 5  # attempts with growing damping at one step
-FIRST_DAMPING, DAMPING_GROWTH, SMALLEST_DAMPING = 1e-2, 10.0, 1e-9
+FIRST_DAMPING, DAMPING_GROWTH, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-2, 10.0, 1e-9, 1e12
 DAMPING_DECAY = 0.9  # faster forgetting cycles between overshooting and shortened steps
 FIRST_SLACKNESS = 1e-4
 RETRY_GROWTH = 100.0
@@ -85,15 +85,16 @@ class KKT(Solver):
         while run.status is None:
             found = workspace.step(run.lin, run.multipliers, damping, slackness)
             if found is None and self.full_steps:
-                return Status.SINGULAR
+                return settle(run, Status.SINGULAR)
             taken = None if found is None else self._search(run, workspace, merit, *found)
-            if taken is None or slackness:
-                if run.infeasible_stationary():
-                    return Status.LOCALLY_INFEASIBLE
+            if (taken is None or slackness) and run.infeasible_stationary():
+                if (ending := leave(run)) is not None:
+                    return ending
+                continue
             if taken is None:
                 failures += 1
                 if failures > FAILURES:
-                    return Status.SINGULAR if found is None else Status.STALLED
+                    return settle(run, Status.SINGULAR if found is None else Status.STALLED)
                 damping = max(RETRY_GROWTH * damping, FIRST_DAMPING)
                 if found is None:
                     slackness = max(RETRY_GROWTH * slackness, FIRST_SLACKNESS)
@@ -112,6 +113,8 @@ class KKT(Solver):
                 return Status.STOP_RULE
             failures = 0
             damping = _next_damping(damping, length)
+            if damping > LARGEST_DAMPING:  # steps no longer move anything
+                return settle(run, Status.STALLED)
             slackness = 0.1 * slackness if slackness > SMALLEST_DAMPING else 0.0
         return None
 

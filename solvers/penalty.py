@@ -18,7 +18,9 @@ from unifg.program import Program
 from unifg.solver import Run, Solver
 from unifg.solvers.damping import Damping, damped_step, norm
 from unifg.solvers.least_squares import require_squares
+from unifg.solvers.least_violation import settle
 from unifg.solvers.model import model_step
+from unifg.solvers.phr import update
 from unifg.solvers.primal import Primal
 from unifg.status import Status
 from unifg.typing import Array
@@ -83,9 +85,7 @@ class Penalty(Solver):
             if not self._violated(run):  # a heavier weight would not help
                 return Status.STALLED
             if rho >= last:
-                if run.infeasible_stationary():
-                    return Status.LOCALLY_INFEASIBLE
-                return Status.STALLED if stalled else Status.STOP_RULE
+                return settle(run, Status.STALLED if stalled else Status.STOP_RULE)
             rho = min(rho * self.penalty_growth, last)
 
     def _minimize(self, run: Run, primal: Primal, none: Array, rho: float) -> bool:
@@ -101,8 +101,8 @@ class Penalty(Solver):
                 return True
             values, step, rejected = taken
             before = primal.merit(run.lin, none, penalty)
+            estimate = _estimate(run.program, run.lin, step, penalty)
             lin = run.program.linearize(values)
-            estimate = primal.next_multipliers(lin.constraints, none, penalty)
             run.accept(lin, estimate, norm(step), 1.0, penalty=rho, damping=damping.value, rejected=rejected)
             if run.status is not None:
                 return False
@@ -113,3 +113,16 @@ class Penalty(Solver):
     def _violated(self, run: Run) -> bool:
         """Whether the constraints as they are ask for a heavier weight."""
         return max(run.optimality.violation, run.optimality.complementarity) > self.tolerance
+
+
+def _estimate(program: Program, lin: Linearization, step: Array, penalty: Array) -> Array:
+    """(M,) multipliers from the linear model of a step: the penalties times the violations after it.
+
+    rho times the violation of the new iterate would be mostly rounding errors once rho is large; these balance the
+    gradient of the cost to the accuracy of the linear solve. The small numbers are added before the large ones.
+    """
+    moved = program.constraints.times(lin.constraint_jacobian, step)
+    estimate = np.empty(len(penalty))
+    lower, upper = program.lower - lin.constraints, program.upper - lin.constraints
+    update(moved, lower, upper, np.zeros(len(penalty)), penalty, estimate)
+    return estimate

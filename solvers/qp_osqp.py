@@ -37,8 +37,17 @@ class OsqpRoute:
 
     def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
         """Solve to ``accuracy``, polish, and measure."""
+        nothing = QPAnswer(np.zeros(self.program.size), multipliers, self.name, 0, np.inf)
+        if (qp.lower >= INFINITY).any() or (qp.upper <= -INFINITY).any():
+            return nothing  # OSQP would print that the limits cross
+        try:
+            return self._solve(qp, multipliers, max(accuracy, TIGHTEST))
+        except osqp.OSQPException:  # a matrix so large that its rounding errors are not convex
+            self._workspace = None
+            return nothing
+
+    def _solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
         lower, upper = np.maximum(qp.lower, -INFINITY), np.minimum(qp.upper, INFINITY)
-        accuracy = max(accuracy, TIGHTEST)
         if self._workspace is None:
             self._workspace = osqp.OSQP()
             self._workspace.setup(

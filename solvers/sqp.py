@@ -20,7 +20,7 @@ from unifg.program import Program
 from unifg.solver import Run, Solver
 from unifg.solvers.damping import norm
 from unifg.solvers.kkt import require_equalities
-from unifg.solvers.least_violation import settle
+from unifg.solvers.least_violation import leave, settle
 from unifg.solvers.qp import QP, QPAnswer, Route, solve_convex, subproblem
 from unifg.solvers.qp_elimination import EliminationRoute
 from unifg.solvers.qp_exact import ExactHessian, holds
@@ -122,7 +122,9 @@ class SQP(Solver):
                 qp = qp.gauss_newton()
                 taken = self._attempt(run, workspace, merit, qp)
             if workspace.elastic_asked and run.infeasible_stationary():
-                return Status.LOCALLY_INFEASIBLE
+                if (ending := leave(run)) is not None:
+                    return ending
+                continue
             if taken is None:
                 failures += 1
                 if failures == FAILURES:

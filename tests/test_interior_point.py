@@ -9,6 +9,7 @@ import unifg as fg
 from benchmarks.control_problems import Unicycle
 from problems import short_drive
 from unifg.solvers import SQP, InteriorPoint
+from unifg.solvers.interior_point import Workspace
 
 
 def test_a_watched_solve_takes_the_same_steps() -> None:
@@ -103,3 +104,21 @@ def test_iteration_limit_returns_the_better_of_start_and_end() -> None:
     assert solution.status is fg.Status.ITERATION_LIMIT
     assert solution.iterations == 1
     assert [row.number for row in solution.history] == [0, 1]
+
+
+def test_control_c_in_the_compiled_loop_is_passed_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody watches, so there is no iterate to return; the prepared run is as good as before."""
+    stated = Unicycle("straight", False, 20).formulation()
+    run = InteriorPoint(tolerance=1e-4).prepare(stated.graph)
+    before = run.solve(stated.guess, check=True)
+
+    def pressed(workspace: Workspace, what: int) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Workspace, "call", pressed)
+        with pytest.raises(KeyboardInterrupt):
+            run.solve(stated.guess)
+    again = run.solve(stated.guess, check=True)
+    assert again.cost == before.cost
+    assert again.iterations == before.iterations

@@ -234,3 +234,20 @@ def test_alm_leaves_a_subproblem_whose_steps_are_too_short_to_be_of_use() -> Non
     solution = solver.solve(graph, {x: np.full((1, 1), 0.3), y: np.zeros((1, 1))})
     assert solution.status is fg.Status.STOP_RULE
     assert solution.violation < 1e-4
+
+
+@pytest.mark.parametrize("solver", BACKENDS, ids=IDS)
+def test_a_far_start_overflows_in_silence(solver: fg.Solver) -> None:
+    """Squares of 1e160 overflow; that is for the status to say, not for a warning or an error of a QP solver."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(lambda p: np.stack([p[:, 0] + np.exp(-p[:, 1]), p[:, 0] ** 2 + 2.0 * p[:, 1]], axis=1), x)
+    constrained = not isinstance(solver, GaussNewton | LevenbergMarquardt | DogLeg)
+    if constrained:
+        graph.constrain(lambda p: p[:, :1] ** 3 + p[:, 1:] ** 2, x, lower=0.0, upper=0.0)
+    if constrained and not isinstance(solver, KKT):
+        graph.bound(x, upper=1e6)
+    for start in ([0.0, -300.0], [1e30, 1.0], [1e5, -200.0]):
+        solution = solver.solve(graph, {x: np.array([start])})
+        assert isinstance(solution.status, fg.Status)
+        assert all(np.isfinite(array).all() for array in solution.values.values())

@@ -51,12 +51,7 @@ def profile(shared_data: Path) -> Path:
 def solved(solver: str, length: int = 60, bounded: bool = False) -> Drive:
     """A drive of the shipped cycle."""
     bounds = (-1200.0, 900.0) if bounded else None
-    return run_tracking(TrackingSettings(length, solver, force_bounds=bounds, tolerance=tolerance(solver)))
-
-
-def tolerance(solver: str) -> float:
-    """Multipliers of some thousands and a violation of 1e-6 take a weight beyond double precision."""
-    return 1e-5 if solver == "penalty" else 1e-6
+    return run_tracking(TrackingSettings(length, solver, force_bounds=bounds))
 
 
 # ---------------------------------------------------------------- the vehicle
@@ -97,11 +92,9 @@ def test_rollout_satisfies_the_residual(rng: np.random.Generator) -> None:
 @pytest.mark.parametrize("solver", BACKENDS)
 def test_costs_of_the_reference(profile: Path, solver: str, linear: bool) -> None:
     for length, cost in zip(LENGTHS, COSTS[linear], strict=True):
-        drive = run_tracking(TrackingSettings(length, solver, profile, linear, tolerance=tolerance(solver)))
+        drive = run_tracking(TrackingSettings(length, solver, profile, linear))
         assert drive.succeeded, drive.solution.report()
-        # The penalty's J is lower by what its violations are worth.
-        allowed = 1e-6 if solver != "penalty" else 5e-6
-        assert drive.cost == pytest.approx(cost, rel=allowed)
+        assert drive.cost == pytest.approx(cost, rel=1e-6)
         assert drive.cost == pytest.approx(2.0 * drive.solution.cost, rel=1e-15)
 
 

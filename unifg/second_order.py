@@ -30,6 +30,16 @@ def lagrangian_hessian(program: Program, lin: Linearization, multipliers: Array)
     return entries
 
 
+def constraint_curvature(program: Program, lin: Linearization, multipliers: Array) -> Array:
+    """Hessian of multipliers' g alone, in the order of ``Program.normal``; arguments as above."""
+    entries = np.zeros(program.normal.nnz)
+    add_curvature(program.arrays, lin.values.flat, np.zeros(len(lin.residual)), multipliers, entries)
+    for term in program.batched:
+        if not isinstance(term.term, Cost):
+            _add(program, term, lin, multipliers, entries)
+    return entries
+
+
 def _add(program: Program, term: CompiledTerm, lin: Linearization, multipliers: Array, entries: Array) -> None:
     """Second derivatives of a term without a kernel."""
     if isinstance(term.term, Cost):

@@ -22,15 +22,17 @@ from unifg.variables import Family, Selection, Variable, as_selection
 
 @dataclass(frozen=True)
 class Guess:
-    """Values of the families and multipliers of the constraints, by term name.
+    """Values of the families, multipliers and penalties of the constraints by term name.
 
     Attributes:
         values: (count, storage) per family.
         multipliers: (n, m) per constraint term; absent terms start at zero.
+        penalties: (n, m) per constraint term, of backends that have them; absent terms leave them to the backend.
     """
 
     values: Mapping[Family, Array]
     multipliers: Mapping[str, Array] = field(default_factory=dict)
+    penalties: Mapping[str, Array] = field(default_factory=dict)
 
 
 class Solution:
@@ -50,6 +52,7 @@ class Solution:
         program: Program,
         linearization: Linearization,
         multipliers: Array,
+        penalties: Array,
         status: Status,
         measured: Optimality,
         history: list[Iteration] | Callable[[], list[Iteration]],
@@ -60,7 +63,7 @@ class Solution:
         """Assembled by :class:`unifg.Solver`."""
         self._program = program
         self._lin = linearization
-        self._multipliers = multipliers
+        self._multipliers, self._penalties = multipliers, penalties
         self._data = dict(program.data)
         self._equality = program.equality
         self._lower, self._upper = program.lower, program.upper
@@ -99,11 +102,12 @@ class Solution:
     @property
     def multipliers(self) -> dict[str, Array]:
         """Multipliers of every constraint term, (n, m) each."""
-        program = self._program
-        return {
-            term.name: self._multipliers[rows].reshape(term.count, term.size).copy()
-            for term, rows in zip(program.constraint_terms, program.slices, strict=True)
-        }
+        return self._by_term(self._multipliers)
+
+    @property
+    def penalties(self) -> dict[str, Array]:
+        """Penalties the solve ended with, (n, m) for every constraint term; empty when the backend has none."""
+        return self._by_term(self._penalties) if self._penalties.any() else {}
 
     @property
     def worst(self) -> tuple[str, int] | None:
@@ -138,7 +142,7 @@ class Solution:
         """A guess moved ``by`` stages towards the end of the horizon, for the next control tick.
 
         Member k of each family takes the value of member k + by, the last ones repeat the end. The
-        multipliers of a factor move with the stage of its first variable.
+        multipliers and penalties of a factor move with the stage of its first variable.
 
         Args:
             *families: the families that run along the horizon.
@@ -151,12 +155,15 @@ class Solution:
             self._require(as_selection(family))
             stages = np.minimum(np.arange(family.count) + by, family.count - 1)
             values[family] = values[family][stages]
-        multipliers = self.multipliers
+        multipliers, penalties = self.multipliers, self.penalties
         for term in self._program.constraint_terms:
             first = term.gathers[0].selection
             if first.family in families and len(first) == term.count:
-                multipliers[term.name] = multipliers[term.name][_shifted_rows(first.indices, by)]
-        return Guess(values, multipliers)
+                rows = _shifted_rows(first.indices, by)
+                multipliers[term.name] = multipliers[term.name][rows]
+                if penalties:
+                    penalties[term.name] = penalties[term.name][rows]
+        return Guess(values, multipliers, penalties)
 
     def covariance(self, *variables: Variable) -> Array:
         """(k, k) joint covariance of the selected unknowns, in their tangent spaces, in the order given.
@@ -222,6 +229,14 @@ class Solution:
         distance = np.where(np.isfinite(limit), np.abs(self._lin.constraints - limit), np.inf)
         held: BoolArray = np.abs(self._multipliers) > distance
         return held
+
+    def _by_term(self, stacked: Array) -> dict[str, Array]:
+        """Rows of the constraints, (n, m) for every term."""
+        program = self._program
+        return {
+            term.name: stacked[rows].reshape(term.count, term.size).copy()
+            for term, rows in zip(program.constraint_terms, program.slices, strict=True)
+        }
 
     def _require(self, selection: Selection) -> None:
         if selection.family not in self._lin.values:

@@ -129,6 +129,7 @@ class Run:
         values: at the present iterate.
         lin: linearisation there.
         multipliers: (M,) present multipliers.
+        penalties: (M,) those of the guess, for backends that have any, who leave their last ones here; zero for none.
         optimality: KKT numbers of both.
         status: None while the solve goes on.
         history: rows so far.
@@ -151,7 +152,7 @@ class Run:
         self.iterations = 0
         if solver.verbose:
             logger.info(HEADER)
-        self.values, self.multipliers = values, multipliers
+        self.values, self.multipliers, self.penalties = values, multipliers, np.zeros(len(multipliers))
         self.alone = not (self.watched or solver.search_iterations) and solver.runs_alone(program)
         if not self.alone:
             self.accept(program.linearize(values), multipliers, 0.0, 0.0)
@@ -160,6 +161,11 @@ class Run:
     def seconds(self) -> float:
         """Time since the solve began."""
         return time.perf_counter() - self._started
+
+    @property
+    def out_of_time(self) -> bool:
+        """Whether the time limit has passed."""
+        return self.seconds > self._solver.time_limit
 
     def accept(
         self,
@@ -265,6 +271,7 @@ class Run:
             self.program,
             self.lin,
             self.multipliers,
+            self.penalties,
             status,
             measured,
             self._recall or self.history,
@@ -282,7 +289,7 @@ class Run:
             return Status.UNBOUNDED
         if self.iterations >= self._solver.max_iterations:
             return Status.ITERATION_LIMIT
-        if self.seconds > self._solver.time_limit:
+        if self.out_of_time:
             return Status.TIME_LIMIT
         return None
 
@@ -325,11 +332,11 @@ class Prepared:
         """Solve from ``guess``; arguments and errors as for :meth:`Solver.solve`."""
         program = self.program
         program.bind(data or {})
-        carried = {} if isinstance(guess, Mapping) else dict(guess.multipliers)
-        start = guess if isinstance(guess, Mapping) else guess.values
-        values = program.values_from(start)
-        multipliers = self._multipliers({**carried, **(duals or {})})
-        run = Run(self.solver, program, values, multipliers, callback)
+        values = program.values_from(guess if isinstance(guess, Mapping) else guess.values)
+        carried = {} if isinstance(guess, Mapping) else guess.multipliers
+        run = Run(self.solver, program, values, self._stacked("multipliers", {**carried, **(duals or {})}), callback)
+        if not isinstance(guess, Mapping):
+            run.penalties = self._stacked("penalties", guess.penalties)
         self._refuse_not_finite(run)
         reason = None
         if run.status is None:
@@ -353,26 +360,23 @@ class Prepared:
         """Workspaces hold compiled objects that do not pickle; they are rebuilt on first use."""
         return {**self.__dict__, "_workspace": None}
 
-    def _multipliers(self, duals: Mapping[str, ArrayLike]) -> Array:
+    def _stacked(self, what: str, given: Mapping[str, ArrayLike]) -> Array:
+        """(M,) multipliers or penalties, zero where none are given."""
         result = np.zeros(self.program.constraints.count)
-        terms = self._constraints
-        for name, value in duals.items():
-            if name not in terms:
-                known = ", ".join(terms) or "none"
-                raise GraphError(
-                    f"multipliers given for '{name}', which is no constraint (there are: {known})", term=name
-                )
-            term, rows = terms[name]
+        for name, value in given.items():
+            if name not in self._constraints:
+                known = ", ".join(self._constraints) or "none"
+                raise GraphError(f"{what} given for '{name}', which is no constraint (there are: {known})", term=name)
+            term, rows = self._constraints[name]
             array = np.asarray(value, dtype=np.float64)
             if array.shape != (term.count, term.size):
                 raise GraphError(
-                    f"multipliers of '{name}' have shape {array.shape}, expected {(term.count, term.size)}",
-                    term=name,
+                    f"{what} of '{name}' have shape {array.shape}, expected {(term.count, term.size)}", term=name
                 )
             result[rows] = array.ravel()
-        if not np.isfinite(result).all():
+        if given and not np.isfinite(result).all():
             name = self.program.row_name(int(np.flatnonzero(~np.isfinite(result))[0]))[0]
-            raise GraphError(f"multipliers of '{name}' are not finite", term=name)
+            raise GraphError(f"{what} of '{name}' are not finite", term=name)
         return result
 
     def _refuse_not_finite(self, run: Run) -> None:

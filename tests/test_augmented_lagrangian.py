@@ -1,0 +1,131 @@
+"""The augmented Lagrangian's scaling of constraints, and what it takes from one solve to the next."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from benchmarks.control_loops import Ours
+from benchmarks.control_problems import Unicycle
+from problems import ecg2o, short_drive
+from unifg.solvers import SQP, AugmentedLagrangian
+from unifg.typing import Array
+
+
+def beside_a_disc(scale: float) -> tuple[fg.Graph, dict[fg.Family, Array]]:
+    """Points on a line that a disc is in the way of; the clearance is stated in units of 1 / ``scale`` metres."""
+    graph = fg.Graph()
+    p = graph.variables("p", fg.Rn(2), 5)
+    wishes = np.stack([np.linspace(-1.0, 1.0, 5), np.zeros(5)], axis=1)
+    graph.minimize(fg.prior, p, wishes, sigma=0.5)
+    graph.minimize(lambda a, b: b - a, p[:-1], p[1:], sigma=0.3)
+
+    def clearance(x: Array) -> Array:
+        distance: Array = np.linalg.norm(x - [0.1, -0.2], axis=1, keepdims=True)
+        return scale * (distance - 0.5)
+
+    graph.constrain(clearance, p, lower=0.0, name="clearance")
+    graph.constrain(lambda x: x[:, :1] + x[:, 1:], p[0], lower=-1.0, upper=-1.0, name="start")
+    return graph, {p: wishes + np.array([0.0, 0.3])}
+
+
+def test_a_unit_of_a_constraint_changes_little() -> None:
+    """Millimetres, metres or kilometres: nearly the same iterations, and multipliers in inverse units."""
+    graph, guess = beside_a_disc(1.0)
+    solver = AugmentedLagrangian(tolerance=1e-6)
+    metres = solver.solve(graph, guess, check=True)
+    assert np.abs(metres.dual("clearance")).max() > 0.1
+    for scale in (1e-3, 1e3):
+        graph, guess = beside_a_disc(scale)
+        solution = solver.solve(graph, guess, check=True)
+        # The tolerance of the violation has the unit too: of kilometres it is a loose one.
+        assert solution.iterations <= metres.iterations + 4
+        np.testing.assert_allclose(scale * solution.dual("clearance"), metres.dual("clearance"), rtol=5e-3, atol=1e-4)
+        plain = replace(solver, scaling=False).solve(graph, guess)
+        assert not plain.converged or plain.iterations > solution.iterations
+
+
+def test_penalties_follow_the_scale_of_their_rows() -> None:
+    graph, guess = beside_a_disc(1e3)
+    solution = AugmentedLagrangian().solve(graph, guess, check=True)
+    ratio = solution.penalties["start"] / solution.penalties["clearance"][:1]
+    assert ratio.item() == pytest.approx((1e3 / 2.0) ** 2, rel=0.2)  # rows of length 1 stay, of 1000 come to 2
+    plain = AugmentedLagrangian(scaling=False).solve(*short_drive(), check=True)
+    assert len({value for rows in plain.penalties.values() for value in rows.ravel()}) == 1
+
+
+def test_rows_without_slope_at_the_start_are_left_alone() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [2.0])
+    graph.constrain(lambda a: a**2, x, lower=1.0, upper=1.0, name="square")
+    solution = AugmentedLagrangian(max_iterations=1).solve(graph, {x: np.zeros((1, 1))})
+    assert np.isfinite(solution.penalties["square"]).all()
+    assert AugmentedLagrangian().solve(graph, {x: np.zeros((1, 1))}).converged
+
+
+def test_penalties_travel_with_multipliers() -> None:
+    """A second solve begins where the first ended, and needs less than one with multipliers alone."""
+    graph, guess = short_drive()
+    x, u = graph.families["x"], graph.families["u"]
+    run = AugmentedLagrangian().prepare(graph)
+    cold = run.solve(guess, check=True)
+    assert {name: rows.shape for name, rows in cold.penalties.items()} == {
+        name: rows.shape for name, rows in cold.multipliers.items()
+    }
+    moved = cold.shifted(x, u)
+    warm = run.solve(moved, check=True)
+    without = run.solve(replace(moved, penalties={}), check=True)
+    assert warm.history[1].details["penalty"] == cold.history[-1].details["penalty"]
+    assert warm.iterations < without.iterations < cold.iterations
+    np.testing.assert_array_equal(run.solve(moved)[u], warm[u], err_msg="a solve depends on its arguments alone")
+
+
+def test_closed_loop_takes_fewer_iterations_with_its_penalties() -> None:
+    problem = Unicycle("straight", True, 50)
+    spent = {}
+    for carried in (True, False):
+        driver, pose, spent[carried] = Ours(AugmentedLagrangian(tolerance=1e-4), problem, carried), problem.start, 0
+        for index in range(30):
+            control, _, iterations, status = driver.control(pose, index)
+            assert status == "converged"
+            spent[carried] += iterations if index else 0
+            pose = problem.plant(pose, control, index)
+    assert spent[True] < 0.8 * spent[False], spent
+
+
+def test_given_penalties_are_taken_term_by_term() -> None:
+    graph, guess = short_drive()
+    wanted = {"dynamics": np.full((12, 3), 700.0), "limits": np.full((12, 2), 70.0)}
+    solution = AugmentedLagrangian(max_iterations=1).solve(graph, fg.Guess(guess, {}, wanted))
+    for name, rows in wanted.items():
+        np.testing.assert_allclose(solution.penalties[name], rows)
+    named = AugmentedLagrangian(penalty=3.0, scaling=False, max_iterations=1).solve(graph, fg.Guess(guess, {}, wanted))
+    assert {value for rows in named.penalties.values() for value in rows.ravel()} == {3.0}, "an option is an order"
+
+
+def test_penalties_are_checked_and_others_have_none() -> None:
+    graph, guess = short_drive()
+    assert SQP().solve(graph, guess).penalties == {}
+    with pytest.raises(fg.GraphError, match="penalties given for 'nobody'"):
+        AugmentedLagrangian().solve(graph, fg.Guess(guess, {}, {"nobody": np.ones((1, 1))}))
+    with pytest.raises(fg.GraphError, match="penalties of 'dynamics' have shape"):
+        AugmentedLagrangian().solve(graph, fg.Guess(guess, {}, {"dynamics": np.ones((1, 1))}))
+
+
+def test_the_literal_loop_is_not_scaled() -> None:
+    graph, guess = ecg2o((-0.2, -0.2))
+    solution = AugmentedLagrangian(schedule="bazzana", penalty=10.0).solve(graph, guess)
+    assert solution.penalties == {name: pytest.approx(10.0) for name in solution.multipliers}
+
+
+@pytest.mark.parametrize("start", [(-2.0, -2.0), (2.0, 2.0)])
+@pytest.mark.parametrize("penalty", [1e-3, 10.0, 1e6])
+def test_the_literal_loop_may_run_away_and_says_so(start: tuple[float, float], penalty: float) -> None:
+    """Full Gauss-Newton steps without a merit function; warnings are errors here."""
+    solution = AugmentedLagrangian(schedule="bazzana", penalty=penalty).solve(*ecg2o(start))
+    assert solution.status in (fg.Status.SINGULAR, fg.Status.NOT_FINITE, fg.Status.ITERATION_LIMIT)
+    assert np.isfinite(solution.cost)

@@ -1,0 +1,103 @@
+"""What backends say where constraints contradict each other, and where they only seem to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.kkt import infeasible_stationary
+from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
+from unifg.solvers.least_violation import least_violation
+from unifg.typing import Array
+
+BACKENDS: dict[str, fg.Solver] = {
+    "kkt": KKT(),
+    "kkt-full": KKT(full_steps=True),
+    "penalty": Penalty(),
+    "alm": AugmentedLagrangian(),
+    "sqp": SQP(),
+    "sqp-exact": SQP(hessian="exact"),
+    "sqp-graph": SQP(qp="graph"),
+    "ipm": InteriorPoint(),
+}
+Problem = tuple[fg.Graph, dict[fg.Family, Array]]
+
+
+def two_values(weight: float) -> Problem:
+    """x = 0 and weight (x - 1) = 0."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [5.0])
+    graph.constrain(fg.prior, x, [0.0], lower=0.0, upper=0.0, name="zero")
+    graph.constrain(lambda v: weight * (v - 1.0), x, lower=0.0, upper=0.0, name="one")
+    return graph, {x: np.array([[3.0]])}
+
+
+def chain() -> Problem:
+    """A chain of points whose ends are given; one in the middle is to have a square of -1."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 4)
+    graph.minimize(fg.between, x[:-1], x[1:], [1.0, 0.0])
+    graph.constrain(fg.prior, x[0], [0.0, 0.0], lower=0.0, upper=0.0, name="start")
+    graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x[2], lower=-1.0, upper=-1.0, name="square")
+    graph.constrain(lambda p: p[:, :1], x[3], lower=3.0, upper=3.0, name="end")
+    return graph, {x: np.ones((4, 2))}
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize(("weight", "meeting"), [(1.0, 0.5), (1e3, 1e6 / (1e6 + 1.0))])
+def test_contradicting_equalities_end_at_the_least_violation(name: str, weight: float, meeting: float) -> None:
+    """The least squares of both violations, and the worse of the two by its name."""
+    graph, guess = two_values(weight)
+    solution = BACKENDS[name].solve(graph, guess)
+    assert solution.status is fg.Status.LOCALLY_INFEASIBLE, solution.report()
+    assert solution[graph.families["x"]][0, 0] == pytest.approx(meeting, abs=1e-6)
+    if weight > 1.0:
+        assert solution.worst == ("zero", 0)
+    assert "Largest violation" in solution.report()
+
+
+@pytest.mark.parametrize("name", [name for name in BACKENDS if name != "kkt-full"])
+def test_one_impossible_row_among_others_is_named(name: str) -> None:
+    graph, guess = chain()
+    solution = BACKENDS[name].solve(graph, guess)
+    assert solution.status is fg.Status.LOCALLY_INFEASIBLE, solution.report()
+    assert solution.worst == ("square", 0)
+    assert solution.violation == pytest.approx(1.0, abs=1e-5)
+    x = graph.families["x"]
+    np.testing.assert_allclose(solution[x][0], 0.0, atol=1e-4)
+    assert solution[x][3, 0] == pytest.approx(3.0, abs=1e-4)
+
+
+def saddle(away: float = 0.0) -> Problem:
+    """1 + x^2 = y^2: at the origin the violation is stationary, yet along y it falls."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(fg.prior, x, [0.0, 0.5])
+    graph.constrain(lambda p: 1.0 + p[:, :1] ** 2 - p[:, 1:] ** 2, x, lower=0.0, upper=0.0, name="hyperbola")
+    return graph, {x: np.array([[away, 0.0]])}
+
+
+@pytest.mark.parametrize("name", [name for name in BACKENDS if name != "kkt-full"])
+def test_a_saddle_of_the_violation_is_not_taken_for_its_minimum(name: str) -> None:
+    graph, guess = saddle()
+    solution = BACKENDS[name].solve(graph, guess)
+    assert solution.status is not fg.Status.LOCALLY_INFEASIBLE, solution.report()
+    assert solution.violation < 1e-5
+
+
+@pytest.mark.parametrize(
+    "build", [lambda: two_values(1e3), chain, lambda: saddle(0.3)], ids=["values", "chain", "saddle"]
+)
+def test_least_violation_is_stationary_or_none(build: Callable[[], Problem]) -> None:
+    graph, guess = build()
+    program = graph.compile()
+    lin = program.linearize(program.values_from(guess))
+    found = least_violation(program, lin, 1e-6)
+    outside = np.abs(program.violation(found.constraints)).max()
+    assert outside <= 1e-6 or infeasible_stationary(program, found, 1e-6)
+    stopped = least_violation(program, lin, 1e-6, out_of_time=lambda: True)
+    np.testing.assert_array_equal(stopped.values.flat, lin.values.flat)
