@@ -43,6 +43,7 @@ types: $(VENV)/ready-dev
 bench: $(VENV)/ready-bench
 	$(BIN)/python -m benchmarks.reference_problems
 	$(BIN)/python -m benchmarks.obstacle_fields
+	$(BIN)/python -m benchmarks.obstacle_courses
 	$(BIN)/python -m benchmarks.incremental
 	$(BIN)/python -m benchmarks.collection
 	$(BIN)/python -m benchmarks.ecg2o

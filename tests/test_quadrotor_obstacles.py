@@ -1,0 +1,217 @@
+"""The flight past three walls and a cylinder: what must come out, what must be noticed, what is drawn and written."""
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from benchmarks.obstacle_courses import METHODS, Method, Outcome, distinct, lowest, render, wilson
+from judge import judge
+from unifg.errors import BackendError, ScenarioError
+from unifg.models import avoidance, quadrotor
+from unifg.scenarios import cli
+from unifg.scenarios.quadrotor import obstacles, obstacles_arguments
+from unifg.scenarios.quadrotor.layouts import Layout, obstacle_course
+from unifg.scenarios.quadrotor.obstacles import Course, CourseSettings, backend, course_guess, run_course, state_problem
+from unifg.scenarios.quadrotor.obstacles_log import course_log
+from unifg.scenarios.quadrotor.obstacles_plots import chosen_iterates, picture, plot_above
+from unifg.scenarios.quadrotor.obstacles_results import course_metrics, summary
+from unifg.scenarios.quadrotor.world import VEHICLE_RADIUS
+
+BACKENDS = (("sqp", "exact"), ("sqp", "gauss-newton"), ("ipm", "exact"), ("ipm", "gauss-newton"), ("alm", None))
+POTENTIAL, HARD = 61.2071, 29.8606  # costs of the nominal layout, on which all five backends agree
+
+
+@cache
+def flown(**changes: object) -> Course:
+    return run_course(CourseSettings(**changes))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("solver", "hessian"), BACKENDS)
+@pytest.mark.parametrize(("avoidance", "cost"), [("potential", POTENTIAL), ("hard", HARD)])
+def test_every_backend_finds_the_same_flight(solver: str, hessian: str | None, avoidance: str, cost: float) -> None:
+    course = flown(solver=solver, hessian=hessian, avoidance=avoidance)
+    s = course.settings
+    assert course.solution.status is fg.Status.CONVERGED
+    assert course.solution.cost == pytest.approx(cost, abs=1e-3)
+    assert course.succeeded and course.arrived and course.clear and course.flyable
+    assert course.clearance[1:].min() >= (s.clearance - 1e-6 if avoidance == "hard" else 0.3)
+    assert course.clearance.min() - 0.04 < course.clearance_between <= course.clearance.min()
+    np.testing.assert_array_equal(course.states[0], [*course.layout.start, 1, 0, 0, 0, 0, 0, 0])
+    again = quadrotor.rollout(course.states[0], course.controls, s.dt, s.vehicle)
+    np.testing.assert_allclose(again[:, [0, 1, 2, 7, 8, 9]], course.states[:, [0, 1, 2, 7, 8, 9]], atol=1e-4)
+    assert course.states[:, 2].min() >= -1e-6
+    assert np.abs(course.states[:, 7:]).max() <= s.speed_limit + 1e-6
+    assert course.drift < 0.1  # the trapezoid of 0.1 s against a fine integrator, over the whole flight
+
+
+@pytest.mark.parametrize(("solver", "way"), [("sqp", "potential"), ("ipm", "hard")])
+def test_an_independent_judge_agrees(solver: str, way: str) -> None:
+    settings = CourseSettings(solver=solver, avoidance=way, horizon=20, dt=0.25)  # type: ignore[arg-type]
+    layout = settings.layout()
+    graph, x, u = state_problem(settings, layout)
+    states, controls = course_guess(replace(settings, guess="way"), layout)
+    solution = backend(settings).solve(graph, {x: states, u: controls}, check=True)
+    assert judge(graph, solution).worst() < 5e-6
+
+
+def test_the_exact_hessian_saves_iterations() -> None:
+    exact, rough = flown(solver="sqp", hessian="exact"), flown(solver="sqp", hessian="gauss-newton")
+    assert 2 * exact.solution.iterations <= rough.solution.iterations
+
+
+def test_gauss_newton_knows_a_quarter_of_the_curvature() -> None:
+    root = avoidance.inverse_distance_root(avoidance.sphere_clearance, 0.1).function
+    place, size = (np.zeros((1, 3)), np.zeros(1)), 1e-4
+    for d in (0.3, 1.0, 4.0):
+        low, here, high = (root(np.array([[d + step, 0.0, 0.0]]), *place).item() for step in (-size, 0.0, size))
+        slope = (high - low) / (2.0 * size)
+        curvature = 0.5 * (high**2 - 2.0 * here**2 + low**2) / size**2
+        assert 0.5 * here**2 == pytest.approx(1.0 / d)
+        assert slope**2 / curvature == pytest.approx(0.25, abs=1e-3)
+
+
+@pytest.mark.parametrize("solver", ["sqp", "ipm"])
+def test_a_general_cost_and_its_square_are_the_same_problem(solver: str) -> None:
+    general, square = flown(solver=solver, general=True), flown(solver=solver)
+    assert general.succeeded
+    assert general.solution.cost == pytest.approx(square.solution.cost, abs=1e-5)
+    np.testing.assert_allclose(general.states, square.states, atol=1e-4)
+
+
+def test_a_local_minimum_is_no_success() -> None:
+    course = flown(avoidance="hard", guess="hover")
+    assert course.solution.converged and course.clear and course.flyable
+    assert course.target_distance > 1.0
+    assert not course.arrived and not course.safe and not course.succeeded
+
+
+def test_a_wall_crossed_between_two_nodes_is_a_collision() -> None:
+    wall = np.array([[[1.0, -2.0], [1.0, 2.0]]])
+    layout = Layout(np.zeros(3), np.array([2.0, 0.0, 0.0]), np.zeros((0, 3)), wall, np.array([[-1, -2], [3, 2]]))
+    settings = CourseSettings(horizon=2, dt=1.0)
+    hover = quadrotor.hover(settings.vehicle)
+    states = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0], (3, 1))
+    states[:, 0] = [-1.4, 0.6, 2.6]
+    graph, x, u = state_problem(settings, layout)
+    solution = backend(replace(settings, avoidance="hard")).solve(graph, {x: states, u: np.tile(hover, (2, 1))})
+    course = Course(settings, layout, solution, states, np.tile(hover, (2, 1)), states[None])
+    assert course.flyable
+    assert course.clearance.min() == pytest.approx(0.4 - VEHICLE_RADIUS)
+    assert course.clearance_between == pytest.approx(-VEHICLE_RADIUS)
+    assert not course.clear
+    bent = states.copy()
+    bent[1, 1] += 0.01
+    assert not replace(course, states=bent).flyable
+    assert not replace(course, controls=course.controls - [0.0, 0.0, 0.0, 11.0]).flyable
+
+
+def test_guesses() -> None:
+    settings, layout = CourseSettings(), obstacle_course()
+    hover, _ = course_guess(replace(settings, guess="hover"), layout)
+    line, _ = course_guess(replace(settings, guess="line"), layout)
+    way, controls = course_guess(replace(settings, guess="way"), layout)
+    assert (hover == hover[0]).all()
+    assert layout.distance(line[:, :2]).min() < 0.1 and layout.distance(way[:, :2]).min() > 0.5
+    for states in (line, way):
+        np.testing.assert_allclose(states[-1, :3], layout.target, atol=1e-12)
+        np.testing.assert_allclose(states[:-1, :3] + settings.dt * states[1:, 7:], states[1:, :3], atol=1e-12)
+    assert (controls == quadrotor.hover(settings.vehicle)).all()
+    assert settings.chosen_guess == "hover" and replace(settings, avoidance="hard").chosen_guess == "way"
+
+
+def test_what_cannot_be_asked_for() -> None:
+    with pytest.raises(ScenarioError, match="unknown solver 'newton'"):
+        run_course(CourseSettings(solver="newton"))
+    with pytest.raises(ScenarioError, match="alm knows the Gauss-Newton Hessian only"):
+        run_course(CourseSettings(solver="alm", hessian="exact"))
+    with pytest.raises(ScenarioError, match="unknown guess"):
+        run_course(CourseSettings(guess="luck"))  # type: ignore[arg-type]
+    with pytest.raises(BackendError, match="scalar cost 'cylinder'"):
+        run_course(CourseSettings(solver="alm", general=True))
+    corners = np.array([[1.0, -1.0], [3.0, -1.0], [3.0, 1.0], [1.0, 1.0]])
+    box = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+    closed = Layout(np.zeros(3), np.array([2.0, 0.0, 1.0]), np.zeros((0, 3)), box, np.array([[-1, -2], [4, 2]]), "box")
+    with pytest.raises(ScenarioError, match=r"'box' has no way of clearance 0\.3 m"):
+        course_guess(CourseSettings(guess="way"), closed)
+
+
+def test_pictures_show_four_iterates_and_every_number() -> None:
+    course = flown()
+    assert len(course.iterates) == course.solution.iterations + 1
+    np.testing.assert_array_equal(course.iterates[-1], course.states)
+    assert chosen_iterates(1) == [0] and chosen_iterates(3) == [0, 1, 2] and chosen_iterates(41) == [0, 1, 13, 40]
+    figure = picture(course)
+    axes = figure.get_axes()
+    assert len(axes) == 10
+    assert [line.get_xydata().shape[0] for line in axes[-1].lines] == [len(course.iterates), 4]  # type: ignore[union-attr]
+    first = plot_above(course, 1, axes[0])
+    labels = first.get_legend_handles_labels()[1]
+    assert "node where the hull would touch" in labels  # the first step leads through a wall
+
+
+def test_the_log_is_the_flight() -> None:
+    course = flown()
+    log = course_log(course)
+    assert log.ticks == 4 * course.settings.horizon + 1 and log.dt == pytest.approx(0.025)
+    np.testing.assert_allclose(log.truth[::4], course.states, atol=1e-6)
+    np.testing.assert_allclose(log.plans[:, -1], np.tile(course.states[-1, :3], (log.ticks, 1)))
+    assert log.succeeded and "seed" not in log.settings
+    assert log.clearance.min() == pytest.approx(course.clearance_between, abs=1e-2)
+    assert not course_log(flown(avoidance="hard", guess="hover")).reached
+
+
+def test_numbers_and_words() -> None:
+    course = flown()
+    numbers = course_metrics(course)
+    assert len(numbers["costs"]) == len(numbers["violations"]) == numbers["iterations"] + 1
+    assert numbers["costs"][-1] == pytest.approx(numbers["cost"])
+    assert 0.0 < numbers["max_tilt_rad"] < 0.6 and numbers["path_length_m"] > 8.0
+    assert "arrived" in summary(course) and "clear" in summary(course)
+    assert "NOT ARRIVED" in summary(flown(avoidance="hard", guess="hover"))
+
+
+def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["run", "quadrotor-obstacles", "--out", str(tmp_path)]
+    assert cli.main([*words, "--solver", "ipm", "--avoidance", "hard", "--seed", "1003"]) == 0
+    assert "obstacle course 1003" in capsys.readouterr().out
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["iterates.png", "metrics.json", "scene.html"]
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["succeeded"] and metrics["guess"] == "way" and metrics["layout"] == "obstacle course 1003"
+    assert cli.main([*words, "--solver", "alm", "--hessian", "exact"]) == 2
+    assert cli.main([*words, "--seed", "-1"]) == 2
+
+
+def test_the_command_line_reports_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from unifg.scenarios.quadrotor import obstacles_results
+
+    monkeypatch.setattr(obstacles_results, "write_results", lambda folder, course: [])
+    words = ["run", "quadrotor-obstacles", "--avoidance", "hard", "--guess", "hover", "--out", str(tmp_path)]
+    assert cli.main(words) == 1
+
+
+def test_the_command_line_offers_what_the_scenario_has() -> None:
+    for name in ("SOLVERS", "HESSIANS", "AVOIDANCES", "GUESSES"):
+        assert getattr(obstacles_arguments, name) == getattr(obstacles, name)
+
+
+def test_statistics_of_the_study() -> None:
+    # Newcombe (1998), table I: 81 of 263, 15 of 148, 0 of 20.
+    assert wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
+    assert wilson(15, 148) == pytest.approx((0.0624, 0.1605), abs=1e-4)
+    assert wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
+    assert distinct([]) == 0 and distinct([1.0, 1.0 + 1e-6, 1.01, 5.0]) == 3
+    good = Outcome(0, "converged", True, True, True, True, 2.0, 0.0, 0.1, 5, 1.0)
+    results = {method: [good] for method in METHODS}
+    cheap = Method("potential", "way", "ipm", "exact")
+    results[cheap] = [replace(good, cost=1.0, clear=False)]
+    results[Method("hard", "line", "ipm", "exact")] = [replace(good, cost=0.5, converged=False)]
+    assert [o and o.cost for o in lowest(results, "potential")] == [1.0]
+    assert [o and o.cost for o in lowest(results, "hard")] == [2.0]
+    text = render(results, [obstacle_course()])
+    assert "| potential | 0 | 1 | 0 | 0 | 2 | 1 | 1 | 0 |" in text
+    assert "| potential | way | ipm, exact | 0 | 0 to 79 % | 1 | 0 | 1 | 1 | 5 | 1 |" in text
