@@ -23,6 +23,8 @@ from unifg import __version__
 from unifg.errors import UnifgError
 from unifg.history import Iteration
 from unifg.scenarios import solve_arguments, velocity_tracking_arguments
+from unifg.scenarios.outcome import Outcome, Progress
+from unifg.scenarios.quadrotor import mpc_arguments, obstacles_arguments
 from unifg.scenarios.results import summary, write_results
 
 __all__ = ["SCENARIOS", "SOLVERS", "Outcome", "Scenario", "main"]
@@ -33,27 +35,9 @@ COUPLINGS = ("sequential", "joint")
 MANOEUVRES = ("behind", "obstacle")
 
 Pose = tuple[float, float, float]
-Progress = Callable[[float, str], None]
 
 _PAIRED_OPTIONS = ("--start", "--goal", "--force-bounds")
 _NEGATIVE = re.compile(r"-[\d.]")
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How a run ended.
-
-    Attributes:
-        succeeded: whether the robot did what it was asked.
-        interrupted: whether the user stopped it.
-        summary: table for people.
-        write: writes the results into an existing folder and returns the files.
-    """
-
-    succeeded: bool
-    interrupted: bool
-    summary: str
-    write: Callable[[Path], list[Path]]
 
 
 @dataclass(frozen=True)
@@ -381,6 +365,20 @@ SCENARIOS = {
         random=False,
         solvers=velocity_tracking_arguments.SOLVERS,
         solver="kkt",
+    ),
+    "quadrotor-mpc": Scenario(
+        mpc_arguments.DESCRIPTION,
+        mpc_arguments.add_arguments,
+        mpc_arguments.run,
+        solvers=mpc_arguments.SOLVERS,
+        solver="ipm",
+    ),
+    "quadrotor-obstacles": Scenario(
+        obstacles_arguments.DESCRIPTION,
+        obstacles_arguments.add_arguments,
+        obstacles_arguments.run,
+        random=False,  # its seed has no default: without one, the nominal layout
+        solvers=obstacles_arguments.SOLVERS,
     ),
 }
 """Everything ``unifg run`` can run."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -159,7 +159,7 @@ class Solution:
         for term in self._program.constraint_terms:
             first = term.gathers[0].selection
             if first.family in families and len(first) == term.count:
-                rows = _shifted_rows(first.indices, by)
+                rows = _shifted_rows(first.indices.astype(np.int64).tobytes(), by)
                 multipliers[term.name] = multipliers[term.name][rows]
                 if penalties:
                     penalties[term.name] = penalties[term.name][rows]
@@ -245,16 +245,21 @@ class Solution:
             )
 
 
-def _shifted_rows(stages: IntArray, by: int) -> IntArray:
+@lru_cache(maxsize=256)
+def _shifted_rows(stages: bytes, by: int) -> IntArray:
     """For each factor the factor ``by`` stages later with the same rank within its stage.
 
-    Where no such stage exists, the last stage that has that rank serves.
+    Where no such stage exists, the last stage that has that rank serves. Control loops ask for the same every tick.
+
+    Args:
+        stages: of the factors, int64.
+        by: number of stages.
     """
     place: dict[tuple[int, int], int] = {}
     seen: dict[int, int] = {}
     keys = []
     last: dict[int, int] = {}
-    for factor, stage in enumerate(stages.tolist()):
+    for factor, stage in enumerate(np.frombuffer(stages, dtype=np.int64).tolist()):
         rank = seen.get(stage, 0)
         seen[stage] = rank + 1
         place[stage, rank] = factor

@@ -13,6 +13,7 @@ from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
 
 Source: TypeAlias = Literal["solved", "violating", "kept", "braking"]
+Avoidance: TypeAlias = Literal["clearance", "potential"]
 BACKENDS = ("ipm", "sqp", "alm")
 
 
@@ -73,9 +74,9 @@ class ControllerSettings:
     margin_limit: float = 0.1
     cylinders: int = 5
     movers: int = 2
-    mover_margin: float = 0.15
-    mover_growth: float = 0.15
-    avoidance: Literal["clearance", "potential"] = "clearance"
+    mover_margin: float = 0.25
+    mover_growth: float = 0.25
+    avoidance: Avoidance = "clearance"
     general_costs: bool = False
     goal_sigma: float = 1.0
     potential_weight: float = 1.0

@@ -1,0 +1,129 @@
+"""The campaign of flights: what is flown, that it can go on where it stopped, and what its tables say."""
+
+from __future__ import annotations
+
+import copy
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from benchmarks import quadrotor_flights, quadrotor_tables
+from benchmarks.quadrotor_flights import Job, jobs_of, read_rows
+from unifg.scenarios.quadrotor.episode import FlightSettings, run_flight
+from unifg.scenarios.quadrotor.flight_log import FlightLog
+
+Row = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def short_rows() -> dict[str, Row]:
+    """A row of each coupling, of flights that last a moment; through JSON, as they are stored."""
+    rows = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(quadrotor_flights, "run_flight", moment)
+        for coupling in quadrotor_tables.VARIANTS:
+            row = quadrotor_flights.fly(Job("flights", "ipm", coupling, 1006))
+            rows[coupling] = json.loads(json.dumps(row, allow_nan=False))
+    return rows
+
+
+def moment(settings: FlightSettings) -> FlightLog:
+    """Fly a little longer than the first time at which the mass is looked at."""
+    return run_flight(replace(settings, time_limit=1.1))
+
+
+def test_every_study_flies_what_it_should() -> None:
+    jobs = jobs_of(
+        quadrotor_flights.STUDIES, quadrotor_flights.SOLVERS, quadrotor_flights.COUPLINGS, range(100), "code"
+    )
+    count = {study: sum(job.study == study for job in jobs) for study in quadrotor_flights.STUDIES}
+    assert count == {
+        "flights": 7 * 100, "potential": 3 * 100, "association": 100, "movers": 100, "weights": 60,
+        "timing": 20 * 2 * (3 + 1 + 1),
+    }  # fmt: skip
+    assert len({job.key for job in jobs}) == len(jobs)
+    weighted = next(job for job in jobs if job.weight == 10.0).settings()
+    assert (weighted.coupling, weighted.controller.control_weight) == ("joint", 10.0)
+    assert next(job for job in jobs if job.study == "potential").settings().controller.avoidance == "potential"
+    assert next(job for job in jobs if job.study == "association").settings().estimator.association == "unknown"
+    assert next(job for job in jobs if job.study == "movers").settings().movers == 2
+
+
+def test_finished_flights_are_not_repeated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    flown: list[Job] = []
+
+    def fly(job: Job) -> Row:
+        flown.append(job)
+        return {"key": list(job.key), "error": "none", **job.__dict__}
+
+    monkeypatch.setattr(quadrotor_flights, "fly", fly)
+    monkeypatch.setattr(quadrotor_flights, "code_digest", lambda: "now")
+    store = tmp_path / "rows.jsonl"
+    words = ["--seeds", "1000:1003", "--studies", "flights", "--solvers", "sqp", "--store", str(store)]
+    assert quadrotor_flights.main(words) == 0
+    assert len(flown) == 6
+    store.write_text(store.read_text() + '{"cut off')
+    assert quadrotor_flights.main(words) == 0
+    assert len(flown) == 6
+    monkeypatch.setattr(quadrotor_flights, "code_digest", lambda: "later")
+    store.write_text(store.read_text() + "\n")
+    assert quadrotor_flights.main(words) == 0
+    assert len(flown) == 12
+    assert len(read_rows(store, None)) == 12
+    assert len(read_rows(store, "later")) == 6
+
+
+def test_rows_have_what_tables_need(short_rows: dict[str, Row]) -> None:
+    text = quadrotor_tables.render(list(short_rows.values()))
+    assert "1 seeds" in text
+    assert "0 of 1" in text
+    assert "m from the target after 1.1 s" in text
+    assert "| ipm | sequential | 1 | 1 |" in text
+    assert "nan" not in text
+    for block in text.split("\n\n"):
+        lines = [line for line in block.splitlines() if line.startswith("|")]
+        assert len({line.count("|") for line in lines}) <= 1
+
+
+def test_a_failure_is_told(short_rows: dict[str, Row]) -> None:
+    row = copy.deepcopy(short_rows["sequential"])
+    row["metrics"] |= {"collisions": 1, "reached": True}
+    row["contact"] = {"time_s": 3.2, "place": [4.0, -1.0, 1.5], "position_error_m": 0.02, "emergency_before": 4}
+    assert "touched at 3.2 s, (4.0, -1.0, 1.5); belief off by 2 cm, 4 of 20 ticks" in quadrotor_tables.failures([row])
+    row["metrics"]["succeeded"] = True
+    assert quadrotor_tables.failures([row]) == ""
+
+
+def test_differences_are_paired(short_rows: dict[str, Row]) -> None:
+    def variant(value: float | None) -> Row:
+        row = copy.deepcopy(short_rows["joint"])
+        row["metrics"]["time_to_goal_s"] = value
+        return row
+
+    read = quadrotor_tables.MEASURES["time to goal [s]"]
+    mine = {0: variant(3.0), 1: variant(4.0), 2: variant(None), 4: variant(9.0)}
+    base = {0: variant(1.0), 1: variant(5.0), 2: variant(6.0), 3: variant(7.0)}
+    np.testing.assert_array_equal(quadrotor_tables.paired(mine, base, read), ([3.0, 4.0], [1.0, 5.0]))
+
+
+def test_the_worst_run_counts_and_enough_ticks_are_needed() -> None:
+    def row(run: int, milliseconds: float, ticks: int) -> Row:
+        times = {"estimate_ms": [milliseconds] * ticks, "plan_ms": [1.0] * ticks}
+        return {"study": "timing", "solver": "ipm", "coupling": "joint", "run": run, "metrics": {}, **times}
+
+    rows = [row(0, 4.0, 3000), row(0, 6.0, 2500), row(1, 9.0, 5000)]
+    assert "| ipm | joint | 2 | 5000 | 10.0 | 10.0 | 10.0 | 9.0 / 9.0 | 1.0 / 1.0 |" in quadrotor_tables.ticks(rows)
+    assert "| yes |" in quadrotor_tables.goals(rows)
+    assert "| no |" in quadrotor_tables.goals([row(0, 4.0, 4999)])
+    assert "| no |" in quadrotor_tables.goals([row(0, 20.0, 5000)])
+
+
+def test_wilson_intervals() -> None:
+    for good, count in ((95, 100), (5, 5), (0, 7), (1, 2)):
+        wanted = stats.binomtest(good, count).proportion_ci(0.95, "wilson")
+        assert quadrotor_tables.wilson(good, count) == pytest.approx((wanted.low, wanted.high), abs=1e-4)

@@ -1,0 +1,374 @@
+"""The quadrotor's joint graph: what the past says, how far the plan may pull it, and what a plan must keep.
+
+One window, filled by a flight, serves most tests: several controllers solve it, none changes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from benchmarks import quadrotor_pull
+from unifg.lie import SO3
+from unifg.models import quadrotor
+from unifg.program import Program
+from unifg.scenarios.quadrotor.belief import Belief
+from unifg.scenarios.quadrotor.episode import Flight, FlightSettings
+from unifg.scenarios.quadrotor.estimator import Estimator
+from unifg.scenarios.quadrotor.joint import JointController, JointSettings
+from unifg.scenarios.quadrotor.joint_pilot import JointPilot, joint_pilot
+from unifg.scenarios.quadrotor.layouts import Layout
+from unifg.scenarios.quadrotor.plan import BACKENDS, ControllerSettings, Movers, Plan
+from unifg.scenarios.quadrotor.slots import FAR_AWAY
+from unifg.scenarios.quadrotor.standardised import standardised
+from unifg.scenarios.quadrotor.window_terms import Shared, WindowTerms
+from unifg.solvers import InteriorPoint
+from unifg.typing import Array
+
+SEED = 1000  # of those open to tuning
+FREE = JointSettings(np.inf)
+
+
+class Past:
+    """A window filled by a flight, up to a tick that has not been planned yet."""
+
+    def __init__(self, ticks: int, settings: FlightSettings) -> None:
+        flight = Flight(settings)
+        control: Array | None = None
+        for _ in range(ticks):
+            control = flight.pilot.tick(flight.world.sense(), control).controls[0]
+            flight.world.step(control, settings.controller.dt)
+        self.layout: Layout = flight.conditions.layout
+        self.estimator: Estimator = flight.pilot.estimator
+        self.belief: Belief = self.estimator.update(flight.world.sense(), control)
+
+    def controller(self, joint: JointSettings, solver: str = "ipm", **changes: object) -> JointController:
+        """A joint graph on this window."""
+        settings = replace(ControllerSettings(), **changes)  # type: ignore[arg-type]
+        return JointController(self.estimator, self.layout, solver, settings, joint)
+
+    def pulled(self, believed: Belief) -> dict[str, Array]:
+        """How far a belief is from what the past says, in standard deviations."""
+        past = self.belief
+        known = past.parameters_sigma > 0.0
+        sigma = np.sqrt(np.diagonal(past.landmarks.covariances, axis1=1, axis2=2))
+        return {
+            "state": quadrotor.STATE.local(past.state[None], believed.state[None])[0] / past.sigma,
+            "parameters": ((believed.parameters.packed - past.parameters.packed)[known] / past.parameters_sigma[known]),
+            "landmarks": (believed.landmarks.positions - past.landmarks.positions) / sigma,
+        }
+
+
+@pytest.fixture(scope="module")
+def past() -> Past:
+    return Past(40, FlightSettings(seed=SEED))
+
+
+@pytest.fixture
+def compilations(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """Grows by one with every graph that is compiled."""
+    made: list[int] = []
+    build = Program.__init__
+
+    def counted(self: Program, *arguments: object, **options: object) -> None:
+        made.append(len(made))
+        build(self, *arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Program, "__init__", counted)
+    yield made
+
+
+def alone(past: Past) -> tuple[fg.Solution, fg.Family, Shared]:
+    """The past's terms in a graph of their own, solved to the end."""
+    window, graph = past.estimator.window, fg.Graph()
+    present = graph.variables("present", quadrotor.STATE, 1)
+    shared = Shared(graph, window.settings, window.parameters)
+    terms = WindowTerms(graph, present[:], shared, window.settings)
+    guess = {**terms.guess(window), present: window.present[None]}
+    solution = InteriorPoint(tolerance=1e-9).solve(graph, guess, data=terms.data(window))
+    assert solution.status.converged
+    return solution, present, shared
+
+
+def defects(plan: Plan, parameters: quadrotor.Parameters, dt: float) -> Array:
+    """(N, 9) of the implicit trapezoid, written out."""
+    x, y, u = plan.states[:-1], plan.states[1:], plan.controls
+
+    def acceleration(states: Array) -> Array:
+        R = SO3.matrix(states[:, 3:7])
+        along = np.einsum("nji,nj->ni", R, states[:, 7:])
+        force = u[:, 3:] * R[:, :, 2] - np.einsum("nij,nj->ni", R, np.array(parameters.drag) * along)
+        world = np.array([*parameters.wind, parameters.updraft - quadrotor.GRAVITY])
+        total: Array = force / parameters.mass + world
+        return total
+
+    turned = SO3.log(SO3.compose(SO3.inverse(x[:, 3:7]), y[:, 3:7]))
+    moved = y[:, :3] - x[:, :3] - 0.5 * dt * (x[:, 7:] + y[:, 7:])
+    hastened = y[:, 7:] - x[:, 7:] - 0.5 * dt * (acceleration(x) + acceleration(y))
+    return np.concatenate([moved, turned - dt * u[:, :3], hastened], axis=1)
+
+
+# ---------------------------------------------------------------- what the graph says
+
+
+def test_without_wishes_the_past_decides(past: Past) -> None:
+    """A future that costs nothing leaves states, parameters and landmarks where the past alone puts them."""
+    controller = past.controller(FREE, control_weight=1e-9, tolerance=1e-7)
+    assert controller.plan(past.belief).status is fg.Status.CONVERGED
+    solution, present, shared = alone(past)
+    marks = [past.estimator.atlas.slot_of(name) for name in past.belief.landmarks.ids.tolist()]
+    believed = controller.believed
+    assert np.abs(quadrotor.STATE.local(solution[present], believed.state[None])).max() < 1e-6
+    assert np.abs(believed.landmarks.positions - solution[shared.landmarks][marks]).max() < 1e-6
+    found = np.concatenate([solution[family][0] for family in shared.parameters])
+    assert np.abs(believed.parameters.packed - found).max() < 1e-6
+
+
+def test_wishes_pull_on_what_is_shared(past: Past) -> None:
+    """The bias of one graph without a bound: it grows with the weight of the future's costs, in all that is shared."""
+    pulled = []
+    for weight in (0.1, 1.0, 100.0):
+        controller = past.controller(FREE, control_weight=weight)
+        assert controller.plan(past.belief).source == "solved"
+        pulled.append({name: float(np.abs(value).max()) for name, value in past.pulled(controller.believed).items()})
+    for name in ("state", "parameters", "landmarks"):
+        weak, normal, strong = (row[name] for row in pulled)
+        assert 2.0 * weak < normal < 0.2
+        assert strong > 2.0 * normal
+        assert strong > 0.1
+
+
+def test_the_pull_is_bounded(past: Past) -> None:
+    for bound in (0.1, 0.5):
+        controller = past.controller(JointSettings(bound), control_weight=100.0)
+        assert controller.plan(past.belief).status.converged
+        found = np.concatenate([np.abs(value).ravel() for value in past.pulled(controller.believed).values()])
+        assert bound - 2e-3 < found.max() < bound + 2e-3
+
+
+@pytest.mark.parametrize("solver", BACKENDS)
+def test_a_plan_moves_as_the_shared_parameters_say_and_keeps_clear_of_the_shared_map(solver: str, past: Past) -> None:
+    controller = past.controller(JointSettings(), solver, margin=0.9)  # so wide that the way does not keep it
+    s, plan, believed = controller.settings, controller.plan(past.belief), controller.believed
+    assert plan.source == "solved"
+    assert believed is not past.belief
+    assert np.array_equal(plan.states[0], believed.state)
+    assert np.abs(defects(plan, believed.parameters, s.dt)).max() < s.feasible
+    cylinders = believed.landmarks.cylinders
+    gaps = np.hypot(*np.moveaxis(plan.states[15:, None, :2] - cylinders.positions, 2, 0)) - cylinders.radii
+    doubt = np.sqrt(np.linalg.eigvalsh(cylinders.covariances)[:, -1])
+    spare = gaps - s.vehicle_radius - s.margin - np.minimum(s.sigmas * doubt, s.margin_limit)
+    assert -5e-3 < spare.min() < 5e-3
+    tilt = SO3.matrix(plan.states[1:, 3:7])[:, 2, :2]
+    assert np.abs(tilt).max() < s.lean_limit + 1e-2
+    assert np.all(np.abs(plan.controls[:, :3]) <= s.rate_limits)
+
+
+def test_backends_believe_the_same(past: Past) -> None:
+    found = {}
+    for solver in BACKENDS:
+        controller = past.controller(FREE, solver)
+        controller.plan(past.belief)
+        found[solver] = past.pulled(controller.believed)
+    for name, value in found["ipm"].items():
+        assert np.abs(value).max() > 0.02
+        for solver in ("sqp", "alm"):
+            assert np.abs(value - found[solver][name]).max() < 0.01
+
+
+def test_a_known_mass_stays_what_it_is() -> None:
+    flight = FlightSettings(seed=SEED)
+    window = replace(flight.estimator.window, estimated=("wind",))
+    past = Past(12, replace(flight, estimator=replace(flight.estimator, window=window)))
+    controller = past.controller(FREE, control_weight=10.0)
+    assert controller.plan(past.belief).source == "solved"
+    assert controller.believed.parameters.mass == past.belief.parameters.mass
+    assert controller.believed.parameters.drag == past.belief.parameters.drag
+    assert controller.believed.parameters.wind != past.belief.parameters.wind
+
+
+@pytest.mark.parametrize("general", [False, True])
+def test_ta_s_costs_pull_on_the_map_too_and_are_bounded(general: bool, past: Past) -> None:
+    """1/d of the map's variables pushes cylinders off the plan, by many sigmas unless it is stopped."""
+    found = []
+    for joint in (FREE, JointSettings(0.5)):
+        controller = past.controller(joint, avoidance="potential", general_costs=general, potential_weight=100.0)
+        plan = controller.plan(past.belief)
+        assert plan.source == "solved"
+        found.append(max(float(np.abs(value).max()) for value in past.pulled(controller.believed).values()))
+        before, after = past.belief.landmarks.cylinders, controller.believed.landmarks.cylinders
+        away = before.positions - plan.states[1:, None, :2]
+        near = int(np.argmin(np.hypot(*np.moveaxis(away, 2, 0)).min(axis=0) - before.radii))
+        push = (away[:, near] / (away[:, near] ** 2).sum(axis=1, keepdims=True)).sum(axis=0)
+        moved = after.positions[near] - before.positions[near]
+        assert moved @ push > 0.0
+    assert found[0] > 2.0
+    assert 0.45 < found[1] < 0.51
+
+
+def test_no_wish_makes_drag_negative() -> None:
+    """Ta's goal is far away: a vehicle that air pushes along would be there sooner, if there were one."""
+    settings = FlightSettings(seed=SEED, coupling="joint")
+    flight = Flight(settings)
+    found, state = flight.conditions, flight.pilot.belief.state
+    wishful = replace(settings.controller, avoidance="potential")
+    pilot = joint_pilot("ipm", found.layout, state, found.nominal, settings.estimator, wishful, FREE)
+    control: Array | None = None
+    drag = []
+    for _ in range(25):
+        plan = pilot.tick(flight.world.sense(), control)
+        assert plan.source == "solved"
+        drag.append(pilot.belief.parameters.drag)
+        control = plan.controls[0]
+        flight.world.step(control, settings.controller.dt)
+    assert -1e-6 < np.min(drag) < 1e-3
+
+
+# ---------------------------------------------------------------- from tick to tick
+
+
+def test_a_solve_that_bends_its_constraints_is_not_believed(past: Past, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A first step from far away says little; the vehicle brakes, and the estimate is that of the past."""
+    controller = past.controller(JointSettings(0.5, carry=True), control_weight=100.0)
+    before = past.estimator.window.states.copy()
+    monkeypatch.setattr(controller, "_cold", InteriorPoint(max_iterations=1).prepare(controller._cold.program.graph))
+    plan = controller.plan(past.belief)
+    assert plan.status is fg.Status.ITERATION_LIMIT
+    assert plan.emergency
+    assert controller.believed is past.belief
+    assert np.array_equal(past.estimator.window.states, before)
+
+
+def test_multipliers_stay_with_what_they_belong_to(past: Past) -> None:
+    controller = past.controller(JointSettings())
+    controller.plan(past.belief)
+    obstacles = controller._slots.fill(
+        past.belief.state, np.tile(past.belief.state[:3], (31, 1)), past.belief.landmarks, Movers.none()
+    )
+    guess = controller._guess
+    assert guess is not None
+    given = {name: np.ones_like(value) for name, value in guess.multipliers.items()}
+    given["dynamics"] = np.arange(given["dynamics"].size, dtype=float).reshape(given["dynamics"].shape)
+    others, held, slots = controller._split(obstacles)
+    assert held.sum() == len(slots) >= 3
+    assert np.all(others.centres[:, held] == FAR_AWAY)  # nothing is both data and variable
+    gone = slots[0]
+    controller._names[gone] = 99  # at the last solve the slot held something else
+    kept = controller._refreshed(fg.Guess(guess.values, given), obstacles).multipliers
+    pairs = kept["landmarks"].reshape(controller.settings.horizon, -1)
+    expected = np.zeros(pairs.shape[1])
+    expected[slots[1:]] = 1.0
+    assert np.array_equal(pairs, np.tile(expected, (len(pairs), 1)))
+    assert not kept["pull of landmarks"][gone].any()
+    assert kept["pull of landmarks"][slots[1:]].all()
+    assert not kept["cylinders"][:, held].any()
+    assert np.array_equal(kept["dynamics"][:-1], given["dynamics"][1:])
+    assert np.array_equal(kept["dynamics"][-1:], given["dynamics now"])
+
+
+def test_the_structure_is_compiled_once(compilations: list[int]) -> None:
+    """Landmarks come into view and leave the map of the window; nothing is compiled again."""
+    settings = FlightSettings(seed=SEED, coupling="joint")
+    window = replace(settings.estimator.window, landmarks=4, length=5)
+    flight = Flight(replace(settings, estimator=replace(settings.estimator, window=window)))
+    assert isinstance(flight.pilot, JointPilot)
+    control: Array | None = None
+    begun, known, retired = 0, [], 0
+    for tick in range(60):
+        plan = flight.pilot.tick(flight.world.sense(), control)
+        control = plan.controls[0]
+        flight.world.step(control, settings.controller.dt)
+        begun = len(compilations) if tick == 0 else begun
+        known.append(len(flight.pilot.belief.landmarks))
+        retired = known[-1] - int(flight.pilot.estimator.atlas.used.sum())
+        assert not plan.emergency
+    assert known[-1] > known[0] and retired > 0
+    assert len(compilations) == begun
+    assert flight.world.collisions == 0
+
+
+@pytest.mark.parametrize("association", ["known", "unknown"])
+def test_a_flight_believes_what_the_joint_graph_says(association: str) -> None:
+    settings = FlightSettings(seed=SEED, coupling="joint")
+    flight = Flight(replace(settings, estimator=replace(settings.estimator, association=association)))
+    pilot, world = flight.pilot, flight.world
+    assert isinstance(pilot, JointPilot)
+    control: Array | None = None
+    errors, differences = [], []
+    for _ in range(50):
+        control = pilot.tick(world.sense(), control).controls[0]
+        past = pilot.estimator.belief()
+        errors.append(np.linalg.norm(pilot.belief.state[:3] - world.state[:3]))
+        step = quadrotor.STATE.local(past.state[None], pilot.belief.state[None])[0]
+        differences.append(np.abs(step / past.sigma).max())
+        assert np.array_equal(past.covariance, pilot.belief.covariance)  # of the past's terms alone
+        world.step(control, settings.controller.dt)
+    assert world.collisions == 0 and not any(pilot.controller.emergencies.values())
+    assert world.state[0] > flight.conditions.layout.start[0] + 2.0
+    assert max(errors) < 0.1
+    assert 1e-3 < max(differences) < 0.51
+    assert abs(pilot.belief.parameters.mass / flight.conditions.true.mass - 1.0) < 0.02
+
+
+def test_the_window_goes_on_from_the_past_unless_told_otherwise() -> None:
+    for carry in (False, True):
+        past = Past(30, FlightSettings(seed=SEED))
+        controller = past.controller(JointSettings(np.inf, carry), control_weight=10.0)
+        controller.plan(past.belief)
+        taken, said = past.estimator.window.present, controller.believed.state
+        assert np.abs(said - past.belief.state).max() > 1e-5
+        assert np.array_equal(taken, said if carry else past.belief.state)
+        assert (past.estimator.window.parameters[0] == controller.believed.parameters.mass) == carry
+
+
+# ---------------------------------------------------------------- settings and residuals
+
+
+def test_a_pull_of_nothing_is_refused() -> None:
+    for pull in (0.0, -1.0, np.nan):
+        with pytest.raises(fg.ScenarioError, match="sequential"):
+            JointSettings(pull)
+
+
+@pytest.mark.parametrize("manifold", [quadrotor.STATE, fg.Rn(2)])
+def test_standardised_differences(manifold: fg.Manifold) -> None:
+    rng = np.random.default_rng(0)
+    n, d, step = 4, manifold.dim, 1e-6
+    reference = manifold.retract(np.tile(manifold.identity(), (n, 1)), rng.normal(size=(n, d)))
+    x = manifold.retract(reference, 0.3 * rng.normal(size=(n, d)))
+    sigma = rng.uniform(0.1, 2.0, (n, d))
+    residual = standardised(manifold)
+    assert np.allclose(residual.function(x, reference, sigma), manifold.local(reference, x) / sigma, atol=1e-12)
+    kernel = residual.kernel
+    assert kernel is not None
+    J = kernel.jacobian(x, reference, sigma)[0]
+    for k in range(d):
+        move = step * np.eye(d)[k]
+        ahead, behind = (residual.function(manifold.retract(x, s * move[None]), reference, sigma) for s in (1.0, -1.0))
+        assert np.allclose(J[:, :, k], (ahead - behind) / (2.0 * step), atol=1e-6)
+
+
+# ---------------------------------------------------------------- what is measured
+
+
+def test_the_pull_is_measured() -> None:
+    """Two short flights of the benchmark: without a bound, and with so small a weight that nothing pulls."""
+    strong = quadrotor_pull.Job(SEED, 0.5, "", weight=10.0, pull=np.inf)
+    weak = replace(strong, weight=1e-6)
+    rows = {job.weight: {SEED: quadrotor_pull.fly(job)} for job in (strong, weak)}
+    assert rows[10.0][SEED]["mean"]["sigma"] > 0.5 > 1e-2 > rows[1e-6][SEED]["max"]["sigma"]
+    groups = [([str(weight)], found) for weight, found in rows.items()]
+    assert quadrotor_pull.of_variant([row for found in rows.values() for row in found.values()], weak.variant) == {
+        SEED: rows[1e-6][SEED]
+    }
+    for text in (
+        quadrotor_pull.pull_table(groups, ["weight"]),
+        quadrotor_pull.error_table(groups, ["weight"], rows[1e-6]),
+    ):
+        assert len(text.splitlines()) == 4
+        assert len({line.count("|") for line in text.splitlines()}) == 1
+        assert "nan" not in text

@@ -1,0 +1,358 @@
+"""Flights through the corridor: every coupling flies, variants of a seed are paired, a failing tick ends nothing."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from unifg.errors import ScenarioError
+from unifg.lie import SO3
+from unifg.scenarios import cli
+from unifg.scenarios.quadrotor import episode, mpc_arguments, results
+from unifg.scenarios.quadrotor.conditions import DRAG, MASS, WIND, draw_conditions
+from unifg.scenarios.quadrotor.episode import Flight, FlightSettings, run_flight
+from unifg.scenarios.quadrotor.flight_log import FlightLog
+from unifg.scenarios.quadrotor.metrics import flight_metrics, state_errors
+from unifg.scenarios.quadrotor.pilot import COUPLINGS
+from unifg.scenarios.quadrotor.sensor import Reading
+from unifg.scenarios.quadrotor.tracker import Tracker
+from unifg.typing import Array
+
+SEED = 1006  # of those open to tuning
+
+
+def silent(done: float, text: str) -> None:
+    """Show nothing."""
+
+
+def short(seconds: float = 1.0, **changes: object) -> FlightSettings:
+    """A flight that ends early."""
+    return replace(FlightSettings(seed=SEED, time_limit=seconds), **changes)  # type: ignore[arg-type]
+
+
+# ------------------------------------------------------------------- flying
+
+
+@pytest.mark.parametrize("coupling", COUPLINGS)
+def test_every_coupling_flies_and_knows_where_it_is(coupling: str) -> None:
+    log = run_flight(short(1.5, coupling=coupling))
+    assert (log.ticks, log.collisions, log.reached) == (30, 0, False)
+    assert "failed" not in log.statuses
+    assert not log.emergency.any()
+    assert log.truth[-1, 0] > log.truth[0, 0] + 0.8
+    assert np.abs(state_errors(log)[:, :3]).max() < 0.1
+    assert log.settings["coupling"] == coupling
+    assert (log.estimate_ms > 0.0).all()
+    assert (log.plan_ms > 0.0).all()
+
+
+@pytest.mark.parametrize("solver", ["sqp", "alm"])
+def test_every_backend_flies(solver: str) -> None:
+    log = run_flight(short(1.0, solver=solver))
+    assert log.collisions == 0
+    assert log.truth[-1, 0] > log.truth[0, 0] + 0.3
+
+
+def test_a_flight_reaches_the_target_and_learns_the_mass() -> None:
+    log = run_flight(FlightSettings(seed=SEED))
+    assert log.succeeded
+    assert log.target_distance[-1] < episode.REACHED_DISTANCE
+    assert np.linalg.norm(log.believed[-1, :3] - log.layout.target) < episode.REACHED_DISTANCE
+    assert np.linalg.norm(log.truth[-1, 7:]) < episode.REACHED_SPEED
+    assert abs(log.parameters[0, 0] / log.parameters_true[0] - 1.0) > 0.03
+    error = flight_metrics(log)["mass_error_relative_5s"]
+    assert error is not None
+    assert error < 0.01
+    # The cylinders were not known: each appears when it is seen.
+    known = [len(row.ids) for row in log.landmarks]
+    assert known[0] < known[-1]
+    for ids, row in zip(log.seen, log.landmarks, strict=True):
+        assert set(ids.tolist()) <= set(row.ids.tolist())
+
+
+@pytest.mark.parametrize("association", ["known", "unknown"])
+def test_walls_on_the_map_correct_the_heading_and_cylinders_do_not(association: str) -> None:
+    headings = []
+    for surveyed in (True, False):
+        flight = Flight(short(1.0))
+        estimator = type(flight.pilot.estimator)
+        state = flight.pilot.estimator.window.present.copy()
+        turn = SO3.exp(np.array([0.0, 0.0, 0.02]))
+        state[3:7] = SO3.compose(turn, flight.world.state[3:7])
+        settings = replace(flight.settings.estimator, association=association)
+        corners = flight.world.layout.corners if surveyed else None
+        flight.pilot.estimator = estimator(state, flight.conditions.nominal, settings, corners)
+        log = flight.run(silent)
+        headings.append(abs(state_errors(log)[-1, 5]))
+        window = flight.pilot.estimator.window
+        assert window.surveyed.any() == surveyed
+        for place in window.survey[window.surveyed]:
+            assert np.linalg.norm(flight.world.layout.corners - place, axis=1).min() == 0.0
+    assert headings[0] < 0.005
+    assert headings[1] > 0.01
+
+
+def test_moving_discs_are_flown_around() -> None:
+    log = run_flight(short(2.0, movers=2))
+    assert log.collisions == 0
+    assert log.movers.shape == (40, 2, 3)
+
+
+def test_the_separate_coupling_learns_no_parameters_and_the_others_do() -> None:
+    logs = {coupling: run_flight(short(1.0, coupling=coupling)) for coupling in COUPLINGS}
+    nominal = draw_conditions(SEED).nominal.packed
+    np.testing.assert_array_equal(logs["separate"].parameters, np.tile(nominal, (20, 1)))
+    for coupling in ("sequential", "joint"):
+        assert abs(logs[coupling].parameters[-1, 0] - nominal[0]) > 0.02
+
+
+# ------------------------------------------------------------------- pairing
+
+
+def overheard(flight: Flight) -> tuple[list[Reading], list[Array]]:
+    """Readings of a flight and the true states at which they were made."""
+    readings: list[Reading] = []
+    states: list[Array] = []
+    sense = flight.world.sense
+
+    def listen() -> Reading:
+        states.append(flight.world.state)
+        readings.append(sense())
+        return readings[-1]
+
+    flight.world.sense = listen  # type: ignore[method-assign]
+    flight.run(silent)
+    return readings, states
+
+
+def test_variants_of_a_seed_meet_the_same_world_and_noise() -> None:
+    noise: list[Array] = []
+    paths = []
+    for coupling in ("separate", "sequential"):
+        flight = Flight(short(1.0, coupling=coupling))
+        readings, states = overheard(flight)
+        height = np.array([r.height - x[2] for r, x in zip(readings, states, strict=True)])
+        tilt = np.array([r.tilt - SO3.matrix(x[None, 3:7])[0, 2] for r, x in zip(readings, states, strict=True)])
+        things = flight.world.things()
+        thing = int(readings[0].ids[0])
+        ranges = np.array(
+            [
+                r.ranges[r.ids == thing][0] - np.linalg.norm(things[thing, :2] - x[:2])
+                for r, x in zip(readings, states, strict=True)
+            ]
+        )
+        noise.append(np.column_stack([height, tilt, ranges]))
+        paths.append(np.array(states))
+    np.testing.assert_allclose(noise[0], noise[1], atol=1e-12)
+    assert np.abs(paths[0][-1] - paths[1][-1]).max() > 1e-6  # they do fly differently
+
+
+def test_a_flight_repeats_itself() -> None:
+    first, second = run_flight(short(0.5)), run_flight(short(0.5))
+    np.testing.assert_array_equal(first.truth, second.truth)
+    np.testing.assert_array_equal(first.believed, second.believed)
+
+
+def test_conditions_depend_on_the_seed_alone() -> None:
+    found = [draw_conditions(seed) for seed in range(1000, 1040)]
+    again = draw_conditions(1000)
+    np.testing.assert_array_equal(found[0].true.packed, again.true.packed)
+    np.testing.assert_array_equal(found[0].deviation, again.deviation)
+    masses = np.array([c.nominal.mass for c in found])
+    np.testing.assert_allclose(np.abs(masses - MASS), 0.05)
+    assert {masses.min() < MASS, masses.max() > MASS} == {True}
+    truths = np.array([c.true.packed for c in found])
+    assert (truths[:, 1:4] >= DRAG[0]).all()
+    assert (truths[:, 1:4] <= DRAG[1]).all()
+    wind = np.hypot(truths[:, 4], truths[:, 5])
+    assert wind.max() <= WIND
+    assert np.ptp(wind) > 0.5 * WIND
+    # Another mass error changes nothing else.
+    other = draw_conditions(1000, 0.2)
+    np.testing.assert_array_equal(other.true.packed, found[0].true.packed)
+    assert abs(other.nominal.mass - MASS) == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(("seed", "error"), [(-1, 0.05), (0, 1.0), (0, -0.1)])
+def test_impossible_conditions_are_refused(seed: int, error: float) -> None:
+    with pytest.raises(ScenarioError):
+        draw_conditions(seed, error)
+
+
+# ------------------------------------------------------------------- endings
+
+
+def test_an_interrupt_keeps_what_was_flown() -> None:
+    count = 0
+
+    def interrupt(done: float, text: str) -> None:
+        nonlocal count
+        count += 1
+        if count == 4:
+            raise KeyboardInterrupt
+
+    log = run_flight(short(), interrupt)
+    assert (log.ticks, log.interrupted, log.succeeded) == (4, True, False)
+
+
+def test_a_failing_tick_does_not_end_the_flight() -> None:
+    flight = Flight(short(0.5))
+    tick, count = flight.pilot.tick, 0
+
+    def fail(reading: Reading, control: Array | None) -> object:
+        nonlocal count
+        count += 1
+        if count == 5:
+            raise ValueError("not today")
+        return tick(reading, control)
+
+    flight.pilot.tick = fail  # type: ignore[assignment,method-assign]
+    log = flight.run(silent)
+    assert log.ticks == 10
+    assert [status == "failed" for status in log.statuses] == [k == 4 for k in range(10)]
+    assert log.emergency[4]
+    assert not log.emergency[5]
+
+
+def test_collisions_are_counted_and_many_end_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    def drop(reading: Reading, control: Array | None) -> object:
+        raise ArithmeticError("engines off")
+
+    def fall(*given: object) -> Array:
+        return np.zeros(4)
+
+    monkeypatch.setattr(episode, "braking_control", fall)
+    logs = []
+    for most in (1, 3):
+        monkeypatch.setattr(episode, "COLLISIONS", most)
+        flight = Flight(short(1.5))
+        flight.pilot.tick = drop  # type: ignore[assignment,method-assign]
+        logs.append(flight.run(silent))
+    assert [log.collisions for log in logs] == [1, 1]
+    assert logs[0].ticks < logs[1].ticks == 30
+    assert not logs[1].succeeded
+
+
+def test_arrival_needs_belief_and_truth(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = Flight(short(0.2))
+    there = np.concatenate([flight.world.layout.target, [1.0, 0.0, 0.0, 0.0], np.zeros(3)])
+    tick = flight.pilot.tick
+
+    def dream(reading: Reading, control: Array | None) -> object:
+        plan = tick(reading, control)
+        flight.pilot.belief = replace(flight.pilot.belief, state=there)
+        return plan
+
+    flight.pilot.tick = dream  # type: ignore[assignment,method-assign]
+    assert not flight.run(silent).reached
+    monkeypatch.setattr(episode, "REACHED_DISTANCE", 100.0)
+    log = run_flight(short(0.2))
+    assert (log.reached, log.ticks) == (True, 1)
+
+
+@pytest.mark.parametrize(
+    "change", [{"coupling": "loose"}, {"solver": "newton"}, {"seed": -1}, {"movers": -1}], ids=lambda c: next(iter(c))
+)
+def test_what_does_not_exist_is_refused(change: dict[str, object]) -> None:
+    with pytest.raises(ScenarioError):
+        Flight(short(0.2, **change))
+
+
+def test_a_flight_needs_time() -> None:
+    with pytest.raises(ScenarioError, match="time limit"):
+        FlightSettings(time_limit=0.0)
+
+
+# ------------------------------------------------------------------- moving discs
+
+
+def sighting(time: float, places: Array, ids: list[int], state: Array) -> Reading:
+    """A reading without noise of moving discs at some places."""
+    forward = SO3.matrix(state[None, 3:7])[0, :, 0]
+    offset = places - state[:2]
+    bearings = np.arctan2(offset[:, 1], offset[:, 0]) - np.arctan2(forward[1], forward[0])
+    count = len(ids)
+    return Reading(
+        time, np.array(ids), bearings, np.hypot(*offset.T), np.full(count, 0.4), np.zeros(count, dtype=np.intp),
+        np.ones(count, dtype=bool), 1.5, np.array([0.0, 0.0, 1.0]), np.zeros(3),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("association", ["known", "unknown"])
+def test_tracks_find_velocities(association: str) -> None:
+    tracker = Tracker(association=association)
+    velocities = np.array([[0.5, -0.3], [-0.4, 0.0]])
+    for k in range(12):
+        time = 0.05 * k
+        state = np.concatenate([[0.1 * k, 0.0, 1.5], SO3.exp(np.array([0.0, 0.0, 0.3 + 0.02 * k])), np.zeros(3)])
+        places = np.array([[5.0, 1.0], [5.0, -1.5]]) + time * velocities
+        order = [0, 1] if k % 2 else [1, 0]  # an unknown association must not depend on the order
+        movers = tracker.update(sighting(time, places[order], [[20, 21][i] for i in order], state), state)
+    rows = np.argsort(-movers.centres[:, 1])
+    np.testing.assert_allclose(movers.centres[rows], places, atol=1e-9)
+    np.testing.assert_allclose(movers.velocities[rows], velocities, atol=1e-9)
+    np.testing.assert_allclose(movers.radii, 0.4)
+    # Out of sight a disc goes on for a while and is then given up.
+    unseen = sighting(1.0, np.zeros((0, 2)), [], state)
+    later = tracker.update(unseen, state)
+    np.testing.assert_allclose(later.centres[rows], places + (1.0 - time) * velocities, atol=1e-9)
+    assert len(tracker.update(replace(unseen, time=3.0), state)) == 0
+
+
+# ------------------------------------------------------------------- the command
+
+
+def chosen(*words: str) -> argparse.Namespace:
+    """What the command line makes of the scenario's own words."""
+    parser = argparse.ArgumentParser()
+    mpc_arguments.add_arguments(parser)
+    return argparse.Namespace(**vars(parser.parse_args(words)), solver="sqp", seed=7)
+
+
+def test_arguments_arrive() -> None:
+    assert mpc_arguments.settings_of(chosen()) == FlightSettings("sqp", "sequential", 7)
+    words = ("--coupling", "joint", "--association", "unknown", "--avoidance", "potential", "--movers", "2")
+    settings = mpc_arguments.settings_of(chosen(*words, "--mass-error", "0.1"))
+    assert (settings.coupling, settings.movers, settings.mass_error) == ("joint", 2, 0.1)
+    assert settings.estimator.association == "unknown"
+    assert settings.controller.avoidance == "potential"
+    assert mpc_arguments.SOLVERS[0] == cli.SCENARIOS["quadrotor-mpc"].solver
+
+
+@pytest.mark.parametrize("words", [("--movers", "-1"), ("--mass-error", "1"), ("--coupling", "loose")])
+def test_wrong_arguments_are_refused(words: tuple[str, ...], tmp_path: Path) -> None:
+    assert cli.main(["run", "quadrotor-mpc", *words, "--out", str(tmp_path)]) == 2
+
+
+def only_a_moment(monkeypatch: pytest.MonkeyPatch, change: Callable[[FlightLog], FlightLog]) -> None:
+    """Let the command fly for half a second."""
+
+    def fly(settings: FlightSettings, progress: episode.Progress) -> FlightLog:
+        return change(run_flight(replace(settings, time_limit=0.5), progress))
+
+    monkeypatch.setattr(episode, "run_flight", fly)
+
+
+def test_the_command_writes_its_results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    only_a_moment(monkeypatch, lambda log: log)
+    monkeypatch.setattr(results, "write_scene", lambda path, log: path)  # takes seconds, and has tests of its own
+    assert cli.main(["run", "quadrotor-mpc", "--seed", str(SEED), "--out", str(tmp_path)]) == 1  # not there yet
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["settings"]["seed"] == SEED
+    assert metrics["ticks"] == 10
+    assert {"overview.png", "metrics.json", "flight.npz"} <= {path.name for path in tmp_path.iterdir()}
+
+
+@pytest.mark.parametrize(("collisions", "status"), [(0, 0), (1, 1)])
+def test_the_exit_status_says_whether_it_arrived(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, collisions: int, status: int
+) -> None:
+    only_a_moment(monkeypatch, lambda log: replace(log, reached=True, collisions=collisions))
+    monkeypatch.setattr(results, "write_results", lambda folder, log: [])
+    assert cli.main(["run", "quadrotor-mpc", "--seed", str(SEED), "--out", str(tmp_path)]) == status
