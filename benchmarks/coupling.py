@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,7 +46,7 @@ OBSTACLES = 2
 RESAMPLES = 2000
 
 # Name, unit, and how to read each measure from the metrics.
-MEASURES = {
+MEASURES: dict[str, Callable[[Any], float]] = {
     "localisation, mean [mm]": lambda m: 1e3 * m["localisation_error_m"]["mean"],
     "localisation, max [mm]": lambda m: 1e3 * m["localisation_error_m"]["max"],
     "heading, mean [mrad]": lambda m: 1e3 * m["localisation_error_rad"]["mean"],
