@@ -34,6 +34,7 @@ ENDINGS = {
     state.STALLED: Status.STALLED,
     state.NOT_FINITE: Status.NOT_FINITE,
 }
+NO_ANSWER = -1
 STUCK = (Status.STALLED, Status.SINGULAR)
 
 
@@ -76,10 +77,12 @@ class InteriorPoint(Solver):
         if not run.alone:
             ending = self._guided(run, workspace)
             return settle(run, ending) if ending in STUCK else ending
-        workspace.call(state.LOOP)
+        interrupted = workspace.loop()
         lin, iterations = workspace.found(), int(work.counts[state.ITERATION])
         run.conclude(lin, work.multipliers.copy(), iterations, _history(work, lin.norms, run.seconds))
         ending = ENDINGS[int(work.counts[state.ANSWER])]
+        if interrupted:
+            run.status = ending if ending is Status.CONVERGED else Status.INTERRUPTED
         return settle(run, ending) if ending in STUCK else ending
 
     def _guided(self, run: Run, workspace: Workspace) -> Status | None:
@@ -101,6 +104,8 @@ class InteriorPoint(Solver):
                 numbers[state.TRIAL_COST], work.trial_constraints[:] = found.cost, found.constraints
                 workspace.call(state.JUDGE)
             if counts[state.ANSWER] == state.AGAIN:
+                if run.out_of_time:
+                    return Status.TIME_LIMIT
                 continue
             if counts[state.ANSWER] != state.ACCEPTED:
                 return ENDINGS[int(counts[state.ANSWER])]
@@ -167,6 +172,21 @@ class Workspace:
     def call(self, function: int) -> None:
         """Run one of the linked functions."""
         call(self.problem.links[function], self._address)
+
+    def loop(self) -> bool:
+        """Run the whole solve; returns whether control-C was pressed, which Python learns when it is over.
+
+        Raises:
+            KeyboardInterrupt: when it was pressed before the solve had begun.
+        """
+        self.work.counts[state.ANSWER] = NO_ANSWER
+        try:
+            self.call(state.LOOP)
+        except KeyboardInterrupt:
+            if self.work.counts[state.ANSWER] == NO_ANSWER:
+                raise
+            return True
+        return False
 
     def prepare(self, run: Run, options: InteriorPoint) -> Work:
         """Set up one solve with the present data."""

@@ -7,8 +7,8 @@ its contribution to the linear system is the block A and nothing else:
     [ A  0  ] [ dlambda ] = - [ h                  ]
 
 The weight is indefinite, so the system is assembled as blocks, never through a square root. It is factorised with
-+shift and -shift on its diagonal, so that no order of elimination meets a vanishing pivot, and refined until the shift
-is gone. H is that of Gauss-Newton.
+a shift of every row in its own units, so that no order of elimination meets a vanishing pivot, and refined until the
+shift is gone (:mod:`unifg.elimination.saddle`). H is that of Gauss-Newton.
 
 The paper takes every step in full. By default a step has to lower the l1 merit f + price |h| (Nocedal and Wright,
 chapter 18): the cost alone would reject steps that restore feasibility. A full step that is rejected is corrected once
@@ -33,8 +33,7 @@ from unifg.solvers.primal import DIAGONAL_FLOOR
 from unifg.status import Status
 from unifg.typing import Array
 
-SHIFT = 1e-10  # on the diagonal of the scaled system; refined away
-RESIDUAL = 1e-8  # relative, of a system that counts as solved
+RESIDUAL = 1e-8  # relative, in the equilibrated system, of one that counts as solved
 ARMIJO = 1e-4
 ROUNDING = 1e-13
 SHORTEST = 1e-6
@@ -193,8 +192,7 @@ class Newton:
         pull = (largest(lin.constraint_jacobian) or 1.0) ** 2 / curvature
         self._data[diagonal[:n]] += damping * np.maximum(curvatures, DIAGONAL_FLOOR * curvature)
         self._data[diagonal[n:]] -= slackness * pull
-        self._added[:n], self._added[n:] = SHIFT * curvature, -SHIFT * pull
-        if not self.system.factorization.factor(self._data, self._added):
+        if not self.system.saddle.factor(self._data):
             return None
         return self.resolve(lin, multipliers, np.zeros(len(multipliers)))
 
@@ -204,12 +202,8 @@ class Newton:
         right = np.empty(n + len(rows))
         right[:n] = -program.lagrangian_gradient(lin, multipliers)[program.columns.free]
         right[n:] = program.lower[rows] - (lin.constraints + bend)[rows]
-        found = self.system.factorization.refine(self._data, right)
-        # Constraints by themselves: multipliers that blow up would hide that they contradict each other.
-        rest = self.system.pattern.times(self._data, found) - right
-        size = largest(self._data) * largest(found) + largest(right[:n])
-        reach = largest(lin.constraint_jacobian) * largest(found[:n]) + largest(right[n:])
-        if not (largest(rest[:n]) <= RESIDUAL * size and largest(rest[n:]) <= RESIDUAL * reach):
+        found, error = self.system.saddle.solve(right)
+        if not error <= RESIDUAL:
             return None
         change = np.zeros(len(multipliers))
         change[rows] = found[n:]
@@ -218,7 +212,6 @@ class Newton:
     def _structure(self, program: Program) -> None:
         self.system = KktSystem(program, program.equality)
         self._data = np.zeros(self.system.pattern.nnz)
-        self._added = np.zeros(self.system.pattern.size)
 
 
 class Merit:

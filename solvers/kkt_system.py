@@ -8,6 +8,7 @@ import numpy as np
 
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.plan import Plan
+from unifg.elimination.saddle import SaddlePoint
 from unifg.jit import compiled
 from unifg.program import Program
 from unifg.sparse import Symmetric
@@ -44,6 +45,7 @@ class KktSystem:
     Attributes:
         equality: (M,) which rows are equalities.
         factorization: of the matrix, in which every pivot of a multiplier is expected to be negative.
+        saddle: the same, for solving without a shift.
         arrays: for compiled code.
     """
 
@@ -69,6 +71,7 @@ class KktSystem:
             np.concatenate([program.blocks, last + label.ravel()]),
             negative=np.arange(n + len(rows)) >= n,
         )
+        self.saddle = SaddlePoint(self.factorization, n)
         self.arrays = KktArrays(
             self.factorization.plan,
             np.array([n, len(rows)]),

@@ -24,6 +24,7 @@ from unifg.typing import Array, BoolArray, IntArray
 ITERATIONS = 60
 BOUNDARY = 0.995  # fraction of the way to the boundary
 SHIFT = 1e-10  # keeps the KKT matrix quasi-definite, relative to nothing: rows are in the problem's own units
+RESIDUAL = 1e-8  # relative, of a linear system without a solution: the rows contradict each other
 HOPELESS = 1e9  # multipliers beyond this mean that the rows contradict each other
 
 
@@ -54,6 +55,9 @@ class GraphRoute:
         if qp.pattern is not program.normal:
             hessian = np.zeros(program.normal.nnz)
             hessian[program.objective_places] = qp.hessian
+        if not len(below) and not len(above):
+            error = self._linear(qp, hessian, dual, step)
+            return QPAnswer(step, dual, self.name, 1, qp_error(qp, step, dual), not error <= RESIDUAL)
         iterations = _minimize(
             program.arrays,
             self._system.arrays,
@@ -73,6 +77,20 @@ class GraphRoute:
         infeasible = bool(np.abs(dual).max(initial=0.0) > HOPELESS) or iterations < 0
         return QPAnswer(step, dual, self.name, abs(iterations), qp_error(qp, step, dual), infeasible)
 
+    def _linear(self, qp: QP, hessian: Array, dual: Array, step: Array) -> float:
+        """Solve the KKT system: sets ``step``, moves ``dual``, returns the relative residual."""
+        program, arrays, n = self.program, self._system.arrays, self.program.size
+        data, right = np.zeros(self._system.pattern.nnz), np.empty(n + len(arrays.rows))
+        fill(arrays, hessian, qp.jacobian, data)
+        if not self._system.saddle.factor(data):
+            return np.inf
+        pull = program.constraints.transposed_times(qp.jacobian, dual)[program.columns.free]
+        right[:n], right[n:] = -(qp.gradient + pull), qp.lower[arrays.rows]
+        found, error = self._system.saddle.solve(right)
+        step[:] = found[:n]
+        dual[arrays.rows] += found[n:]
+        return error
+
 
 @compiled
 def _minimize(
@@ -91,7 +109,7 @@ def _minimize(
     step: Array,
     dual: Array,
 ) -> int:
-    """Mehrotra's method from step zero; returns the iterations, negative when a system was singular."""
+    """Mehrotra's method from step zero, with sides; returns the iterations, negative when a system was singular."""
     n, equalities, sides, count = kkt.size[0], kkt.size[1], len(side_row), len(lower)
     linear, row_terms, weights, move = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count)
     full, data = np.zeros(len(terms.unknown)), np.zeros(len(kkt.plan.slots))
@@ -113,13 +131,11 @@ def _minimize(
             value = side_sign[k] * (linear[side_row[k]] - side_limit[k])
             worst = max(worst, abs(value - s[k]), s[k] * y[k])
             gap += s[k] * y[k]
-        mu = gap / max(1, sides)
+        mu = gap / sides
         _residual(terms, kkt, free, hessian, gradient, jacobian, lower, linear, row_terms, step, full, right)
         for k in range(n + equalities):
             worst = max(worst, abs(right[k]))
         if worst <= accuracy and iteration > 0:
-            break
-        if sides == 0 and iteration > 3:
             break
         weights[:] = 0.0
         for k in range(sides):
@@ -131,7 +147,7 @@ def _minimize(
             return -iteration - 1
         # Predictor: aim at complementarity zero; corrector: at what the predictor suggests is within reach.
         centre = 0.0
-        for corrector in range(1 if sides == 0 else 2):
+        for corrector in range(2):
             row_terms[:] = 0.0
             for k in range(sides):
                 target[k] = s[k] * y[k] - centre + (ds[k] * dy[k] if corrector == 1 else 0.0)
@@ -154,12 +170,12 @@ def _minimize(
                     primal = min(primal, -s[k] / ds[k])
                 if dy[k] < 0.0:
                     longest = min(longest, -y[k] / dy[k])
-            if corrector == 0 and sides > 0:
+            if corrector == 0:
                 reached = 0.0
                 for k in range(sides):
                     reached += (s[k] + primal * ds[k]) * (y[k] + longest * dy[k])
                 centre = mu * (reached / max(gap, 1e-300)) ** 3
-        length = 1.0 if sides == 0 else min(1.0, BOUNDARY * min(primal, longest))
+        length = min(1.0, BOUNDARY * min(primal, longest))
         largest = 0.0
         for k in range(n):
             step[k] += length * found[k]

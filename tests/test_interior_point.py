@@ -106,8 +106,45 @@ def test_iteration_limit_returns_the_better_of_start_and_end() -> None:
     assert [row.number for row in solution.history] == [0, 1]
 
 
-def test_control_c_in_the_compiled_loop_is_passed_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody watches, so there is no iterate to return; the prepared run is as good as before."""
+@pytest.mark.parametrize("iterations", [2, 100])
+def test_control_c_in_the_compiled_loop_ends_it(monkeypatch: pytest.MonkeyPatch, iterations: int) -> None:
+    """Python learns of it when the loop is over: what it found counts."""
+    stated = Unicycle("straight", False, 20).formulation()
+    run = InteriorPoint(max_iterations=iterations).prepare(stated.graph)
+    undisturbed = run.solve(stated.guess)
+    call = Workspace.call
+
+    def pressed(workspace: Workspace, what: int) -> None:
+        call(workspace, what)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Workspace, "call", pressed)
+    solution = run.solve(stated.guess)
+    assert solution.status is (fg.Status.INTERRUPTED if iterations == 2 else fg.Status.CONVERGED)
+    assert solution.iterations == undisturbed.iterations == len(solution.history) - 1
+    assert solution.cost == undisturbed.cost
+    assert solution.violation == undisturbed.violation
+
+
+def test_control_c_while_a_stalled_solve_is_settled(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.constrain(lambda p: p**2 + 1.0, x, lower=0.0, upper=0.0)
+    graph.minimize(fg.prior, x, [0.0])
+    run, guess = InteriorPoint().prepare(graph), {x: np.array([[3.0]])}
+    assert run.solve(guess).status is fg.Status.LOCALLY_INFEASIBLE
+
+    def pressed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("unifg.solvers.interior_point.settle", pressed)
+    solution = run.solve(guess)
+    assert solution.status is fg.Status.INTERRUPTED
+    assert solution.violation < 11.0
+
+
+def test_control_c_before_the_compiled_loop_is_passed_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is no iterate to return; the prepared run is as good as before."""
     stated = Unicycle("straight", False, 20).formulation()
     run = InteriorPoint(tolerance=1e-4).prepare(stated.graph)
     before = run.solve(stated.guess, check=True)

@@ -210,3 +210,38 @@ def test_search_without_search_jacobians_changes_nothing() -> None:
     solution = KKT(search_iterations=3).solve(graph, guess)  # nothing here has a search Jacobian
     assert solution.converged
     assert [row.number for row in solution.history] == list(range(solution.iterations + 1))
+
+
+def chain(
+    units: tuple[float, ...], noise: float, sight: float, arrival: float
+) -> tuple[fg.Graph, dict[fg.Family, Array]]:
+    """Integrators in a row over 20 steps, each in its own unit; noise and an unknown bias drive the last one alone."""
+    n, steps, unit = len(units), 20, np.array(units)
+    transition = np.outer(unit, 1.0 / unit) * (np.eye(n) + 0.1 * np.diag(np.ones(n - 1), 1))
+    rng = np.random.default_rng(0)
+    graph = fg.Graph()
+    x, w = graph.variables("x", fg.Rn(n), steps + 1), graph.variables("w", fg.Rn(1), steps)
+    b = graph.variables("b", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x[0], np.zeros(n), sigma=unit * arrival, name="arrival")
+    graph.minimize(fg.prior, b, [0.0], sigma=1.0, name="bias")
+    graph.minimize(fg.prior, w, [0.0], sigma=noise, name="noise")
+    seen = unit[0] * rng.normal(size=(steps + 1, 1))
+    graph.minimize(lambda p, z: p[:, :1] - z, x, seen, sigma=sight * unit[0], name="sight")
+    push = unit * (np.arange(n) == n - 1)
+    graph.constrain(lambda p, w, b, q: q - p @ transition.T - (w + b) * push, x[:-1], w, b, x[1:], lower=0.0, upper=0.0)
+    guess: dict[fg.Family, Array] = {f: rng.normal(size=(f.count, f.manifold.storage)) for f in (x, w, b)}
+    return graph, guess
+
+
+@pytest.mark.parametrize("full_steps", [False, True])
+@pytest.mark.parametrize("noise", [1.0, 1e-3, 1e-6])
+@pytest.mark.parametrize("units", [(1.0, 1.0, 1.0), (1e3, 1.0, 1e-3), (1e-3, 1.0, 1e3)])
+def test_weights_and_units_of_linear_problems_do_not_matter(
+    units: tuple[float, ...], noise: float, full_steps: bool
+) -> None:
+    """One system solves them; a second one finds that to the last digit."""
+    for sight, arrival in ((1.0, 1.0), (1e-3, 1.0), (1.0, 1e3), (1.0, 1e-4)):
+        graph, guess = chain(units, noise, sight, arrival)
+        solution = KKT(full_steps=full_steps).solve(graph, guess)
+        assert solution.converged, (sight, arrival, solution.report())
+        assert solution.iterations <= 2

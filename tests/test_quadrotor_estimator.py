@@ -19,6 +19,8 @@ from unifg.scenarios.quadrotor.estimator import DeadReckoningEstimator, Estimato
 from unifg.scenarios.quadrotor.layouts import Layout
 from unifg.scenarios.quadrotor.window import WindowSettings, without
 from unifg.scenarios.quadrotor.world import QuadrotorWorld, Reading
+from unifg.solver import Prepared
+from unifg.solvers import KKT
 from unifg.typing import Array
 
 DT = 0.05
@@ -166,6 +168,27 @@ def test_the_covariance_is_that_of_the_terms() -> None:
     columns = program.columns.unknown[program.columns.of(estimator.terms.present).ravel()]
     scale = np.outer(belief.sigma, belief.sigma)
     np.testing.assert_allclose(dense[np.ix_(columns, columns)] / scale, belief.covariance / scale, atol=2e-3)
+    shared = estimator.terms.shared
+    every = [estimator.terms.present, *(family[:] for family in (*shared.parameters[:3], shared.landmarks))]
+    own = program.columns.unknown[np.concatenate([program.columns.of(selection).ravel() for selection in every])]
+    scale = np.sqrt(np.outer(dense.diagonal()[own], dense.diagonal()[own]))
+    block = estimator.solution.covariance(*every)
+    np.testing.assert_allclose(block / scale, dense[np.ix_(own, own)] / scale, atol=1e-8)
+
+
+def test_the_window_is_a_problem_for_newton_too() -> None:
+    """Hard dynamics with noise on some rows, metres beside kilograms and radians: full steps, no line search."""
+    estimator = begin(1)
+    run = Prepared(KKT(full_steps=True), estimator._run.program)
+    for reading, control, _ in flight(1):
+        estimator.predict(reading, control)
+        estimator.see(reading)
+        window, terms = estimator.window, estimator.terms
+        guess = {**terms.guess(window), estimator._present: window.present[None]}
+        solution = run.solve(guess, data=terms.data(window))
+        assert solution.converged, solution.report()
+        assert solution.iterations <= 6
+        estimator.estimate()
 
 
 def test_the_mass_is_known_soon() -> None:

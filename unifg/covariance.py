@@ -1,21 +1,25 @@
 """Covariances of unknowns: blocks of the inverse Hessian, or of the inverse KKT matrix, read off the elimination tree.
 
 With constraints the (1, 1) block of [[H, A'], [A, 0]]^-1 is taken, A being the active rows: a direction that an
-active constraint forbids has no variance.
+active constraint forbids has no variance. The tree would give the inverse of the matrix with its shift
+(:mod:`unifg.elimination.saddle`), which weak directions feel; so every column is solved for and refined.
 """
 
 from __future__ import annotations
 
+from weakref import WeakKeyDictionary
+
 import numpy as np
 
 from unifg.elimination.factorization import Factorization
+from unifg.elimination.saddle import SaddlePoint
 from unifg.errors import GraphError
 from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.sparse import Symmetric
 from unifg.typing import Array, BoolArray, IntArray
 
-REGULARISATION = 1e-9  # of the KKT matrix, relative to its largest entry; refined away
+SOLVED = 1e-6  # residual of a column, in the equilibrated system, that belongs to a determined unknown
 WEAK = 1e-13  # pivots below this, relative to the diagonal, are rounding errors
 UNDETERMINED = "the covariance does not exist: some direction is not determined by the costs; run graph.check(guess)"
 
@@ -35,9 +39,11 @@ class Covariances:
             GraphError: when the information is singular or not finite.
         """
         self._program = program
-        self._constrained = bool(active.any())
-        if self._constrained:
-            self._factorise_kkt(lin, active)
+        self._held: Held | None = None
+        if active.any():
+            self._held = Held.of(program, active)
+            self._data = self._held.entries(lin)
+            self._held.factor(self._data)
             return
         self._factorization = program.normal_solver()
         if not self._factorization.factor(lin.hessian):
@@ -53,17 +59,10 @@ class Covariances:
             GraphError: when one of them is fixed, or not determined.
         """
         chosen = self._unknowns(columns)
-        if not self._constrained:
+        if self._held is None:
             return self._factorization.inverse_block(chosen)
-        result = np.empty((len(chosen), len(chosen)))
-        for k, column in enumerate(chosen):
-            right = np.zeros(self._pattern.size)
-            right[column] = 1.0
-            solution = self._factorization.refine(self._exact, right, steps=20)
-            if np.abs(right - self._pattern.times(self._exact, solution)).max() > 1e-6:
-                raise GraphError(UNDETERMINED)
-            result[:, k] = solution[chosen]
-        return 0.5 * (result + result.T)
+        self._held.factor(self._data)
+        return self._held.block(chosen)
 
     def blocks(self, columns: IntArray) -> Array:
         """(n, d, d) marginal covariance of each row of (n, d) full tangent columns.
@@ -71,7 +70,7 @@ class Covariances:
         Raises:
             GraphError: when one of them is fixed, or not determined.
         """
-        if self._constrained:
+        if self._held is not None:
             return np.array([self.joint(row) for row in columns])
         chosen = self._unknowns(columns.ravel()).reshape(columns.shape)
         _, first, node = np.unique(self._program.blocks, return_index=True, return_inverse=True)
@@ -89,17 +88,78 @@ class Covariances:
             raise GraphError(f"{family}[{index}] is fixed: it has no covariance", family=family, index=index)
         return chosen
 
-    def _factorise_kkt(self, lin: Linearization, active: BoolArray) -> None:
-        program, n = self._program, self._program.size
-        hessian = program.normal.matrix(lin.hessian).tocoo()
-        jacobian = program.constraints.matrix(lin.constraint_jacobian)[active].tocoo()
-        total = n + jacobian.shape[0]
-        self._pattern = Symmetric(total, [(hessian.row, hessian.col), (jacobian.col, n + jacobian.row)])
-        self._exact = np.zeros(self._pattern.nnz)
-        np.add.at(self._exact, self._pattern.positions(hessian.row, hessian.col), hessian.data)
-        np.add.at(self._exact, self._pattern.positions(jacobian.col, n + jacobian.row), jacobian.data)
-        scale = max(float(np.abs(lin.hessian).max(initial=0.0)), 1e-300)
-        signs = np.where(np.arange(total) < n, 1.0, -1.0)
-        self._factorization = Factorization(self._pattern)
-        if not self._factorization.factor(self._exact, REGULARISATION * scale * signs):
+
+class Held:
+    """The KKT matrix of a graph with some rows held; its structure is kept for the next solution of the same graph."""
+
+    def __init__(self, program: Program, active: BoolArray) -> None:
+        """Number the held rows after the unknowns."""
+        n, constraints = program.size, program.constraints
+        self.active = active.copy()
+        number = np.full(len(active), -1, dtype=np.intp)
+        number[active] = n + np.arange(int(active.sum()))
+        kept = number[constraints.free_rows] >= 0
+        self._entries = constraints.free[kept]
+        columns, rows = constraints.free_columns[kept], number[constraints.free_rows[kept]]
+        normal = program.normal
+        across = np.repeat(np.arange(n), np.diff(normal.indptr))
+        pattern = Symmetric(n + int(active.sum()), [(normal.indices, across), (columns, rows)])
+        self._normal, self._places = pattern.positions(normal.indices, across), pattern.positions(columns, rows)
+        self._saddle = SaddlePoint(Factorization(pattern, _labels(program, active)), n)
+        self._factored: Array | None = None  # no solution, which would keep its program alive
+
+    @staticmethod
+    def of(program: Program, active: BoolArray) -> Held:
+        """The structure used last, if it is for the same rows."""
+        held = _LAST.get(program)
+        if held is None or not np.array_equal(held.active, active):
+            held = _LAST[program] = Held(program, active)
+        return held
+
+    def entries(self, lin: Linearization) -> Array:
+        """(nnz,) entries of the matrix at a linearisation."""
+        data = np.zeros(self._saddle.factorization.pattern.nnz)
+        data[self._normal] = lin.hessian
+        np.add.at(data, self._places, lin.constraint_jacobian[self._entries])
+        return data
+
+    def factor(self, data: Array) -> None:
+        """Factorise, unless these very entries were the last to be.
+
+        Raises:
+            GraphError: when an entry is not finite.
+        """
+        if self._factored is data:
+            return
+        self._factored = None
+        if not self._saddle.factor(data):
             raise GraphError("the covariance does not exist: the Hessian is not finite")
+        self._factored = data
+
+    def block(self, chosen: IntArray) -> Array:
+        """(k, k) block of the inverse over unknowns.
+
+        Raises:
+            GraphError: when one of them is not determined.
+        """
+        block, right = np.empty((len(chosen), len(chosen))), np.zeros(self._saddle.factorization.pattern.size)
+        for k, row in enumerate(chosen):
+            right[row] = 1.0
+            solution, _ = self._saddle.solve(right)
+            if not np.abs(self._saddle.residual(solution, right)).max() <= SOLVED * self._saddle.scale[row]:
+                raise GraphError(UNDETERMINED)
+            block[:, k] = solution[chosen]
+            right[row] = 0.0
+        return 0.5 * (block + block.T)
+
+
+_LAST: WeakKeyDictionary[Program, Held] = WeakKeyDictionary()
+
+
+def _labels(program: Program, active: BoolArray) -> IntArray:
+    """(n + m,) node of each unknown and held row: the rows of one factor are one node."""
+    factor = np.zeros(len(active), dtype=np.int64)
+    for k, (term, part) in enumerate(zip(program.constraint_terms, program.slices, strict=True)):
+        factor[part] = (k << 40) + np.arange(part.stop - part.start) // term.size
+    last = int(program.blocks[-1]) + 1 if program.size else 0
+    return np.concatenate([program.blocks, last + np.unique(factor[active], return_inverse=True)[1].ravel()])

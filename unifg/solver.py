@@ -346,7 +346,7 @@ class Prepared:
                 run.search(self._workspace)
                 reason = self.solver.iterate(run, self._workspace)
             except KeyboardInterrupt:
-                if run.alone:
+                if run._best is None:
                     raise  # there is nothing to return
                 run.status = Status.INTERRUPTED
             if run.alone and not run.iterations:

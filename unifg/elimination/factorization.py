@@ -147,7 +147,7 @@ class Factorization:
         """Solve A x = right for a matrix near the factorised one, by iterative refinement.
 
         After ``factor(data, added)`` this solves the system without ``added``, say [[H, A'], [A, 0]] after
-        factorising [[H + dI, A'], [A, -dI]].
+        factorising [[H + dI, A'], [A, -dI]]; :mod:`unifg.elimination.saddle` chooses what to add.
 
         Args:
             data: (nnz,) entries of A.
@@ -163,7 +163,8 @@ class Factorization:
         data = _numbers(data, self.pattern.nnz, "data")
         right = _numbers(right, self.pattern.size, "the right-hand side")
         out = np.empty(len(right))
-        substitution.refine(self.plan, self._indptr, self._indices, data, right, out, tolerance, steps)
+        own, rows = np.ones(len(right)), len(right)
+        substitution.refine(self.plan, self._indptr, self._indices, data, right, own, rows, out, tolerance, steps)
         return out
 
     @property

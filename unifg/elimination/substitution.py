@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from unifg.elimination.fronts import factor
@@ -9,6 +11,9 @@ from unifg.elimination.plan import ADJACENT, FIRST, FRONTS, INDEX, PANEL, PIVOTS
 from unifg.elimination.vectors import Address, address, blend, get, load, minus, plus_products, put, splat, store, total
 from unifg.jit import compiled
 from unifg.typing import Array, IntArray
+
+MEMORY = 4  # corrections that are combined
+PATIENCE = 2  # of them in a row that may fail to halve the residual
 
 
 @compiled
@@ -147,12 +152,21 @@ def solve_columns(plan: Plan, right: Array, out: Array) -> None:
 
 @compiled
 def residual(
-    indptr: IntArray, indices: IntArray, data: Array, x: Array, right: Array, out: Array, bulk: Array
-) -> tuple[float, float]:
+    indptr: IntArray,
+    indices: IntArray,
+    data: Array,
+    x: Array,
+    right: Array,
+    scale: Array,
+    first: int,
+    out: Array,
+    bulk: Array,
+) -> float:
     """``out`` = right - A x for the upper triangle of A by columns; ``bulk`` = |right| + |A| |x|.
 
     Returns:
-        max |out|, max bulk: what rounding errors of the residual are relative to.
+        max scale |out| / max scale bulk, what rounding errors of the residual are relative to; the larger ratio of the
+        rows before ``first`` and of the others.
     """
     scalars = len(x)
     for i in range(scalars):
@@ -169,20 +183,37 @@ def residual(
                 bulk[row] += abs(entry * value)
         out[column] -= products
         bulk[column] += sizes
-    error, size = 0.0, 0.0
-    for i in range(scalars):
-        if not abs(out[i]) <= error:  # so that NaN is not lost
-            error = abs(out[i])
-        if bulk[i] > size:
-            size = bulk[i]
-    return error, size
+    worst = 0.0
+    for part in range(2):
+        error, size = 0.0, 0.0
+        for i in range(first if part else 0, scalars if part else first):
+            if not scale[i] * abs(out[i]) <= error:  # so that NaN is not lost
+                error = scale[i] * abs(out[i])
+            size = max(size, scale[i] * bulk[i])
+        relative = error / size if size > 0.0 else error
+        if not relative <= worst:
+            worst = relative
+    return worst
 
 
 @compiled
 def refine(
-    plan: Plan, indptr: IntArray, indices: IntArray, data: Array, right: Array, out: Array, tolerance: float, steps: int
+    plan: Plan,
+    indptr: IntArray,
+    indices: IntArray,
+    data: Array,
+    right: Array,
+    scale: Array,
+    first: int,
+    out: Array,
+    tolerance: float,
+    steps: int,
 ) -> float:
     """Solve A x = right for A near the factorised matrix, by iterative refinement from x = 0.
+
+    Where a correction alone does not do, it is combined with the last ones so that the residual is least (generalised
+    conjugate residuals, S. Eisenstat, H. Elman, M. Schultz, SIAM J. Numer. Anal. 20 (1983)): weak directions, for which
+    what was added to the diagonal matters, are few.
 
     Args:
         plan: with its factorisation, say of A with something added to the diagonal.
@@ -190,30 +221,77 @@ def refine(
         indices: its rows.
         data: its entries.
         right: (n,).
+        scale: (n,) factors of the rows, where their residuals are compared.
+        first: row from which on rows are measured by themselves, say those of multipliers; n for none.
         out: (n,) receives x, the best of the iterates.
-        tolerance: of max |right - A x|, relative to max (|A| |x| + |right|).
+        tolerance: of the residual, as :func:`residual` measures it.
         steps: corrections at most.
 
     Returns:
         The relative residual reached.
     """
     scalars = len(right)
-    rest, step, trial, bulk = np.empty(scalars), np.empty(scalars), np.empty(scalars), np.empty(scalars)
-    best = np.inf
-    for i in range(scalars):
-        out[i], trial[i], rest[i] = 0.0, 0.0, right[i]
-    for _ in range(steps + 1):
+    x, rest, trial, after = np.zeros(scalars), right.copy(), np.empty(scalars), np.empty(scalars)
+    step, other, bulk = np.empty(scalars), np.empty(scalars), np.empty(scalars)
+    moves, effects = np.zeros((MEMORY, scalars)), np.zeros((MEMORY, scalars))
+    best, idle = np.inf, 0
+    out[:] = 0.0
+    for k in range(steps + 1):
         solve(plan, rest, step)
         for i in range(scalars):
-            trial[i] += step[i]
-        error, size = residual(indptr, indices, data, trial, right, rest, bulk)
-        relative = error / size if size > 0.0 else error
-        if not relative < best:
+            trial[i] = x[i] + step[i]
+        relative = residual(indptr, indices, data, trial, right, scale, first, after, bulk)
+        if not relative < np.inf:
             break
-        slow = relative > 0.5 * best
-        best = relative
-        for i in range(scalars):
-            out[i] = trial[i]
-        if best <= tolerance or slow:
+        if relative > tolerance:
+            for i in range(scalars):
+                bulk[i] = scale[i] * (rest[i] - after[i])
+            _remember(k % MEMORY, step, bulk, moves, effects)
+            if k > 0:
+                _least(x, rest, scale, moves, effects, other)
+                combined = residual(indptr, indices, data, other, right, scale, first, step, bulk)
+                if combined < relative:
+                    relative = combined
+                    trial[:], after[:] = other, step
+        idle = idle + 1 if relative > 0.5 * best else 0
+        if relative < best:
+            best = relative
+            out[:] = trial
+        if best <= tolerance or idle == PATIENCE:
             break
+        x[:], rest[:] = trial, after
     return best
+
+
+@compiled
+def _remember(place: int, step: Array, effect: Array, moves: Array, effects: Array) -> None:
+    """Keep a correction and its effect on the scaled residual, without what the others kept do, and of length one."""
+    move, own = moves[place], effects[place]
+    move[:], own[:] = step, effect
+    for j in range(len(moves)):
+        if j != place:
+            share = 0.0
+            for i in range(len(own)):
+                share += own[i] * effects[j, i]
+            for i in range(len(own)):
+                move[i] -= share * moves[j, i]
+                own[i] -= share * effects[j, i]
+    square = 0.0
+    for i in range(len(own)):
+        square += own[i] ** 2
+    length = 1.0 / math.sqrt(square) if square > 0.0 else 0.0
+    for i in range(len(own)):
+        move[i] *= length
+        own[i] *= length
+
+
+@compiled
+def _least(x: Array, rest: Array, scale: Array, moves: Array, effects: Array, out: Array) -> None:
+    """``out`` = x and the combination of corrections after which the scaled residual ``rest`` is least."""
+    out[:] = x
+    for j in range(len(moves)):
+        share = 0.0
+        for i in range(len(x)):
+            share += scale[i] * rest[i] * effects[j, i]
+        for i in range(len(x)):
+            out[i] += share * moves[j, i]
