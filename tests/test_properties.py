@@ -51,7 +51,8 @@ def wild(seed: int) -> tuple[fg.Graph, Guess]:
     graph.minimize(fg.prior, poses[0], 0.3 * rng.standard_normal(3), sigma=0.5)
     graph.minimize(fg.between, poses[:-1], poses[1:], [1.0, 0.0, rng.uniform(-0.5, 0.5)], robust=_loss(rng))
     graph.minimize(fg.prior, turn, fg.SO3.exp(0.8 * rng.standard_normal((2, 3))), name="attitudes")
-    graph.minimize(lambda p, x: np.hypot(*(p - x[:, :2]).T)[:, None] - 1.0, points, poses, name="ranges")
+    # A corner of the box may bring a point and a pose together, where a distance has no derivative.
+    graph.minimize(lambda p, x: np.hypot(0.1, np.hypot(*(p - x[:, :2]).T))[:, None] - 1.0, points, poses, name="ranges")
     if rng.random() < 0.7:
         low = rng.uniform(-1.0, 0.5, 2)
         graph.bound(points, lower=low, upper=low + rng.uniform(0.0, 1.5, 2), name="box")
