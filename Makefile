@@ -52,6 +52,7 @@ bench: $(VENV)/ready-bench
 	$(BIN)/python -m benchmarks.navigation --coupling joint
 	$(BIN)/python -m benchmarks.coupling
 	$(BIN)/python -m benchmarks.quadrotor_pull
+	$(BIN)/python -m benchmarks.quadrotor_flights
 	$(BIN)/python -m benchmarks.elimination
 
 fences: $(VENV)/ready
