@@ -174,7 +174,7 @@ def measure() -> dict[str, dict[str, Outcome]]:
 def render(results: dict[str, dict[str, Outcome]]) -> str:
     """The page."""
     notes = (
-        f"{machine('unifg', 'numpy', 'scipy', 'casadi')} State of the code: `{code_digest()}`. Default options, one "
+        f"{machine('numpy', 'scipy', 'casadi')} State of the code: `{code_digest()}`. Default options, one "
         "solve from the standard start of each problem."
     )
     parts = [notes, _summary(results), "## What is not solved", _failures(results)]

@@ -156,7 +156,7 @@ def render(results: dict[Problem, dict[str, Outcome]], rounds: int) -> str:
         f"Cold: from the listed guess, tolerance {TOLERANCE:.0e} of every solver, median processor time of {rounds} "
         f"interleaved solves (one where it took more than {SLOW:.0f} ms). The cost of an interior point is above the "
         "optimum by about the tolerance times the number of active limits; listed optima were found at 1e-9. Same "
-        f"optimum: within {SAME:.0e}. {machine('unifg', 'numpy', 'numba', *(('casadi',) if peers else ()))}"
+        f"optimum: within {SAME:.0e}. {machine('numpy', 'numba', *(('casadi',) if peers else ()))}"
     )
     return "\n\n".join([summary, table(head, lines, text=3), notes])
 

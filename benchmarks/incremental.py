@@ -237,7 +237,7 @@ def main() -> None:
     head = ["median [ms]", "mean [ms]", "95 % [ms]", "99 % [ms]", "largest [ms]", "stating, median [ms]"]
     text = [
         f"{'M3500' if folder else 'A generated grid'}, {len(graph.poses)} poses, {len(graph.edges)} edges; "
-        f"{arguments.rounds} rounds. {machine('unifg', 'numpy', 'numba', 'gtsam')}",
+        f"{arguments.rounds} rounds. {machine('numpy', 'numba', 'gtsam')}",
         table(
             ["smoother", "relinearise, every", *head, "1/2 chi2 at the end"],
             measured(incremental(graph, peer), arguments.rounds),

@@ -303,7 +303,7 @@ def render(results: Results, layouts: Sequence[Layout]) -> str:
             "How solves ended:",
             words(results),
             "Iterations and times are medians, times are the processor's. `python -m benchmarks.obstacle_courses`. "
-            + machine("unifg", "numpy", "scipy", "osqp", "piqp"),
+            + machine("numpy", "scipy", "osqp", "piqp"),
         )
     )
 

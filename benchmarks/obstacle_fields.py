@@ -223,7 +223,7 @@ def render(results: Results, fields: int) -> str:
     parts.append(table(changes, moves, text=2))
     parts.append(
         f"{fields} fields, seeds 0 to {fields - 1}; tolerance {TOLERANCE:g}; `python -m benchmarks.obstacle_fields`. "
-        f"{machine('unifg', 'numpy', 'scipy', 'osqp', 'piqp')}"
+        f"{machine('numpy', 'scipy', 'osqp', 'piqp')}"
     )
     return "\n\n".join(parts)
 
