@@ -17,9 +17,9 @@ from unifg.errors import GraphError
 from unifg.jit import compiled
 from unifg.kernels import Kernel
 from unifg.lie import LieGroup, Manifold, Rn
+from unifg.lie.product import leaves
 from unifg.lie.scalar import se2, se3, so2, so3
 from unifg.residuals import Residual, residual
-from unifg.retraction import leaves
 from unifg.typing import Array
 
 VECTOR = 0  # how a leaf is compared; groups by their numbers in GROUPS
@@ -49,7 +49,7 @@ def joint_prior(*manifolds: Manifold) -> Residual:
 
 @cache
 def _complete(manifolds: tuple[Manifold, ...]) -> Residual:
-    parts = [leaf for manifold in manifolds for leaf, _, _ in leaves(manifold, 0, 0)]
+    parts = [leaf for manifold in manifolds for leaf, _, _ in leaves(manifold)]
     storage, dim = (sum(getattr(part, size) for part in parts) for size in ("storage", "dim"))
     if all(_kind(leaf) is not None for leaf in parts):
         table = [[cast(int, _kind(leaf)), leaf.storage, leaf.dim] for leaf in parts]

@@ -18,8 +18,9 @@ from unifg.differentiation import FIRST_STEP
 from unifg.errors import GraphError
 from unifg.jit import LIBERTIES
 from unifg.kernels import Kernel
-from unifg.lie import Manifold, Product, Rn
+from unifg.lie import Manifold, Rn
 from unifg.lie.lookup import functions_of
+from unifg.lie.product import leaves
 from unifg.lie.scalar import rn
 
 logger = logging.getLogger("unifg")
@@ -114,9 +115,13 @@ def _differences(
     yield "        moved[k] = v[k]"
     column = 0
     for at, manifold in slots:
-        for leaf, stored, tangent in _leaves(name, manifold, at, 0):
+        for leaf, stored, tangent in leaves(manifold, at):
             module = rn if isinstance(leaf, Rn) else functions_of(leaf)
-            assert module is not None
+            if module is None:
+                raise GraphError(
+                    f"{name}: {leaf.name} has no compiled retraction, which a compiled residual needs for its "
+                    "derivatives; attach a compiled Jacobian, or write the residual as a batched NumPy function"
+                )
             retract = f"retract_{leaf.name.split('(')[0]}"
             names[retract] = module.retract
             move = f"{retract}(vector(v, {stored}, {leaf.storage}), vector(step, 0, {leaf.dim}), "
@@ -133,20 +138,6 @@ def _differences(
             yield f"    for k in range({stored}, {stored + leaf.storage}):"
             yield "        moved[k] = v[k]"
         column += manifold.dim
-
-
-def _leaves(name: str, manifold: Manifold, storage: int, tangent: int) -> Iterator[tuple[Manifold, int, int]]:
-    """The components of products, down to those with a compiled retraction."""
-    if isinstance(manifold, Product):
-        for part in manifold.components.values():
-            yield from _leaves(name, part.manifold, storage + part.storage.start, tangent + part.tangent.start)
-        return
-    if not isinstance(manifold, Rn) and functions_of(manifold) is None:
-        raise GraphError(
-            f"{name}: {manifold.name} has no compiled retraction, which a compiled residual needs for its derivatives; "
-            "attach a compiled Jacobian, or write the residual as a batched NumPy function"
-        )
-    yield manifold, storage, tangent
 
 
 def _product(shape: tuple[int, ...]) -> int:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from unifg.calls import RETRACTION, address, call_retraction, vector
 from unifg.columns import Columns, Values
 from unifg.jit import compiled
-from unifg.lie import Manifold, Product, Rn
+from unifg.lie import Manifold, Rn
 from unifg.lie.lookup import functions_of
+from unifg.lie.product import leaves
 from unifg.terms import Fix
 from unifg.typing import Array, IntArray
 
@@ -31,7 +32,7 @@ class Retraction:
         self._kept = []  # addresses are good for as long as the functions live
         parts = []
         for family in columns.families:
-            parts_of = list(leaves(family.manifold, 0, 0))
+            parts_of = list(leaves(family.manifold))
             if any(_compiled_retraction(leaf) is None for leaf, _, _ in parts_of):
                 self._python.append(family)
                 continue
@@ -102,15 +103,6 @@ def retractions(manifolds: Sequence[Manifold]) -> list[list[int]]:
             parts.append([where, stored, leaf.storage, leaf.dim, moved])
         storage, tangent = storage + manifold.storage, tangent + manifold.dim
     return parts
-
-
-def leaves(manifold: Manifold, storage: int, tangent: int) -> Iterator[tuple[Manifold, int, int]]:
-    """The components of products, down to manifolds that are none, and where each begins."""
-    if not isinstance(manifold, Product):
-        yield manifold, storage, tangent
-        return
-    for part in manifold.components.values():
-        yield from leaves(part.manifold, storage + part.storage.start, tangent + part.tangent.start)
 
 
 def _compiled_retraction(manifold: Manifold) -> object:

@@ -10,7 +10,8 @@ import numpy as np
 from unifg.columns import Columns, Values
 from unifg.errors import GraphError
 from unifg.lie import LieGroup, Manifold
-from unifg.retraction import Retraction, leaves
+from unifg.lie.product import leaves
+from unifg.retraction import Retraction
 from unifg.typing import ArrayLike
 from unifg.variables import Family
 
@@ -28,7 +29,7 @@ class Start:
         self._retraction = retraction
         self._particular: list[tuple[Family, slice, Manifold]] = []
         for family in columns.families:
-            for leaf, storage, _ in leaves(family.manifold, 0, 0):
+            for leaf, storage, _ in leaves(family.manifold):
                 if getattr(type(leaf), "is_valid", None) is not LieGroup.is_valid:
                     self._particular.append((family, slice(storage, storage + leaf.storage), leaf))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, overload
@@ -242,6 +242,15 @@ class ProductGroup(Product, LieGroup):
         d = np.asarray(d, dtype=np.float64)
         blocks = [(t, g.right_jacobian_inverse(d[..., t])) for g, _, t, _, _ in self._groups]
         return _block_diagonal(d.shape[:-1], self.dim, blocks)
+
+
+def leaves(manifold: Manifold, storage: int = 0, tangent: int = 0) -> Iterator[tuple[Manifold, int, int]]:
+    """The components of products, down to manifolds that are none, and where each begins in storage and tangent."""
+    if not isinstance(manifold, Product):
+        yield manifold, storage, tangent
+        return
+    for part in manifold.components.values():
+        yield from leaves(part.manifold, storage + part.storage.start, tangent + part.tangent.start)
 
 
 def _block_diagonal(batch: tuple[int, ...], size: int, blocks: list[tuple[slice, Array]]) -> Array:

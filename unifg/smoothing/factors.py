@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from math import isfinite, sqrt
 from typing import Any
@@ -15,8 +14,9 @@ from unifg.factors import prior
 from unifg.graph import AnyResidual, complete
 from unifg.jit import compiled, is_compiled
 from unifg.kernels import Kernel, side_by_side
-from unifg.lie import Manifold, Product, Rn
+from unifg.lie import Manifold, Rn
 from unifg.lie.lookup import functions_of
+from unifg.lie.product import leaves
 from unifg.per_factor import per_factor
 from unifg.residuals import Residual
 from unifg.robust import DCS, Cauchy, GemanMcClure, Huber, Loss, Tukey
@@ -283,7 +283,7 @@ class Kinds:
             if known == manifold:
                 return place
         parts: list[int] = []
-        for leaf, storage, tangent in leaves(manifold, 0, 0):
+        for leaf, storage, tangent in leaves(manifold):
             where = deviation = 0
             if not isinstance(leaf, Rn):
                 functions = functions_of(leaf)
@@ -303,12 +303,3 @@ class Kinds:
         self.fields += [len(parts) // PART, *parts]
         self._known.append((manifold, place))
         return place
-
-
-def leaves(manifold: Manifold, storage: int, tangent: int) -> Iterator[tuple[Manifold, int, int]]:
-    """The components of products, down to manifolds that are none, and where each begins."""
-    if not isinstance(manifold, Product):
-        yield manifold, storage, tangent
-        return
-    for part in manifold.components.values():
-        yield from leaves(part.manifold, storage + part.storage.start, tangent + part.tangent.start)
