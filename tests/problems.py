@@ -214,6 +214,64 @@ def short_drive(disc: bool = True) -> tuple[fg.Graph, Guess]:
     return graph, {x: np.stack([ahead, 0.0 * ahead, 0.0 * ahead], axis=1), u: np.tile([0.8, 0.0], (count, 1))}
 
 
+def pose_chain(
+    manifold: fg.Manifold, count: int, seed: int, pinned: tuple[int, ...], unit: float = 1.0, information: float = 1.0
+) -> tuple[fg.Graph, Guess]:
+    """Poses along noisy odometry; those pinned are held by hard priors, which the guess keeps.
+
+    Args:
+        manifold: SE2 or SE3.
+        count: poses.
+        seed: of the way, of its measurements and of the guess.
+        pinned: poses with a hard prior.
+        unit: of length [m].
+        information: of odometry of 0.1 units and 0.1 rad.
+    """
+    rng, size = np.random.default_rng(seed), manifold.dim
+    scale = np.where(np.arange(size) < (2 if size == 3 else 3), unit, 1.0)
+    steps = scale * (0.3 * rng.normal(size=(count - 1, size)) + np.eye(size)[0])
+    poses = [manifold.identity()]
+    for step in steps:
+        poses.append(manifold.retract(poses[-1], step))
+    graph = fg.Graph()
+    x = graph.variables("x", manifold, count)
+    moves = steps + 0.05 * scale * rng.normal(size=steps.shape)
+    measured = np.stack([manifold.retract(manifold.identity(), move) for move in moves])
+    graph.minimize(fg.between, x[:-1], x[1:], measured, sigma=0.1 * scale / information**0.5)
+    for k in pinned:
+        graph.constrain(fg.prior, x[k], poses[k], lower=0.0, upper=0.0, name=f"pin {k}")
+    guess = np.stack([manifold.retract(pose, 0.1 * scale * rng.normal(size=size)) for pose in poses])
+    for k in pinned:
+        guess[k] = poses[k]
+    return graph, {x: guess}
+
+
+def anchored_square() -> tuple[fg.Graph, Guess]:
+    """The square of poses, its first one held by a constraint that the guess keeps."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE2, 4)
+    quarter = [1.0, 0.0, np.pi / 2.0]
+    graph.constrain(fg.prior, x[0], [0.0, 0.0, 0.0], lower=0.0, upper=0.0, name="anchor")
+    graph.minimize(fg.between, x, x[[1, 2, 3, 0]], quarter, information=np.diag([4.0, 4.0, 25.0]))
+    return graph, {x: np.array([[0.0, 0.0, 0.0], [1.3, -0.2, 1.2], [0.7, 1.2, 2.8], [-0.3, 0.8, -1.2]])}
+
+
+def rolled_out_drive() -> tuple[fg.Graph, Guess]:
+    """A drive whose guess keeps its dynamics, its start, stated as a constraint, and its limits."""
+    count, dt = 12, 0.2
+    graph = fg.Graph()
+    x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
+    graph.constrain(fg.prior, x[0], [0.0, 0.0, 0.0], lower=0.0, upper=0.0, name="start")
+    graph.minimize(unicycle.tracking, x[-1], [1.5, 0.6, 0.4], sigma=0.1)
+    graph.minimize(fg.prior, u, [0.0, 0.0], sigma=2.0)
+    graph.minimize(unicycle.rate, u[:-1], u[1:], sigma=1.0)
+    graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], dt, lower=0.0, upper=0.0, name="dynamics")
+    controls, poses = np.tile([0.6, 0.3], (count, 1)), [np.zeros(3)]
+    for speed, turn in controls:
+        poses.append(fg.SE2.retract(poses[-1], dt * np.array([speed, 0.0, turn])))
+    return graph, {x: np.stack(poses), u: controls}
+
+
 def inverse_distance() -> tuple[fg.Graph, Guess]:
     """A scalar cost 1/d that pushes away from the origin against a quadratic pull: d^3 = 1 by hand."""
     graph = fg.Graph()
@@ -276,5 +334,17 @@ PROBLEMS = [
     ),
     Problem("product state", product_state, 3.0, duals={"speed": [[0.0], [1.0]]}),
     Problem("short drive", short_drive, np.nan),
+    Problem(
+        "anchored square",
+        anchored_square,
+        0.0,
+        answer={"x": [[0, 0, 0], [1, 0, np.pi / 2], [1, 1, np.pi], [0, 1, -np.pi / 2]]},
+        duals={"anchor": [[0.0, 0.0, 0.0]]},
+    ),
+    Problem("pinned ends, SE(2)", partial(pose_chain, fg.SE2, 12, 0, (0, 11)), np.nan),
+    Problem("pinned ends, SE(3)", partial(pose_chain, fg.SE3, 12, 0, (0, 11)), np.nan),
+    Problem("anchored chain, SE(3)", partial(pose_chain, fg.SE3, 12, 1, (0,)), 0.0, duals={"pin 0": [[0.0] * 6]}),
+    Problem("every pose pinned", partial(pose_chain, fg.SE2, 6, 2, tuple(range(6))), np.nan),
+    Problem("rolled-out drive", rolled_out_drive, np.nan),
     Problem("inverse distance", inverse_distance, 1.5, scalar=True, answer={"x": [[1.0]]}),
 ]

@@ -9,7 +9,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems import STARTS, ecg2o, short_drive, three_variable_qp
+from problems import STARTS, ecg2o, pose_chain, short_drive, three_variable_qp
 from unifg.models import unicycle
 from unifg.solvers import KKT, SQP
 from unifg.typing import Array
@@ -245,3 +245,18 @@ def test_weights_and_units_of_linear_problems_do_not_matter(
         solution = KKT(full_steps=full_steps).solve(graph, guess)
         assert solution.converged, (sight, arrival, solution.report())
         assert solution.iterations <= 2
+
+
+@pytest.mark.parametrize("full_steps", [False, True])
+@pytest.mark.parametrize("pinned", [(0,), (0, 39), tuple(range(40))], ids=["first", "both ends", "all"])
+@pytest.mark.parametrize("manifold", [fg.SE2, fg.SE3], ids=["SE2", "SE3"])
+def test_hard_priors_that_hold_already_are_no_obstacle(
+    manifold: fg.Manifold, pinned: tuple[int, ...], full_steps: bool
+) -> None:
+    """Rows that ask an unknown not to move have nothing but rounding to be compared with."""
+    for seed, unit, information in ((0, 1.0, 1.0), (1, 1e3, 1.0), (2, 1e-3, 1.0), (3, 1.0, 1e6), (4, 1.0, 1e-6)):
+        graph, guess = pose_chain(manifold, 40, seed, pinned, unit, information)
+        solution = KKT(full_steps=full_steps, tolerance=max(1e-6, 1e-10 * information / unit)).solve(graph, guess)
+        assert solution.converged, (seed, unit, information, solution.report())
+        if full_steps or len(pinned) > 1:  # an open end swings far in the first step, and a merit function slows it
+            assert solution.iterations <= 12, (seed, unit, information)

@@ -61,7 +61,9 @@ BUILD: dict[str, Callable[[], tuple[fg.Graph, Guess]]] = {
     "repulsion": repulsion,
     "two rotations": two_rotations,
 }
-SMOOTH = [name for name in BUILD if name != "drive to a pose"]  # NumPy residuals: the same differences on both sides
+INDEFINITE = ("anchored square", "pinned ends, SE(3)", "anchored chain, SE(3)")  # exact Hessians at these guesses
+# NumPy residuals, the same differences on both sides:
+SMOOTH = [name for name in BUILD if name != "drive to a pose" and name not in INDEFINITE]
 
 
 def test_there_are_problems_enough() -> None:

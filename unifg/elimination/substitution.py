@@ -14,6 +14,7 @@ from unifg.typing import Array, IntArray
 
 MEMORY = 4  # corrections that are combined
 PATIENCE = 2  # of them in a row that may fail to halve the residual
+ROUNDING = 1e-7  # of what the rows of unknowns have on the right
 
 
 @compiled
@@ -164,6 +165,12 @@ def residual(
 ) -> float:
     """``out`` = right - A x for the upper triangle of A by columns; ``bulk`` = |right| + |A| |x|.
 
+    The rows from ``first`` on, those of multipliers, may ask that unknowns do not move at all: then their own bulk is
+    rounding only. So their size is at least that of the unknowns, x / scale, which their entries near one multiply
+    (J. Rigal and J. Gaches, "On the compatibility of a given solution with the data of a linear system", J. ACM 14
+    (1967)), and at least a small part of what the unknowns' rows have on the right: where nothing moves, rounding of
+    these is left. Multipliers do not count, which grow without limit where constraints contradict each other.
+
     Returns:
         max scale |out| / max scale bulk, what rounding errors of the residual are relative to; the larger ratio of the
         rows before ``first`` and of the others.
@@ -183,9 +190,9 @@ def residual(
                 bulk[row] += abs(entry * value)
         out[column] -= products
         bulk[column] += sizes
-    worst = 0.0
+    worst, least = 0.0, 0.0
     for part in range(2):
-        error, size = 0.0, 0.0
+        error, size = 0.0, least
         for i in range(first if part else 0, scalars if part else first):
             if not scale[i] * abs(out[i]) <= error:  # so that NaN is not lost
                 error = scale[i] * abs(out[i])
@@ -193,6 +200,8 @@ def residual(
         relative = error / size if size > 0.0 else error
         if not relative <= worst:
             worst = relative
+        for i in range(first):
+            least = max(least, abs(x[i]) / scale[i], ROUNDING * scale[i] * abs(right[i]))
     return worst
 
 
