@@ -52,7 +52,7 @@ class NotConverged(RuntimeError):
     """Raised by ``solve(..., check=True)``; carries the solution that fell short.
 
     Attributes:
-        solution: the best iterate found, with its status and KKT numbers.
+        solution: the last iterate, with its status and KKT numbers.
     """
 
     def __init__(self, solution: Solution) -> None:

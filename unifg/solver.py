@@ -218,7 +218,7 @@ class Run:
         """
         start, carried = self.values, self.multipliers
         self._move(lin, multipliers)
-        if not self.optimality.passes(self.tolerance):  # the start may be better
+        if not self.optimality.finite:
             self._move(self.program.linearize(start), carried)
             self._keep_best()
             self._move(lin, multipliers)
@@ -256,14 +256,19 @@ class Run:
         return infeasible_stationary(self.program, self.lin, self.tolerance)
 
     def finish(self, reason: Status | None) -> Solution:
-        """Return the best iterate, judged by the KKT test of the original problem."""
+        """Return the last iterate, judged by the KKT test of the original problem.
+
+        No ranking of iterates comes before the backend's own choice: a step of a real-time iteration may raise every
+        merit, and would never be taken from a feasible start. Only where the last iterate is not finite does the best
+        of the others stand in for it.
+        """
         status = self.status or reason or Status.STALLED
         if status is Status.STALLED and self.infeasible_stationary():
             status = Status.LOCALLY_INFEASIBLE
-        if status not in (Status.CONVERGED, Status.LOCALLY_INFEASIBLE):
+        if not self.optimality.finite:
             self._move(self._best_lin, self._best_multipliers)
         measured = self.optimality
-        if measured.passes(self.tolerance):
+        if measured.passes(self.tolerance) and status is not Status.UNBOUNDED:
             status = Status.CONVERGED
         elif status.converged:
             status = Status.STALLED
@@ -283,10 +288,10 @@ class Run:
     def _decide(self) -> Status | None:
         if not self.optimality.finite:
             return Status.NOT_FINITE
+        if self.lin.cost < UNBOUNDED_COST:  # out there, derivatives may be lost to rounding and look like zero
+            return Status.UNBOUNDED
         if self.optimality.passes(self.tolerance):
             return Status.CONVERGED
-        if self.lin.cost < UNBOUNDED_COST:
-            return Status.UNBOUNDED
         if self.iterations >= self._solver.max_iterations:
             return Status.ITERATION_LIMIT
         if self.out_of_time:
@@ -294,7 +299,7 @@ class Run:
         return None
 
     def _keep_best(self) -> None:
-        """Feasible iterates rank by how nearly they are stationary, others by violation."""
+        """What to return if the last iterate is not finite: feasible ones rank by stationarity, others by violation."""
         measured = self.optimality
         feasible = measured.violation <= self.tolerance
         error = max(measured.stationarity, measured.complementarity)

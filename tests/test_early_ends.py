@@ -1,0 +1,213 @@
+"""What a solve returns that ends early: where the backend had got to, not the guess."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.models import obstacles, unicycle
+from unifg.scenarios.manoeuvres import CASES, ManoeuvreSettings, state_problem
+from unifg.solver import Run
+from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
+from unifg.typing import Array
+
+N, DT, TICKS, MOVED_AT = 15, 0.1, 60, 3
+NEAR, FAR = np.array([1.0, 0.2]), np.array([1.4, 0.9])
+CENTRE, RADIUS = np.array([0.9, 0.45]), 0.2
+REACHED = 0.02  # [m] of the converged loop's end; what is left of a slow approach
+
+
+def missing(pose: Array, goal: Array) -> Array:
+    """Way to a goal: without a heading, which a unicycle would only creep towards."""
+    return goal - pose[:, :2]
+
+
+class Loop:
+    """A unicycle sent to one goal, and at tick 3 to another; plain MPC, nothing but graph, guess and solve."""
+
+    def __init__(self, limits: bool = True, disc: bool = False, soft: bool = False) -> None:
+        self.graph = fg.Graph()
+        self.x, self.u = self.graph.variables("x", fg.SE2, N + 1), self.graph.variables("u", fg.Rn(2), N)
+        self.start = self.graph.data("start", np.zeros(3))
+        self.goal = self.graph.data("goal", NEAR)
+        self.graph.fix(self.x[0], self.start)
+        self.graph.minimize(missing, self.x[1:-1], self.goal, sigma=1.0, name="way")
+        self.graph.minimize(missing, self.x[-1], self.goal, sigma=0.1, name="goal")
+        self.graph.minimize(fg.prior, self.u, [0.0, 0.0], sigma=2.0, name="effort")
+        x, u = self.x, self.u
+        if soft:
+            self.graph.minimize(unicycle.dynamics, x[:-1], u, x[1:], DT, sigma=0.02, name="motion")
+        else:
+            self.graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], DT, lower=0.0, upper=0.0, name="motion")
+        if limits:
+            self.graph.bound(u, lower=[-1.0, -2.0], upper=[1.0, 2.0], name="limits")
+        if disc:
+            centre, radius = CENTRE[None], np.array([RADIUS])
+            self.graph.constrain(obstacles.disc_clearance, x[1:], centre, radius, lower=0.0, name="disc")
+
+    def first(self) -> fg.Solution:
+        """Converged plan for the first goal."""
+        line = np.linspace(0.0, 1.0, N + 1)[:, None] * [*NEAR, 0.0]
+        rest = {self.x: line, self.u: np.zeros((N, 2))}
+        solution = InteriorPoint().solve(self.graph, rest)
+        assert solution.converged
+        return solution
+
+    def drive(self, solver: fg.Solver, feasible: bool) -> Array:
+        """Poses of a drive whose plans start at shifted ones, rolled out from the robot when ``feasible``."""
+        run, plan, pose = solver.prepare(self.graph), self.first(), np.zeros(3)
+        poses = [pose]
+        for tick in range(TICKS):
+            guess = plan.shifted(self.x, self.u) if tick else fg.Guess(plan.values, plan.multipliers, plan.penalties)
+            values = dict(guess.values)
+            if feasible:
+                values[self.u] = np.clip(values[self.u], [-1.0, -2.0], [1.0, 2.0])
+                values[self.x] = unicycle.rollout(pose, values[self.u], DT)
+            plan = run.solve(
+                fg.Guess(values, guess.multipliers, guess.penalties),
+                data={self.start: pose, self.goal: NEAR if tick < MOVED_AT else FAR},
+            )
+            pose = unicycle.rollout(pose, np.clip(plan[self.u][:1], [-1.0, -2.0], [1.0, 2.0]), DT)[-1]
+            poses.append(pose)
+        return np.array(poses)
+
+
+BACKENDS: dict[str, Callable[[int], fg.Solver]] = {
+    "sqp": lambda k: SQP(max_iterations=k),
+    "sqp, full steps": lambda k: SQP(max_iterations=k, full_steps=True),
+    "sqp, exact": lambda k: SQP(max_iterations=k, hessian="exact"),
+    "sqp on the graph": lambda k: SQP(max_iterations=k, qp="graph"),
+    "interior point": lambda k: InteriorPoint(max_iterations=k),
+    "augmented Lagrangian": lambda k: AugmentedLagrangian(max_iterations=k),
+    "penalty": lambda k: Penalty(max_iterations=k, penalty=1e4),
+    "kkt": lambda k: KKT(max_iterations=k),
+    "kkt, full steps": lambda k: KKT(max_iterations=k, full_steps=True),
+}
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("iterations", [1, 2, 3, 5])
+@pytest.mark.parametrize("feasible", [True, False], ids=["rolled out", "shifted"])
+def test_few_iterations_follow_a_moved_goal(name: str, iterations: int, feasible: bool) -> None:
+    arrives_as_converged(name, lambda loop: loop.drive(BACKENDS[name](iterations), feasible), feasible)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("feasible", [True, False], ids=["rolled out", "shifted"])
+def test_little_time_follows_a_moved_goal(name: str, feasible: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Run, "seconds", property(lambda run: 1.0 * len(run.history)))  # an iteration takes a second
+
+    def drive(loop: Loop) -> Array:
+        solver = BACKENDS[name](200)
+        solver.time_limit = 2.5
+        return loop.drive(solver, feasible)
+
+    arrives_as_converged(name, drive, feasible)
+
+
+def arrives_as_converged(name: str, drive: Callable[[Loop], Array], feasible: bool) -> None:
+    ends = converged_end(name, feasible)
+    assert np.linalg.norm(ends - FAR) < 0.02  # the loop is one that arrives
+    assert drive(Loop(limits="kkt" not in name))[-1, :2] == pytest.approx(ends, abs=REACHED)
+
+
+@cache
+def converged_end(name: str, feasible: bool) -> Array:
+    """Where the loop ends that solves every tick."""
+    return Loop(limits="kkt" not in name).drive(BACKENDS[name](200), feasible)[-1, :2]
+
+
+@pytest.mark.parametrize("name", [name for name in BACKENDS if "kkt" not in name])
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_few_iterations_pass_a_disc(name: str, iterations: int) -> None:
+    loop = Loop(disc=True)
+    poses = loop.drive(BACKENDS[name](iterations), feasible=True)
+    assert np.linalg.norm(poses[-1, :2] - FAR) < 0.05
+    gaps = np.linalg.norm(poses[:, :2] - CENTRE, axis=1) - RADIUS
+    assert gaps.min() > -0.01  # an iteration that has not converged may touch it
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("iterations", [1, 2, 3, 5, 9])
+def test_the_last_iterate_is_returned(name: str, iterations: int) -> None:
+    loop = Loop(limits="kkt" not in name)
+    ahead = np.tile([0.2, 0.1], (N, 1))
+    guess = {loop.x: unicycle.rollout(np.zeros(3), ahead, DT), loop.u: ahead}  # keeps every constraint
+    solution = BACKENDS[name](iterations).solve(loop.graph, guess, data={loop.goal: FAR})
+    last = solution.history[-1]
+    assert solution.iterations == last.number > 0
+    assert (solution.cost, solution.violation) == (last.cost, last.violation)
+    assert not np.array_equal(solution[loop.u], ahead)
+
+
+def test_a_stop_rule_returns_the_iterate_at_which_it_fired() -> None:
+    """Bazzana's loop on soft dynamics, from a guess that keeps every constraint and costs ten times as much."""
+    loop = Loop(soft=True)
+    rest = {loop.x: np.zeros((N + 1, 3)), loop.u: np.zeros((N, 2))}
+    for short in (1e-2, 1e-3):
+        solver = AugmentedLagrangian(
+            schedule="bazzana", penalty=0.1, step_tolerance=short, violation_tolerance=1e-2, tolerance=1e-12
+        )
+        solution = solver.solve(loop.graph, rest)
+        assert solution.status is fg.Status.STOP_RULE, solution.report()
+        last = solution.history[-1]
+        assert last.step_norm < short
+        assert (solution.cost, solution.stationarity) == (last.cost, last.stationarity)
+        assert solution.cost < 0.5 * solution.history[0].cost
+
+
+def test_the_manoeuvre_behind_in_the_paper_s_form() -> None:
+    settings = ManoeuvreSettings()
+    graph, x, _, guess = state_problem(next(case for case in CASES.values() if case.name == "behind"), settings)
+    solver = AugmentedLagrangian(schedule="bazzana", penalty=0.5, step_tolerance=1e-2, violation_tolerance=1e-1)
+    solution = solver.solve(graph, guess)
+    assert not np.array_equal(solution[x], guess.values[x])
+    assert solution.cost == solution.history[-1].cost
+
+
+@pytest.mark.parametrize("solver", [SQP(max_iterations=2000), InteriorPoint(max_iterations=2000)])
+def test_an_unbounded_solve_returns_its_last_finite_iterate(solver: fg.Solver) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize_scalar(lambda p: -(p[:, 0] ** 3), x)
+    graph.bound(x, lower=0.0)
+    solution = solver.solve(graph, {x: [[1.0]]})
+    assert solution.status is fg.Status.UNBOUNDED, solution.report()
+    assert solution.cost < -1e20
+    assert np.isfinite(solution[x]).all() and solution[x] > 1e6
+
+
+class Flies(fg.Solver):
+    """Steps to 2, 3 and then to where nothing is finite, or says that it is done where it is not."""
+
+    def workspace(self, program: object) -> None:
+        return None
+
+    def iterate(self, run: Run, workspace: None) -> fg.Status | None:
+        for target in (2.0, 3.0, np.inf):
+            step = target - run.values.flat
+            run.accept(run.program.linearize(run.program.retract(run.values, step)), run.multipliers, 1.0, 1.0)
+        return None
+
+
+def test_only_where_the_last_iterate_is_not_finite_another_stands_in() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [2.1], name="wish")
+    solution = Flies().solve(graph, {x: [[0.0]]})
+    assert solution.status is fg.Status.NOT_FINITE
+    assert solution[x].item() == 2.0  # nearer to being stationary than 0 and 3
+    assert np.isfinite(solution.cost)
+
+
+def test_nothing_unbounded_is_called_converged() -> None:
+    """Beyond 1e10 a difference of a scalar cost may vanish, and a vanishing gradient passes for a stationary one."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize_scalar(lambda p: np.minimum(-p[:, 0], -2e20), x)
+    solution = SQP().solve(graph, {x: [[1.0]]})
+    assert solution.status is fg.Status.UNBOUNDED
