@@ -11,28 +11,28 @@ from collections.abc import Callable
 
 import numpy as np
 
-from unifg.kkt import blocked, infeasible_stationary
+from unifg.kkt import NEGLIGIBLE, infeasible_stationary
 from unifg.linearization import Linearization
-from unifg.passes import add_constraints
 from unifg.program import Program
-from unifg.second_order import constraint_curvature
 from unifg.solver import Run
-from unifg.solvers.damping import largest
+from unifg.solvers.damping import norm
 from unifg.status import Status
-from unifg.typing import Array, BoolArray
+from unifg.violation import ViolationModel, descent
 
 STEPS = 200
 FIRST_DAMPING, LARGEST_DAMPING, GROWTH, SHRINK = 1e-3, 1e10, 4.0, 0.2
-FLOOR = 1e-6  # of the largest diagonal entry: unknowns that no violated row touches
 PROGRESS = 1e-12  # smallest relative decrease that counts; below it, the gradient has to halve
 ROUNDING = 1e-14
-ASIDE = 1e-3  # standard deviation of the tangent step off a point that may be a saddle
+ASIDE = 1e-3  # standard deviation of the step off a point that may be a saddle
 LESS = 1e-4  # relative decrease that tells a saddle from a minimum in a flat valley
 
 
 def settle(run: Run, status: Status) -> Status:
-    """End a solve that stalled: LOCALLY_INFEASIBLE at the point of least violation, else ``status`` where it is."""
-    if run.status is not None or run.optimality.violation <= run.tolerance:
+    """End a solve that stalled: LOCALLY_INFEASIBLE at the point of least violation, else ``status`` where it is.
+
+    A solve that has met its constraints somewhere has seen that they can be met: it stays where it is.
+    """
+    if run.status is not None or run.has_been_feasible:
         return status
     found = run.lin
     if not run.infeasible_stationary():
@@ -48,7 +48,7 @@ def settle(run: Run, status: Status) -> Status:
 
 
 def leave(run: Run) -> Status | None:
-    """Where the violation is stationary: LOCALLY_INFEASIBLE, or None once the iterate was moved off a saddle."""
+    """Where the violation is stationary: LOCALLY_INFEASIBLE, or None once the iterate was moved to violate less."""
     found = _downhill(run, run.lin)
     if found is None:
         return Status.LOCALLY_INFEASIBLE
@@ -57,15 +57,28 @@ def leave(run: Run) -> Status | None:
 
 
 def _downhill(run: Run, lin: Linearization) -> Linearization | None:
-    """A point that violates less, looked for from beside a stationary one; None at a minimum."""
+    """A point that violates less than a stationary one; None at a minimum.
+
+    It is looked for from where the solve has been, then from beside, off a saddle, at two distances: one in the units
+    of the unknowns, and one that is the same in any unit, but tells nothing where the violation is flat.
+    """
     program = run.program
-    aside = ASIDE * np.random.default_rng(0).standard_normal(program.size)
-    beside = program.linearize(program.retract(lin.values, aside))
-    if not beside.finite:
-        return None
-    found = least_violation(program, beside, run.tolerance, lambda: run.out_of_time)
-    here, there = ((program.violation(at.constraints) ** 2).sum() for at in (lin, found))
-    return found if found.finite and there < (1.0 - LESS) * here else None
+    direction = ASIDE * np.random.default_rng(0).standard_normal(program.size)
+    here = _squared(program, lin)
+    starts = [run.least_violated, program.retract(lin.values, direction)]
+    starts.append(program.retract(lin.values, ViolationModel(program, lin).lengths * direction))
+    for k, values in enumerate(starts):
+        start = program.linearize(values)
+        if not start.finite or (k == 0 and not _squared(program, start) < (1.0 - LESS) * here):
+            continue
+        found = least_violation(program, start, run.tolerance, lambda: run.out_of_time)
+        if found.finite and _squared(program, found) < (1.0 - LESS) * here:
+            return found
+    return None
+
+
+def _squared(program: Program, lin: Linearization) -> float:
+    return float((program.violation(lin.constraints) ** 2).sum())
 
 
 def least_violation(
@@ -73,7 +86,8 @@ def least_violation(
 ) -> Linearization:
     """Descend on the violation until it is stationary, gone, or nothing helps.
 
-    Unknowns at a bound that holds them back are held there for the step.
+    Unknowns at a bound that holds them back are held there for the step. Damping is relative to the largest curvature
+    that each unknown has shown (More, The Levenberg-Marquardt algorithm, 1978), so units do not matter.
 
     Args:
         program: the compiled graph.
@@ -81,36 +95,27 @@ def least_violation(
         tolerance: largest violation that counts as none.
         out_of_time: asked before every step whether to end where it is.
     """
-    solver, normal = program.normal_solver(), program.normal
-    columns = np.repeat(np.arange(program.size), np.diff(normal.indptr))
+    solver = program.normal_solver()
     lin = program.linearize(program.within_bounds(lin.values))
-    damping = FIRST_DAMPING
+    damping, size = FIRST_DAMPING, np.zeros(program.size)
     for _ in range(STEPS):
         outside = program.violation(lin.constraints)
-        if np.abs(outside).max(initial=0.0) <= tolerance or infeasible_stationary(program, lin, tolerance):
+        if np.abs(outside).max(initial=0.0) <= tolerance or out_of_time():
             return lin
-        if out_of_time():
+        model = ViolationModel(program, lin)
+        if model.promises_less_than(NEGLIGIBLE):
             return lin
-        # What the violated rows bend matters: the least violation is not small.
-        entries = constraint_curvature(program, lin, outside)
-        counted = (outside != 0.0) | program.equality
-        add_constraints(program.arrays, lin.constraint_jacobian, counted.astype(np.float64), entries)
-        pull, held = _pull(program, lin)
-        entries[held[normal.indices] | held[columns]] = 0.0
-        size, value = np.abs(entries[normal.diagonal]), float(outside @ outside)
-        size = np.maximum(size, FLOOR * size.max(initial=1.0))
+        size = np.maximum(size, model.size)
         while damping <= LARGEST_DAMPING:
-            damped = entries.copy()
-            damped[normal.diagonal] += damping * size
-            if solver.factor(damped):
-                values = program.within_bounds(program.retract(lin.values, -solver.solve(pull)))
+            if solver.factor(model.damped(damping, size)):
+                values = program.within_bounds(program.retract(lin.values, -solver.solve(model.gradient)))
                 trial = program.evaluate(values)
-                there = float((program.violation(trial.constraints) ** 2).sum()) if trial.finite else np.inf
-                if there < (1.0 - PROGRESS) * value:
+                there = 0.5 * float((program.violation(trial.constraints) ** 2).sum()) if trial.finite else np.inf
+                if there < (1.0 - PROGRESS) * model.value:
                     break
-                if there <= (1.0 + ROUNDING) * value:
-                    after, _ = _pull(program, program.linearize(values))
-                    if largest(after) <= 0.5 * largest(pull):
+                if there <= (1.0 + ROUNDING) * model.value:
+                    after, _ = descent(program, program.linearize(values))
+                    if norm(after / np.sqrt(size)) <= 0.5 * norm(model.gradient / np.sqrt(size)):
                         break
             damping *= GROWTH
         else:
@@ -118,13 +123,3 @@ def least_violation(
         lin = program.linearize(values)
         damping *= SHRINK
     return lin
-
-
-def _pull(program: Program, lin: Linearization) -> tuple[Array, BoolArray]:
-    """(n,) gradient of 1/2 |violation|^2, zero for unknowns that a bound holds back, and which those are."""
-    outside = program.violation(lin.constraints)
-    pull = program.constraints.transposed_times(lin.constraint_jacobian, outside)[program.columns.free]
-    held = np.zeros(program.size, dtype=bool)
-    held[blocked(program, lin.constraints, pull)] = True
-    pull[held] = 0.0
-    return pull, held

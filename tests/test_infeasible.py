@@ -12,6 +12,7 @@ from unifg.kkt import infeasible_stationary
 from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
 from unifg.solvers.least_violation import least_violation
 from unifg.typing import Array
+from units import drive
 
 BACKENDS: dict[str, fg.Solver] = {
     "kkt": KKT(),
@@ -23,6 +24,7 @@ BACKENDS: dict[str, fg.Solver] = {
     "sqp-graph": SQP(qp="graph"),
     "ipm": InteriorPoint(),
 }
+LEAST = 0.00253189415  # squared, of a drive whose end is out of reach
 Problem = tuple[fg.Graph, dict[fg.Family, Array]]
 
 
@@ -101,3 +103,41 @@ def test_least_violation_is_stationary_or_none(build: Callable[[], Problem]) -> 
     assert outside <= 1e-6 or infeasible_stationary(program, found, 1e-6)
     stopped = least_violation(program, lin, 1e-6, out_of_time=lambda: True)
     np.testing.assert_array_equal(stopped.values.flat, lin.values.flat)
+
+
+def bay() -> Problem:
+    """x^3 - 3 x + 3 = 0 has its root at -2.1; at 1, where the cost pulls, it is 1 and no nearer root is in sight."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [1.0], sigma=0.01)
+    graph.constrain(lambda p: p**3 - 3.0 * p + 3.0, x, lower=0.0, upper=0.0, name="cubic")
+    return graph, {x: np.array([[np.roots([1.0, 0.0, -3.0, 3.0])[0].real]])}
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_what_was_feasible_once_is_not_called_infeasible(name: str) -> None:
+    """Whatever valley a backend goes astray in: it started where the constraint holds."""
+    graph, guess = bay()
+    assert BACKENDS[name].solve(graph, guess).status is not fg.Status.LOCALLY_INFEASIBLE
+    if name != "kkt-full":  # full steps come across the root
+        x = graph.families["x"]
+        assert BACKENDS[name].solve(graph, {x: [[1.5]]}).status is fg.Status.LOCALLY_INFEASIBLE  # this start is not
+
+
+@pytest.mark.parametrize("unit", [1e-8, 1e-4, 1.0, 1e4, 1e8])
+def test_the_unit_of_an_unknown_does_not_decide_what_is_infeasible(unit: float) -> None:
+    """Neither the verdict on a point where steps still help, nor the way to the least violation."""
+    graph, guess = drive(position=unit)
+    program = graph.compile()
+    assert not infeasible_stationary(program, program.linearize(program.values_from(guess)), 1e-6)
+    for name in ("sqp", "sqp-graph", "ipm"):
+        assert BACKENDS[name].solve(graph, guess).status is not fg.Status.LOCALLY_INFEASIBLE, name
+    graph, guess = drive(position=unit, blocked=True)
+    program = graph.compile()
+    found = least_violation(program, program.linearize(program.values_from(guess)), 1e-6)
+    assert infeasible_stationary(program, found, 1e-6)
+    outside = program.violation(found.constraints)
+    assert outside @ outside == pytest.approx(LEAST, rel=1e-6)
+    solution = SQP().solve(graph, guess)
+    assert solution.status is fg.Status.LOCALLY_INFEASIBLE
+    assert solution.violation == pytest.approx(np.abs(outside).max(), rel=1e-4)

@@ -21,7 +21,10 @@ from unifg import passes
 from unifg.jit import compiled
 from unifg.linearization import Linearization
 from unifg.program import Program
-from unifg.typing import Array, BoolArray, IntArray
+from unifg.typing import Array, IntArray
+from unifg.violation import ViolationModel
+
+NEGLIGIBLE = 1e-12  # share of the squared violation
 
 
 @dataclass(frozen=True)
@@ -109,32 +112,12 @@ def _measure(
 
 
 def infeasible_stationary(program: Program, lin: Linearization, tolerance: float) -> bool:
-    """Whether the point is stationary for 1/2 |violation|^2 without being feasible.
+    """Whether the point is stationary for 1/2 |violation|^2 without being feasible, in whatever units the unknowns are.
 
-    Descent directions that satisfied bounds of the unknowns block do not count. The gradient A' v is compared with
-    the size of v and of the entries of A, if any exceeds one: where A itself vanishes, so does the gradient.
+    It is where the best step of :class:`unifg.violation.ViolationModel` would take away less than 1e-12 of it, as an
+    error of 1e-6 in a residual of one would. Descent directions that satisfied bounds of the unknowns block do not
+    count.
     """
-    outside = program.violation(lin.constraints)
-    if np.abs(outside).max(initial=0.0) <= tolerance:
+    if np.abs(program.violation(lin.constraints)).max(initial=0.0) <= tolerance:
         return False
-    pull = program.constraints.transposed_times(lin.constraint_jacobian, outside)[program.columns.free]
-    pull[blocked(program, lin.constraints, pull)] = 0.0
-    size = np.abs(lin.constraint_jacobian).max(initial=1.0) * np.abs(outside).max()
-    return bool(np.abs(pull).max(initial=0.0) <= 1e-6 * size)
-
-
-def blocked(program: Program, constraints: Array, gradient: Array) -> IntArray:
-    """Unknowns that rest on a bound which descent along ``gradient`` (n,) would leave."""
-    columns, at_lower, at_upper = _walls(program, constraints)
-    return columns[((gradient[columns] > 0.0) & at_lower) | ((gradient[columns] < 0.0) & at_upper)]
-
-
-def _walls(program: Program, constraints: Array) -> tuple[IntArray, BoolArray, BoolArray]:
-    """Unknowns with bounds, and whether each rests on its lower or upper one."""
-    rows, columns = program.constraints.free_rows, program.constraints.free_columns
-    bounds = program.bound_rows[rows]
-    rows, columns = rows[bounds], columns[bounds]
-    near = 1e-9 * np.maximum(1.0, np.abs(constraints[rows]))
-    at_lower = np.abs(constraints[rows] - program.lower[rows]) <= near
-    at_upper = np.abs(constraints[rows] - program.upper[rows]) <= near
-    return columns, at_lower, at_upper
+    return ViolationModel(program, lin).promises_less_than(NEGLIGIBLE)

@@ -149,6 +149,7 @@ class Run:
         self.status: Status | None = None
         self._best: tuple[float, float] | None = None
         self._recall: Callable[[], list[Iteration]] | None = None
+        self._least, self._least_values, self._start = np.inf, values, values
         self.iterations = 0
         if solver.verbose:
             logger.info(HEADER)
@@ -229,6 +230,8 @@ class Run:
     def _move(self, lin: Linearization, multipliers: Array) -> None:
         self.lin, self.values, self.multipliers = lin, lin.values, multipliers
         self.optimality = optimality(self.program, lin, multipliers)
+        if self.optimality.violation < self._least:
+            self._least, self._least_values = self.optimality.violation, lin.values
 
     def begin_at(self, lin: Linearization) -> None:
         """Move the start, as onto the bounds, without spending an iteration."""
@@ -251,6 +254,22 @@ class Run:
                 return
             self.accept(reached, self.multipliers, float(np.linalg.norm(step)), 1.0, search=1)
 
+    @property
+    def least_violated(self) -> Values:
+        """Values of least violation among the start and all iterates."""
+        if self.alone:  # then nobody has looked at the start
+            outside = self.program.violation(self.program.evaluate(self._start).constraints)
+            size = float(np.abs(outside).max(initial=0.0))
+            if size < self._least:
+                self._least, self._least_values = size, self._start
+        return self._least_values
+
+    @property
+    def has_been_feasible(self) -> bool:
+        """Whether the start or an iterate met the constraints, which proves that they can be met."""
+        _ = self.least_violated
+        return self._least <= self.tolerance
+
     def infeasible_stationary(self) -> bool:
         """Whether no nearby point violates the constraints less, though they are violated."""
         return infeasible_stationary(self.program, self.lin, self.tolerance)
@@ -265,6 +284,8 @@ class Run:
         status = self.status or reason or Status.STALLED
         if status is Status.STALLED and self.infeasible_stationary():
             status = Status.LOCALLY_INFEASIBLE
+        if status is Status.LOCALLY_INFEASIBLE and self.has_been_feasible:
+            status = Status.STALLED
         if not self.optimality.finite:
             self._move(self._best_lin, self._best_multipliers)
         measured = self.optimality
