@@ -4,6 +4,9 @@
 #   make test     run the tests
 #   make lint     check style (ruff) and types (mypy)
 #   make bench    measure everything again and rewrite the tables in docs/ (long)
+#   make results PAGE=control-cases    measure one page of docs/ again; without PAGE, list them
+#   make stale    name the pages of docs/ whose tables were measured on other sources
+#   make release-check    the same, and fail if there are any
 #   make fences   run the shell commands shown in README.md and docs/
 #   make clean    remove everything made here
 #
@@ -21,7 +24,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Matrices here are small: more threads per process only make the processes wait for each other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: help demo test lint types bench fences clean
+.PHONY: help demo test lint types bench results stale release-check fences clean
 .DELETE_ON_ERROR:
 
 help:
@@ -41,19 +44,17 @@ types: $(VENV)/ready-dev
 	$(BIN)/mypy
 
 bench: $(VENV)/ready-bench
-	$(BIN)/python -m benchmarks.reference_problems
-	$(BIN)/python -m benchmarks.obstacle_fields
-	$(BIN)/python -m benchmarks.obstacle_courses
-	$(BIN)/python -m benchmarks.incremental
-	$(BIN)/python -m benchmarks.collection
-	$(BIN)/python -m benchmarks.ecg2o
-	$(BIN)/python -m benchmarks.control_cases
-	$(BIN)/python -m benchmarks.navigation
-	$(BIN)/python -m benchmarks.navigation --coupling joint
-	$(BIN)/python -m benchmarks.coupling
-	$(BIN)/python -m benchmarks.quadrotor_pull
-	$(BIN)/python -m benchmarks.quadrotor_flights
-	$(BIN)/python -m benchmarks.elimination
+	$(BIN)/python -m benchmarks.pages measure all
+
+results: $(VENV)/ready-bench
+	@test -n "$(PAGE)" || { $(BIN)/python -m benchmarks.pages; echo "Choose: make results PAGE=name"; exit 2; }
+	$(BIN)/python -m benchmarks.pages measure $(PAGE)
+
+stale: $(VENV)/ready
+	@$(BIN)/python -m benchmarks.pages stale
+
+release-check: $(VENV)/ready
+	@$(BIN)/python -m benchmarks.pages stale --strict
 
 fences: $(VENV)/ready
 	$(BIN)/python docs/check_shell_fences.py

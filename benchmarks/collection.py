@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 import unifg as fg
-from benchmarks.report import CHECKOUT, OUT, code_digest, machine, put_results, table
+from benchmarks.report import CHECKOUT, OUT, machine, put_results, table
 from unifg.solvers import (
     KKT,
     SQP,
@@ -174,7 +174,7 @@ def measure() -> dict[str, dict[str, Outcome]]:
 def render(results: dict[str, dict[str, Outcome]]) -> str:
     """The page."""
     notes = (
-        f"{machine('numpy', 'scipy', 'casadi')} State of the code: `{code_digest()}`. Default options, one "
+        f"{machine('numpy', 'scipy', 'casadi')} Default options, one "
         "solve from the standard start of each problem."
     )
     parts = [notes, _summary(results), "## What is not solved", _failures(results)]

@@ -188,7 +188,7 @@ def render(rows: list[Row]) -> str:
         "Time per tick, pooled over all drives of a backend.", _times(rows),
         "Outcome of the control solve, share of ticks.", _statuses(rows),
         machine("numpy", "scipy", "osqp", "piqp", "qdldl", "pymunk")
-        + f" {_at_once(rows)} Digest of the code: `{rows[0]['code']}`.",
+        + f" {_at_once(rows)}",
     ]  # fmt: skip
     return "\n\n".join(parts)
 
@@ -300,7 +300,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     name = "navigation" if options.coupling == COUPLINGS[0] else f"{options.coupling}-drives"
 
-    folder, code = data_folder(), code_digest()
+    folder, code = data_folder(), code_digest("benchmarks.navigation")
     cases = [case for case in CASES if case.map is None or folder is not None]
     if folder is None:
         print("No maps in $UNIFG_DATA or ../shared/data: only the shipped building is driven.")
@@ -326,7 +326,8 @@ def main(arguments: list[str] | None = None) -> int:
     (OUT / f"{name}.md").write_text(text + "\n", encoding="utf-8", newline="\n")
     print(text)
     if {(c.name, s, seed) for c in CASES for s in SOLVERS for seed in SEEDS} <= {_key(row)[:3] for row in rows}:
-        put_results(CHECKOUT / "docs" / f"{name}.md", f"Drives, {options.coupling} coupling", text)
+        codes = {str(row["code"]) for row in rows}
+        put_results(CHECKOUT / "docs" / f"{name}.md", f"Drives, {options.coupling} coupling", text, codes)
     else:
         print(f"\nThe campaign is incomplete, so docs/{name}.md is left as it was.")
     return 0 if all(all(passes(row).values()) for row in rows) else 1

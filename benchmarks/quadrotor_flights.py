@@ -209,7 +209,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     store.parent.mkdir(parents=True, exist_ok=True)
     if options.fresh:
         store.unlink(missing_ok=True)
-    code = code_digest()
+    code = code_digest("benchmarks.quadrotor_flights")
     rows = read_rows(store, None if options.any_code else code)
     jobs = jobs_of(options.studies, options.solvers, options.couplings, options.seeds, code)
     done = {tuple(row["key"][:-1]) for row in rows}
@@ -224,7 +224,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     store.with_suffix(".md").write_text(text + "\n", encoding="utf-8", newline="\n")
     print(text)
     if set(options.seeds) <= set(CORRIDOR_SEEDS):
-        put_results(CHECKOUT / "docs" / "quadrotor-mpc.md", "Scenario: quadrotor-mpc", text)
+        codes = {str(row["code"]) for row in rows}
+        put_results(CHECKOUT / "docs" / "quadrotor-mpc.md", "Scenario: quadrotor-mpc", text, codes)
     return 0
 
 

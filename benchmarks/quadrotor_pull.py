@@ -294,7 +294,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.fresh:
         store.unlink(missing_ok=True)
     rows = [json.loads(line) for line in store.read_text().splitlines()] if store.exists() else []
-    code, seeds = code_digest(), list(TUNING_SEEDS[: options.seeds])
+    code, seeds = code_digest("benchmarks.quadrotor_pull"), list(TUNING_SEEDS[: options.seeds])
     rows = rows if options.report else [row for row in rows if json.loads(row["key"])["code"] == code]
     done = {row["key"] for row in rows}
     todo = [] if options.report else [job for job in jobs_of(seeds, options.seconds, code) if job.key not in done]
@@ -306,7 +306,8 @@ def main(arguments: list[str] | None = None) -> int:
             file.write(json.dumps(row) + "\n")
             file.flush()
     page = CHECKOUT / "docs" / "quadrotor-joint.md"
-    put_results(page, "One graph that estimates and flies", render(rows, seeds, options.seconds))
+    codes = {json.loads(row["key"])["code"] for row in rows}
+    put_results(page, "One graph that estimates and flies", render(rows, seeds, options.seconds), codes)
     return 0
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import platform
 from collections.abc import Iterable, Sequence
@@ -10,6 +9,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import unifg
+from benchmarks.pages import DIGEST_LINE, PAGES
+from benchmarks.sources import digest
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 OUT = CHECKOUT / "out" / "benchmarks"
@@ -31,19 +32,27 @@ def machine(*packages: str) -> str:
     )
 
 
-def code_digest() -> str:
-    """A short digest of the package's source: results of two states of the code are never mixed."""
-    digest = hashlib.sha256()
-    package = Path(unifg.__file__).parent
-    for folder in (package, package / "solvers", package / "models", package / "scenarios"):
-        for path in sorted(folder.rglob("*")):
-            if path.suffix in (".py", ".pgm", ".yaml"):
-                digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()[:12]
+def code_digest(module: str) -> str:
+    """A short digest of what a measuring module depends on: results of two states of the code are never mixed."""
+    return digest([module])
 
 
-def put_results(page: Path, title: str, text: str) -> None:
-    """Replace what stands between the markers of a page; a missing page is begun, missing markers are appended."""
+def put_results(page: Path, title: str, text: str, codes: Iterable[str] | None = None) -> None:
+    """Replace what stands between the markers of a page; a missing page is begun, missing markers are appended.
+
+    The digest of the sources goes with it, by which :mod:`benchmarks.pages` knows whether the page is up to date.
+
+    Args:
+        page: to write.
+        title: of a new page.
+        text: Markdown.
+        codes: digests of the states of the code that were measured, when that was not now; mixed ones make a page that
+            counts as stale.
+    """
+    known = PAGES.get(page.stem)
+    if known is not None and known.path == page:
+        measured = set(codes if codes is not None else [known.digest])
+        text = f"{text.strip()}\n\n{DIGEST_LINE.format(' and '.join(f'`{code}`' for code in sorted(measured)))}"
     old = page.read_text(encoding="utf-8") if page.is_file() else f"# {title}\n"
     if BEGIN not in old:
         old = f"{old.rstrip()}\n\n{BEGIN}\n{END}\n"

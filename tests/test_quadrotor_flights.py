@@ -62,7 +62,7 @@ def test_finished_flights_are_not_repeated(monkeypatch: pytest.MonkeyPatch, tmp_
         return {"key": list(job.key), "error": "none", **job.__dict__}
 
     monkeypatch.setattr(quadrotor_flights, "fly", fly)
-    monkeypatch.setattr(quadrotor_flights, "code_digest", lambda: "now")
+    monkeypatch.setattr(quadrotor_flights, "code_digest", lambda _: "now")
     store = tmp_path / "rows.jsonl"
     words = ["--seeds", "1000:1003", "--studies", "flights", "--solvers", "sqp", "--store", str(store)]
     assert quadrotor_flights.main(words) == 0
@@ -70,7 +70,7 @@ def test_finished_flights_are_not_repeated(monkeypatch: pytest.MonkeyPatch, tmp_
     store.write_text(store.read_text() + '{"cut off')
     assert quadrotor_flights.main(words) == 0
     assert len(flown) == 6
-    monkeypatch.setattr(quadrotor_flights, "code_digest", lambda: "later")
+    monkeypatch.setattr(quadrotor_flights, "code_digest", lambda _: "later")
     store.write_text(store.read_text() + "\n")
     assert quadrotor_flights.main(words) == 0
     assert len(flown) == 12

@@ -1,0 +1,306 @@
+"""What the backends claim about problems of control, judged from outside.
+
+    python -m benchmarks.claims [--parkings P] [--seeds S] [--kinds K ...] [--backends B ...]
+
+A hundred parkings of a kinematic bicycle and fourteen other kinds of control problem, each stated twice
+(:mod:`benchmarks.twins`): as a graph with residuals as a user writes them, and in casadi, whose exact derivatives judge
+what every backend answers (:mod:`benchmarks.exact_judge`). Needs casadi. Writes docs/claims.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from tqdm import tqdm
+
+import unifg as fg
+from benchmarks import twin_flights, twin_ground, twin_machines
+from benchmarks.exact_judge import Judge, Peer
+from benchmarks.report import CHECKOUT, OUT, machine, put_results, table
+from benchmarks.twins import Twin
+from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
+
+TOLERANCE = 1e-6
+SAME = 1e-4  # relative difference below which two costs are one optimum
+AGREED = 1e-7
+"""Relative difference of the two statements, whose gradients we get by central differences, casadi exactly."""
+DOUBT = 1.1
+"""A KKT number this many times the tolerance contradicts CONVERGED: differences are not exact to the last digit."""
+STATIONARY = 1e-4
+"""Relative gradient of the violation below which a point counts as stationary for it."""
+
+PARKING: Callable[..., Twin] = twin_ground.parking
+KINDS: dict[str, Callable[..., Twin]] = {
+    "free final time": twin_flights.free_time,
+    "two robots": twin_ground.two_robots,
+    "relay": twin_ground.relay,
+    "thrust cone": twin_flights.landing,
+    "attitude slew": twin_flights.slew,
+    "minimum snap": twin_flights.minimum_snap,
+    "pendulum": twin_ground.pendulum,
+    "cart-pole": twin_ground.cart_pole,
+    "gates": twin_flights.gates,
+    "two-link arm": twin_machines.arm,
+    "hover with drag": twin_flights.hover,
+    "lane change": twin_ground.lane_change,
+    "payload": twin_machines.payload,
+    "orbit": twin_flights.orbit,
+}
+BACKENDS: dict[str, fg.Solver] = {
+    "alm": AugmentedLagrangian(),
+    "sqp": SQP(),
+    "sqp exact": SQP(hessian="exact"),
+    "sqp graph": SQP(qp="graph"),
+    "ipm": InteriorPoint(),
+    "penalty": Penalty(),
+}
+EQUALITY_BACKENDS: dict[str, fg.Solver] = {"kkt": KKT(), **BACKENDS}
+
+
+@dataclass
+class Answer:
+    """One backend's answer and what the judge says about its claim.
+
+    Attributes:
+        status: claimed, a name of :class:`unifg.Status`.
+        iterations: counted by the backend.
+        seconds: processor time, the graph compiled before.
+        cost: as judged.
+        stationarity, violation, complementarity: as judged, at the multipliers of the answer.
+        claim: "true", "false", "saddle" (stationary for the violation, but left by IPOPT for a feasible point), or
+            "none" where nothing was claimed.
+        reason: of a false claim.
+    """
+
+    status: str
+    iterations: int
+    seconds: float
+    cost: float
+    stationarity: float
+    violation: float
+    complementarity: float
+    claim: str = "none"
+    reason: str = ""
+
+
+def answer(backend: fg.Solver, twin: Twin, judge: Judge) -> Answer:
+    """Solve from the guess and judge."""
+    run = backend.prepare(twin.graph)
+    begin = time.process_time()
+    solution = run.solve(twin.guess)
+    seconds = time.process_time() - begin
+    exact = judge.numbers(solution.values, solution.multipliers)
+    result = Answer(
+        solution.status.name, solution.iterations, seconds, exact.cost, exact.stationarity, exact.violation,
+        exact.complementarity,
+    )  # fmt: skip
+    if solution.status is fg.Status.CONVERGED:
+        result.claim = "true"
+        for name in ("stationarity", "violation", "complementarity"):
+            if not getattr(exact, name) <= DOUBT * backend.tolerance:
+                result.claim, result.reason = "false", f"{name} is {getattr(exact, name):.2g}"
+    elif solution.status is fg.Status.LOCALLY_INFEASIBLE:
+        result.claim, result.reason = infeasible(solution, judge, backend.tolerance)
+    elif solution.status is fg.Status.UNBOUNDED:
+        result.claim, result.reason = "false", "every objective here is a sum of squares"
+    return result
+
+
+def infeasible(solution: fg.Solution, judge: Judge, tolerance: float) -> tuple[str, str]:
+    """Judge a claim that no nearby point violates the constraints less."""
+    seen = min(row.violation for row in solution.history)
+    if seen <= tolerance:
+        return "false", f"an iterate keeps the constraints to {seen:.1g}"
+    values = solution.values
+    least, slope = judge.least_from(values), judge.slope_of_violation(values)
+    if slope <= STATIONARY:
+        return ("saddle", "") if least.feasible else ("true", "")
+    if least.after >= 0.99 * least.before:
+        return "true", ""  # no sum of absolute violations is less: stationary in that norm
+    end = "none" if least.feasible else f"{least.after:.2g}"
+    return "false", f"the violation falls from {least.before:.2g} to {end} within {least.far:.2g}; slope {slope:.1g}"
+
+
+def disagreement(twin: Twin, judge: Judge) -> float:
+    """Largest difference of cost, rows and gradient of the two statements, relative, at a random point by the guess."""
+    rng = np.random.default_rng(0)
+    values = {
+        family: family.manifold.retract(v, 0.05 * rng.normal(size=(len(v), family.manifold.dim)))
+        for family, v in twin.guess.items()
+    }
+    program = twin.graph.compile()
+    lin = program.linearize(program.values_from(values))
+    cost, rows, gradient, _ = judge.at(lin.values)
+    free = program.columns.free
+    pairs = ((lin.cost, cost), (lin.constraints, rows), (lin.gradient[free], gradient[free]))
+    return max(float(np.abs(a - b).max(initial=0.0) / max(1.0, np.abs(b).max(initial=0.0))) for a, b in pairs)
+
+
+@dataclass
+class Case:
+    """All answers to one problem."""
+
+    kind: str
+    seed: int
+    equalities_only: bool
+    answers: dict[str, Answer]
+    ipopt: Peer
+    fatrop: Peer | None
+
+
+def measure(
+    build: Callable[..., Twin], seed: int, backends: Mapping[str, fg.Solver], equalities_only: bool = False
+) -> Case:
+    """State a problem, solve it with everything."""
+    twin = build(seed, equalities_only)
+    judge = Judge(twin)
+    apart = disagreement(twin, judge)
+    if apart > AGREED:
+        raise RuntimeError(f"{twin.name}: the graph and the casadi statement differ by {apart:.1e}")
+    answers = {name: answer(backend, twin, judge) for name, backend in backends.items()}
+    ipopt, fatrop = judge.ipopt(twin.guess, TOLERANCE), judge.fatrop(twin.guess, TOLERANCE)
+    return Case(twin.kind, seed, equalities_only, answers, ipopt, fatrop)
+
+
+def results(cases: Iterable[Case]) -> dict[str, list[Case]]:
+    """Cases by kind, those without inequalities marked."""
+    found: dict[str, list[Case]] = {}
+    for case in cases:
+        found.setdefault(case.kind + (" =" if case.equalities_only else ""), []).append(case)
+    return found
+
+
+def lost(case: Case, name: str) -> bool:
+    """Whether IPOPT solved what a backend did not."""
+    return case.ipopt.solved and case.answers[name].status != "CONVERGED"
+
+
+def summary(cases: list[Case], names: Iterable[str]) -> str:
+    """One row per backend."""
+    rows = []
+    for name in names:
+        mine = [(case, case.answers[name]) for case in cases if name in case.answers]
+        solved = [(case, a) for case, a in mine if a.status == "CONVERGED"]
+        worst = max((max(a.stationarity, a.violation, a.complementarity) for _, a in solved), default=np.nan)
+        both = [a.cost / case.ipopt.cost - 1.0 for case, a in solved if case.ipopt.solved]
+        dead = Counter(a.claim for _, a in mine if a.status == "LOCALLY_INFEASIBLE")
+        rows.append(
+            (
+                name,
+                f"{len(solved)} / {len(mine)}",
+                str(sum(a.claim == "false" for _, a in solved)),
+                f"{worst:.2e}",
+                f"{dead['true']} / {dead['saddle']} / {dead['false']}",
+                str(sum(lost(case, name) for case, _ in mine)),
+                str(sum(not case.ipopt.solved for case, _ in solved)),
+                f"{sum(b < -SAME for b in both)} / {sum(abs(b) <= SAME for b in both)} / {sum(b > SAME for b in both)}",
+                f"{np.median([float(a.iterations) for _, a in solved] or [np.nan]):.0f}",
+                f"{np.median([a.seconds for _, a in mine]):.2f}",
+            )
+        )
+    head = (
+        "backend", "converged", "false", "largest exact KKT number", "infeasible: true / saddle / false",
+        "lost to IPOPT", "IPOPT lost", "cost below / at / above IPOPT's", "iterations", "CPU [s]",
+    )  # fmt: skip
+    return table(head, rows)
+
+
+def endings(case_list: list[Case], name: str) -> str:
+    """How the solves of one kind by one backend ended."""
+    counts = Counter(case.answers[name].status for case in case_list if name in case.answers)
+    if not counts:
+        return "-"
+    converged = counts.pop("CONVERGED", 0)
+    others = ", ".join(f"{count} {status.lower().replace('_', ' ')}" for status, count in counts.most_common())
+    return f"{converged} / {converged + sum(counts.values())}" + (f" ({others})" if others else "")
+
+
+def render(cases: list[Case]) -> str:
+    """All tables."""
+    groups = results(cases)
+    names = [name for name in EQUALITY_BACKENDS if any(name in case.answers for case in cases)]
+    parts = []
+    for title, chosen in (
+        ("Parkings", [c for c in cases if c.kind == "parking"]),
+        ("The other kinds", [c for c in cases if c.kind != "parking" and not c.equalities_only]),
+        ("The other kinds, equalities only", [c for c in cases if c.equalities_only]),
+    ):
+        if chosen:
+            solved, staged = sum(c.ipopt.solved for c in chosen), [c.fatrop for c in chosen if c.fatrop is not None]
+            parts.append(
+                f"{title}: {len(chosen)} problems. IPOPT solves {solved} of them, in "
+                f"{np.median([c.ipopt.iterations for c in chosen if c.ipopt.solved]):.0f} iterations in the median; "
+                f"fatrop {sum(peer.solved for peer in staged)} of the {len(staged)} that have its form."
+            )
+            parts.append(summary(chosen, [n for n in names if any(n in c.answers for c in chosen)]))
+    rows = []
+    for kind, group in groups.items():
+        peers = [c.fatrop for c in group if c.fatrop is not None]
+        rows.append(
+            (
+                kind,
+                f"{sum(c.ipopt.solved for c in group)} / {len(group)}",
+                f"{sum(peer.solved for peer in peers)} / {len(peers)}" if peers else "-",
+                *(endings(group, name) for name in names),
+            )
+        )
+    parts += ["Converged of all, with the other endings:", table(("kind", "IPOPT", "fatrop", *names), rows)]
+    wrong = [
+        f"- {case.kind} {case.seed}{' =' if case.equalities_only else ''}, {name}: `{a.status}`, but {a.reason}."
+        for case in cases for name, a in case.answers.items() if a.claim == "false"
+    ]  # fmt: skip
+    parts.append("\n".join(["False claims:", "", *wrong]) if wrong else "There is no false claim.")
+    parts.append(
+        f"Tolerance {TOLERANCE:.0e} of every solver, default options. Lost: IPOPT says it solved the problem from the "
+        f"same guess and the backend does not. Same cost: within {SAME:.0e}. Iterations are medians of converged "
+        f"solves, times those of all, the processor's. {machine('numpy', 'numba', 'casadi')}"
+    )
+    return "\n\n".join(parts)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure and write; 0 only without a false claim."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.claims", description=__doc__.split("\n")[0])
+    parser.add_argument("--parkings", type=int, default=100)
+    parser.add_argument("--seeds", type=int, default=5, help="of every other kind")
+    parser.add_argument("--kinds", nargs="*", help="only these")
+    parser.add_argument("--backends", nargs="*", help="only these")
+    parser.add_argument("--quick", action="store_true", help="print, write no page")
+    options = parser.parse_args(arguments)
+
+    def chosen(backends: dict[str, fg.Solver]) -> dict[str, fg.Solver]:
+        return {name: b for name, b in backends.items() if not options.backends or name in options.backends}
+
+    jobs: list[tuple[Callable[..., Twin], int, dict[str, fg.Solver], bool]] = []
+    for name, build in KINDS.items():
+        if not options.kinds or name in options.kinds:
+            jobs += [(build, seed, chosen(BACKENDS), False) for seed in range(options.seeds)]
+            jobs += [(build, seed, chosen(EQUALITY_BACKENDS), True) for seed in range(options.seeds)]
+    if not options.kinds or "parking" in options.kinds:
+        jobs += [(PARKING, seed, chosen(BACKENDS), False) for seed in range(options.parkings)]
+    cases = []
+    OUT.mkdir(parents=True, exist_ok=True)
+    with (OUT / "claims.jsonl").open("w", encoding="utf-8") as store:
+        for build, seed, backends, equal in tqdm(jobs, unit="problem"):
+            case = measure(build, seed, backends, equal)
+            cases.append(case)
+            store.write(json.dumps(asdict(case)) + "\n")
+            store.flush()
+            for backend, result in case.answers.items():
+                if result.claim == "false":
+                    tqdm.write(f"{case.kind} {seed}{' =' if equal else ''} {backend}: {result.status}: {result.reason}")
+    text = render(cases)
+    print(text)
+    if not (options.quick or options.kinds or options.backends):
+        put_results(CHECKOUT / "docs" / "claims.md", "What the backends claim, judged from outside", text)
+    return 1 if any(a.claim == "false" for case in cases for a in case.answers.values()) else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,125 @@
+"""The pages with measured tables: what measures each, and whether it still describes the code.
+
+    python -m benchmarks.pages                      names the pages and whether they are up to date
+    python -m benchmarks.pages stale [--strict]     names the stale ones; with --strict that is an error
+    python -m benchmarks.pages measure PAGE ...     measures pages again, ``all`` for every one
+
+``make results PAGE=...`` and ``make bench`` measure, ``make release-check`` is strict. A page is stale when the digest
+it carries is not that of the sources it depends on now (:mod:`benchmarks.sources`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.sources import CHECKOUT, digest
+
+DOCS = CHECKOUT / "docs"
+DIGEST_LINE = "Digest of the sources: {}."
+CARRIED = re.compile(r"^Digest of the sources: `(?P<digest>[0-9a-f]{12})`\.$", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Page:
+    """One page of docs/ with measured tables.
+
+    Attributes:
+        name: of the file, without its ending.
+        module: measures and writes it.
+        arguments: given to the module.
+        hours: about how long on two cores, for those who wait.
+    """
+
+    name: str
+    module: str
+    arguments: tuple[str, ...] = ()
+    hours: float = 0.1
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return DOCS / f"{self.name}.md"
+
+    @property
+    def digest(self) -> str:
+        """Of the sources as they are now."""
+        return digest([self.module])
+
+    @property
+    def carried(self) -> str | None:
+        """The digest the page carries."""
+        text = self.path.read_text(encoding="utf-8") if self.path.is_file() else ""
+        found = CARRIED.search(text)
+        return found["digest"] if found else None
+
+
+PAGES = {
+    page.name: page
+    for page in (
+        Page("reference-problems", "benchmarks.reference_problems"),
+        Page("models", "benchmarks.obstacle_fields"),
+        Page("quadrotor-obstacles", "benchmarks.obstacle_courses", hours=0.5),
+        Page("smoothing", "benchmarks.incremental", hours=0.2),
+        Page("collection", "benchmarks.collection"),
+        Page("velocity-tracking", "benchmarks.ecg2o"),
+        Page("control-cases", "benchmarks.control_cases", hours=0.5),
+        Page("claims", "benchmarks.claims", hours=1.5),
+        Page("navigation", "benchmarks.navigation", hours=2.0),
+        Page("joint-drives", "benchmarks.navigation", ("--coupling", "joint"), hours=2.0),
+        Page("joint", "benchmarks.coupling", hours=5.0),
+        Page("quadrotor-joint", "benchmarks.quadrotor_pull", hours=2.0),
+        Page("quadrotor-mpc", "benchmarks.quadrotor_flights", hours=8.0),
+        Page("benchmarks", "benchmarks.elimination", hours=0.5),
+    )
+}
+
+
+def stale() -> list[Page]:
+    """Pages that carry another digest than that of their sources, or none."""
+    return [page for page in PAGES.values() if page.carried != page.digest]
+
+
+def sentence(page: Page) -> str:
+    """What is wrong with a stale page and what to do."""
+    carried = f"measured on {page.carried}" if page.carried else "carries no digest"
+    return f"docs/{page.name}.md: {carried}, the sources are {page.digest}: make results PAGE={page.name}"
+
+
+def measure(pages: list[Page]) -> int:
+    """Measure pages one after the other; the worst exit code."""
+    worst = 0
+    for page in pages:
+        print(f"docs/{page.name}.md by {page.module}, about {page.hours:g} h", flush=True)
+        command = [sys.executable, "-m", page.module, *page.arguments]
+        worst = max(worst, abs(subprocess.run(command, cwd=CHECKOUT, check=False).returncode))
+    return worst
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """See the module's docstring."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.pages", description=__doc__.split("\n")[0])
+    actions = parser.add_subparsers(dest="action")
+    check = actions.add_parser("stale", help="name the pages that no longer describe the code")
+    check.add_argument("--strict", action="store_true", help="fail if there are any")
+    again = actions.add_parser("measure", help="measure pages again")
+    again.add_argument("pages", nargs="+", choices=["all", *PAGES], metavar="PAGE", help=", ".join(PAGES))
+    options = parser.parse_args(arguments)
+    if options.action == "measure":
+        return measure(list(PAGES.values()) if "all" in options.pages else [PAGES[name] for name in options.pages])
+    if options.action == "stale":
+        wrong = stale()
+        for page in wrong:
+            print(sentence(page))
+        return 1 if wrong and options.strict else 0
+    for page in PAGES.values():
+        print(f"{page.name:20} {page.module:30} {'up to date' if page.carried == page.digest else 'stale'}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,105 @@
+"""A small part of benchmarks/claims.py: what backends claim, judged by casadi's exact derivatives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
+
+pytest.importorskip("casadi", reason="the judge differentiates with casadi, which comes with the extra 'bench'")
+
+from benchmarks import claims, twin_ground
+from benchmarks.claims import answer, disagreement, infeasible
+from benchmarks.exact_judge import Judge
+from benchmarks.twins import Twin
+
+BACKENDS: dict[str, fg.Solver] = {
+    "alm": AugmentedLagrangian(),
+    "sqp": SQP(),
+    "exact": SQP(hessian="exact"),
+    "graph": SQP(qp="graph"),
+    "ipm": InteriorPoint(),
+    "penalty": Penalty(),
+}
+
+
+def stated(kind: str, seed: int = 0, equalities_only: bool = False) -> tuple[Twin, Judge]:
+    twin = {"parking": twin_ground.parking, **claims.KINDS}[kind](seed, equalities_only)
+    return twin, Judge(twin)
+
+
+@pytest.mark.parametrize("kind", ["parking", "attitude slew", "thrust cone", "two-link arm", "minimum snap"])
+def test_both_statements_are_one_problem(kind: str) -> None:
+    """Cost, rows and gradient along the right perturbation agree; the study asserts it of every problem."""
+    twin, judge = stated(kind, seed=1)
+    np.testing.assert_array_equal(twin.graph.compile().columns.free, np.flatnonzero(~twin.held))
+    assert disagreement(twin, judge) < claims.AGREED
+
+
+def test_two_different_problems_are_told_apart() -> None:
+    twin, judge = stated("orbit")
+    assert disagreement(twin, judge) < claims.AGREED
+    (u,) = (family for family in twin.guess if family.name == "u")
+    twin.graph.minimize(fg.prior, u[:1], [0.0, 0.0], sigma=30.0)  # one stage, weak, in one of them
+    assert disagreement(twin, judge) > claims.AGREED
+
+
+@pytest.mark.parametrize("kind", ["hover with drag", "attitude slew"])
+@pytest.mark.parametrize("name", BACKENDS)
+def test_converged_is_true(name: str, kind: str) -> None:
+    twin, judge = stated(kind)
+    result = answer(BACKENDS[name], twin, judge)
+    assert (result.status, result.claim) == ("CONVERGED", "true"), result
+
+
+@pytest.mark.parametrize("kind", ["orbit", "attitude slew"])
+def test_converged_is_true_without_inequalities(kind: str) -> None:
+    twin, judge = stated(kind, equalities_only=True)
+    result = answer(KKT(), twin, judge)
+    assert (result.status, result.claim) == ("CONVERGED", "true"), result
+
+
+def test_infeasible_is_true() -> None:
+    """A way point inside the ball that must not be entered."""
+    twin, judge = stated("minimum snap", seed=1)
+    result = answer(SQP(), twin, judge)
+    assert (result.status, result.claim) == ("LOCALLY_INFEASIBLE", "true"), result
+    assert not judge.ipopt(twin.guess, 1e-6).solved
+
+
+def test_parkings_make_no_false_claim() -> None:
+    twin, judge = stated("parking", 1)
+    for name in ("alm", "sqp"):
+        result = answer(BACKENDS[name], twin, judge)
+        assert (result.status, result.claim) == ("CONVERGED", "true"), result
+
+
+def test_the_judge_contradicts_what_is_false() -> None:
+    """Wrong points, multipliers of wrong size and of wrong sign, and infeasibility that is none."""
+    twin, judge = stated("hover with drag", seed=1)
+    solution = SQP().solve(twin.graph, twin.guess, check=True)
+    duals = solution.multipliers
+    assert judge.numbers(solution.values, duals).worst < 1e-6
+    rotors = duals["rotors"]
+    assert np.abs(rotors).max() > 1e-2  # active
+    assert judge.numbers(solution.values, {**duals, "rotors": 1.001 * rotors}).stationarity > 1e-5
+    assert judge.numbers(solution.values, {**duals, "rotors": -rotors}).complementarity > 1e-2
+    moved = solution.values
+    moved[next(f for f in moved if f.name == "u")] *= 1.01
+    assert judge.numbers(moved, duals).violation > 1e-5
+
+    class Lying(fg.Solver):
+        """Claims that its last iterate is a point of least violation."""
+
+        def workspace(self, program: object) -> None:
+            return None
+
+        def iterate(self, run: object, workspace: None) -> fg.Status:
+            return fg.Status.LOCALLY_INFEASIBLE
+
+    assert infeasible(Lying().solve(twin.graph, twin.guess), judge, 1e-6)[0] == "false"
+    seen = Lying().solve(twin.graph, solution.values)
+    if seen.status is fg.Status.LOCALLY_INFEASIBLE:
+        assert infeasible(seen, judge, 1e-6)[0] == "false"

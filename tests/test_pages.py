@@ -1,0 +1,117 @@
+"""Pages with measured tables carry the digest of what they depend on; stale ones are named."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+
+import pytest
+
+from benchmarks import pages, report, sources
+from benchmarks.pages import PAGES
+from benchmarks.report import BEGIN, put_results
+from benchmarks.sources import CHECKOUT, code_of, depends_on
+
+RELEASE = "UNIFG_RELEASE"
+
+
+@pytest.mark.filterwarnings("default:pages are stale")
+def test_pages_describe_the_code() -> None:
+    """Names the stale pages; fails for them only before a release, when UNIFG_RELEASE is set."""
+    wrong = [pages.sentence(page) for page in pages.stale()]
+    if os.environ.get(RELEASE):
+        assert wrong == []
+    if wrong:
+        warnings.warn(f"pages are stale, see make stale: {', '.join(p.name for p in pages.stale())}", stacklevel=1)
+
+
+def test_every_measured_page_is_in_the_table() -> None:
+    marked = {path.stem for path in (CHECKOUT / "docs").glob("*.md") if BEGIN in path.read_text(encoding="utf-8")}
+    assert marked == set(PAGES)
+
+
+def names(module: str) -> set[str]:
+    return {path.relative_to(CHECKOUT).as_posix() for path in depends_on([module])}
+
+
+def test_digests_follow_imports() -> None:
+    velocity, smoothing = names("benchmarks.ecg2o"), names("benchmarks.incremental")
+    assert {"benchmarks/ecg2o.py", "solvers/kkt.py", "unifg/elimination/ordering.py", "unifg/lie/so3.py"} <= velocity
+    assert "solvers/gauss_newton.py" in smoothing
+    assert "solvers/interior_point.py" not in smoothing  # its package hands the names on, one by one
+    assert "tests/hock_schittkowski.py" in names("benchmarks.collection")
+    assert "scenarios/building.pgm" in names("benchmarks.navigation")  # data beside the modules
+    assert not {"benchmarks/report.py", "benchmarks/pages.py"} & velocity
+
+
+def house(root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A checkout of four files: a measurement, a package that hands names on, and two modules behind it."""
+    files = {
+        "benchmarks/study.py": '"""Measures."""\nfrom unifg.solvers import Good\n\nprint(Good)  # it\n',
+        "solvers/__init__.py": "from unifg.solvers.bad import Bad\nfrom unifg.solvers.good import Good\n",
+        "solvers/good.py": "import typing\nif typing.TYPE_CHECKING:\n    from unifg.solvers import Bad\nGood = 1\n",
+        "solvers/bad.py": "Bad = 2\n",
+    }
+    for name, text in files.items():
+        (root / name).parent.mkdir(exist_ok=True)
+        (root / name).write_text(text)
+    monkeypatch.setattr(sources, "CHECKOUT", root)
+    monkeypatch.setattr(sources, "BARE", root / "tests")
+    monkeypatch.setattr(sources, "FOLDERS", {"unifg.solvers": root / "solvers", "benchmarks": root / "benchmarks"})
+    return root
+
+
+def fresh(modules: list[str]) -> str:
+    """The digest by a process that has read nothing yet."""
+    for cached in (sources.imported, sources._handed_on, sources._content):
+        cached.cache_clear()
+    return sources.digest(modules)
+
+
+def test_a_digest_changes_with_the_code_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = house(tmp_path, monkeypatch)
+    before = fresh(["benchmarks.study"])
+    assert {p.name for p in depends_on(["benchmarks.study"])} == {"study.py", "good.py"}
+
+    study = root / "benchmarks" / "study.py"
+    study.write_text('"""Says more."""\n\n# why\nfrom unifg.solvers import Good  # one\n\n\nprint(Good)\n')
+    (root / "solvers" / "bad.py").write_text("Bad = 3\n")
+    assert fresh(["benchmarks.study"]) == before
+
+    (root / "solvers" / "good.py").write_text("Good = 2\n")
+    assert fresh(["benchmarks.study"]) != before
+    sources.imported.cache_clear()
+    sources._handed_on.cache_clear()
+    sources._content.cache_clear()
+
+
+def test_code_is_what_runs() -> None:
+    source = 'def f():\n    """Doc."""\n    return "# kept"  # dropped\n\n\nx = """\ntext\n"""\n'
+    assert code_of(source) == 'def f():\n    return "# kept"\nx = """\ntext\n"""'
+
+
+def test_a_page_is_stale_until_it_is_measured_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pages, "DOCS", tmp_path)
+    page = PAGES["collection"]
+    assert page in pages.stale() and "carries no digest" in pages.sentence(page)
+
+    put_results(page.path, "A page", "| a |\n|---|\n| 1 |")
+    assert page not in pages.stale()
+    assert f"Digest of the sources: `{page.digest}`." in page.path.read_text()
+
+    put_results(page.path, "A page", "old", ["0" * 12])
+    assert "measured on 000000000000" in pages.sentence(page) and page in pages.stale()
+    put_results(page.path, "A page", "mixed", ["0" * 12, page.digest])
+    assert page in pages.stale()
+
+    monkeypatch.setattr(pages, "PAGES", {page.name: page})
+    assert pages.main(["stale"]) == 0
+    assert pages.main(["stale", "--strict"]) == 1
+    put_results(page.path, "A page", "new")
+    assert pages.main(["stale", "--strict"]) == 0
+
+
+def test_a_study_without_a_page_of_its_own_carries_no_digest(tmp_path: Path) -> None:
+    put_results(tmp_path / "notes.md", "Notes", "text")
+    assert (tmp_path / "notes.md").read_text() == f"# Notes\n\n{BEGIN}\ntext\n{report.END}\n"
