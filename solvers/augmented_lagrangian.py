@@ -159,7 +159,7 @@ class AugmentedLagrangian(Solver):
             if change <= violation_goal:
                 multipliers = after
                 violation_goal = max(min(violation_goal / rho**0.9, FALL * change), least)
-                gradient_goal = max(0.1 * gradient_goal, 0.1 * self.tolerance)
+                gradient_goal = max(0.1 * gradient_goal, 0.0 if run.program.least_squares else 0.1 * self.tolerance)
             else:
                 if run.infeasible_stationary() and (ending := leave(run)) is not None:
                     return ending
@@ -206,6 +206,8 @@ class AugmentedLagrangian(Solver):
 
     def _goals(self, run: Run, primal: Primal, rho: float, weights: Array) -> tuple[float, float]:
         """First accuracy of the subproblem's gradient, and the scaled violation that earns a dual step."""
+        if run.program.least_squares:  # one subproblem, and no absolute measure of its gradient
+            return 0.0, 1.0
         size = largest(primal.gradient(run.lin, run.multipliers, rho * weights))
         return max(min(0.1 * size, 1.0), 0.1 * self.tolerance), float(max(rho**-0.1, 0.1 * self.tolerance))
 

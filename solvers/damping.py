@@ -51,7 +51,8 @@ def damped_step(
         The new values, the tangent step and the number of rejected trials; None when no damping helps.
     """
     merit = primal.merit(lin, multipliers, penalty)
-    slack = ROUNDING * max(1.0, abs(merit))
+    # Least squares has no unit: what is rounding depends on the cost alone.
+    slack = ROUNDING * (merit if primal.program.least_squares else max(1.0, abs(merit)))
     rejected = 0
     while damping.value <= LARGEST:
         found = model_step(primal, lin, multipliers, penalty, damping.value)

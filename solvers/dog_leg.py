@@ -48,7 +48,7 @@ class DogLeg(LeastSquares):
 
     def iterate(self, run: Run, workspace: Primal) -> Status | None:
         """Iterate to convergence."""
-        radius = self.radius
+        radius, run.lent = self.radius, workspace
         while run.status is None:
             lin = run.lin
             path = Path.at(workspace, lin)
@@ -60,7 +60,7 @@ class DogLeg(LeastSquares):
                 predicted = path.decrease(step)
                 values, trial = workspace.trial(lin, step)
                 actual = lin.cost - trial.cost
-                slack = ROUNDING * max(1.0, abs(lin.cost))
+                slack = ROUNDING * lin.cost
                 gain = actual / predicted if predicted > slack else 1.0
                 good = trial.finite and actual >= ACCEPT * predicted - slack
                 if not good or gain < POOR:

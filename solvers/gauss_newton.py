@@ -31,15 +31,15 @@ class GaussNewton(LeastSquares):
     def search_step(self, run: Run, workspace: Primal, lin: Linearization) -> Array | None:
         """The full Gauss-Newton step."""
         none = np.zeros(0)
-        return workspace.direction(workspace.curvature(lin, none, none), workspace.gradient(lin, none, none))
+        return workspace.direction(lin.hessian, workspace.gradient(lin, none, none))
 
     def iterate(self, run: Run, workspace: Primal) -> Status | None:
         """Iterate to convergence."""
-        none = np.zeros(0)
+        none, run.lent = np.zeros(0), workspace
         while run.status is None:
             lin = run.lin
             gradient = workspace.gradient(lin, none, none)
-            step = workspace.direction(workspace.curvature(lin, none, none), gradient)
+            step = workspace.direction(lin.hessian, gradient)
             if step is None:
                 return Status.SINGULAR
             slope = float(gradient @ step)
@@ -48,7 +48,7 @@ class GaussNewton(LeastSquares):
             # Full steps are the rule: linearise at once, and only shortened steps are evaluated by themselves.
             trial = run.program.evaluate(reached.values, lin.weights) if lin.weights else reached
             while self.line_search and not (
-                trial.finite and trial.cost <= lin.cost + ARMIJO * length * slope + ROUNDING * max(1.0, lin.cost)
+                trial.finite and trial.cost <= (1.0 + ROUNDING) * lin.cost + ARMIJO * length * slope
             ):
                 length *= 0.5
                 if length < SHORTEST:

@@ -64,8 +64,8 @@ class InteriorPoint(Solver):
                 raise BackendError(f"{self.name}: {name} must be positive, found {value}")
 
     def runs_alone(self, program: Program) -> bool:
-        """Whether a compiled loop can make the whole solve."""
-        return program.fully_compiled
+        """Whether a compiled loop can make the whole solve; that of least squares is tested outside, at every step."""
+        return program.fully_compiled and not program.least_squares
 
     def workspace(self, program: Program) -> Workspace:
         """Structure of the KKT matrix."""
@@ -199,6 +199,8 @@ class Workspace:
         numbers, counts = work.numbers, work.counts
         work.values[:], work.multipliers[:] = run.values.flat, run.multipliers
         numbers[state.MU], numbers[state.TOLERANCE] = options.barrier, run.tolerance
+        if run.program.least_squares:  # its test has no absolute tolerance
+            numbers[state.TOLERANCE] = 0.0
         numbers[state.RHO] = options.price
         counts[state.LIMIT], counts[state.EXACT] = options.max_iterations, options.hessian == "exact"
         return work

@@ -33,7 +33,7 @@ class LevenbergMarquardt(LeastSquares):
 
     def iterate(self, run: Run, workspace: Primal) -> Status | None:
         """Iterate to convergence."""
-        none = np.zeros(0)
+        none, run.lent = np.zeros(0), workspace
         damping = Damping(self.damping)
         while run.status is None:
             used = damping.value

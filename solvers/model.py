@@ -43,6 +43,7 @@ def model_step(
         The tangent step and the decrease the model predicts; None when a system cannot be factorised.
     """
     program = primal.program
+    primal.damping = damping
     step = np.zeros(program.size)
     predicted = _minimize(
         program.arrays,
@@ -60,6 +61,7 @@ def model_step(
         damping,
         step,
     )
+    primal.solver.adopt(not np.isnan(predicted))
     return None if np.isnan(predicted) else (step, predicted)
 
 

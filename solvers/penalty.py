@@ -106,7 +106,8 @@ class Penalty(Solver):
             run.accept(lin, estimate, norm(step), 1.0, penalty=rho, damping=damping.value, rejected=rejected)
             if run.status is not None:
                 return False
-            if before - primal.merit(lin, none, penalty) <= ROUNDING * max(1.0, abs(before)):
+            unit = 0.0 if run.program.least_squares else 1.0
+            if before - primal.merit(lin, none, penalty) <= ROUNDING * max(unit, abs(before)):
                 return True
         return False
 

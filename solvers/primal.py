@@ -23,12 +23,14 @@ class Primal:
     Attributes:
         program: the compiled graph.
         solver: factorisation of the normal equations.
+        damping: what was added to the diagonal of the matrix factorised last, relative to it.
     """
 
     def __init__(self, program: Program) -> None:
         """Analyse the structure of the normal equations."""
         self.program = program
         self.solver = program.normal_solver()
+        self.damping = 0.0
 
     def next_multipliers(self, constraints: Array, multipliers: Array, penalty: Array) -> Array:
         """(M,) lambda+: the first-order dual update, zero for inactive rows."""
@@ -54,6 +56,7 @@ class Primal:
 
     def direction(self, curvature: Array, gradient: Array) -> Array | None:
         """Solve H d = -gradient; None when the matrix cannot be factorised."""
+        self.damping = 0.0
         if not self.solver.factor(curvature):
             return None
         step = -self.solver.solve(gradient)

@@ -17,6 +17,7 @@ from unifg.typing import Array
 from unifg.variables import Data, Selection
 
 STEP = 1e-5
+ROUNDING = 1e-12  # of the residuals of graphs that fit exactly, numbers of order one
 
 
 @dataclass
@@ -38,6 +39,8 @@ def judge(graph: fg.Graph, solution: fg.Solution, data: dict[Data, Array] | None
     data = data or {}
     values = solution.values
     moved = [(family, row, column) for family, row, column in _free(graph)]
+    if all(isinstance(term, Cost) for term in graph.terms):
+        return Verdict(_relative_offset(graph, values, moved, data), 0.0, 0.0, 0.0)
     gradient = np.array(
         [(_f(graph, _at(values, m, STEP), data) - _f(graph, _at(values, m, -STEP), data)) for m in moved]
     )
@@ -59,6 +62,42 @@ def judge(graph: fg.Graph, solution: fg.Solution, data: dict[Data, Array] | None
         float((np.abs(duals) * slack).max(initial=0.0)) / scale,
         float(wrong.max(initial=0.0)),
     )
+
+
+def _relative_offset(
+    graph: fg.Graph,
+    values: dict[fg.Family, Array],
+    moved: list[tuple[fg.Family, int, int]],
+    data: dict[Data, Array],
+) -> float:
+    """|P r| / |r| of least squares, P projecting onto the columns of a dense Jacobian by differences."""
+    here, weights = _whitened(graph, values, data)
+    columns = [
+        _whitened(graph, _at(values, m, STEP), data)[0] - _whitened(graph, _at(values, m, -STEP), data)[0]
+        for m in moved
+    ]
+    jacobian = np.sqrt(weights)[:, None] * np.array(columns).T / (2.0 * STEP)
+    here = np.sqrt(weights) * here
+    share = float(np.linalg.norm(jacobian @ np.linalg.lstsq(jacobian, here, rcond=None)[0]))
+    return 0.0 if share <= ROUNDING else share / float(np.linalg.norm(here))
+
+
+def _whitened(graph: fg.Graph, values: dict[fg.Family, Array], data: dict[Data, Array]) -> tuple[Array, Array]:
+    """Stacked whitened residuals of all costs, and the weight that its loss gives each of them."""
+    parts, weights = [np.zeros(0)], [np.zeros(0)]
+    for term in graph.terms:
+        assert isinstance(term, Cost)
+        r = _call(term, values, data)
+        if term.sigma is not None:
+            r = r / _parameter(term.sigma, data)
+        elif term.information is not None:
+            omega = np.broadcast_to(_parameter(term.information, data), (len(r), r.shape[1], r.shape[1]))
+            r = np.einsum("nji,nj->ni", np.linalg.cholesky(omega), r)
+        squared = (r**2).sum(axis=1)
+        weight = np.ones(len(r)) if term.robust is None else term.robust.weight(squared)
+        parts.append(r.ravel())
+        weights.append(np.repeat(np.where(_active(term, data), weight, 0.0), r.shape[1]))
+    return np.concatenate(parts), np.concatenate(weights)
 
 
 def _free(graph: fg.Graph) -> list[tuple[fg.Family, int, int]]:

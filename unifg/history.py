@@ -15,7 +15,8 @@ class Iteration:
     Attributes:
         number: 0 at the start.
         cost: objective.
-        stationarity, violation, complementarity: KKT numbers with the multipliers of this iteration.
+        stationarity, violation, complementarity: KKT numbers with the multipliers of this iteration; far from the end,
+            the relative offset of least squares is a lower bound.
         step_norm: Euclidean norm of the tangent step taken.
         step_length: fraction of the computed step that was taken.
         seconds: since the solve began.

@@ -8,6 +8,10 @@ For min f(x) s.t. l <= g(x) <= u with L = f + lambda' g, at a point and multipli
   pointing at a limit that does not exist has the wrong sign and counts as |lambda_i|.
 
 Stationarity and complementarity are divided by max(1, mean|lambda| / 100); the violation is not scaled.
+
+Pure least squares, a graph without constraints and scalar costs, has a zero point of cost, and with it a measure that
+does not depend on the unit of the information: there the stationarity is the relative offset of
+:mod:`unifg.relative_offset`, and the Hessian must be regular too: where it is not, some unknowns may be moved freely.
 """
 
 from __future__ import annotations
@@ -21,6 +25,7 @@ from unifg import passes
 from unifg.jit import compiled
 from unifg.linearization import Linearization
 from unifg.program import Program
+from unifg.relative_offset import Factored, relative_offset
 from unifg.typing import Array, IntArray
 from unifg.violation import ViolationModel
 
@@ -35,6 +40,7 @@ class Optimality:
         stationarity, violation, complementarity: as defined in the module's docstring.
         worst_row: constraint row with the largest violation, or -1 without constraints.
         finite: whether everything could be evaluated.
+        determined: whether no unknown may be moved freely; looked at for least squares only.
     """
 
     stationarity: float
@@ -42,20 +48,34 @@ class Optimality:
     complementarity: float
     worst_row: int
     finite: bool
+    determined: bool = True
 
-    def passes(self, tolerance: float) -> bool:
+    def holds(self, tolerance: float) -> bool:
         """Whether all three numbers are within ``tolerance``."""
         return self.finite and max(self.stationarity, self.violation, self.complementarity) <= tolerance
 
+    def passes(self, tolerance: float) -> bool:
+        """Whether all three numbers are within ``tolerance``, at a point that is determined."""
+        return self.determined and self.holds(tolerance)
 
-def optimality(program: Program, lin: Linearization, multipliers: Array) -> Optimality:
+
+def optimality(
+    program: Program, lin: Linearization, multipliers: Array, enough: float = 0.0, lent: Factored | None = None
+) -> Optimality:
     """Measure the KKT conditions at a linearised point.
 
     Args:
         program: the compiled graph with its data bound.
         lin: linearisation at the point, whose gradient is the true one, robust losses included.
         multipliers: (M,) one per constraint row.
+        enough: of least squares, a relative offset above this may be a lower bound, which takes no factorisation.
+        lent: of least squares, a backend's factorisation near this point.
     """
+    if program.least_squares:
+        offset = relative_offset(program, lin, enough, lent)
+        if not (offset.finite and np.isfinite(lin.cost)):
+            return Optimality(np.inf, np.inf, np.inf, -1, False)
+        return Optimality(offset.value, 0.0, 0.0, -1, True, offset.determined)
     gradient = lin.gradient
     if program.constraints.count:
         gradient = gradient.copy()

@@ -92,6 +92,11 @@ class Program:
         self.bind({})
 
     @property
+    def least_squares(self) -> bool:
+        """Whether the objective is a sum of squares, robust or not, and nothing constrains it."""
+        return bool(self.cost_terms) and not (self.scalar_terms or self.constraint_terms)
+
+    @property
     def fully_compiled(self) -> bool:
         """Whether a compiled loop can do without Python: every term a kernel, no robust loss, compiled retractions."""
         return not (self.batched or self.scalar_terms or self.table.robust) and self.retraction.compiled

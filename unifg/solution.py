@@ -41,7 +41,8 @@ class Solution:
     Attributes:
         status: why the solve ended.
         cost: objective, with its 1/2.
-        stationarity, violation, complementarity: KKT numbers, see :mod:`unifg.kkt`.
+        stationarity, violation, complementarity: KKT numbers, see :mod:`unifg.kkt`. The stationarity of pure least
+            squares is its relative offset, free of the unit of cost; above the tolerance, at least this.
         iterations: number of iterations taken.
         seconds: wall-clock time of the solve.
         solver: name of the backend.
@@ -205,10 +206,15 @@ class Solution:
 
     def report(self) -> str:
         """The status sentence with the numbers behind it."""
+        kkt = (
+            f"relative offset {self.stationarity:.1e}"
+            if self._program.least_squares
+            else f"stationarity {self.stationarity:.1e}, violation {self.violation:.1e}, "
+            f"complementarity {self.complementarity:.1e}"
+        )
         text = (
             f"{self.solver}: {self.status.value} Cost {self.cost:.6g} after {self.iterations} iterations in "
-            f"{1e3 * self.seconds:.1f} ms; stationarity {self.stationarity:.1e}, violation {self.violation:.1e}, "
-            f"complementarity {self.complementarity:.1e}."
+            f"{1e3 * self.seconds:.1f} ms; {kkt}."
         )
         if self.worst is not None and self.violation > 0.0 and not self.converged:
             name, index = self.worst

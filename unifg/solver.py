@@ -18,6 +18,7 @@ from unifg.history import HEADER, Iteration, line
 from unifg.kkt import infeasible_stationary, optimality
 from unifg.linearization import Linearization
 from unifg.program import Program
+from unifg.relative_offset import Factored
 from unifg.solution import Guess, Solution
 from unifg.status import Status
 from unifg.typing import Array, ArrayLike
@@ -136,6 +137,8 @@ class Run:
         iterations: so far.
         alone: whether nobody looks before the end; there is no linearisation then until :meth:`conclude`.
         tolerance: of the KKT test.
+        lent: the backend's factorisation of a matrix near the Hessian of the objective, which the KKT test of least
+            squares may use and overwrite; None where the backend has no such thing.
     """
 
     def __init__(self, solver: Solver, program: Program, values: Values, multipliers: Array, callback: Callback | None):
@@ -150,6 +153,7 @@ class Run:
         self._best: tuple[float, float] | None = None
         self._recall: Callable[[], list[Iteration]] | None = None
         self._least, self._least_values, self._start = np.inf, values, values
+        self.lent: Factored | None = None
         self.iterations = 0
         if solver.verbose:
             logger.info(HEADER)
@@ -229,7 +233,7 @@ class Run:
 
     def _move(self, lin: Linearization, multipliers: Array) -> None:
         self.lin, self.values, self.multipliers = lin, lin.values, multipliers
-        self.optimality = optimality(self.program, lin, multipliers)
+        self.optimality = optimality(self.program, lin, multipliers, self.tolerance, self.lent)
         if self.optimality.violation < self._least:
             self._least, self._least_values = self.optimality.violation, lin.values
 
@@ -291,6 +295,8 @@ class Run:
         measured = self.optimality
         if measured.passes(self.tolerance) and status is not Status.UNBOUNDED:
             status = Status.CONVERGED
+        elif measured.holds(self.tolerance) and not measured.determined:
+            status = Status.UNDETERMINED
         elif status.converged:
             status = Status.STALLED
         return Solution(
@@ -313,6 +319,8 @@ class Run:
             return Status.UNBOUNDED
         if self.optimality.passes(self.tolerance):
             return Status.CONVERGED
+        if self.optimality.holds(self.tolerance):
+            return Status.UNDETERMINED
         if self.iterations >= self._solver.max_iterations:
             return Status.ITERATION_LIMIT
         if self.out_of_time:

@@ -18,6 +18,10 @@ class Status(Enum):
         "The point is stationary for the violation of the constraints: no nearby point violates them less."
     )
     UNBOUNDED = "The objective fell below every reasonable value: it is probably unbounded below."
+    UNDETERMINED = (
+        "The costs are stationary but do not determine every unknown: others would fit as well; run "
+        "graph.check(guess), fix a variable or add priors."
+    )
     SINGULAR = (
         "The linear system is singular: the costs do not determine every unknown; run graph.check(guess), add priors, "
         "or use a damped backend."

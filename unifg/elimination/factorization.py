@@ -103,6 +103,15 @@ class Factorization:
         self._ready = bool(fronts.factor(self.plan, data, added))
         return self._ready
 
+    def adopt(self, success: bool) -> None:
+        """Take over what a compiled caller has factorised through `plan`.
+
+        Args:
+            success: what ``fronts.factor`` answered.
+        """
+        self._forget()
+        self._ready = success
+
     def factor_solve(self, data: Array, added: Array | None, right: Array, out: Array) -> bool:
         """Factorise and solve in one compiled call.
 

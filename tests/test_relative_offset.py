@@ -1,0 +1,324 @@
+"""Convergence of least squares: the same verdict in every unit of cost, and none where the costs determine nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.elimination.factorization import Factorization
+from unifg.files.g2o import read_g2o
+from unifg.lie import LieGroup
+from unifg.linearization import Linearization
+from unifg.pose_graphs import manhattan, sphere
+from unifg.program import Program
+from unifg.relative_offset import relative_offset
+from unifg.solvers import (
+    KKT,
+    SQP,
+    AugmentedLagrangian,
+    DogLeg,
+    GaussNewton,
+    InteriorPoint,
+    LevenbergMarquardt,
+    Penalty,
+)
+from unifg.typing import Array
+
+Made = tuple[fg.Graph, dict[fg.Family, Array]]
+
+BACKENDS = [GaussNewton(), LevenbergMarquardt(), DogLeg(), InteriorPoint(), SQP(), KKT(), AugmentedLagrangian()]
+BACKENDS += [Penalty()]
+DAMPED = [LevenbergMarquardt(), InteriorPoint(), SQP(), KKT(), AugmentedLagrangian(), Penalty()]
+
+
+def decay(times: float, noise: float = 0.05) -> Made:
+    """An exponential through noisy points, its information multiplied by ``times``."""
+    rng = np.random.default_rng(3)
+    t = np.linspace(0.0, 4.0, 40)[:, None]
+    y = 2.0 * np.exp(-0.7 * t) + 0.5 + noise * rng.standard_normal(t.shape)
+    graph = fg.Graph()
+    p = graph.variables("p", fg.Rn(3), 1)
+
+    def misfit(p: Array, t: Array, y: Array) -> Array:
+        return p[:, :1] * np.exp(-p[:, 1:2] * t) + p[:, 2:] - y
+
+    points = graph.data("t", t, each=True), graph.data("y", y, each=True)
+    graph.minimize(misfit, p, *points, sigma=0.05 / times**0.5)
+    return graph, {p: np.array([[1.0, 1.0, 0.0]])}
+
+
+def city(times: float) -> Made:
+    """A planar pose graph."""
+    pose_graph = manhattan(60, seed=1).pose_graph
+    pose_graph.edges.information[:] *= times
+    graph, _, guess = pose_graph.graph()
+    return graph, guess
+
+
+def robust(loss: Callable[[float], fg.Loss]) -> Callable[[float], Made]:
+    """Points with outliers; thresholds are in units of the residual, and scale with it."""
+
+    def make(times: float) -> Made:
+        z = np.random.default_rng(5).standard_normal((30, 2))
+        z[:6] += 8.0
+        graph = fg.Graph()
+        x = graph.variables("x", fg.Rn(2), 1)
+
+        def misfit(x: Array, z: Array) -> Array:
+            return np.concatenate([np.sin(x[:, :1]) + x[:, 1:], x[:, 1:]], axis=1) - z
+
+        graph.minimize(misfit, x, graph.data("z", z, each=True), sigma=times**-0.5, robust=loss(times**0.5))
+        return graph, {x: np.array([[1.0, 2.0]])}
+
+    return make
+
+
+PROBLEMS = {
+    "decay": decay,
+    "exact decay": lambda times: decay(times, noise=0.0),
+    "city": city,
+    "Huber": robust(lambda unit: fg.Huber(1.3 * unit)),
+    "Tukey": robust(lambda unit: fg.Tukey(5.0 * unit)),
+}
+
+
+@pytest.mark.parametrize("problem", PROBLEMS)
+@pytest.mark.parametrize("solver", BACKENDS, ids=lambda s: s.name)
+def test_the_unit_of_cost_changes_nothing(solver: fg.Solver, problem: str) -> None:
+    """Information times 1e6 used to end at the iteration limit, times 1e-6 was called converged far from the end."""
+    graph, guess = PROBLEMS[problem](1.0)
+    reference = solver.solve(graph, guess, check=True)
+    assert reference.stationarity <= 1e-6
+    # Quadratic programs are solved to an absolute accuracy: SQP answers for fewer orders of magnitude.
+    for times in (1e-6, 1e6) if isinstance(solver, SQP) else (1e-12, 1e-6, 1e6, 1e12):
+        graph, guess = PROBLEMS[problem](times)
+        solution = solver.solve(graph, guess)
+        assert solution.converged, (times, solution.report())
+        assert abs(solution.iterations - reference.iterations) <= (3 if isinstance(solver, SQP) else 1)
+        assert solution.cost / times == pytest.approx(reference.cost, rel=1e-11, abs=1e-24)
+
+
+@pytest.mark.parametrize("solver", BACKENDS, ids=lambda s: s.name)
+def test_the_answer_is_within_the_tolerance_of_the_best_cost(solver: fg.Solver) -> None:
+    """Cost left to gain is the tolerance squared, as a share."""
+    graph, guess = decay(1e-6)
+    best = GaussNewton(tolerance=1e-9).solve(graph, guess, check=True).cost
+    for tolerance in (1e-2, 1e-4, 1e-6):
+        solver = type(solver)(tolerance=tolerance)
+        solution = solver.solve(graph, guess, check=True)
+        assert solution.cost <= best * (1.0 + 2.0 * tolerance**2 + 1e-14)
+
+
+def dense_offset(program: Program, lin: Linearization) -> float:
+    """|P r| / |r| by dense QR."""
+    jacobian = program.costs.matrix(lin.jacobian).toarray()
+    q, _ = np.linalg.qr(jacobian)
+    return float(np.linalg.norm(q.T @ lin.residual) / np.linalg.norm(lin.residual))
+
+
+@pytest.mark.parametrize("problem", ["decay", "city", "Huber", "Tukey"])
+def test_the_offset_is_that_of_a_dense_projection(problem: str) -> None:
+    """At the guess, on the way with a factor that is one step old, damped or not, and at the end."""
+    graph, guess = PROBLEMS[problem](1e3)
+    program = graph.compile()
+    program.bind({})
+    for solver in (GaussNewton, LevenbergMarquardt):
+        for k in range(6):
+            solution = solver(max_iterations=k).solve(graph, guess)
+            lin = program.linearize(solution.values)
+            exact = dense_offset(program, lin)
+            measured = relative_offset(program, lin)
+            assert measured.determined and measured.finite
+            assert measured.value == pytest.approx(exact, rel=1e-6, abs=1e-13)
+            bound = relative_offset(program, lin, enough=1e-6).value
+            assert bound <= exact * (1.0 + 1e-6) and (bound <= 1e-6) == (exact <= 1e-6)
+            assert solution.stationarity <= exact * (1.0 + 1e-4)
+            assert solution.converged == (exact <= 1e-6)
+
+
+def test_backends_that_lend_their_factor_take_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+    factor = Factorization.factor
+
+    def counted(self: Factorization, data: Array, added: Array | None = None) -> bool:
+        made.append(1)
+        return factor(self, data, added)
+
+    monkeypatch.setattr(Factorization, "factor", counted)
+    for graph, _, guess in (manhattan(200, seed=4).pose_graph.graph(), sphere(5, 10).pose_graph.graph()):
+        for solver, own in ((GaussNewton(), 1), (DogLeg(), 1), (LevenbergMarquardt(), 0)):  # LM's are compiled
+            made.clear()
+            solution = solver.solve(graph, guess, check=True)
+            assert len(made) == own * solution.iterations
+
+
+def free_city(times: float = 1.0) -> Made:
+    """A pose graph that nothing ties to the world."""
+    pose_graph = manhattan(60, seed=1).pose_graph
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE2, len(pose_graph.poses))
+    edges = pose_graph.edges
+    graph.minimize(fg.between, x[edges.first], x[edges.second], edges.measured, information=times * edges.information)
+    return graph, {x: pose_graph.poses}
+
+
+@pytest.mark.parametrize("solver", BACKENDS, ids=lambda s: s.name)
+def test_no_information_is_no_solution(solver: fg.Solver) -> None:
+    """All information zero used to be CONVERGED without a word."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 3)
+    graph.minimize(fg.prior, x, [1.0, 2.0], information=np.zeros((2, 2)))
+    solution = solver.solve(graph, {x: np.ones((3, 2))})
+    assert solution.status is fg.Status.UNDETERMINED
+    assert not solution.converged
+    assert "do not determine every unknown" in solution.report()
+    with pytest.raises(fg.NotConverged):
+        solver.solve(graph, {x: np.ones((3, 2))}, check=True)
+
+
+@pytest.mark.parametrize("solver", DAMPED, ids=lambda s: s.name)
+@pytest.mark.parametrize("times", [1e-6, 1.0, 1e6])
+def test_a_graph_that_floats_is_undetermined(solver: fg.Solver, times: float) -> None:
+    """Damping finds a stationary point, which is one of many."""
+    graph, guess = free_city(times)
+    solution = solver.solve(graph, guess)
+    assert solution.status is fg.Status.UNDETERMINED, solution.report()
+    assert solution.stationarity <= 1e-6
+    tied, _, start = manhattan(60, seed=1).pose_graph.graph()
+    assert solution.cost == pytest.approx(times * GaussNewton().solve(tied, start, check=True).cost, rel=1e-10)
+    assert GaussNewton().solve(graph, solution).status is fg.Status.UNDETERMINED
+
+
+def test_a_landmark_whose_only_sighting_is_rejected_is_undetermined() -> None:
+    """A truncated loss takes away in the last step what held the landmark in the one before."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 2)
+    graph.minimize(fg.prior, x[0], [1.0, 2.0], sigma=0.1)
+    graph.minimize(fg.prior, x[1], [9.0, 2.0], sigma=0.1, robust=fg.TruncatedLeastSquares(3.0), name="sighting")
+    solution = LevenbergMarquardt().solve(graph, {x: np.zeros((2, 2))})
+    assert solution.status is fg.Status.UNDETERMINED
+    near = LevenbergMarquardt().solve(graph, {x: np.array([[0.0, 0.0], [9.1, 2.0]])})
+    assert near.converged
+
+
+@pytest.mark.parametrize("solver", DAMPED, ids=lambda s: s.name)
+def test_what_is_switched_off_is_not_asked_for(solver: fg.Solver) -> None:
+    """An unknown whose factors are all inactive keeps its guess; one with zero information is missing something."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 3)
+    on = graph.data("on", np.array([True, True, False]))
+    graph.minimize(fg.prior, x, [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]], sigma=0.1, active=on)
+    graph.minimize(lambda a: a**2, x[:2])
+    run = solver.prepare(graph)
+    solution = run.solve({x: np.ones((3, 2))})
+    assert solution.converged, solution.report()
+    np.testing.assert_array_equal(solution[x][2], [1.0, 1.0])
+    assert run.solve({x: np.ones((3, 2))}, data={on: np.ones(3, dtype=bool)}).converged
+
+
+def test_costs_between_fixed_variables_do_not_hide_the_rest() -> None:
+    """They are constants: however large, they belong to no angle between residual and tangent space."""
+    graph, guess = decay(1.0)
+    anchor = graph.variables("anchor", fg.Rn(1), 2)
+    graph.fix(anchor, [[0.0], [1.0]])
+    graph.minimize(fg.prior, anchor, [1e9], name="constant")
+    solution = GaussNewton().solve(graph, {**guess, anchor: np.zeros((2, 1))}, check=True)
+    plain, start = decay(1.0)
+    free = GaussNewton().solve(plain, start, check=True)
+    assert solution.iterations == free.iterations
+    assert solution.stationarity == pytest.approx(free.stationarity, rel=1e-9)
+
+
+GROUPS: list[LieGroup] = [fg.Rn(2), fg.SE2, fg.SE3]
+
+
+def exact(manifold: LieGroup, offset: float, sigma: float) -> Made:
+    """A loop of poses whose measurements all agree, far from the origin."""
+    rng = np.random.default_rng(11)
+    count = 12
+    truth = manifold.retract(np.tile(manifold.identity(), (count, 1)), rng.normal(size=(count, manifold.dim)))
+    position = min(manifold.storage, 3 if manifold is fg.SE3 else 2)
+    truth[:, :position] += offset
+    graph = fg.Graph()
+    x = graph.variables("x", manifold, count)
+    i, j = np.arange(count), (np.arange(count) + 1) % count
+    measured = manifold.compose(manifold.inverse(truth[i]), truth[j])
+    graph.minimize(fg.between, x[i], x[j], measured, sigma=sigma)
+    graph.minimize(fg.prior, x[0], truth[0], sigma=sigma)
+    return graph, {x: manifold.retract(truth, 0.05 * rng.normal(size=(count, manifold.dim)))}
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e3, 5e6])
+@pytest.mark.parametrize("sigma", [1.0, 1e-3])
+@pytest.mark.parametrize("manifold", GROUPS, ids=lambda m: m.name)
+def test_graphs_that_fit_exactly_end_at_rounding(manifold: LieGroup, sigma: float, offset: float) -> None:
+    """Their residual is rounding, and so is every angle with it: the floor ends the solve, not the limit."""
+    graph, guess = exact(manifold, offset, sigma)
+    for solver in (GaussNewton(), LevenbergMarquardt(), DogLeg(radius=1e3)):
+        solution = solver.solve(graph, guess)
+        assert solution.converged, (solver.name, solution.report())
+        assert solution.iterations <= 8
+        assert solution.stationarity == 0.0 or solution.stationarity <= 1e-6
+        rounding = 12 * 1e-15 * max(1.0, offset) / sigma
+        assert solution.cost <= rounding**2 * 12
+
+
+def test_an_exact_answer_of_zero_takes_few_steps() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 3)
+    graph.minimize(fg.prior, x[0], [0.0, 0.0], sigma=0.3)
+    graph.minimize(lambda a, b: b - a + 0.1 * np.sin(b - a), x[:-1], x[1:], sigma=0.3)
+    for solver in (GaussNewton(), LevenbergMarquardt(), DogLeg()):
+        solution = solver.solve(graph, {x: np.arange(6.0).reshape(3, 2)}, check=True)
+        assert solution.iterations <= 8
+
+
+def test_scalar_costs_keep_the_gradient_and_constraints_the_kkt_test() -> None:
+    """A cost that is not a square has no zero point: its stationarity is the gradient, in the user's units."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [2.0], sigma=1e-3)
+    graph.minimize_scalar(lambda a: 5.0 + 0.0 * a[:, 0], x, name="constant")
+    lin = graph.compile().linearize({x: np.array([[2.0 + 1e-9]])})
+    assert fg.optimality(graph.compile(), lin, np.zeros(0)).stationarity == pytest.approx(1e-3, rel=1e-3)
+    bounded = fg.Graph()
+    y = bounded.variables("y", fg.Rn(1), 1)
+    bounded.minimize(fg.prior, y, [2.0], sigma=1e-3)
+    bounded.bound(y, upper=9.0)
+    lin = bounded.compile().linearize({y: np.array([[2.0 + 1e-9]])})
+    assert fg.optimality(bounded.compile(), lin, np.zeros(1)).stationarity == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_the_report_says_which_measure_it_is() -> None:
+    graph, guess = decay(1.0)
+    assert "relative offset" in GaussNewton().solve(graph, guess).report()
+    p = next(iter(guess))
+    graph.bound(p, upper=9.0)
+    assert "relative offset" not in InteriorPoint().solve(graph, guess).report()
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "chi2", "most"),
+    [
+        ("M3500", 137.9148782, 7),
+        ("intel", 45.0042331, 5),
+        ("parking-garage", 1.2683848, 4),
+        ("sphere2500", 1351.4019259, 8),
+    ],
+)
+def test_published_optima_in_other_units(shared_data: Path, name: str, chi2: float, most: int) -> None:
+    pose_graph = read_g2o(shared_data / "pose_graphs" / f"{name}.g2o.gz")
+    for times in (1.0, 1e-6, 1e6):
+        pose_graph.edges.information[:] *= times
+        graph, _, guess = pose_graph.graph()
+        solution = GaussNewton().solve(graph, guess, check=True)
+        assert 2.0 * solution.cost / times == pytest.approx(chi2, rel=1e-7)
+        best = GaussNewton(tolerance=1e-9).solve(graph, solution).cost
+        assert solution.cost <= best * (1.0 + 1e-9)
+        assert solution.iterations <= most
+        pose_graph.edges.information[:] /= times
