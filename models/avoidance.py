@@ -22,7 +22,7 @@ from functools import cache
 import numpy as np
 
 from unifg.calls import vector
-from unifg.errors import GraphError
+from unifg.errors import GraphError, ModelError
 from unifg.jit import compiled
 from unifg.kernels import Kernel
 from unifg.lie import Rn
@@ -320,7 +320,7 @@ def inverse_distance_root(clearance: Residual, nearest: float = 0.1) -> Residual
         nearest: d0, where the parabola takes over [m].
 
     Raises:
-        ValueError: when ``nearest`` is not positive, or the clearance is not compiled.
+        ModelError: when ``nearest`` is not positive, or the clearance is not compiled.
     """
     kernel = _kernel_of(clearance, nearest)
     assert kernel.second is not None
@@ -345,7 +345,7 @@ def inverse_distance(clearance: Residual, nearest: float = 0.1, weight: float = 
         weight: factor [m].
 
     Raises:
-        ValueError: when ``nearest`` is not positive, or the clearance is not compiled.
+        ModelError: when ``nearest`` is not positive, or the clearance is not compiled.
     """
     root = inverse_distance_root(clearance, nearest)
     half = 0.5 * weight
@@ -361,8 +361,8 @@ def inverse_distance(clearance: Residual, nearest: float = 0.1, weight: float = 
 
 def _kernel_of(clearance: Residual, nearest: float) -> Kernel:
     if not nearest > 0.0:
-        raise ValueError(f"1/d needs a positive distance where its parabola takes over, found nearest={nearest}")
+        raise ModelError(f"1/d needs a positive distance where its parabola takes over, found nearest={nearest}")
     kernel = clearance.kernel
     if kernel is None or kernel.second is None:
-        raise ValueError(f"1/d needs a compiled clearance with a second derivative, found '{clearance.name}'")
+        raise ModelError(f"1/d needs a compiled clearance with a second derivative, found '{clearance.name}'")
     return kernel

@@ -12,6 +12,7 @@ import numpy as np
 
 from unifg.calls import local_vector
 from unifg.differentiation import FIRST_STEP
+from unifg.errors import ModelError
 from unifg.jit import compiled
 from unifg.typing import Array
 
@@ -54,7 +55,7 @@ class CompiledField:
         Arguments with a single row are shared by all.
 
         Raises:
-            ValueError: when there are fewer or more inputs, or one has another length.
+            ModelError: when there are fewer or more inputs, or one has another length.
         """
         x, u = self._rows(x, inputs)
         velocity = np.empty((len(u), self.dim))
@@ -65,10 +66,10 @@ class CompiledField:
         """(n, dim, dim) derivatives along x, and (n, dim, length) along every input.
 
         Raises:
-            ValueError: when the field has none, or the inputs do not fit.
+            ModelError: when the field has none, or the inputs do not fit.
         """
         if self.derivative is None:
-            raise ValueError("this compiled field has no derivative: give CompiledField(..., derivative=)")
+            raise ModelError("this compiled field has no derivative: give CompiledField(..., derivative=)")
         x, u = self._rows(x, inputs)
         by_x, by_u = np.empty((len(u), self.dim, self.dim)), np.empty((len(u), self.dim, self.controls))
         _derivatives(self.derivative)(x, u, by_x, by_u)
@@ -78,11 +79,11 @@ class CompiledField:
     def _rows(self, x: Array, inputs: Sequence[Array]) -> tuple[Array, Array]:
         """States and inputs side by side: contiguous, as many rows in both."""
         if len(inputs) != len(self.lengths):
-            raise ValueError(f"this compiled field takes {len(self.lengths)} inputs, found {len(inputs)}")
+            raise ModelError(f"this compiled field takes {len(self.lengths)} inputs, found {len(inputs)}")
         for place, (given, length) in enumerate(zip(inputs, self.lengths, strict=True)):
             if np.ndim(given) != 2 or given.shape[1] != length:
                 what = "controls have" if len(inputs) == 1 else f"input {place} has"
-                raise ValueError(f"{what} shape {np.shape(given)}, expected (n, {length})")
+                raise ModelError(f"{what} shape {np.shape(given)}, expected (n, {length})", index=place)
         count = max(len(part) for part in (x, *inputs))
         u = np.empty((count, self.controls))
         at = 0

@@ -14,6 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy import ndimage
 
+from unifg.errors import ModelError
 from unifg.jit import compiled
 from unifg.typing import Array, ArrayLike, BoolArray
 
@@ -41,15 +42,15 @@ class DistanceMap:
             origin: (x, y, yaw) [m, m, rad].
 
         Raises:
-            ValueError: values are not a finite (H, W) grid, or the resolution is not positive.
+            ModelError: values are not a finite (H, W) grid, or the resolution is not positive.
         """
         self.values: Array = np.ascontiguousarray(values, dtype=np.float64)
         self.resolution = float(resolution)
         pose = np.asarray(origin, dtype=np.float64).ravel()
         if self.values.ndim != 2 or self.values.size == 0 or not np.all(np.isfinite(self.values)):
-            raise ValueError(f"distance map: values {self.values.shape} must be a finite (H, W) grid")
+            raise ModelError(f"distance map: values {self.values.shape} must be a finite (H, W) grid")
         if not self.resolution > 0.0 or pose.shape != (3,):
-            raise ValueError(
+            raise ModelError(
                 f"distance map: resolution {resolution!r} must be positive; origin {origin!r}: (x, y, yaw)"
             )
         self.origin: tuple[float, float, float] = (float(pose[0]), float(pose[1]), float(pose[2]))
@@ -78,10 +79,10 @@ class DistanceMap:
         """
         mask = np.asarray(occupied, dtype=bool)
         if mask.ndim != 2 or mask.size == 0:
-            raise ValueError(f"distance map: occupied of shape {mask.shape} must be a (H, W) grid")
+            raise ModelError(f"distance map: occupied of shape {mask.shape} must be a (H, W) grid")
         limit = resolution * math.hypot(*mask.shape) if cap is None else float(cap)
         if not limit > 0.0:
-            raise ValueError(f"distance map: cap {cap!r} must be positive [m]")
+            raise ModelError(f"distance map: cap {cap!r} must be positive [m]")
         if mask.all() or not mask.any():
             return cls(np.full(mask.shape, -limit if mask.all() else limit), resolution, origin)
         outside = np.asarray(ndimage.distance_transform_edt(~mask), dtype=np.float64)

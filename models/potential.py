@@ -30,6 +30,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from unifg.calls import vector
+from unifg.errors import ModelError
 from unifg.jit import compiled
 from unifg.kernels import Kernel
 from unifg.residuals import Residual, residual
@@ -143,15 +144,15 @@ def potential(
             the side of the body on which the obstacle is not, to the left of one dead ahead.
 
     Raises:
-        ValueError: when the thresholds are not 0 < near < far, the sense is unknown or its weight negative, or the
+        ModelError: when the thresholds are not 0 < near < far, the sense is unknown or its weight negative, or the
             distance has no Jacobian.
     """
     if not 0.0 < near < far:
-        raise ValueError(f"potential: thresholds must be 0 < near < far, found near = {near}, far = {far}")
+        raise ModelError(f"potential: thresholds must be 0 < near < far, found near = {near}, far = {far}")
     if distance.jacobian is None:
-        raise ValueError(f"potential: '{distance.name}' has no attached Jacobian: use fg.residual(function, jacobian)")
+        raise ModelError(f"potential: '{distance.name}' has no attached Jacobian: use fg.residual(function, jacobian)")
     if sense not in ("circulate", "aside") or (sense == "aside" and vortex < 0.0):
-        raise ValueError(
+        raise ModelError(
             f"potential: sense must be 'circulate', or 'aside' with a positive vortex; found {sense!r}, {vortex}"
         )
     name = f"{distance.name} potential"

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unifg.errors import ModelError
 from unifg.kernels import Kernel
 from unifg.lie import SO3, Product, Rn
 from unifg.models import quadrotor_dynamics, quadrotor_flight, quadrotor_second
@@ -83,7 +84,7 @@ class Parameters:
         updraft: vertical acceleration [m/s^2].
 
     Raises:
-        ValueError: on a mass that is not positive, a negative drag, a wrong length, or what is not finite.
+        ModelError: on a mass that is not positive, a negative drag, a wrong length, or what is not finite.
     """
 
     mass: float = 1.0
@@ -95,7 +96,7 @@ class Parameters:
         """Refuse what cannot fly."""
         drag, wind = tuple(float(d) for d in self.drag), tuple(float(a) for a in self.wind)
         if len(drag) != 3 or len(wind) != 2:
-            raise ValueError(
+            raise ModelError(
                 f"a quadrotor has 3 drag coefficients and 2 of the wind, found {len(drag)} and {len(wind)}"
             )
         object.__setattr__(self, "mass", float(self.mass))
@@ -103,11 +104,11 @@ class Parameters:
         object.__setattr__(self, "wind", wind)
         object.__setattr__(self, "updraft", float(self.updraft))
         if not np.isfinite(self.packed).all():
-            raise ValueError(f"a quadrotor's parameters must be finite, found {self}")
+            raise ModelError(f"a quadrotor's parameters must be finite, found {self}")
         if self.mass <= 0.0:
-            raise ValueError(f"a quadrotor's mass must be positive, found {self.mass:g} kg")
+            raise ModelError(f"a quadrotor's mass must be positive, found {self.mass:g} kg")
         if min(drag) < 0.0:
-            raise ValueError(f"a quadrotor's drag must not be negative, found {drag} kg/s")
+            raise ModelError(f"a quadrotor's drag must not be negative, found {drag} kg/s")
 
     @property
     def packed(self) -> Array:
@@ -119,11 +120,11 @@ class Parameters:
         """From (7,) numbers in the order of :attr:`packed`.
 
         Raises:
-            ValueError: on another shape, or on numbers the constructor refuses.
+            ModelError: on another shape, or on numbers the constructor refuses.
         """
         numbers = np.asarray(packed, dtype=np.float64)
         if numbers.shape != (7,):
-            raise ValueError(f"a quadrotor has 7 parameters, found shape {numbers.shape}")
+            raise ModelError(f"a quadrotor has 7 parameters, found shape {numbers.shape}")
         mass, *rest = numbers.tolist()
         return cls(mass, (rest[0], rest[1], rest[2]), (rest[3], rest[4]), rest[5])
 
@@ -141,7 +142,7 @@ def step(x: ArrayLike, u: ArrayLike, dt: ArrayLike, parameters: Parameters) -> A
         (n, 10) next states.
 
     Raises:
-        ValueError: on another shape.
+        ModelError: on another shape.
     """
     x, u = _rows(x, 10, "states"), _rows(u, 4, "controls")
     moved = np.empty((max(len(x), len(u)), 10))
@@ -153,7 +154,7 @@ def rollout(start: ArrayLike, u: ArrayLike, dt: ArrayLike, parameters: Parameter
     """States reached from ``start`` (10,) under controls (n, 4), step after step: (n + 1, 10).
 
     Raises:
-        ValueError: on another shape.
+        ModelError: on another shape.
     """
     start, u = _single(start, 10, "state"), _rows(u, 4, "controls")
     states = np.empty((len(u) + 1, 10))
@@ -188,12 +189,12 @@ def fly(
         (10,) state.
 
     Raises:
-        ValueError: on another shape, or no substep.
+        ModelError: on another shape, or no substep.
     """
     state, u = _single(state, 10, "state"), _single(u, 4, "control")
     disturbance = np.zeros(6) if noise is None else _single(noise, 6, "noise")
     if substeps < 1:
-        raise ValueError(f"fly needs at least one substep, found {substeps}")
+        raise ModelError(f"fly needs at least one substep, found {substeps}")
     reached = state.copy()
     quadrotor_flight.integrate(reached, u, disturbance, parameters.packed, float(dt) / substeps, substeps)
     return reached
@@ -208,12 +209,12 @@ def hover_attitude(parameters: Parameters) -> Array:
     """(4,) quaternion that leans into the wind by the shortest turn from level; level without wind.
 
     Raises:
-        ValueError: when the updraft carries the vehicle, so that no thrust T > 0 at all holds it.
+        ModelError: when the updraft carries the vehicle, so that no thrust T > 0 at all holds it.
     """
     x, y, z = _lift(parameters)
     length = math.hypot(x, y, z)
     if z <= 0.0:
-        raise ValueError(f"an updraft of {parameters.updraft:g} m/s^2 carries the vehicle: it cannot hover")
+        raise ModelError(f"an updraft of {parameters.updraft:g} m/s^2 carries the vehicle: it cannot hover")
     return SO3.from_quaternion_wxyz(np.array([length + z, -y, x, 0.0]) / math.hypot(length + z, x, y))
 
 
@@ -226,14 +227,14 @@ def _single(given: ArrayLike, size: int, what: str) -> Array:
     """One row, contiguous."""
     array = np.ascontiguousarray(given, dtype=np.float64)
     if array.shape != (size,):
-        raise ValueError(f"a quadrotor's {what} has shape ({size},), found {array.shape}")
+        raise ModelError(f"a quadrotor's {what} has shape ({size},), found {array.shape}")
     return array
 
 
 def _rows(given: ArrayLike, size: int, what: str) -> Array:
     array = np.asarray(given, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != size:
-        raise ValueError(f"a quadrotor's {what} have shape (n, {size}), found {array.shape}")
+        raise ModelError(f"a quadrotor's {what} have shape (n, {size}), found {array.shape}")
     return array
 
 

@@ -32,7 +32,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from unifg.errors import UnifgError
+from unifg.errors import ModelError, UnifgError
 from unifg.jit import compiled
 from unifg.kernels import Argument, Kernel
 from unifg.lie import LieGroup, Rn
@@ -82,12 +82,12 @@ def integrator(
             along the input; by differences when absent. A compiled field brings its own.
 
     Raises:
-        ValueError: on an unknown method, or a compiled field whose dimension is not that of the group.
+        ModelError: on an unknown method, or a compiled field whose dimension is not that of the group.
     """
     tableau = _tableau(method)
     if isinstance(field, CompiledField):
         if field.dim != group.dim:
-            raise ValueError(f"{tableau.name}: the field has {field.dim} velocities, {group.name} takes {group.dim}")
+            raise ModelError(f"{tableau.name}: the field has {field.dim} velocities, {group.name} takes {group.dim}")
         functions, bend = scalar_rn if isinstance(group, Rn) else functions_of(group), bend_of(group)
         if functions is not None and bend is not None and jacobian in (None, field.jacobian):
             kernel = step_kernel(functions, bend, field, group.storage, ROOM * -(-tableau.stages // ROOM))
@@ -108,13 +108,13 @@ def trapezoid(group: LieGroup, field: Field, form: Form = "full", jacobian: Fiel
         jacobian: as there.
 
     Raises:
-        ValueError: on an unknown form, or a compiled field whose dimension is not that of the group.
+        ModelError: on an unknown form, or a compiled field whose dimension is not that of the group.
     """
     if form == "full":
         return integrator(group, field, "full trapezoid", jacobian)
     if form == "simplified":
         return integrator(group, field, "simplified trapezoid", jacobian)
-    raise ValueError(f"trapezoid: form must be 'full' or 'simplified', found {form!r}")
+    raise ModelError(f"trapezoid: form must be 'full' or 'simplified', found {form!r}")
 
 
 def _tableau(method: Method) -> Tableau:
@@ -124,7 +124,7 @@ def _tableau(method: Method) -> Tableau:
         return METHODS[method]
     except KeyError:
         known = ", ".join(f"'{name}'" for name in METHODS)
-        raise ValueError(f"method must be a Tableau or one of {known}; found {method!r}") from None
+        raise ModelError(f"method must be a Tableau or one of {known}; found {method!r}") from None
 
 
 # ---------------------------------------------------------------- simulation
@@ -145,7 +145,7 @@ def advance(group: LieGroup, field: Field, x: Array, *inputs: Array, h: ArrayLik
 
     Raises:
         UnifgError: when Newton's method does not converge: the step is too long.
-        ValueError: on an unknown method, or a field or inputs that do not fit.
+        ModelError: on an unknown method, or a field or inputs that do not fit.
     """
     return _advance(group, integrator(group, field, method), _tableau(method), x, inputs, h)
 
@@ -174,7 +174,7 @@ def rollout(
 
     Raises:
         UnifgError: when Newton's method does not converge in a step of an implicit method.
-        ValueError: on an unknown method, or a field or inputs that do not fit.
+        ModelError: on an unknown method, or a field or inputs that do not fit.
     """
     tableau, defect = _tableau(method), integrator(group, field, method)
     parts = [np.atleast_2d(np.asarray(part, dtype=np.float64)) for part in inputs]
@@ -186,7 +186,7 @@ def rollout(
     if isinstance(field, CompiledField) and tableau.explicit and functions is not None and defect.kernel is not None:
         u = np.concatenate([*parts, np.empty((count, 0))], axis=1)
         if u.shape[1] != field.controls:
-            raise ValueError(f"the inputs have {u.shape[1]} numbers, the field takes {field.controls}")
+            raise ModelError(f"the inputs have {u.shape[1]} numbers, the field takes {field.controls}")
         loop = rollout_kernel(defect.kernel.function, functions, group.storage, group.dim)
         loop(states[0].copy(), h / substeps, defect.kernel.table, u, substeps, states)
         return states

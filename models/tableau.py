@@ -19,6 +19,7 @@ from functools import cached_property
 
 import numpy as np
 
+from unifg.errors import ModelError
 from unifg.typing import Array
 
 
@@ -37,7 +38,7 @@ class Tableau:
             method.
 
     Raises:
-        ValueError: when the numbers do not make a method.
+        ModelError: when the numbers do not make a method.
     """
 
     name: str
@@ -52,13 +53,13 @@ class Tableau:
         stages = len(self.weights)
         if tuple(len(row) for row in self.matrix) != tuple(range(stages)):
             rows = [len(row) for row in self.matrix]
-            raise ValueError(f"{self.name}: the rows of the matrix have {rows} numbers, expected {list(range(stages))}")
+            raise ModelError(f"{self.name}: the rows of the matrix have {rows} numbers, expected {list(range(stages))}")
         if len(self.ends) not in (0, stages):
-            raise ValueError(f"{self.name}: {len(self.ends)} ends for {stages} stages")
+            raise ModelError(f"{self.name}: {len(self.ends)} ends for {stages} stages")
         if abs(sum(self.weights) - 1.0) > 1e-12:
-            raise ValueError(f"{self.name}: the weights sum to {sum(self.weights)}, expected 1")
+            raise ModelError(f"{self.name}: the weights sum to {sum(self.weights)}, expected 1")
         if not set(self.flat) <= set(range(stages)):
-            raise ValueError(f"{self.name}: flat names stages {self.flat}, there are {stages}")
+            raise ModelError(f"{self.name}: flat names stages {self.flat}, there are {stages}")
 
     @property
     def stages(self) -> int:

@@ -170,14 +170,14 @@ def test_least_squares_backends_take_the_twin() -> None:
 
 
 def test_what_the_potential_needs() -> None:
-    with pytest.raises(ValueError, match="positive distance"):
+    with pytest.raises(fg.ModelError, match="positive distance"):
         avoidance.inverse_distance_root(avoidance.cylinder_clearance, 0.0)
-    with pytest.raises(ValueError, match="positive distance"):
+    with pytest.raises(fg.ModelError, match="positive distance"):
         avoidance.inverse_distance(avoidance.cylinder_clearance, np.nan)
     plain: Residual = residual(lambda p: p[:, :1])
-    with pytest.raises(ValueError, match="compiled clearance"):
+    with pytest.raises(fg.ModelError, match="compiled clearance"):
         avoidance.inverse_distance_root(plain)
-    with pytest.raises(ValueError, match="second derivative, found 'disc clearance margin'"):
+    with pytest.raises(fg.ModelError, match="second derivative, found 'disc clearance margin'"):
         avoidance.inverse_distance_root(obstacles.shortfall(obstacles.disc_clearance, 0.1))
     planar = avoidance.inverse_distance_root(obstacles.disc_clearance)  # any clearance, also of other robots
     np.testing.assert_allclose(planar(np.array([[2.5, 0.0, 0.3]]), *ALONE), [[1.0]])

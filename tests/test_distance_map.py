@@ -8,6 +8,7 @@ from time import perf_counter
 import numpy as np
 import pytest
 
+from unifg.errors import ModelError
 from unifg.models.distance_map import DistanceMap
 from unifg.typing import Array
 
@@ -116,13 +117,13 @@ def test_nan_in_gives_nan_out_and_batches_keep_their_shape() -> None:
 
 
 def test_bad_grids_are_refused() -> None:
-    with pytest.raises(ValueError, match="finite"):
+    with pytest.raises(ModelError, match="finite"):
         DistanceMap(np.array([[math.nan]]), 0.1, (0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="resolution"):
+    with pytest.raises(ModelError, match="resolution"):
         DistanceMap(np.zeros((2, 2)), -0.1, (0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="cap"):
+    with pytest.raises(ModelError, match="cap"):
         DistanceMap.from_occupancy(np.eye(3, dtype=bool), 0.1, (0, 0, 0), cap=-1.0)
-    with pytest.raises(ValueError, match="grid"):
+    with pytest.raises(ModelError, match="grid"):
         DistanceMap.from_occupancy(np.zeros(3, dtype=bool), 0.1, (0, 0, 0))
 
 

@@ -72,11 +72,11 @@ def test_vortex_is_tangent_to_the_contours(vortex: float) -> None:
 
 def test_vortex_is_off_by_default_and_bad_thresholds_are_refused() -> None:
     assert potential(disc_clearance).search is None
-    with pytest.raises(ValueError, match=r"0 < near < far, found near = 0\.9"):
+    with pytest.raises(fg.ModelError, match=r"0 < near < far, found near = 0\.9"):
         potential(disc_clearance, near=0.9)
-    with pytest.raises(ValueError, match="found 'aside', -1"):
+    with pytest.raises(fg.ModelError, match="found 'aside', -1"):
         potential(disc_clearance, vortex=-1.0, sense="aside")
-    with pytest.raises(ValueError, match="has no attached Jacobian"):
+    with pytest.raises(fg.ModelError, match="has no attached Jacobian"):
         potential(fg.residual(lambda x: x[:, :1]))
     copy = pickle.loads(pickle.dumps(potential(disc_clearance, vortex=1.0)))
     assert copy(at([0.1]), CENTRE, RADIUS)[0, 0] == pytest.approx(SCALE * 8.75)

@@ -322,25 +322,25 @@ def test_parameters_go_round() -> None:
     ],
 )
 def test_parameters_that_cannot_fly_are_refused(given: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(fg.ModelError, match=message):
         Parameters(**given)
 
 
 def test_wrong_shapes_are_refused() -> None:
     x, u = states(3), controls(3)
-    with pytest.raises(ValueError, match=r"states have shape \(n, 10\), found \(10,\)"):
+    with pytest.raises(fg.ModelError, match=r"states have shape \(n, 10\), found \(10,\)"):
         quadrotor.step(x[0], u, 0.1, CALM)
-    with pytest.raises(ValueError, match=r"controls have shape \(n, 4\)"):
+    with pytest.raises(fg.ModelError, match=r"controls have shape \(n, 4\)"):
         quadrotor.rollout(x[0], u[:, :3], 0.1, CALM)
-    with pytest.raises(ValueError, match=r"state has shape \(10,\)"):
+    with pytest.raises(fg.ModelError, match=r"state has shape \(10,\)"):
         quadrotor.fly(x, u[0], 0.1, CALM)
-    with pytest.raises(ValueError, match=r"noise has shape \(6,\)"):
+    with pytest.raises(fg.ModelError, match=r"noise has shape \(6,\)"):
         quadrotor.fly(x[0], u[0], 0.1, CALM, np.zeros(3))
-    with pytest.raises(ValueError, match="at least one substep"):
+    with pytest.raises(fg.ModelError, match="at least one substep"):
         quadrotor.fly(x[0], u[0], 0.1, CALM, substeps=0)
-    with pytest.raises(ValueError, match=r"7 parameters, found shape \(6,\)"):
+    with pytest.raises(fg.ModelError, match=r"7 parameters, found shape \(6,\)"):
         Parameters.unpacked(np.ones(6))
-    with pytest.raises(ValueError, match="carries the vehicle"):
+    with pytest.raises(fg.ModelError, match="carries the vehicle"):
         quadrotor.hover_attitude(Parameters(updraft=10.0))
     with pytest.raises(GraphError, match="argument 3 has shape"):
         quadrotor.dynamics(x, u, x, np.ones(6), 0.1)

@@ -202,7 +202,7 @@ def test_drives_as_a_hard_constraint(form: Form) -> None:
 
 
 def test_unknown_form_is_refused_and_residuals_pickle() -> None:
-    with pytest.raises(ValueError, match="'full' or 'simplified', found 'half'"):
+    with pytest.raises(fg.ModelError, match="'full' or 'simplified', found 'half'"):
         rkmk.trapezoid(fg.SE2, current, "half")  # type: ignore[arg-type]
     copy = pickle.loads(pickle.dumps(rkmk.trapezoid(fg.SE2, current)))
     assert np.isfinite(copy(START, CONTROL, START, 0.1)).all()
@@ -241,11 +241,11 @@ def test_compiled_fields_with_derivatives_of_somebody_else_are_batched() -> None
 
 def test_compiled_fields_are_checked_and_pickle() -> None:
     field = CompiledField(spiral, 4, 1)
-    with pytest.raises(ValueError, match="the field has 4 velocities, SE2 takes 3"):
+    with pytest.raises(fg.ModelError, match="the field has 4 velocities, SE2 takes 3"):
         rkmk.trapezoid(fg.SE2, field)
-    with pytest.raises(ValueError, match="no derivative"):
+    with pytest.raises(fg.ModelError, match="no derivative"):
         field.jacobian(START, CONTROL)
-    with pytest.raises(ValueError, match=r"controls have shape \(1, 2\), expected \(n, 1\)"):
+    with pytest.raises(fg.ModelError, match=r"controls have shape \(1, 2\), expected \(n, 1\)"):
         field(START, CONTROL)
     copy = pickle.loads(pickle.dumps(rkmk.trapezoid(fg.SE2, rkmk.unicycle_field)))
     np.testing.assert_allclose(copy(START, CONTROL, START, 0.1), [[-0.1, 0.0, -0.08]], rtol=1e-15)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from unifg.errors import FileFormatError
+from unifg.errors import FileFormatError, ModelError
 from unifg.files.ros_map import OccupancyMap, load_map, save_map
 from unifg.typing import Array
 
@@ -136,13 +136,13 @@ def test_a_damaged_image_and_a_missing_file_are_refused(tmp_path: Path) -> None:
 
 def test_impossible_maps_cannot_be_made() -> None:
     some, none = np.ones((2, 3), dtype=bool), np.zeros((2, 3), dtype=bool)
-    with pytest.raises(ValueError, match="both occupied and free"):
+    with pytest.raises(ModelError, match="both occupied and free"):
         OccupancyMap(some, some, 0.1, (0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="one shape"):
+    with pytest.raises(ModelError, match="one shape"):
         OccupancyMap(some, none[:1], 0.1, (0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="resolution"):
+    with pytest.raises(ModelError, match="resolution"):
         OccupancyMap(some, none, 0.0, (0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="origin"):
+    with pytest.raises(ModelError, match="origin"):
         OccupancyMap(some, none, 0.1, (0.0, math.inf, 0.0))
 
 

@@ -13,7 +13,15 @@ solution = SQP().solve(graph, {x: np.zeros((2, 3))})
 from importlib.metadata import PackageNotFoundError, version
 
 from unifg.check import Finding, Report
-from unifg.errors import BackendError, FileFormatError, GraphError, NotConverged, ScenarioError, UnifgError
+from unifg.errors import (
+    BackendError,
+    FileFormatError,
+    GraphError,
+    ModelError,
+    NotConverged,
+    ScenarioError,
+    UnifgError,
+)
 from unifg.factors import ManifoldResidual, between, difference, prior
 from unifg.graph import Graph
 from unifg.history import Iteration
@@ -57,6 +65,7 @@ __all__ = [
     "Loss",
     "Manifold",
     "ManifoldResidual",
+    "ModelError",
     "NotConverged",
     "Optimality",
     "Prepared",

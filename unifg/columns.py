@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from unifg.errors import GraphError
 from unifg.terms import Fix
 from unifg.typing import Array, IntArray
 from unifg.variables import Family, Selection
@@ -112,4 +113,4 @@ class Columns:
         for family in reversed(self.families):
             if column >= self.offsets[family]:
                 return family.name, (column - self.offsets[family]) // family.manifold.dim
-        raise IndexError(column)
+        raise GraphError(f"column {column} belongs to no family", index=column)

@@ -1,4 +1,9 @@
-"""Exceptions: what was found, where it was found, and what to do about it."""
+"""Exceptions: what was found, where it was found, and what to do about it.
+
+Everything unifg itself raises is a :class:`UnifgError`, and so a ``ValueError``. Python's own exceptions are left to
+what Python itself asks for: ``AttributeError`` from ``__getattr__`` (``hasattr`` and pickling live on it),
+``ImportError`` where an optional package is missing, ``NotImplementedError`` in methods a subclass gives.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +14,12 @@ if TYPE_CHECKING:
 
 
 class UnifgError(ValueError):
-    """Base of every error raised by unifg."""
-
-
-class GraphError(UnifgError):
-    """The graph, its guess or its data cannot be solved as given.
+    """Base of every error raised by unifg.
 
     Attributes:
         term: name of the term concerned, if any.
         family: name of the variable family concerned, if any.
-        index: position within the family or the term, if any.
+        index: position within the family, the term or the argument concerned, if any.
     """
 
     def __init__(
@@ -36,6 +37,14 @@ class GraphError(UnifgError):
         self.index = index
 
 
+class GraphError(UnifgError):
+    """The graph, its guess or its data cannot be solved as given."""
+
+
+class ModelError(UnifgError):
+    """A model, a map or a method was given numbers or functions it cannot be made of, or cannot be evaluated with."""
+
+
 class BackendError(UnifgError):
     """The chosen backend cannot take this class of problem, or is not installed."""
 
@@ -48,14 +57,24 @@ class FileFormatError(UnifgError):
     """A file does not say what its format promises."""
 
 
-class NotConverged(RuntimeError):
+class NotConverged(UnifgError, RuntimeError):
     """Raised by ``solve(..., check=True)``; carries the solution that fell short.
 
+    Also a ``RuntimeError``: the input was sound, the solve was not.
+
     Attributes:
-        solution: the last iterate, with its status and KKT numbers.
+        solution: the iterate the solve ended with, with its status and KKT numbers.
+        term: of the constraint violated most, None where none is.
+        index: its factor.
     """
 
     def __init__(self, solution: Solution) -> None:
         """Keep the solution and repeat its report as the message."""
-        super().__init__(solution.report())
+        worst = solution.worst if solution.violation > 0.0 else None
+        term, index = worst or (None, None)
+        super().__init__(solution.report(), term=term, index=index)
         self.solution = solution
+
+    def __reduce__(self) -> tuple[type[NotConverged], tuple[Solution]]:
+        """Made from the solution, not from its report."""
+        return type(self), (self.solution,)

@@ -16,6 +16,7 @@ from typing import Any, cast
 import numpy as np
 
 from unifg.calls import local_matrix, local_vector, vector
+from unifg.errors import GraphError
 from unifg.jit import compiled
 from unifg.kernels import Kernel
 from unifg.lie import LieGroup, Manifold, Rn
@@ -37,7 +38,11 @@ class ManifoldResidual:
     build: Callable[[Manifold], Residual]
 
     def on(self, manifold: Manifold) -> Residual:
-        """The residual for variables on ``manifold``."""
+        """The residual for variables on ``manifold``.
+
+        Raises:
+            GraphError: when it has no meaning there.
+        """
         return self.build(manifold)
 
 
@@ -178,7 +183,7 @@ def _build_prior(manifold: Manifold) -> Residual:
 
 def _build_between(manifold: Manifold) -> Residual:
     if not isinstance(manifold, LieGroup):
-        raise TypeError(f"between needs a Lie group, found {manifold.name}; use difference")
+        raise GraphError(f"between needs a Lie group, found {manifold.name}; use difference")
     return _complete(
         cast(Hashable, manifold),
         "between",

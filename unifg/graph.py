@@ -106,7 +106,7 @@ class Graph:
         """
         if sigma is not None and information is not None:
             raise GraphError(f"term '{name or function}': give sigma or information, not both", term=name)
-        wrapped = complete(function, arguments)
+        wrapped = complete(function, arguments, name)
         unique = self._unique(name, wrapped.name)
         normal, active, count = self._arguments(unique, arguments, active)
         return self._add(Cost(unique, wrapped, normal, active, count, sigma, information, robust))
@@ -118,7 +118,7 @@ class Graph:
 
         Gradient and Hessian blocks come from batched differentiation. Least-squares backends refuse it.
         """
-        wrapped = complete(function, arguments)
+        wrapped = complete(function, arguments, name)
         unique = self._unique(name, wrapped.name)
         normal, active, count = self._arguments(unique, arguments, active)
         return self._add(ScalarCost(unique, wrapped, normal, active, count))
@@ -139,7 +139,7 @@ class Graph:
         Raises:
             GraphError: when a lower limit exceeds its upper limit.
         """
-        wrapped = complete(function, arguments)
+        wrapped = complete(function, arguments, name)
         unique = self._unique(name, wrapped.name)
         normal, active, count = self._arguments(unique, arguments, active)
         check_limits(unique, lower, upper)
@@ -266,14 +266,25 @@ class Graph:
         return candidate
 
 
-def complete(function: AnyResidual, arguments: tuple[Any, ...]) -> Residual:
-    """Give a manifold residual the manifold of its first variable; wrap plain functions."""
+def complete(function: AnyResidual, arguments: tuple[Any, ...], name: str | None = None) -> Residual:
+    """Give a manifold residual the manifold of its first variable; wrap plain functions.
+
+    Raises:
+        GraphError: naming the term and the family when the residual has no meaning on that manifold.
+    """
     if not isinstance(function, ManifoldResidual):
         return as_residual(function)
     for argument in arguments:
         if is_variable(argument):
-            return function.on(as_selection(argument).manifold)
-    raise GraphError(f"'{function.name}' has no variable among its arguments: pass a family or a selection")
+            selection = as_selection(argument)
+            try:
+                return function.on(selection.manifold)
+            except GraphError as error:
+                family = selection.family.name
+                raise GraphError(
+                    f"term '{name or function.name}': {error} (family '{family}')", term=name, family=family
+                ) from error
+    raise GraphError(f"'{function.name}' has no variable among its arguments: pass a family or a selection", term=name)
 
 
 def itself(value: Array) -> Array:

@@ -314,7 +314,7 @@ class Program:
         for term, rows in zip(self.constraint_terms, self.slices, strict=True):
             if rows.start <= row < rows.stop:
                 return term.name, (row - rows.start) // term.size
-        raise IndexError(row)
+        raise GraphError(f"row {row} belongs to no constraint", index=row)
 
     def cost_rows(self, names: Sequence[str]) -> BoolArray:
         """(C,) whether each cost row belongs to one of the named terms.

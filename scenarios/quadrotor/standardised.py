@@ -6,6 +6,7 @@ from collections.abc import Callable, Hashable
 from functools import cache
 from typing import cast
 
+from unifg.errors import GraphError
 from unifg.jit import compiled
 from unifg.kernels import Kernel
 from unifg.lie import LieGroup, Manifold, Rn
@@ -28,7 +29,7 @@ def _of_vector(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
 def _of_group(group: LieGroup) -> Callable[..., None]:
     functions = functions_of(group)
     if functions is None:
-        raise TypeError(f"standardised: {group.name} has no compiled functions")
+        raise GraphError(f"standardised: {group.name} has no compiled functions")
     storage, dim = group.storage, group.dim
     local, inverse_jacobian = functions.local, functions.right_jacobian_inverse
 
@@ -52,17 +53,16 @@ def standardised(manifold: Manifold) -> Residual:
     reference: (n, storage). sigma: (n, d), positive.
 
     Raises:
-        TypeError: for a manifold that is no group with compiled functions.
+        GraphError: for a manifold that is no group with compiled functions.
     """
     return _made(cast(Hashable, manifold))
 
 
 @cache
 def _made(manifold: Hashable) -> Residual:
-    assert isinstance(manifold, Manifold)
+    if not isinstance(manifold, LieGroup):
+        raise GraphError(f"standardised needs a Lie group, found {cast(Manifold, manifold).name}")
     arguments = (manifold, (manifold.storage,), (manifold.dim,))
     if isinstance(manifold, Rn):
         return residual(Kernel(_of_vector, arguments, manifold.dim, name="standardised", linear=True))
-    if not isinstance(manifold, LieGroup):
-        raise TypeError(f"standardised needs a Lie group, found {manifold.name}")
     return residual(Kernel(_of_group(manifold), arguments, manifold.dim, name="standardised"))

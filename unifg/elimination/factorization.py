@@ -137,8 +137,7 @@ class Factorization:
         """Solve for one right-hand side (n,) or several (n, k).
 
         Raises:
-            RuntimeError: there is no factorisation.
-            UnifgError: the right-hand side has the wrong shape.
+            UnifgError: there is no factorisation, or the right-hand side has the wrong shape.
         """
         self._demand("solve")
         if right.ndim == 1:
@@ -165,8 +164,7 @@ class Factorization:
             steps: corrections at most; fewer when they stop paying.
 
         Raises:
-            RuntimeError: there is no factorisation.
-            UnifgError: an array has the wrong shape.
+            UnifgError: there is no factorisation, or an array has the wrong shape.
         """
         self._demand("refine")
         data = _numbers(data, self.pattern.nnz, "data")
@@ -206,7 +204,7 @@ class Factorization:
         """(n,) diagonal D of the factorisation L D L' with unit L, in the order of elimination.
 
         Raises:
-            RuntimeError: there is no factorisation.
+            UnifgError: there is no factorisation.
         """
         self._demand("pivots")
         result: Array = (self.plan.signs / self.plan.pivots**2)[: self.pattern.size]
@@ -230,7 +228,7 @@ class Factorization:
         """(nnz,) entries of the inverse at the places of the pattern, at the cost of about two factorisations.
 
         Raises:
-            RuntimeError: there is no factorisation.
+            UnifgError: there is no factorisation.
         """
         result: Array = self._filled(None)[self.plan.slots]
         return result
@@ -242,7 +240,7 @@ class Factorization:
         take a solve each.
 
         Raises:
-            RuntimeError: there is no factorisation.
+            UnifgError: there is no factorisation.
         """
         self._demand("inverse_block")
         rows = np.asarray(rows, dtype=np.int64)
@@ -262,7 +260,7 @@ class Factorization:
         """Marginal covariance (d, d) of every node, all in about the time of two factorisations.
 
         Raises:
-            RuntimeError: there is no factorisation.
+            UnifgError: there is no factorisation.
         """
         panels = self._filled(None)
         plan, starts = self.plan, self.structure.starts
@@ -321,7 +319,7 @@ class Factorization:
 
     def _demand(self, what: str) -> None:
         if not self._ready:
-            raise RuntimeError(f"{what} called before a successful factor")
+            raise UnifgError(f"{what} called before a successful factor: call factor, and look whether it returns True")
 
 
 def _rebuilt(

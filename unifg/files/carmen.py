@@ -126,7 +126,7 @@ def read_carmen(path: str | Path, field_of_view: float = math.pi) -> CarmenLog:
                 _front_laser(words, groups, field_of_view)
             else:
                 _robot_laser(words, groups)
-        except (ValueError, IndexError) as error:
+        except (FileFormatError, IndexError) as error:
             raise FileFormatError(f"{path}, line {number}: {tag}: {error}") from None
     if not motions and not groups:
         raise FileFormatError(f"{path}: no line begins with {', '.join(_READ)}: is this a CARMEN log?")
@@ -178,12 +178,12 @@ def _scans(group: _Group) -> Scans:
 
 def _require(words: list[str], count: int) -> None:
     if len(words) != count:
-        raise ValueError(f"{len(words)} words, expected {count}")
+        raise FileFormatError(f"{len(words)} words, expected {count}")
 
 
 def _count(word: str) -> int:
     if not word.isdecimal():
-        raise ValueError(f"{word!r} is not a number of readings")
+        raise FileFormatError(f"{word!r} is not a number of readings")
     return int(word)
 
 
@@ -191,7 +191,7 @@ def _number(word: str) -> float:
     try:
         value = float(word)
     except ValueError:
-        raise ValueError(f"{word!r} is not a number") from None
+        raise FileFormatError(f"{word!r} is not a number") from None
     if not math.isfinite(value):
-        raise ValueError(f"{word} is not a finite number")
+        raise FileFormatError(f"{word} is not a finite number")
     return value

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from unifg.errors import FileFormatError
+from unifg.errors import FileFormatError, ModelError
 from unifg.typing import Array, BoolArray
 
 _DEFAULT_OCCUPIED, _DEFAULT_FREE = 0.65, 0.196
@@ -46,19 +46,19 @@ class OccupancyMap:
         """Refuse masks and numbers that cannot be a map.
 
         Raises:
-            ValueError: shapes differ, a cell is both occupied and free, or a number is not usable.
+            ModelError: shapes differ, a cell is both occupied and free, or a number is not usable.
         """
         if self.occupied.ndim != 2 or self.occupied.shape != self.free.shape or self.occupied.size == 0:
-            raise ValueError(
+            raise ModelError(
                 f"map {self.name!r}: occupied {self.occupied.shape} and free {self.free.shape} must be "
                 "(H, W) of one shape"
             )
         if np.any(self.occupied & self.free):
-            raise ValueError(f"map {self.name!r}: some cells are both occupied and free")
+            raise ModelError(f"map {self.name!r}: some cells are both occupied and free")
         if not (math.isfinite(self.resolution) and self.resolution > 0.0):
-            raise ValueError(f"map {self.name!r}: resolution {self.resolution!r} must be positive [m]")
+            raise ModelError(f"map {self.name!r}: resolution {self.resolution!r} must be positive [m]")
         if len(self.origin) != 3 or not all(math.isfinite(value) for value in self.origin):
-            raise ValueError(f"map {self.name!r}: origin {self.origin!r} must be finite (x, y, yaw)")
+            raise ModelError(f"map {self.name!r}: origin {self.origin!r} must be finite (x, y, yaw)")
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unifg.errors import ModelError
 from unifg.lie import SE2, SE3, LieGroup
 from unifg.pose_graphs.initialise import odometric
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph
@@ -46,10 +47,10 @@ def manhattan(count: int = 1000, seed: int = 0, outliers: float = 0.0, block: in
         block: metres between crossings.
 
     Raises:
-        ValueError: an argument is out of its range.
+        ModelError: an argument is out of its range.
     """
     if count < 2 or block < 1:
-        raise ValueError(f"manhattan: count {count} must be at least 2 and block {block} at least 1")
+        raise ModelError(f"manhattan: count {count} must be at least 2 and block {block} at least 1")
     rng = np.random.default_rng(seed)
     side = max(2, round((count / (4.0 * block)) ** 0.5))  # each street is driven a few times
     cells = np.zeros((count, 3), dtype=np.int64)  # x and y [m], heading in quarter turns
@@ -86,10 +87,10 @@ def sphere(
         radius: of the sphere [m].
 
     Raises:
-        ValueError: an argument is out of its range.
+        ModelError: an argument is out of its range.
     """
     if rings < 2 or per_ring < 4 or not radius > 0.0:
-        raise ValueError(f"sphere: rings {rings} >= 2, per_ring {per_ring} >= 4 and radius {radius} > 0 are needed")
+        raise ModelError(f"sphere: rings {rings} >= 2, per_ring {per_ring} >= 4 and radius {radius} > 0 are needed")
     rng = np.random.default_rng(seed)
     count = rings * per_ring
     turn = np.arange(count) / per_ring
@@ -123,7 +124,7 @@ def _simulated(
 ) -> Simulated:
     """Measure along the way and across the closures, and add wrong closures between random poses."""
     if not 0.0 <= share < 1.0:
-        raise ValueError(f"outliers {share} must be a share in [0, 1)")
+        raise ModelError(f"outliers {share} must be a share in [0, 1)")
     count = len(truth)
     along = np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
     pairs = np.concatenate([along, closures])

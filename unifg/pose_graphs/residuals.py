@@ -11,6 +11,7 @@ from functools import cache
 from types import ModuleType
 
 from unifg.calls import local_matrix, local_vector, vector
+from unifg.errors import GraphError
 from unifg.factors import ManifoldResidual
 from unifg.jit import compiled
 from unifg.kernels import Kernel
@@ -105,7 +106,7 @@ def _chart_kernel(space: bool) -> Kernel:
 
 def _build_chart(manifold: Manifold) -> Residual:
     if manifold not in (SE2, SE3):
-        raise TypeError(f"chart_between needs poses in SE2 or SE3, found {manifold.name}; use between")
+        raise GraphError(f"chart_between needs poses in SE2 or SE3, found {manifold.name}; use between")
     return residual(_chart_kernel(manifold == SE3))
 
 
@@ -177,7 +178,7 @@ def _sighting_kernel(space: bool) -> Kernel:
 
 def _build_sighting(manifold: Manifold) -> Residual:
     if manifold not in (SE2, SE3):
-        raise TypeError(f"sighting needs poses in SE2 or SE3, found {manifold.name}")
+        raise GraphError(f"sighting needs poses in SE2 or SE3, found {manifold.name}")
     return residual(_sighting_kernel(manifold == SE3))
 
 

@@ -1,0 +1,160 @@
+"""Every error of the library is one of its own and says where; Python's exceptions only where Python asks for them."""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import pickle
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from problems import short_drive
+from test_house import LIBRARY, name_of
+from unifg.elimination.factorization import Factorization
+from unifg.files.ros_map import OccupancyMap
+from unifg.models import quadrotor
+from unifg.models.distance_map import DistanceMap
+from unifg.models.rkmk import integrator
+from unifg.models.tableau import Tableau
+from unifg.pose_graphs.generate import manhattan
+from unifg.pose_graphs.residuals import chart_between, sighting
+from unifg.scenarios.quadrotor.standardised import standardised
+from unifg.solvers import SQP
+from unifg.sparse import Symmetric
+
+EXCEPTIONS = {
+    name for name, kind in vars(builtins).items() if isinstance(kind, type) and issubclass(kind, BaseException)
+}
+
+
+def plain(source: str) -> list[str]:
+    """List where a source raises one of Python's own exceptions though Python does not ask for it."""
+
+    def walk(node: ast.AST, function: str, handled: str) -> Iterator[str]:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            function = node.name
+        if isinstance(node, ast.ExceptHandler):
+            handled = ast.unparse(node.type) if node.type else ""
+        if isinstance(node, ast.Raise) and node.exc is not None:
+            called = node.exc.func if isinstance(node.exc, ast.Call) else node.exc
+            name = called.id if isinstance(called, ast.Name) else ""
+            asked = (
+                name in ("NotImplementedError", "KeyboardInterrupt")
+                or (name == "AttributeError" and function == "__getattr__")
+                or (name == "ImportError" and handled == "ImportError")
+            )
+            if name in EXCEPTIONS and not asked:
+                yield f"line {node.lineno}: {name} in {function or 'the module'}"
+        for child in ast.iter_child_nodes(node):
+            yield from walk(child, function, handled)
+
+    return list(walk(ast.parse(source), "", ""))
+
+
+@pytest.mark.parametrize("path", [path for _, path in LIBRARY], ids=name_of)
+def test_no_plain_exception_is_raised(path: Path) -> None:
+    assert plain(path.read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize(
+    ("source", "count"),
+    [
+        ("def f(x):\n    raise ValueError(x)", 1),
+        ("raise TypeError", 1),
+        ("try:\n    f()\nexcept KeyError as error:\n    raise RuntimeError('no') from error", 1),
+        ("def f(self, name):\n    raise AttributeError(name)", 1),
+        ("def __getattr__(self, name):\n    raise AttributeError(name)", 0),
+        ("try:\n    import yaml\nexcept ImportError as error:\n    raise ImportError('pip install') from error", 0),
+        ("raise ImportError('no such backend')", 1),
+        ("try:\n    f()\nexcept KeyError:\n    raise", 0),
+        ("raise GraphError('x', term='dynamics')", 0),
+    ],
+)
+def test_plain_exceptions_are_found(source: str, count: int) -> None:
+    assert len(plain(source)) == count
+
+
+def test_every_error_is_one_of_unifg_and_says_where() -> None:
+    errors = [kind for kind in vars(fg.errors).values() if isinstance(kind, type) and issubclass(kind, Exception)]
+    assert len(errors) >= 7
+    for kind in errors:
+        assert issubclass(kind, fg.UnifgError)
+        if kind is not fg.NotConverged:
+            error = kind("what", term="t", family="x", index=3)
+            again = pickle.loads(pickle.dumps(error))
+            assert (str(again), again.term, again.family, again.index) == ("what", "t", "x", 3)
+
+
+def test_not_converged_is_an_error_of_unifg_and_names_the_worst_factor() -> None:
+    graph, guess = short_drive()
+    with pytest.raises(fg.UnifgError) as caught:
+        SQP(max_iterations=1).solve(graph, guess, check=True)
+    error = caught.value
+    assert isinstance(error, fg.NotConverged) and isinstance(error, RuntimeError)
+    assert error.solution.violation > 0.0
+    assert (error.term, error.index) == error.solution.worst
+    again = pickle.loads(pickle.dumps(error))
+    assert (again.term, again.index, str(again)) == (error.term, error.index, str(error))
+
+
+def test_not_converged_names_nothing_where_nothing_is_violated() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(lambda p: np.cosh(p - 3.0), x)
+    graph.bound(x, lower=-1.0)
+    with pytest.raises(fg.NotConverged) as caught:
+        SQP(max_iterations=1).solve(graph, {x: [[0.0]]}, check=True)
+    assert (caught.value.term, caught.value.index) == (None, None)
+
+
+ON_VECTORS: list[tuple[fg.ManifoldResidual, str]] = [
+    (fg.between, "between needs a Lie group, found"),
+    (chart_between, "chart_between needs poses in SE2 or SE3, found"),
+    (sighting, "sighting needs poses in SE2 or SE3, found"),
+]
+
+
+class Sphere:
+    """No group: a manifold that only knows its name."""
+
+    name = "S2"
+    dim, storage = 2, 3
+
+
+@pytest.mark.parametrize(("function", "message"), ON_VECTORS, ids=[f.name for f, _ in ON_VECTORS])
+def test_a_residual_on_the_wrong_manifold_names_term_and_family(function: fg.ManifoldResidual, message: str) -> None:
+    graph = fg.Graph()
+    manifold = Sphere() if function is fg.between else fg.Rn(3)
+    x = graph.variables("corner", manifold, 2)  # type: ignore[arg-type]
+    with pytest.raises(fg.GraphError, match=f"'odometry': {message} .*'corner'") as caught:
+        graph.minimize(function, x[0], x[1], np.zeros(3), name="odometry")
+    assert (caught.value.term, caught.value.family) == ("odometry", "corner")
+
+
+REFUSED: list[tuple[str, Callable[[], object], type[fg.UnifgError], str]] = [
+    ("standardised", lambda: standardised(Sphere()), fg.GraphError, "Lie group"),  # type: ignore[arg-type]
+    ("mass", lambda: quadrotor.Parameters(mass=-1.0), fg.ModelError, "mass"),
+    ("grid", lambda: DistanceMap(np.zeros(3), 0.1, (0.0, 0.0, 0.0)), fg.ModelError, "grid"),
+    ("method", lambda: integrator(fg.SE2, lambda x, u: u, "rk5"), fg.ModelError, "rk5"),  # type: ignore[arg-type]
+    ("weights", lambda: Tableau("mine", 1, (0.5,), ((),)), fg.ModelError, "sum to 0.5"),
+    ("walk", lambda: manhattan(1), fg.ModelError, "at least 2"),
+    (
+        "map",
+        lambda: OccupancyMap(np.ones((2, 2), bool), np.ones((2, 2), bool), 0.1, (0.0, 0.0, 0.0)),
+        fg.ModelError,
+        "both occupied and free",
+    ),
+    ("factor", lambda: Factorization(Symmetric(2, [])).solve(np.ones(2)), fg.UnifgError, "successful factor"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("breaks", "kind", "message"), [r[1:] for r in REFUSED], ids=[r[0] for r in REFUSED])
+def test_models_maps_and_methods_refuse_with_an_error_of_unifg(
+    breaks: Callable[[], object], kind: type[fg.UnifgError], message: str
+) -> None:
+    with pytest.raises(kind, match=message):
+        breaks()
