@@ -7,6 +7,7 @@
 #   make results PAGE=control-cases    measure one page of docs/ again; without PAGE, list them
 #   make stale    name the pages of docs/ whose tables were measured on other sources
 #   make release-check    the same, and fail if there are any
+#   make mutants  change decisions one at a time and see whether a test notices (hours; FILES='scenarios/joint.py')
 #   make fences   run the shell commands shown in README.md and docs/
 #   make clean    remove everything made here
 #
@@ -24,7 +25,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Matrices here are small: more threads per process only make the processes wait for each other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: help demo test lint types bench results stale release-check fences clean
+.PHONY: help demo test lint types bench results stale release-check mutants fences clean
 .DELETE_ON_ERROR:
 
 help:
@@ -55,6 +56,9 @@ stale: $(VENV)/ready
 
 release-check: $(VENV)/ready
 	@$(BIN)/python -m benchmarks.pages stale --strict
+
+mutants: $(VENV)/ready
+	$(ONE_THREAD) $(BIN)/python -m benchmarks.mutants $(FILES)
 
 fences: $(VENV)/ready
 	$(BIN)/python docs/check_shell_fences.py

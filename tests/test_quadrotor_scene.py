@@ -233,6 +233,21 @@ def test_horizon_and_past_of_every_frame_are_those_of_the_log(page: str, log: Fl
         assert shown == [moment == tick for moment in range(log.ticks)]
 
 
+def test_the_flown_way_appears_piece_by_piece(page: str, log: FlightLog) -> None:
+    """Each piece is hidden until the vehicle has flown it, and stays; together they are the whole way."""
+    commands = _commands(page)
+    tracks = _tracks(commands)
+    begun = [int(path.split("/")[1]) for path in tracks if path.startswith("flown/")]
+    assert begun == list(range(log.ticks - 1))
+    for begin in begun:
+        shown = [_shown(tracks[f"flown/{begin}"][".visible"], moment) for moment in range(log.ticks)]
+        assert shown == [moment > begin for moment in range(log.ticks)]
+        for name, way in (("believed", log.believed), ("truth", log.truth)):
+            points = _vertices(commands, f"flown/{begin}/{name}")
+            middle = points.reshape(-1, 3, 3).mean(axis=1)
+            np.testing.assert_allclose(middle[[0, -1]], way[[begin, begin + 1], :3], atol=1e-6)
+
+
 def test_a_flight_without_estimate_is_shown_without_it() -> None:
     plain = flight(estimated=False, movers=0)
     page = scene_html(plain)

@@ -159,6 +159,22 @@ def test_robot_ghost_and_movers_follow_the_log(page: str, log: EpisodeLog) -> No
     assert moved == {"/meshcat/obstacles/0", "/meshcat/obstacles/3"}
 
 
+def test_the_trail_appears_piece_by_piece_as_the_robot_passes(page: str, log: EpisodeLog) -> None:
+    """Each piece is hidden until the robot has driven it, and stays; together they are the whole way."""
+    commands = _commands(page)
+    pieces = [command for command in commands if "/trail/" in command.get("path", "") and "object" in command]
+    tracks = _tracks(commands)
+    last = log.ticks - 1
+    assert [int(piece["path"].rpartition("/")[2]) for piece in pieces] == list(range(last))
+    for begin, piece in enumerate(pieces):
+        keys = dict(tracks[piece["path"]][".visible"])
+        for moment in range(log.ticks):
+            assert keys[max(time for time in keys if time <= moment)] is (moment > begin)
+        data = piece["object"]["geometries"][0]["data"]["attributes"]["position"]["array"].data
+        middle = np.frombuffer(data, dtype=np.float32).reshape(-1, 2, 3).mean(axis=1)
+        np.testing.assert_allclose(middle[[0, -1], :2], log.true_pose[[begin, begin + 1], :2], atol=1e-6)
+
+
 def test_objects_are_packed_as_the_viewer_wants_them(page: str) -> None:
     for command in _commands(page):
         if command["type"] != "set_object":
