@@ -1,4 +1,4 @@
-"""Newton steps of a primal-dual interior point with elastic inequalities, as compiled functions.
+"""Newton steps of a primal-dual interior point with elastic constraints, as compiled functions.
 
 Every finite limit of an inequality row is a *side* c(x) >= 0, with c = g - lower or upper - g. It has a slack s and an
 elastic variable e with price rho, and both carry a logarithmic barrier:
@@ -13,7 +13,19 @@ With the multiplier y of a side and z = rho - y, the conditions s y = mu and e z
 
 and one factorisation of the KKT matrix per iteration. The filter line search, its constants, the second-order
 correction and the correction of the inertia follow Waechter and Biegler, Math. Program. 106 (2006), sections 2 and 3.
-A row that cannot be satisfied has y = rho and e > 0, so no restoration phase is needed for inequalities.
+A row that cannot be satisfied has y = rho and e > 0.
+
+Equalities hold as they stand, h(x) = 0, until steps become short or fail. From then on they are elastic too, h = p - n
+with p, n > 0 at the price rho: p (rho - lambda) = mu, n (rho + lambda) = mu, and
+
+    A dx - (p / (rho - lambda) + n / (rho + lambda)) dlambda = -h + mu / (rho - lambda) - mu / (rho + lambda).
+
+The phase begins where all of its constraints hold (`_split`), at a mu in proportion to price and violation: an l1
+penalty with a smooth edge, which needs no restoration. Its answers are those of the problem as long as no multiplier
+is at its price; where one is, the price is raised, until the pull of the objective is small beside the forces that the
+constraints exert on each other. Then violation is what is left to minimise, and whoever runs the loop has to find out
+whether less of it is to be had (`VIOLATED`); compare Curtis, Schenk and Waechter, SIAM J. Optim. 20 (2010), and Thierry
+and Biegler, Optim. Methods Softw. 35 (2020).
 """
 
 from __future__ import annotations
@@ -29,6 +41,7 @@ from unifg.solvers.barrier_state import (
     ALPHA,
     ALPHA_DUAL,
     ANSWER,
+    ASKED,
     BORDER,
     COLD,
     COMPLEMENTARITY,
@@ -39,14 +52,18 @@ from unifg.solvers.barrier_state import (
     DE,
     DELTA,
     DESCENT,
+    DN,
+    DP,
     DS,
     DY,
+    ELASTIC,
     FAILURES,
     FILTER,
     FILTERED,
     GAP,
     GAUSS_NEWTON,
     ITERATION,
+    KEPT,
     LAST_DELTA,
     LEAST,
     LIMIT,
@@ -56,16 +73,20 @@ from unifg.solvers.barrier_state import (
     MU,
     NOT_FINITE,
     PHI,
+    RELAX,
     REST,
     RESTORE,
     RHO,
     SAVED_ALPHA,
     SAVED_DE,
+    SAVED_DN,
+    SAVED_DP,
     SAVED_DS,
     SAVED_DUAL,
     SAVED_DY,
     SAVED_SLOPE,
     SCALE,
+    SHORT_STEPS,
     SIDES,
     SIGN,
     SLOPE,
@@ -81,12 +102,15 @@ from unifg.solvers.barrier_state import (
     TRIAL_COST,
     TRIALS,
     TRY,
+    VIOLATED,
     VIOLATION,
     E,
+    N,
+    P,
     S,
     Y,
 )
-from unifg.table import BOUND, COLUMN, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH
+from unifg.table import BOUND, COLUMN, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, Terms
 from unifg.typing import Array, IntArray
 
 OBJECTIVE = 0  # table.COST
@@ -94,7 +118,12 @@ KAPPA = 10.0  # a barrier problem is solved when its error is below KAPPA mu
 ARMIJO = 1e-4
 GAMMA_THETA, GAMMA_PHI = 1e-5, 1e-8
 HALVINGS = 20
-MOST_FAILURES = 8
+FEW_FAILURES, MOST_FAILURES = 2, 8  # of line searches in a row, before equalities become elastic and for good
+SHORT_STEP, MOST_SHORT_STEPS = 0.05, 5  # in a row, before equalities become elastic
+RELAXED_MU = 1e-2  # of price times violation: first mu with elastic equalities
+LATE_MU = 1e-3  # the same: largest mu at which a violation is taken seriously
+AT_PRICE = 0.9  # share of the price from which on a multiplier is at it
+SMALL_PULL = 1e-2  # share of the constraints' forces below which the objective's force counts for nothing
 HIGHEST_PRICE = 1e9
 FIRST_SLACK = 1e-2  # smallest slack of a cold start
 WARM_MU = 1e-5  # largest first mu of a start with multipliers: what is active has been found
@@ -102,31 +131,57 @@ WARM_MU = 1e-5  # largest first mu of a start with multipliers: what is active h
 
 @compiled
 def _merit(
-    numbers: Array, counts: IntArray, sides: Array, side_row: IntArray, cost: float, constraints: Array, alpha: float
+    numbers: Array,
+    counts: IntArray,
+    sides: Array,
+    side_row: IntArray,
+    pairs: Array,
+    prices: Array,
+    rows: IntArray,
+    lower: Array,
+    cost: float,
+    constraints: Array,
+    alpha: float,
 ) -> tuple[float, float]:
-    """Barrier function and violation of the sides, after a step of the slacks."""
-    rho = numbers[RHO]
+    """Barrier function, and violation of sides and equality rows, after a step of what makes them elastic."""
     elastic, logarithms, product, theta = 0.0, 0.0, 1.0, 0.0
     for k in range(counts[SIDES]):
         s, e = sides[S, k] + alpha * sides[DS, k], sides[E, k] + alpha * sides[DE, k]
-        c = sides[SIGN, k] * (constraints[side_row[k]] - sides[BORDER, k])
+        row = side_row[k]
+        c = sides[SIGN, k] * (constraints[row] - sides[BORDER, k])
         theta += abs(c + e - s)
-        elastic += e
+        elastic += prices[row] * e
         product *= s * e
         if k & 3 == 3:  # one logarithm for eight factors, each of moderate size
             logarithms += math.log(product)
             product = 1.0
     logarithms += math.log(product)
-    return cost + rho * elastic - numbers[MU] * logarithms, theta
+    if counts[ELASTIC] == 0:
+        for row in rows:
+            theta += abs(constraints[row] - lower[row])
+    else:
+        product = 1.0
+        for k in range(len(rows)):
+            row, p, n = rows[k], pairs[P, k] + alpha * pairs[DP, k], pairs[N, k] + alpha * pairs[DN, k]
+            theta += abs(constraints[row] - lower[row] - p + n)
+            elastic += prices[row] * (p + n)
+            product *= p * n
+            if k & 3 == 3:
+                logarithms += math.log(product)
+                product = 1.0
+        logarithms += math.log(product)
+    return cost + elastic - numbers[MU] * logarithms, theta
 
 
 @compiled
-def _infeasibility(rows: IntArray, lower: Array, constraints: Array) -> float:
-    """Sum of |h| over the equality rows."""
-    total = 0.0
-    for row in rows:
-        total += abs(constraints[row] - lower[row])
-    return total
+def _split(c: float, rho: float, mu: float) -> tuple[float, float]:
+    """Positive s and e with s - e = c that minimise rho e - mu log s - mu log e."""
+    root = math.sqrt(4.0 * mu * mu + c * c * rho * rho)
+    if c > 0.0:
+        s = (2.0 * mu + c * rho + root) / (2.0 * rho)
+        return s, mu * s / (rho * s - mu)
+    e = (2.0 * mu - c * rho + root) / (2.0 * rho)
+    return mu * e / (rho * e - mu), e
 
 
 @linked
@@ -134,16 +189,15 @@ def measure(address: int) -> None:
     """KKT numbers of the problem at the present iterate, and what the error of the barrier problem is made of."""
     constraint_jacobian, constraints, counts, free = parts(address, "constraint_jacobian constraints counts free")
     full, gradient, multipliers, numbers, side_row = parts(address, "full gradient multipliers numbers side_row")
-    sides, terms = parts(address, "sides terms")
+    pairs, prices, rows, sides, terms = parts(address, "pairs prices rows sides terms")
     lower, upper, constraints, full = terms.lower, terms.upper, constraints, full
-    rho = numbers[RHO]
     gap, least, most = 0.0, math.inf, -math.inf
     for k in range(counts[SIDES]):
         multipliers[side_row[k]] = 0.0
     for k in range(counts[SIDES]):
         row, y = side_row[k], sides[Y, k]
         multipliers[row] -= sides[SIGN, k] * y
-        sy, ez = sides[S, k] * y, sides[E, k] * (rho - y)
+        sy, ez = sides[S, k] * y, sides[E, k] * (prices[row] - y)
         least, most = min(least, min(sy, ez)), max(most, max(sy, ez))
         c = sides[SIGN, k] * (constraints[row] - sides[BORDER, k])
         gap = max(gap, abs(c + sides[E, k] - sides[S, k]))
@@ -178,12 +232,19 @@ def measure(address: int) -> None:
         outside = max(value - upper[row], lower[row] - value)
         if not outside <= violation:
             violation = outside
-        if lower[row] == upper[row]:
-            gap = max(gap, abs(outside))
-        else:
+        if lower[row] != upper[row]:
             limit = upper[row] if multiplier > 0.0 else lower[row]
             slack = abs(value - limit) if math.isfinite(limit) else 1.0
             complementarity = max(complementarity, abs(multiplier) * slack)
+    if counts[ELASTIC] == 0:
+        for row in rows:
+            gap = max(gap, abs(constraints[row] - lower[row]))
+    else:
+        for k in range(len(rows)):
+            row, p, n = rows[k], pairs[P, k], pairs[N, k]
+            pz, nz = p * (prices[row] - multipliers[row]), n * (prices[row] + multipliers[row])
+            least, most = min(least, min(pz, nz)), max(most, max(pz, nz))
+            gap = max(gap, abs(constraints[row] - lower[row] - p + n))
     scale = max(1.0, size / max(1, len(constraints)) / 100.0)
     numbers[SCALE], numbers[STATIONARITY], numbers[VIOLATION] = scale, stationarity / scale, violation
     numbers[COMPLEMENTARITY], numbers[GAP], numbers[LEAST], numbers[MOST] = complementarity / scale, gap, least, most
@@ -197,11 +258,39 @@ def _error(numbers: Array) -> float:
     return error
 
 
+@compiled
+def _forces(
+    terms: Terms, free: IntArray, gradient: Array, multipliers: Array, jacobian: Array, full: Array
+) -> tuple[float, float]:
+    """Largest force of the objective on an unknown, and of all constraints if none of them balanced another."""
+    fields, columns = terms.fields, terms.columns
+    for k in range(len(full)):
+        full[k] = 0.0
+    for t in range(len(fields)):
+        term = fields[t]
+        if term[KIND] == OBJECTIVE:
+            continue
+        width, row, entry, column = term[WIDTH], term[ROW], term[ENTRY], term[COLUMN]
+        for i in range(term[COUNT]):
+            for a in range(term[ROWS]):
+                size = abs(multipliers[row + i * term[ROWS] + a])
+                for d in range(width):
+                    where = columns[column + i * width + d]
+                    if term[KIND] == BOUND:
+                        full[where] += size
+                    else:
+                        full[where] += size * abs(jacobian[entry + (i * term[ROWS] + a) * width + d])
+    pull = push = 0.0
+    for place in free:
+        pull, push = max(pull, abs(gradient[place])), max(push, full[place])
+    return pull, push
+
+
 @linked
 def begin(address: int) -> None:
     """Find the sides; choose mu, slacks and multipliers of a start that has been linearised."""
     constraints, counts, links, multipliers, numbers = parts(address, "constraints counts links multipliers numbers")
-    rows, side_row, sides, terms = parts(address, "rows side_row sides terms")
+    pairs, prices, rows, side_row, sides, terms = parts(address, "pairs prices rows side_row sides terms")
     lower, upper = terms.lower, terms.upper
     count = 0
     for row in range(len(lower)):
@@ -212,7 +301,7 @@ def begin(address: int) -> None:
                     side_row[count] = row
                     sides[SIGN, count], sides[BORDER, count] = 1.0 - 2.0 * which, limit
                     count += 1
-    counts[SIDES] = count
+    counts[SIDES], counts[ELASTIC] = count, 0
     largest = 0.0
     for row in range(len(lower)):
         largest = max(largest, abs(multipliers[row]))
@@ -220,6 +309,8 @@ def begin(address: int) -> None:
     counts[COLD] = 0 if warm else 1
     if largest > 0.5 * rho:
         rho = numbers[RHO] = 10.0 * largest
+    for row in range(len(lower)):
+        prices[row] = rho
     if warm:
         for k in range(count):
             c = sides[SIGN, k] * (constraints[side_row[k]] - sides[BORDER, k])
@@ -240,10 +331,9 @@ def begin(address: int) -> None:
         y = min(y, 0.9 * rho)
         sides[Y, k], sides[S, k], sides[E, k] = y, s, mu / (rho - y)
         sides[DS, k] = sides[DE, k] = sides[DY, k] = 0.0
-    theta = _merit(numbers, counts, sides, side_row, 0.0, constraints, 0.0)[1]
-    theta += _infeasibility(rows, lower, constraints)
+    theta = _merit(numbers, counts, sides, side_row, pairs, prices, rows, lower, 0.0, constraints, 0.0)[1]
     numbers[THETA_SMALL], numbers[THETA_LARGE] = 1e-4 * max(1.0, theta), 1e4 * max(1.0, theta)
-    counts[FILTERED] = counts[ITERATION] = counts[FAILURES] = 0
+    counts[FILTERED] = counts[FAILURES] = counts[SHORT_STEPS] = 0
     numbers[DELTA] = numbers[LAST_DELTA] = numbers[STEP] = numbers[TAKEN] = 0.0
     run(links[MEASURE], (address,))
 
@@ -252,7 +342,9 @@ def begin(address: int) -> None:
 def test(address: int) -> None:
     """Test the iterate; if there is to be a step, lower mu and measure what the line search compares with."""
     constraints, counts, links, log, numbers, rows = parts(address, "constraints counts links log numbers rows")
-    side_row, sides, terms = parts(address, "side_row sides terms")
+    constraint_jacobian, free, full, gradient, kept = parts(address, "constraint_jacobian free full gradient kept")
+    multipliers, pairs, prices, side_row, sides = parts(address, "multipliers pairs prices side_row sides")
+    terms, values = parts(address, "terms values")
     if counts[FAILURES] == 0:
         row = log[min(counts[ITERATION], len(log) - 1)]
         row[0], row[1], row[2] = numbers[COST], numbers[STATIONARITY], numbers[VIOLATION]
@@ -266,24 +358,45 @@ def test(address: int) -> None:
     if worst <= tolerance:
         counts[ANSWER] = CONVERGED
         return
+    if numbers[VIOLATION] <= tolerance:
+        counts[KEPT] = 1
+        for k in range(len(values)):
+            kept[k] = values[k]
     if counts[ITERATION] >= counts[LIMIT]:
         counts[ANSWER] = LIMIT_REACHED
         return
+    if counts[SHORT_STEPS] >= MOST_SHORT_STEPS and counts[ELASTIC] == 0 and numbers[VIOLATION] > tolerance:
+        run(links[RELAX], (address,))
     smallest = 0.1 * tolerance
-    while _error(numbers) <= KAPPA * numbers[MU] and numbers[MU] > smallest:
-        lower = min(0.2 * numbers[MU], numbers[MU] ** 1.5)
-        numbers[MU] = lower if lower > tolerance else smallest
-        counts[FILTERED] = 0
     if _error(numbers) <= KAPPA * numbers[MU] and numbers[VIOLATION] > tolerance:
-        if numbers[RHO] >= HIGHEST_PRICE:
-            counts[ANSWER] = STALLED
-            return
-        numbers[RHO] *= 10.0  # the elastic variables are too cheap
+        last = numbers[MU] <= smallest
+        bound = last  # whether something is violated because its price is too low, or because it has to be
+        if numbers[MU] <= LATE_MU * numbers[RHO] * min(numbers[VIOLATION], 1.0):
+            for k in range(counts[SIDES]):
+                bound = bound or (sides[Y, k] > AT_PRICE * prices[side_row[k]] and sides[E, k] > tolerance)
+            for k in range(len(rows) if counts[ELASTIC] == 1 else 0):
+                row, away = rows[k], max(pairs[P, k], pairs[N, k])
+                bound = bound or (abs(multipliers[row]) > AT_PRICE * prices[row] and away > tolerance)
+        if bound:
+            pull, push = _forces(terms, free, gradient, multipliers, constraint_jacobian, full)
+            run(links[MEASURE], (address,))  # it was written over
+            highest = numbers[RHO] >= HIGHEST_PRICE
+            if numbers[ASKED] < numbers[RHO] and (highest or pull <= SMALL_PULL * push):
+                numbers[ASKED], counts[ANSWER] = numbers[RHO], VIOLATED
+                return
+            if highest:
+                counts[ANSWER] = STALLED
+                return
+            numbers[RHO] *= 10.0
+            for row in range(len(prices)):
+                prices[row] *= 10.0
+            run(links[RELAX], (address,))
+    while _error(numbers) <= KAPPA * numbers[MU] and numbers[MU] > smallest:
+        less = min(0.2 * numbers[MU], numbers[MU] ** 1.5)
+        numbers[MU] = less if less > tolerance else smallest
         counts[FILTERED] = 0
-        numbers[MU] = min(100.0 * numbers[MU], 0.1)
-        run(links[MEASURE], (address,))
-    phi, theta = _merit(numbers, counts, sides, side_row, numbers[COST], constraints, 0.0)
-    theta += _infeasibility(rows, terms.lower, constraints)
+    cost, lower = numbers[COST], terms.lower
+    phi, theta = _merit(numbers, counts, sides, side_row, pairs, prices, rows, lower, cost, constraints, 0.0)
     numbers[PHI], numbers[THETA] = phi, theta
     counts[TRIALS], counts[CORRECTED], counts[ANSWER] = 0, 0, TRY
 
@@ -292,11 +405,13 @@ def test(address: int) -> None:
 def judge(address: int) -> None:
     """Filter test of a trial point: accept it, shorten the step, correct it, or ask for another direction."""
     counts, filter, links, numbers, rows, side_row = parts(address, "counts filter links numbers rows side_row")
-    sides, terms, trial_constraints = parts(address, "sides terms trial_constraints")
-    constraints = trial_constraints
+    pairs, prices, sides, terms = parts(address, "pairs prices sides terms")
+    (constraints,) = parts(address, "trial_constraints")
     alpha, theta, phi, slope = numbers[ALPHA], numbers[THETA], numbers[PHI], numbers[SLOPE]
-    phi_trial, theta_trial = _merit(numbers, counts, sides, side_row, numbers[TRIAL_COST], constraints, alpha)
-    theta_trial += _infeasibility(rows, terms.lower, constraints)
+    cost, lower = numbers[TRIAL_COST], terms.lower
+    phi_trial, theta_trial = _merit(
+        numbers, counts, sides, side_row, pairs, prices, rows, lower, cost, constraints, alpha
+    )
     finite = math.isfinite(phi_trial) and math.isfinite(theta_trial)
     slack = 1e-13 * max(1.0, abs(phi))
     switch = slope < 0.0 and alpha * (-slope) ** 2.3 > theta**1.1 and theta <= numbers[THETA_SMALL]
@@ -328,15 +443,20 @@ def judge(address: int) -> None:
     if counts[TRIALS] > HALVINGS:
         counts[FAILURES] += 1
         numbers[DELTA] = max(1e-3, 100.0 * numbers[DELTA])
-        counts[ANSWER] = STALLED if counts[FAILURES] > MOST_FAILURES else AGAIN
+        counts[ANSWER] = AGAIN
+        if counts[FAILURES] > (MOST_FAILURES if counts[ELASTIC] == 1 else FEW_FAILURES):
+            if counts[ELASTIC] == 1 or numbers[VIOLATION] <= numbers[TOLERANCE]:
+                counts[ANSWER] = STALLED
+            else:
+                run(links[RELAX], (address,))
 
 
 @linked
 def correct(address: int) -> None:
     """Solve again for the constraints as the trial found them, and keep the step in case this does not help."""
     counts, links, numbers, rests, rows, saved = parts(address, "counts links numbers rests rows saved")
-    side_row, sides, step, terms, trial_constraints = parts(address, "side_row sides step terms trial_constraints")
-    constraints = trial_constraints
+    pairs, side_row, sides, step, terms = parts(address, "pairs side_row sides step terms")
+    (constraints,) = parts(address, "trial_constraints")
     alpha = numbers[ALPHA]
     for k in range(len(step)):
         saved[k] = step[k]
@@ -346,8 +466,12 @@ def correct(address: int) -> None:
         c = sides[SIGN, k] * (constraints[side_row[k]] - sides[BORDER, k])
         s, e = sides[S, k] + alpha * sides[DS, k], sides[E, k] + alpha * sides[DE, k]
         sides[REST, k] = alpha * sides[REST, k] + c + e - s
-    for row in rows:
+    for k in range(len(rows)):
+        row = rows[k]
         rests[row] = alpha * rests[row] + constraints[row] - terms.lower[row]
+        if counts[ELASTIC] == 1:
+            pairs[SAVED_DP, k], pairs[SAVED_DN, k] = pairs[DP, k], pairs[DN, k]
+            rests[row] += pairs[N, k] + alpha * pairs[DN, k] - pairs[P, k] - alpha * pairs[DP, k]
     run(links[STEER], (address,))
     numbers[SLOPE] = numbers[SAVED_SLOPE]
     counts[CORRECTED] = 1
@@ -356,12 +480,15 @@ def correct(address: int) -> None:
 @linked
 def restore(address: int) -> None:
     """Go back to the step before its correction."""
-    counts, numbers, saved, sides, step = parts(address, "counts numbers saved sides step")
+    counts, numbers, pairs, saved, sides, step = parts(address, "counts numbers pairs saved sides step")
     for k in range(len(step)):
         step[k] = saved[k]
     numbers[ALPHA], numbers[ALPHA_DUAL] = numbers[SAVED_ALPHA], numbers[SAVED_DUAL]
     for k in range(counts[SIDES]):
         sides[DY, k], sides[DS, k], sides[DE, k] = sides[SAVED_DY, k], sides[SAVED_DS, k], sides[SAVED_DE, k]
+    if counts[ELASTIC] == 1:
+        for k in range(pairs.shape[1]):
+            pairs[DP, k], pairs[DN, k] = pairs[SAVED_DP, k], pairs[SAVED_DN, k]
     counts[CORRECTED] = 0
 
 
@@ -369,26 +496,61 @@ def restore(address: int) -> None:
 def accept(address: int) -> None:
     """Move multipliers and slacks and, unless the step was one of descent, remember where it came from."""
     counts, filter, free, multipliers, numbers, rows = parts(address, "counts filter free multipliers numbers rows")
-    side_row, sides, step, trial_constraints = parts(address, "side_row sides step trial_constraints")
+    pairs, prices, side_row, sides, step = parts(address, "pairs prices side_row sides step")
+    (trial_constraints,) = parts(address, "trial_constraints")
     alpha, dual, n = numbers[ALPHA], numbers[ALPHA_DUAL], len(free)
-    mu, rho = numbers[MU], numbers[RHO]
+    mu = numbers[MU]
     total = 0.0
     for k in range(n):
         total += step[k] ** 2
+    elastic = counts[ELASTIC] == 1
     for k in range(len(rows)):
-        multipliers[rows[k]] += alpha * step[n + k]
+        row = rows[k]
+        multipliers[row] += (dual if elastic else alpha) * step[n + k]
+        if elastic:
+            for which in range(2):
+                pairs[P + which, k] += alpha * pairs[DP + which, k]
+            over, under = 1e-10 * mu / pairs[P, k], 1e-10 * mu / pairs[N, k]
+            multipliers[row] = min(max(multipliers[row], under - prices[row]), prices[row] - over)
+            pairs[DP, k] = pairs[DN, k] = 0.0
     for k in range(counts[SIDES]):
         s, e = sides[S, k] + alpha * sides[DS, k], sides[E, k] + alpha * sides[DE, k]
         c = sides[SIGN, k] * (trial_constraints[side_row[k]] - sides[BORDER, k])
         s = max(s, c + e)  # a longer slack costs nothing
         y = sides[Y, k] + dual * sides[DY, k]
         y = min(max(y, 1e-10 * mu / s), 1e10 * mu / s)  # eq. 16
-        sides[Y, k], sides[S, k], sides[E, k] = min(y, rho - 1e-10 * mu / e), s, e
+        sides[Y, k], sides[S, k], sides[E, k] = min(y, prices[side_row[k]] - 1e-10 * mu / e), s, e
         sides[DS, k] = sides[DE, k] = 0.0
     if counts[DESCENT] == 0 and counts[FILTERED] < FILTER:
         filter[counts[FILTERED], 0] = (1.0 - GAMMA_THETA) * numbers[THETA]
         filter[counts[FILTERED], 1] = numbers[PHI] - GAMMA_PHI * numbers[THETA]
         counts[FILTERED] += 1
     numbers[STEP], numbers[TAKEN] = alpha * math.sqrt(total), alpha
+    counts[SHORT_STEPS] = counts[SHORT_STEPS] + 1 if alpha < SHORT_STEP else 0
     counts[ITERATION] += 1
     counts[FAILURES] = 0
+
+
+@linked
+def relax(address: int) -> None:
+    """Make the equalities elastic: what the iterate violates is paid for, and the path to the answer begins anew."""
+    constraints, counts, links, multipliers, numbers = parts(address, "constraints counts links multipliers numbers")
+    pairs, prices, rows, side_row, sides, terms = parts(address, "pairs prices rows side_row sides terms")
+    counts[ELASTIC], counts[FILTERED], counts[FAILURES], counts[SHORT_STEPS] = 1, 0, 0, 0
+    numbers[DELTA] = numbers[LAST_DELTA] = 0.0
+    mu = numbers[MU] = max(numbers[MU], RELAXED_MU * numbers[RHO] * min(numbers[VIOLATION], 1.0))
+    for k in range(counts[SIDES]):
+        row = side_row[k]
+        c = sides[SIGN, k] * (constraints[row] - sides[BORDER, k])
+        s, e = _split(c, prices[row], mu)
+        sides[S, k], sides[E, k], sides[Y, k] = s, e, mu / s
+        sides[DS, k] = sides[DE, k] = sides[DY, k] = 0.0
+    for k in range(len(rows)):
+        row = rows[k]
+        p, n = _split(constraints[row] - terms.lower[row], 2.0 * prices[row], mu)
+        # p (price - multiplier) = mu and n (price + multiplier) = mu
+        multipliers[row] = prices[row] - mu / p if p > n else mu / n - prices[row]
+        pairs[P, k], pairs[N, k], pairs[DP, k], pairs[DN, k] = p, n, 0.0, 0.0
+    run(links[MEASURE], (address,))
+    theta = _merit(numbers, counts, sides, side_row, pairs, prices, rows, terms.lower, 0.0, constraints, 0.0)[1]
+    numbers[THETA_LARGE] = max(numbers[THETA_LARGE], 1e4 * max(1.0, theta))

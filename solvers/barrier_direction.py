@@ -11,6 +11,7 @@ from unifg.elimination.plan import NEGATIVE
 from unifg.jit import compiled
 from unifg.solvers.barrier_links import holds, linked, parts, run
 from unifg.solvers.barrier_state import (
+    AGAIN,
     ALPHA,
     ALPHA_DUAL,
     ANSWER,
@@ -18,8 +19,11 @@ from unifg.solvers.barrier_state import (
     COLD,
     DE,
     DELTA,
+    DN,
+    DP,
     DS,
     DY,
+    ELASTIC,
     EXACT,
     FACTOR,
     FAILURES,
@@ -27,8 +31,8 @@ from unifg.solvers.barrier_state import (
     ITERATION,
     LAST_DELTA,
     MU,
+    RELAX,
     REST,
-    RHO,
     SIDES,
     SIGN,
     SINGULAR,
@@ -36,9 +40,13 @@ from unifg.solvers.barrier_state import (
     SOLVE,
     STEER,
     TAKEN,
+    TOLERANCE,
     TRY,
+    VIOLATION,
     WEIGHT,
     E,
+    N,
+    P,
     S,
     Y,
 )
@@ -136,19 +144,24 @@ def direct(address: int) -> None:
     constraint_jacobian, constraints, counts = parts(address, "constraint_jacobian constraints counts")
     curvature, data, doubles, entries, free, hessian = parts(address, "curvature data doubles entries free hessian")
     links, numbers, plan, rests, row_weights, rows = parts(address, "links numbers plan rests row_weights rows")
-    shift, side_row, sides, step, terms, unequal = parts(address, "shift side_row sides step terms unequal")
-    rho = numbers[RHO]
+    pairs, prices, shift, side_row, sides = parts(address, "pairs prices shift side_row sides")
+    multipliers, step, terms, unequal = parts(address, "multipliers step terms unequal")
     n, equalities, normal = len(free), len(rows), len(hessian)
     for row in range(len(row_weights)):
         row_weights[row] = 0.0
     for k in range(counts[SIDES]):
         row, y = side_row[k], sides[Y, k]
-        weight = 1.0 / (sides[S, k] / y + sides[E, k] / (rho - y))
+        weight = 1.0 / (sides[S, k] / y + sides[E, k] / (prices[row] - y))
         sides[WEIGHT, k] = weight
         row_weights[row] += weight
         sides[REST, k] = sides[SIGN, k] * (constraints[row] - sides[BORDER, k]) + sides[E, k] - sides[S, k]
-    for row in rows:
-        rests[row] = constraints[row] - terms.lower[row]
+    for k in range(equalities):
+        row = rows[k]
+        rests[row], shift[n + k] = constraints[row] - terms.lower[row], -DUAL_SHIFT
+        if counts[ELASTIC] == 1:
+            p, q, multiplier = pairs[P, k], pairs[N, k], multipliers[row]
+            rests[row] += q - p
+            shift[n + k] -= p / (prices[row] - multiplier) + q / (prices[row] + multiplier)
     # Second derivatives need multipliers, and those of a cold start mean little.
     exact = counts[EXACT] == 1 and counts[FAILURES] < 2 and (counts[ITERATION] > 0 or counts[COLD] == 0)
     share = 1.0 if exact else 0.0  # of the second derivatives
@@ -159,8 +172,6 @@ def direct(address: int) -> None:
     _condense(terms, unequal, row_weights, constraint_jacobian, data)
     for k in range(len(doubles) // 2):
         data[doubles[2 * k]] += data[doubles[2 * k + 1]]
-    for k in range(equalities):
-        shift[n + k] = -DUAL_SHIFT
     delta = numbers[DELTA] if counts[FAILURES] > 0 else 0.0
     # Less of the second derivatives may mean less curvature, and a step that was cut very short had too little.
     blend = numbers[TAKEN] > SHORT or counts[ITERATION] == 0
@@ -190,6 +201,9 @@ def direct(address: int) -> None:
             delta *= FIRST_GROWTH if numbers[LAST_DELTA] == 0.0 else SHIFT_GROWTH
         if delta > LARGEST_SHIFT:
             counts[ANSWER] = SINGULAR
+            if counts[ELASTIC] == 0 and numbers[VIOLATION] > numbers[TOLERANCE]:
+                run(links[RELAX], (address,))
+                counts[ANSWER] = AGAIN
             return
     numbers[DELTA] = delta
     if delta > 0.0:
@@ -202,20 +216,24 @@ def steer(address: int) -> None:
     constraint_jacobian, counts, free, full = parts(address, "constraint_jacobian counts free full")
     gradient, links, numbers, plan, rests, right = parts(address, "gradient links numbers plan rests right")
     row_terms, rows, side_row, sides, step = parts(address, "row_terms rows side_row sides step")
-    terms, unequal = parts(address, "terms unequal")
-    mu, rho = numbers[MU], numbers[RHO]
+    multipliers, pairs, prices, terms, unequal = parts(address, "multipliers pairs prices terms unequal")
+    mu, elastic = numbers[MU], counts[ELASTIC] == 1
     n = len(free)
     for row in range(len(row_terms)):
         row_terms[row] = 0.0
     for k in range(counts[SIDES]):
-        y = sides[Y, k]
-        r = sides[REST, k] + sides[S, k] - sides[E, k] + mu / (rho - y) - mu / y
-        row_terms[side_row[k]] += sides[SIGN, k] * sides[WEIGHT, k] * r
+        row, y = side_row[k], sides[Y, k]
+        r = sides[REST, k] + sides[S, k] - sides[E, k] + mu / (prices[row] - y) - mu / y
+        row_terms[row] += sides[SIGN, k] * sides[WEIGHT, k] * r
     for k in range(n):
         right[k] = -full[free[k]]
     _pull(terms, unequal, row_terms, constraint_jacobian, right)
     for k in range(len(rows)):
-        right[n + k] = -rests[rows[k]]
+        row = rows[k]
+        right[n + k] = -rests[row]
+        if elastic:
+            over, under = prices[row] - multipliers[row], prices[row] + multipliers[row]
+            right[n + k] += pairs[N, k] - pairs[P, k] + mu / over - mu / under
     run(links[SOLVE], (plan, right, step))
     _moves(terms, unequal, step, constraint_jacobian, row_terms)
     slope = 0.0
@@ -225,16 +243,26 @@ def steer(address: int) -> None:
     primal = dual = 0.0  # inverse step lengths
     for k in range(counts[SIDES]):
         s, e, y = sides[S, k], sides[E, k], sides[Y, k]
-        z = rho - y
-        move = sides[SIGN, k] * row_terms[side_row[k]]
+        row = side_row[k]
+        z = prices[row] - y
+        move = sides[SIGN, k] * row_terms[row]
         r = sides[REST, k] + s - e + mu / z - mu / y
         dy = -(move + r) * sides[WEIGHT, k]
         ds = mu / y - s - s / y * dy
         de = mu / z - e + e / z * dy
         sides[DY, k], sides[DS, k], sides[DE, k] = dy, ds, de
-        slope += rho * de - mu * (ds / s + de / e)
+        slope += prices[row] * de - mu * (ds / s + de / e)
         primal = max(primal, max(-ds / s, -de / e))
         dual = max(dual, max(-dy / y, dy / z))
+    if elastic:
+        for k in range(len(rows)):
+            row, p, q, move = rows[k], pairs[P, k], pairs[N, k], step[n + k]
+            over, under = prices[row] - multipliers[row], prices[row] + multipliers[row]
+            dp, dn = mu / over - p + p / over * move, mu / under - q - q / under * move
+            pairs[DP, k], pairs[DN, k] = dp, dn
+            slope += prices[row] * (dp + dn) - mu * (dp / p + dn / q)
+            primal = max(primal, max(-dp / p, -dn / q))
+            dual = max(dual, max(move / over, -move / under))
     numbers[SLOPE] = slope
     numbers[ALPHA] = min(1.0, limit / primal) if primal > 0.0 else 1.0
     numbers[ALPHA_DUAL] = min(1.0, limit / dual) if dual > 0.0 else 1.0

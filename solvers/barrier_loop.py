@@ -30,12 +30,14 @@ from unifg.solvers.barrier_state import (
     EVALUATE,
     EXACT,
     FACTOR,
+    GOING_ON,
     ITERATION,
     JUDGE,
     LINEARIZE,
     LINKS,
     LOOP,
     MEASURE,
+    RELAX,
     RESTORE,
     RETRACT,
     SOLVE,
@@ -94,44 +96,44 @@ def loop(address: int) -> None:
     curvature, gradient, hessian, jacobian, links = parts(address, "curvature gradient hessian jacobian links")
     multipliers, norms, numbers, residual, scratch = parts(address, "multipliers norms numbers residual scratch")
     squares, terms, trial, values = parts(address, "squares terms trial values")
-    started = False
+    moved, started = True, counts[GOING_ON] == 1
     while True:
-        fill(gradient, 0.0)
-        fill(hessian, 0.0)
-        numbers[COST] = number(
-            links[LINEARIZE],
-            (
-                terms,
-                values,
-                False,
-                residual,
-                jacobian,
-                constraints,
-                constraint_jacobian,
-                squares,
-                norms,
-                gradient,
-                hessian,
-                scratch,
-            ),
-        )
-        run(links[MEASURE if started else BEGIN], (address,))
-        started = True
+        if moved:
+            fill(gradient, 0.0)
+            fill(hessian, 0.0)
+            numbers[COST] = number(
+                links[LINEARIZE],
+                (
+                    terms,
+                    values,
+                    False,
+                    residual,
+                    jacobian,
+                    constraints,
+                    constraint_jacobian,
+                    squares,
+                    norms,
+                    gradient,
+                    hessian,
+                    scratch,
+                ),
+            )
+            run(links[MEASURE if started else BEGIN], (address,))
+            started = True
         run(links[TEST], (address,))
-        wanted = counts[EXACT] == 1 and (counts[ITERATION] > 0 or counts[COLD] == 0)
-        if wanted and counts[ANSWER] == TRY:
-            copy(hessian, curvature)
-            run(links[CURVE], (terms, values, residual, multipliers, curvature))
-        while counts[ANSWER] == TRY:
+        if counts[ANSWER] == TRY:
+            if counts[EXACT] == 1 and (counts[ITERATION] > 0 or counts[COLD] == 0):
+                copy(hessian, curvature)
+                run(links[CURVE], (terms, values, residual, multipliers, curvature))
             run(links[DIRECT], (address,))
-            while counts[ANSWER] == TRY:
-                run(links[ADVANCE], (address,))
-                run(links[JUDGE], (address,))
-            if counts[ANSWER] == AGAIN:
-                run(links[TEST], (address,))
-        if counts[ANSWER] != ACCEPTED:
+        while counts[ANSWER] == TRY:
+            run(links[ADVANCE], (address,))
+            run(links[JUDGE], (address,))
+        moved = counts[ANSWER] == ACCEPTED
+        if moved:
+            copy(trial, values)
+        elif counts[ANSWER] != AGAIN:
             return
-        copy(trial, values)
 
 
 @cache
@@ -158,6 +160,7 @@ def addresses() -> IntArray:
         TEST: barrier.test,
         JUDGE: barrier.judge,
         CORRECT: barrier.correct,
+        RELAX: barrier.relax,
         RESTORE: barrier.restore,
         ACCEPT: barrier.accept,
         DIRECT: barrier_direction.direct,

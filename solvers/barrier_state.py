@@ -38,8 +38,9 @@ from unifg.typing import Array, IntArray
     SAVED_SLOPE,  # of the step that a correction replaces
     SAVED_ALPHA,
     SAVED_DUAL,
+    ASKED,  # price at which it was asked whether the violation is the least
     FLOATS,
-) = range(27)
+) = range(28)
 # Places in Work.counts.
 (
     ANSWER,  # of the last call, one of the words below
@@ -54,8 +55,12 @@ from unifg.typing import Array, IntArray
     GAUSS_NEWTON,  # whether the present direction used the Gauss-Newton Hessian
     COLD,  # whether the start had no multipliers
     DESCENT,  # whether the last trial was accepted because it lowers the barrier function
+    ELASTIC,  # whether equalities are elastic, as inequalities always are
+    GOING_ON,  # whether slacks and multipliers are there: the solve goes on where it was
+    KEPT,  # whether an iterate kept all constraints
+    SHORT_STEPS,  # in a row
     INTEGERS,
-) = range(13)
+) = range(17)
 # Rows of Work.sides.
 (
     SIGN,  # +1 for a lower limit, -1 for an upper one
@@ -74,13 +79,24 @@ from unifg.typing import Array, IntArray
     SIDE_ROWS,
 ) = range(14)
 
+# Rows of Work.pairs: what makes an equality row elastic, h = p - n.
+(
+    P,
+    N,
+    DP,
+    DN,
+    SAVED_DP,
+    SAVED_DN,
+    PAIR_ROWS,
+) = range(7)
+
 # What a call answers.
-TRY, ACCEPTED, AGAIN, CONVERGED, LIMIT_REACHED, SINGULAR, STALLED, NOT_FINITE = range(8)
+TRY, ACCEPTED, AGAIN, CONVERGED, LIMIT_REACHED, SINGULAR, STALLED, NOT_FINITE, VIOLATED = range(9)
 # Places in Problem.links.
 (
     FACTOR, SOLVE, LINEARIZE, EVALUATE, CURVE, RETRACT, BEGIN, MEASURE, TEST, DIRECT, STEER, ADVANCE, JUDGE, CORRECT,
-    RESTORE, ACCEPT, LOOP, LINKS,
-) = range(18)  # fmt: skip
+    RESTORE, ACCEPT, RELAX, LOOP, LINKS,
+) = range(19)  # fmt: skip
 
 FILTER = 400  # pairs of theta and phi that are remembered
 
@@ -120,6 +136,9 @@ class Work(NamedTuple):
         numbers, counts: scalars, by the names above.
         sides: (SIDE_ROWS, 2 M) one column for each finite limit of an inequality row.
         side_row: (2 M,) its row.
+        pairs: (PAIR_ROWS, E) one column for each equality row.
+        prices: (M,) of the elastic variables of a row.
+        kept: stored values of the last iterate that kept all constraints.
         values, trial: stored values of the present iterate and of a trial.
         move: (n,) tangent step to the trial.
         spread: (width,) the same over the full tangent space.
@@ -144,6 +163,9 @@ class Work(NamedTuple):
     counts: IntArray
     sides: Array
     side_row: IntArray
+    pairs: Array
+    prices: Array
+    kept: Array
     values: Array
     trial: Array
     move: Array
@@ -198,6 +220,9 @@ def empty_work(
         counts=np.zeros(INTEGERS, dtype=np.int64),
         sides=np.zeros((SIDE_ROWS, max(2 * constraints, 1))),
         side_row=np.zeros(max(2 * constraints, 1), dtype=np.int64),
+        pairs=np.zeros((PAIR_ROWS, max(equalities, 1))),
+        prices=np.zeros(constraints),
+        kept=np.zeros(stored),
         values=np.zeros(stored),
         trial=np.zeros(stored),
         move=np.zeros(unknowns),

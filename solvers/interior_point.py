@@ -23,9 +23,10 @@ from unifg.solvers.barrier_links import memory
 from unifg.solvers.barrier_loop import addresses, call
 from unifg.solvers.barrier_state import Problem, Work, empty_work
 from unifg.solvers.kkt_system import KktSystem, stacked
-from unifg.solvers.least_violation import settle
+from unifg.solvers.least_violation import nearest
 from unifg.status import Status
 from unifg.table import CONSTRAINT, COUNT, KIND, ROW, ROWS
+from unifg.typing import Array
 
 ENDINGS = {
     state.CONVERGED: Status.CONVERGED,
@@ -33,9 +34,11 @@ ENDINGS = {
     state.SINGULAR: Status.SINGULAR,
     state.STALLED: Status.STALLED,
     state.NOT_FINITE: Status.NOT_FINITE,
+    state.VIOLATED: Status.STALLED,
 }
 NO_ANSWER = -1
-STUCK = (Status.STALLED, Status.SINGULAR)
+STUCK = (state.STALLED, state.SINGULAR, state.VIOLATED)
+RESTARTS = 3  # from points that violate less than where the method came to a halt
 
 
 @dataclass(kw_only=True)
@@ -72,26 +75,58 @@ class InteriorPoint(Solver):
         return Workspace(program)
 
     def iterate(self, run: Run, workspace: Workspace) -> Status | None:
-        """Iterate to convergence."""
-        work = workspace.prepare(run, self)
-        if not run.alone:
-            ending = self._guided(run, workspace)
-            return settle(run, ending) if ending in STUCK else ending
+        """Iterate to convergence; where that is not to be had, to a point of least violation, or on from another."""
+        counts = workspace.prepare(run, self).counts
+        restarts = 0
+        while True:
+            reason = self._alone(run, workspace) if run.alone else self._guided(run, workspace)
+            if counts[state.ANSWER] not in STUCK or run.status not in (None, Status.ITERATION_LIMIT):
+                return reason
+            if run.optimality.violation <= run.tolerance:
+                return reason
+            found = run.lin
+            if not run.has_been_feasible:
+                found, least = nearest(run)
+                if least:
+                    run.begin_at(found)
+                    run.status = Status.LOCALLY_INFEASIBLE
+                    return run.status
+            if restarts == RESTARTS or counts[state.ITERATION] >= self.max_iterations or run.out_of_time:
+                return reason
+            if counts[state.ANSWER] == state.VIOLATED:  # the price was too low
+                counts[state.GOING_ON] = 1
+            elif run.has_been_feasible or _largest(run.program.violation(found.constraints)) <= run.tolerance:
+                workspace.begin_at(run.least_violated.flat if run.has_been_feasible else found.values.flat, self)
+                restarts += 1
+            else:
+                return reason
+            run.status = None
+
+    def _alone(self, run: Run, workspace: Workspace) -> Status:
+        """The compiled loop."""
+        work = workspace.work
         interrupted = workspace.loop()
         lin, iterations = workspace.found(), int(work.counts[state.ITERATION])
+        if work.counts[state.KEPT] and work.numbers[state.VIOLATION] > run.tolerance:
+            run.begin_at(run.program.linearize(run.program.columns.view(work.kept.copy())))
         run.conclude(lin, work.multipliers.copy(), iterations, _history(work, lin.norms, run.seconds))
         ending = ENDINGS[int(work.counts[state.ANSWER])]
         if interrupted:
             run.status = ending if ending is Status.CONVERGED else Status.INTERRUPTED
-        return settle(run, ending) if ending in STUCK else ending
+        return ending
 
     def _guided(self, run: Run, workspace: Workspace) -> Status | None:
         """The same loop, with every evaluation made by the program and every iterate shown."""
         program, work = run.program, workspace.work
         numbers, counts = work.numbers, work.counts
         lin = run.lin
+        if not np.array_equal(lin.values.flat, work.values):
+            run.begin_at(program.linearize(program.columns.view(work.values.copy())))
+            lin = run.lin
+            if run.status is not None:
+                return None
         workspace.take(lin)
-        workspace.call(state.BEGIN)
+        workspace.call(state.MEASURE if counts[state.GOING_ON] else state.BEGIN)
         while True:
             workspace.call(state.TEST)
             if counts[state.ANSWER] == state.TRY:
@@ -197,13 +232,20 @@ class Workspace:
             self._describe()
         work = self.work
         numbers, counts = work.numbers, work.counts
-        work.values[:], work.multipliers[:] = run.values.flat, run.multipliers
-        numbers[state.MU], numbers[state.TOLERANCE] = options.barrier, run.tolerance
-        if run.program.least_squares:  # its test has no absolute tolerance
-            numbers[state.TOLERANCE] = 0.0
-        numbers[state.RHO] = options.price
+        # The test of least squares has no absolute tolerance.
+        numbers[state.TOLERANCE] = 0.0 if run.program.least_squares else run.tolerance
+        numbers[state.RHO], numbers[state.ASKED] = options.price, 0.0
+        counts[state.ITERATION], counts[state.KEPT] = 0, 0
         counts[state.LIMIT], counts[state.EXACT] = options.max_iterations, options.hessian == "exact"
+        self.begin_at(run.values.flat, options)
+        work.multipliers[:] = run.multipliers
         return work
+
+    def begin_at(self, values: Array, options: InteriorPoint) -> None:
+        """Go on from other values, about whose multipliers nothing is known."""
+        work = self.work
+        work.values[:], work.multipliers[:] = values, 0.0
+        work.numbers[state.MU], work.counts[state.GOING_ON] = options.barrier, 0
 
     def found(self) -> Linearization:
         """The linearisation at which the compiled loop ended."""
@@ -225,7 +267,7 @@ class Workspace:
     def take(self, lin: Linearization) -> None:
         """Copy a linearisation to where the compiled functions look for it."""
         work = self.work
-        work.numbers[state.COST] = lin.cost
+        work.numbers[state.COST], work.values[:] = lin.cost, lin.values.flat
         work.residual[:], work.jacobian[:] = lin.residual, lin.jacobian
         work.constraints[:], work.constraint_jacobian[:] = lin.constraints, lin.constraint_jacobian
         work.gradient[:], work.hessian[:] = lin.gradient, lin.hessian
@@ -246,6 +288,10 @@ def _history(work: Work, norms: dict[str, float], seconds: float) -> Callable[[]
         return made
 
     return rows
+
+
+def _largest(violation: Array) -> float:
+    return float(np.abs(violation).max(initial=0.0))
 
 
 def _details(mu: float, delta: float, gauss_newton: float) -> dict[str, float | int | str]:

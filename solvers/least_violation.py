@@ -34,17 +34,24 @@ def settle(run: Run, status: Status) -> Status:
     """
     if run.status is not None or run.has_been_feasible:
         return status
+    found, least = nearest(run)
+    if least:
+        run.begin_at(found)
+        run.status = status = Status.LOCALLY_INFEASIBLE
+    return status
+
+
+def nearest(run: Run) -> tuple[Linearization, bool]:
+    """Where descent on the violation from the present iterate ends, and whether nothing near that violates less."""
     found = run.lin
     if not run.infeasible_stationary():
         found = least_violation(run.program, run.lin, run.tolerance, lambda: run.out_of_time)
     while infeasible_stationary(run.program, found, run.tolerance):
-        run.begin_at(found)
         lower = _downhill(run, found)
         if lower is None:
-            run.status = Status.LOCALLY_INFEASIBLE
-            return run.status
+            return found, True
         found = lower
-    return status
+    return found, False
 
 
 def leave(run: Run) -> Status | None:

@@ -137,7 +137,7 @@ def test_control_c_while_a_stalled_solve_is_settled(monkeypatch: pytest.MonkeyPa
     def pressed(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("unifg.solvers.interior_point.settle", pressed)
+    monkeypatch.setattr("unifg.solvers.interior_point.nearest", pressed)
     solution = run.solve(guess)
     assert solution.status is fg.Status.INTERRUPTED
     assert solution.violation < 11.0
