@@ -18,7 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 import unifg as fg
-from benchmarks import control_loops, control_pieces, control_starts
+from benchmarks import compiled_peers, control_loops, control_pieces, control_starts
 from benchmarks.control_problems import Problem, problems
 from benchmarks.report import CHECKOUT, OUT, machine, put_results, table
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
@@ -26,7 +26,8 @@ from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 TOLERANCE = 1e-4
 SAME = 1e-4  # relative difference below which two costs are one optimum
 SLOW = 300.0  # [ms]; a slower solve is not repeated
-PEERS = ("ipopt", "fatrop")
+PEERS = ("ipopt", "fatrop", "fatrop, compiled")
+"""The last one with its functions in machine code, the others in the virtual machine of casadi."""
 SOLVERS: dict[str, fg.Solver] = {
     "ipm": InteriorPoint(tolerance=TOLERANCE),
     "sqp": SQP(tolerance=TOLERANCE),
@@ -82,11 +83,12 @@ def attempt(solver: fg.Solver, problem: Problem) -> Callable[[Outcome], None]:
     return solve
 
 
-def attempt_peer(problem: Problem, plugin: str) -> Callable[[Outcome], None]:
-    """A cold solve through casadi: expressions built and differentiated before."""
+def attempt_peer(problem: Problem, name: str) -> Callable[[Outcome], None]:
+    """A cold solve through casadi: expressions built, differentiated and, if so named, compiled before."""
     from benchmarks.control_peers import peer
 
-    solver = peer(problem, plugin, tol=TOLERANCE)
+    plugin, _, compiled = name.partition(", ")
+    solver = peer(problem, plugin, compiled=bool(compiled), tol=TOLERANCE)
     guess = problem.guess()
 
     def solve(outcome: Outcome) -> None:
@@ -96,11 +98,16 @@ def attempt_peer(problem: Problem, plugin: str) -> Callable[[Outcome], None]:
     return solve
 
 
+def runnable() -> tuple[str, ...]:
+    """Those this machine can run."""
+    return PEERS if compiled_peers.COMPILER else PEERS[:-1]
+
+
 def measure(problem: Problem, rounds: int) -> dict[str, Outcome]:
     """Solve a problem with every solver in turn, ``rounds`` times after one that is not counted."""
     attempts = {name: attempt(solver, problem) for name, solver in SOLVERS.items()}
     if find_spec("casadi") is not None:
-        attempts |= {name: attempt_peer(problem, name) for name in PEERS}
+        attempts |= {name: attempt_peer(problem, name) for name in runnable()}
     outcomes = {name: Outcome() for name in attempts}
     for solve in attempts.values():
         solve(Outcome())
@@ -114,7 +121,7 @@ def measure(problem: Problem, rounds: int) -> dict[str, Outcome]:
 def render(results: dict[Problem, dict[str, Outcome]], rounds: int) -> str:
     """The cold solves as Markdown."""
     names = list(dict.fromkeys(name for outcomes in results.values() for name in outcomes))
-    peers = [name for name in names if name in PEERS]
+    peers = [name for name in PEERS if name in names]
     head = ("case", "solver", "optimum", "cost", "listed", "iterations", "ms", *(f"times {peer}" for peer in peers))
     lines = []
     ratios: dict[tuple[str, str], list[float]] = {}
@@ -123,7 +130,7 @@ def render(results: dict[Problem, dict[str, Outcome]], rounds: int) -> str:
             own = []
             for peer in peers:
                 value = outcome.median / outcomes[peer].median
-                counts = outcome.status == outcomes[peer].status == "converged" and name not in PEERS
+                counts = outcome.status == outcomes[peer].status == "converged" and name not in (peer, *PEERS[:-1])
                 if counts:
                     ratios.setdefault((name, peer), []).append(value)
                 own.append(f"{value:.2f}" if counts else "-")
@@ -156,7 +163,9 @@ def render(results: dict[Problem, dict[str, Outcome]], rounds: int) -> str:
         f"Cold: from the listed guess, tolerance {TOLERANCE:.0e} of every solver, median processor time of {rounds} "
         f"interleaved solves (one where it took more than {SLOW:.0f} ms). The cost of an interior point is above the "
         "optimum by about the tolerance times the number of active limits; listed optima were found at 1e-9. Same "
-        f"optimum: within {SAME:.0e}. {machine('numpy', 'numba', *(('casadi',) if peers else ()))}"
+        f"optimum: within {SAME:.0e}. Our residuals are shipped kernels, which bring their derivatives; fatrop runs in "
+        f"casadi's virtual machine and compiled ({compiled_peers.described()}), IPOPT in the virtual machine. "
+        f"{machine('numpy', 'numba', *(('casadi',) if peers else ()))}"
     )
     return "\n\n".join([summary, table(head, lines, text=3), notes])
 

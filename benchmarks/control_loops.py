@@ -10,6 +10,7 @@ from importlib.util import find_spec
 import numpy as np
 
 import unifg as fg
+from benchmarks import compiled_peers
 from benchmarks.closed_loop import WARM_IPOPT, Driver, Loop
 from benchmarks.control_problems import Problem, Quadrotor, Unicycle
 from benchmarks.report import table
@@ -98,6 +99,8 @@ def drivers(problem: Problem) -> dict[str, tuple[Driver, Callable[[], float]]]:
 
         found["ipopt"] = warm(problem, "ipopt", tol=TOLERANCE, mu_init=1e-3, **WARM_IPOPT)
         found["fatrop"] = warm(problem, "fatrop", tol=TOLERANCE, mu_init=1e-3)
+        if compiled_peers.COMPILER:
+            found["fatrop, compiled"] = warm(problem, "fatrop", compiled=True, tol=TOLERANCE, mu_init=1e-3)
     return found
 
 
@@ -129,7 +132,8 @@ def render(results: Mapping[Problem, Mapping[str, Drive]]) -> str:
     """A table and what it means."""
     head = (
         "closed loop", "solver", "median [ms]", "p99 [ms]", "iterations, median", "mean", "most", "failures",
-        "cost", "penetration [mm]", "times ipopt", "times fatrop", "repeated [ms]", "times fatrop, repeated",
+        "cost", "penetration [mm]", "times ipopt", "times fatrop", "times fatrop, compiled", "repeated [ms]",
+        "times fatrop, repeated",
     )  # fmt: skip
     lines = []
     for problem, loops in results.items():
@@ -137,9 +141,9 @@ def render(results: Mapping[Problem, Mapping[str, Drive]]) -> str:
             median = float(np.median(loop.times))
             ratios = [
                 f"{median / float(np.median(loops[peer].times)):.2f}"
-                if peer in loops and name not in ("ipopt", "fatrop")
+                if peer in loops and name not in (peer, "ipopt", "fatrop")
                 else "-"
-                for peer in ("ipopt", "fatrop")
+                for peer in ("ipopt", "fatrop", "fatrop, compiled")
             ]
             repeated = float(np.median(loop.repeated))
             peer = "fatrop" in loops and name not in ("ipopt", "fatrop")

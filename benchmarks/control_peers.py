@@ -14,20 +14,22 @@ from unifg.models.quadrotor import GRAVITY
 from unifg.typing import Array
 
 
-def peer(problem: Problem, plugin: str, **options: Any) -> UnicyclePeer | QuadrotorPeer:
-    """The expressions of a problem, built and differentiated."""
-    if isinstance(problem, Unicycle):
-        return UnicyclePeer(problem, plugin, **options)
-    return QuadrotorPeer(problem, plugin, **options)
+def peer(problem: Problem, plugin: str, compiled: bool = False, **options: Any) -> UnicyclePeer | QuadrotorPeer:
+    """The expressions of a problem, built and differentiated; in casadi's virtual machine unless ``compiled``."""
+    kind = UnicyclePeer if isinstance(problem, Unicycle) else QuadrotorPeer
+    built: UnicyclePeer | QuadrotorPeer = kind(problem, plugin, **options)  # type: ignore[arg-type]
+    if compiled:
+        built.compile()
+    return built
 
 
-def warm(problem: Problem, plugin: str, **options: Any) -> tuple[closed_loop.Driver, Callable[[], float]]:
+def warm(
+    problem: Problem, plugin: str, compiled: bool = False, **options: Any
+) -> tuple[closed_loop.Driver, Callable[[], float]]:
     """The same, driven in a loop with its own shifted answers; and what repeats its last solve."""
-    if isinstance(problem, Unicycle):
-        planar = UnicyclePeer(problem, plugin, **options)
-        return closed_loop.Warm(planar), planar.again
-    spatial = QuadrotorPeer(problem, plugin, **options)
-    return Warm(spatial), spatial.again
+    built = peer(problem, plugin, compiled, **options)
+    driver = Warm(built) if isinstance(built, QuadrotorPeer) else closed_loop.Warm(built)
+    return driver, built.again
 
 
 class UnicyclePeer(closed_loop.Peer):
@@ -130,11 +132,18 @@ class QuadrotorPeer:
         self.problem = problem
         self.gaps, self.spheres = np.array(gaps), np.array(spheres, dtype=int)
         self._solver: Any = ca.nlpsol("solver", plugin, program, chosen)
+        self._made = plugin, chosen
         free = np.full(10, np.inf)
         lower = np.append(np.tile(np.append(-free, problem.lower), n), -free)
         upper = np.append(np.tile(np.append(free, problem.upper), n), free)
         self._limits = {"lbx": lower, "ubx": upper, "lbg": 0.0, "ubg": np.where(equality, 0.0, np.inf)}
         self.answer: dict[str, Any] = {}
+
+    def compile(self) -> None:
+        """Evaluate its functions in machine code from now on."""
+        from benchmarks.compiled_peers import compiled
+
+        self._solver = compiled(self._solver, *self._made)
 
     def solve(self, states: Array, controls: Array, pose: Array | None = None, first: int = 0, **duals: Any) -> float:
         """Solve from a guess; returns the processor time of the call [ms]."""

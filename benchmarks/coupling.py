@@ -141,7 +141,35 @@ def render(rows: list[Row]) -> str:
                 parts.append(table(["", *VARIANTS], lines))
     refused = sum("error" in row for row in rows)
     parts.append(f"\nIn brackets: 95 % interval of the paired difference to sequential. Episodes refused: {refused}.\n")
-    return "\n".join(parts)
+    return "\n".join([*parts, "", sayings(rows)])
+
+
+def sayings(rows: list[Row]) -> str:
+    """What the tables say, in sentences that are computed from them."""
+    lines = []
+    for route in ROUTES:
+        for solver in ("sqp", "alm"):
+            words = []
+            for name, variant in (("the joint graph", "joint"), ("ten times the control weight", "joint, weight 10")):
+                mine, base = paired(rows, route, solver, variant, "localisation, mean [mm]")
+                if len(mine):
+                    low, high = interval(mine - base)
+                    words.append(
+                        f"{name} localises {(mine - base).mean():+.2g} mm ({low:+.2g} to {high:+.2g}, "
+                        f"{(mine - base).max():+.2g} at most) beside the sequential coupling"
+                    )
+            for what in ("median", "p99"):
+                mine, base = paired(rows, route, solver, "joint", f"localise + plan, {what} [ms]")
+                if len(mine):
+                    words.append(f"its {what} of the time is {100.0 * (mine.mean() / base.mean() - 1.0):+.0f} %")
+            if words:
+                lines.append(f"- {route}, {solver}: {'; '.join(words)}.")
+    driven = [row["metrics"] for row in rows if "metrics" in row]
+    lines.append(
+        f"- {len(driven)} drives, {sum(m['collisions'] for m in driven)} collisions, "
+        f"{sum(not m['reached'] for m in driven)} goals missed; both obstacles stand still in this campaign."
+    )
+    return "\n".join(lines)
 
 
 def _reached(rows: list[Row], route: str, solver: str, variant: str) -> str:

@@ -1,0 +1,66 @@
+"""casadi's functions as C: generated, compiled with the machine's own compiler, and kept by their content.
+
+casadi evaluates expressions in a virtual machine. :func:`compiled` builds the same solver on machine code, as a robot
+would run it. Compiling one of the larger control cases takes a minute, so libraries stay in out/benchmarks/.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from benchmarks.report import OUT
+
+COMPILER = next((name for name in ("gcc", "clang", "cc") if shutil.which(name)), None)
+FLAGS = ("-O2", "-march=native", "-fPIC", "-shared")
+LIBRARIES = OUT / "compiled"
+
+
+def compiled(solver: Any, plugin: str, options: dict[str, Any]) -> Any:
+    """The solver again, its functions in machine code.
+
+    Args:
+        solver: an ``nlpsol`` of casadi.
+        plugin: that it uses.
+        options: with which it was made.
+
+    Raises:
+        RuntimeError: when there is no C compiler or it refuses.
+    """
+    import casadi as ca
+
+    if COMPILER is None:
+        raise RuntimeError("no C compiler found: install gcc, or leave compiled peers out")
+    LIBRARIES.mkdir(parents=True, exist_ok=True)
+    work = LIBRARIES / f"work-{os.getpid()}"
+    work.mkdir(exist_ok=True)
+    here = Path.cwd()
+    try:
+        os.chdir(work)  # casadi writes beside nothing else
+        source = Path(solver.generate_dependencies("functions.c")).resolve()
+        code = source.read_bytes()
+    finally:
+        os.chdir(here)
+    name = hashlib.sha256(code + " ".join((COMPILER, *FLAGS)).encode()).hexdigest()[:16]
+    library = LIBRARIES / f"{name}.so"
+    if not library.is_file():
+        made = work / "made.so"
+        command = [COMPILER, *FLAGS, str(source), "-o", str(made), "-lm"]
+        run = subprocess.run(command, capture_output=True, text=True, check=False)
+        if run.returncode:
+            raise RuntimeError(f"{COMPILER} refused: {run.stderr[:500]}")
+        made.replace(library)
+    shutil.rmtree(work)
+    return ca.nlpsol("solver", plugin, str(library), options)
+
+
+def described() -> str:
+    """Compiler, version and flags, in words."""
+    if COMPILER is None:
+        return "no C compiler"
+    shown = subprocess.run([COMPILER, "-dumpfullversion", "-dumpversion"], capture_output=True, text=True, check=False)
+    return f"{COMPILER} {shown.stdout.split()[0] if shown.stdout else ''} {' '.join(FLAGS[:2])}"
