@@ -197,7 +197,8 @@ class Flies(fg.Solver):
 def test_only_where_the_last_iterate_is_not_finite_another_stands_in() -> None:
     graph = fg.Graph()
     x = graph.variables("x", fg.Rn(1), 1)
-    graph.minimize(fg.prior, x, [2.1], name="wish")
+    graph.minimize(fg.prior, x, [1.0], name="wish")
+    graph.minimize(fg.prior, x, [3.2], name="other wish")
     solution = Flies().solve(graph, {x: [[0.0]]})
     assert solution.status is fg.Status.NOT_FINITE
     assert solution[x].item() == 2.0  # nearer to being stationary than 0 and 3

@@ -21,6 +21,7 @@ from unifg.scenarios.localiser import Localiser
 from unifg.scenarios.metrics import episode_metrics, pose_errors
 from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigation
 from unifg.scenarios.path import path_length
+from unifg.scenarios.perception import Tracks
 from unifg.scenarios.route import Route
 from unifg.scenarios.world import Scan, World
 from unifg.typing import Array
@@ -151,6 +152,7 @@ class Garbage:
     """An answer that must never reach the wheels."""
 
     status = fg.Status.LOCALLY_INFEASIBLE
+    history: tuple[fg.Iteration, ...] = ()
     violation = np.inf
     worst = ("dynamics", 0)
     iterations = 7
@@ -213,6 +215,63 @@ def test_one_failed_solve_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     log = episode.run(lambda done, text: None)
     assert log.succeeded
     assert log.emergency.sum() == 1
+
+
+class Ended:
+    """A solve as the controller sees it: a status and the iterates it passed, (cost, violation, turning speed) each."""
+
+    def __init__(self, status: fg.Status, rows: list[tuple[float, float, float]], solution: fg.Solution) -> None:
+        self.multipliers: dict[str, Array] = {}
+        self.penalties: dict[str, Array] = {}
+        self.status, self.violation = status, rows[-1][1]
+        blank = solution.history[0]
+        self.history = []
+        for cost, violation, turn in rows:
+            values = {**solution.values}
+            family = next(f for f in values if f.name == "control")
+            values[family] = np.full_like(values[family], turn)
+            self.history.append(replace(blank, cost=cost, violation=violation, values=values))
+
+
+NOBODY = Tracks(
+    np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=int), np.zeros(0), np.zeros(0, dtype=bool)
+)
+EARLY, LATE = fg.Status.ITERATION_LIMIT, fg.Status.STOP_RULE
+
+
+@pytest.mark.parametrize(
+    ("status", "rows", "turn"),
+    [
+        (EARLY, [(9.0, 0.0, 0.1), (4.0, 0.0, 0.2), (5.0, 0.0, 0.3)], 0.2),  # the cheapest, neither first nor last
+        (EARLY, [(9.0, 0.0, 0.1), (4.0, 0.1, 0.2), (5.0, 1e-4, 0.3)], 0.3),  # of those that keep the constraints
+        (EARLY, [(3.0, 0.0, 0.1), (4.0, 0.0, 0.2)], 0.1),  # the start may be the best there is
+        (EARLY, [(3.0, 0.1, 0.1), (4.0, 0.2, 0.2)], None),
+        (fg.Status.LOCALLY_INFEASIBLE, [(3.0, 0.0, 0.1), (2.0, 0.2, 0.2)], 0.1),
+        (LATE, [(3.0, 0.0, 0.1), (4.0, 0.2, 0.2)], None),  # a solve that settled is judged by where it settled
+    ],
+)
+def test_of_a_solve_that_ended_early_the_cheapest_plan_is_driven_that_keeps_the_constraints(
+    status: fg.Status, rows: list[tuple[float, float, float]], turn: float | None
+) -> None:
+    episode = Episode(CORNER)
+    controller = episode.pilot.controller
+    pose = np.array(episode.settings.start)
+    data = controller._data(pose, np.tile(pose, (controller.settings.horizon + 1, 1)), NOBODY)
+    solution = controller._at.solve(controller._staying(pose), data=data)
+    ended: Any = Ended(status, rows, solution)
+    found = controller._drivable(ended, data)
+    assert (found is None) == (turn is None)
+    if found is not None:
+        assert np.all(found[controller._u] == turn)
+
+
+def test_of_a_solve_that_settled_its_end_is_driven() -> None:
+    episode = Episode(CORNER)
+    controller = episode.pilot.controller
+    pose = np.array(episode.settings.start)
+    data = controller._data(pose, np.tile(pose, (controller.settings.horizon + 1, 1)), NOBODY)
+    ended: Any = Ended(LATE, [(3.0, 0.0, 0.1), (4.0, 0.0, 0.2)], controller._at.solve(controller._staying(pose)))
+    assert controller._drivable(ended, data) is ended
 
 
 def test_failure_on_the_first_tick_stands_still(monkeypatch: pytest.MonkeyPatch) -> None:
