@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
-from types import ModuleType
 
 import numpy as np
 
-from unifg.calls import local_vector
-from unifg.differentiation import FIRST_STEP
+from unifg.calls import local_matrix, local_vector
 from unifg.errors import ModelError
-from unifg.jit import compiled
+from unifg.jit import compiled, in_order
+from unifg.lie import Manifold
+from unifg.steps import FIRST, TURN, compiled_parts, move, rotation, step_for, step_of, to_body
 from unifg.typing import Array
 
 
@@ -118,42 +118,55 @@ def _derivatives(derivative: Callable[..., None]) -> Callable[..., None]:
     return loop
 
 
-def differences(field: CompiledField, functions: ModuleType, storage: int) -> Callable[..., None]:
+def differences(field: CompiledField, group: Manifold) -> Callable[..., None]:
     """``dF(x, u, by_x, by_u)`` of a field by central differences.
 
     Args:
         field: F.
-        functions: of the group, from :mod:`unifg.lie.scalar`.
-        storage: of the group.
+        group: of x, with compiled functions.
     """
-    function, retract = field.function, functions.retract
-    dim, controls, step = field.dim, field.controls, FIRST_STEP
+    function, dim, controls, storage = field.function, field.dim, field.controls, group.storage
+    parts = tuple(tuple(part) for part in compiled_parts([group]))
 
-    @compiled
+    @in_order
     def derivative(x: Array, u: Array, by_x: Array, by_u: Array) -> None:
         ahead, behind, direction = local_vector(dim), local_vector(dim), local_vector(dim)
-        moved, control = local_vector(storage), local_vector(controls)
+        moved, control, R = local_vector(storage), local_vector(controls), local_matrix(3, 3)
         for i in range(dim):
             direction[i] = 0.0
+        for i in range(storage):
+            moved[i] = x[i]
         for i in range(controls):
             control[i] = u[i]
-        for j in range(dim):
-            direction[j] = step
-            retract(x, direction, moved)
-            function(moved, control, ahead)
-            direction[j] = -step
-            retract(x, direction, moved)
-            function(moved, control, behind)
-            direction[j] = 0.0
-            for i in range(dim):
-                by_x[i, j] = (ahead[i] - behind[i]) / (2.0 * step)
+        for part in range(len(parts)):
+            kind, start, size, width, column, turn = parts[part]
+            for c in range(width):
+                j = column + c
+                step = step_of(x, kind, start, width, turn, c, FIRST)
+                direction[j] = step
+                move(x, kind, start, width, direction, column, moved)
+                function(moved, control, ahead)
+                direction[j] = -step
+                move(x, kind, start, width, direction, column, moved)
+                function(moved, control, behind)
+                direction[j] = 0.0
+                stepped = 2.0 * step if kind == TURN else (x[start + c] + step) - (x[start + c] - step)
+                for i in range(dim):
+                    by_x[i, j] = (ahead[i] - behind[i]) / stepped
+            for k in range(start, start + size):
+                moved[k] = x[k]
+            if turn >= 0:
+                rotation(x, turn, width, R)
+                to_body(R, width, by_x, dim, column)
         for j in range(controls):
+            step = step_for(abs(u[j]), FIRST)
             control[j] = u[j] + step
             function(x, control, ahead)
             control[j] = u[j] - step
             function(x, control, behind)
             control[j] = u[j]
+            stepped = (u[j] + step) - (u[j] - step)
             for i in range(dim):
-                by_u[i, j] = (ahead[i] - behind[i]) / (2.0 * step)
+                by_u[i, j] = (ahead[i] - behind[i]) / stepped
 
     return derivative

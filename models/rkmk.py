@@ -90,9 +90,10 @@ def integrator(
             raise ModelError(f"{tableau.name}: the field has {field.dim} velocities, {group.name} takes {group.dim}")
         functions, bend = scalar_rn if isinstance(group, Rn) else functions_of(group), bend_of(group)
         if functions is not None and bend is not None and jacobian in (None, field.jacobian):
-            kernel = step_kernel(functions, bend, field, group.storage, ROOM * -(-tableau.stages // ROOM))
+            kernel = step_kernel(functions, bend, field, group, ROOM * -(-tableau.stages // ROOM))
             arguments: tuple[Argument, ...] = (group, *(Rn(length) for length in field.lengths), group, 0)
-            return residual(Kernel(kernel, arguments, group.dim, tableau.rows, tableau.name))
+            differenced = field.derivative is None
+            return residual(Kernel(kernel, arguments, group.dim, tableau.rows, tableau.name, differenced=differenced))
         jacobian = jacobian or (field.jacobian if field.derivative is not None else None)
     function = StepDefect(group, field, tableau, jacobian)
     return residual(function, function.jacobian, tableau.name)

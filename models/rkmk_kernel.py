@@ -18,6 +18,7 @@ import numpy as np
 
 from unifg.calls import local_matrix, local_vector, vector
 from unifg.jit import compiled
+from unifg.lie import LieGroup
 from unifg.lie.scalar import rn
 from unifg.models.compiled_field import CompiledField, differences
 from unifg.typing import Array
@@ -114,7 +115,7 @@ def move_of(functions: ModuleType, storage: int, dim: int) -> Callable[..., None
 
 @cache
 def step_kernel(
-    functions: ModuleType, bend: Callable[..., None], field: CompiledField, storage: int, room: int
+    functions: ModuleType, bend: Callable[..., None], field: CompiledField, group: LieGroup, room: int
 ) -> Callable[..., None]:
     """The defect xi - h Phi of a step, and its derivatives, for all methods of so many stages or fewer.
 
@@ -125,13 +126,13 @@ def step_kernel(
         functions: of the group, from :mod:`unifg.lie.scalar`.
         bend: of the group, from :func:`unifg.lie.lookup.bend_of`.
         field: F.
-        storage: of the group.
+        group: of the states.
         room: for stages; one compiled function then serves many methods.
     """
-    velocity, dim, inputs = field.function, field.dim, field.controls
+    velocity, dim, inputs, storage = field.function, field.dim, field.controls, group.storage
     local, retract, unit = functions.local, functions.retract, rn.unit
     inverse_jacobian = functions.right_jacobian_inverse
-    derivative = field.derivative or differences(field, functions, storage)
+    derivative = field.derivative or differences(field, group)
     difference, move = difference_of(functions, storage, dim, inputs), move_of(functions, storage, dim)
     width, all_rows = 2 * dim + inputs, room * dim
 

@@ -154,7 +154,7 @@ def _scalar_costs(qp: QP, names: tuple[str, ...], first: IntArray) -> list[Facto
     """Costs that are no squares, as quadratic factors."""
     factors: list[Factor] = []
     for term in qp.program.scalar_terms:
-        gradient, hessian = term.scalar_derivatives(qp.lin.values)
+        gradient, hessian, _ = term.scalar_derivatives(qp.lin.values)
         if qp.curved_by is None:
             hessian = convexified(hessian)
         factors += _quadratic(qp.program, term, "cost", hessian, gradient, names, first)

@@ -16,6 +16,7 @@ import numpy as np
 from unifg.columns import Columns, Values
 from unifg.differentiation import gradient_and_hessian, jacobian
 from unifg.errors import GraphError
+from unifg.gather import Gather
 from unifg.jit import is_compiled
 from unifg.kernels import Kernel, side_by_side
 from unifg.lie import Manifold
@@ -49,29 +50,6 @@ class Layout:
     columns: IntArray
     kernel_width: int
     keep: list[int] | None
-
-
-class Gather:
-    """Reads one variable argument of a term out of the values, one row per factor."""
-
-    def __init__(self, selection: Selection, count: int) -> None:
-        """Precompute the cheapest way to index."""
-        self.family = selection.family
-        self.selection = selection
-        self.shared = len(selection) == 1 and count > 1
-        self.count = count
-        indices = selection.indices
-        self.rows: slice | IntArray = indices
-        if len(indices) == 1 or bool(np.all(np.diff(indices) == 1)):
-            self.rows = slice(int(indices[0]), int(indices[-1]) + 1)
-        self.columns = None if selection.component is None else selection.storage
-
-    def __call__(self, values: Values) -> Array:
-        """(n, storage) values of this argument."""
-        part = values[self.family][self.rows]
-        if self.columns is not None:
-            part = part[:, self.columns]
-        return np.broadcast_to(part, (self.count, part.shape[1])) if self.shared else part
 
 
 class CompiledTerm:
@@ -174,7 +152,7 @@ class CompiledTerm:
         attached = self.term.residual.search if search and self.term.residual.search else self._jacobian
         points = [gather(values) for gather in self.gathers]
         if attached is None or numerical:
-            blocks = jacobian(lambda *moved: np.asarray(self._call(list(moved))), points, self.manifolds)
+            blocks = jacobian(lambda *moved: self._call(list(moved)), points, self.manifolds)
         else:
             blocks = [np.asarray(block, dtype=np.float64) for block in attached(*self._fill(points))]
             if len(blocks) > len(self.dims) and len(blocks) > max(self._places):
@@ -200,26 +178,39 @@ class CompiledTerm:
         return residual
 
     def second_derivatives(self, values: Values, weights: Array) -> Array:
-        """(n, D, D) Hessians of weights' r, weights (n, m), by differences of the Jacobians; zero where inactive."""
+        """(n, D, D) Hessians of weights' r, weights (n, m), by differences; zero where inactive."""
         points = [gather(values) for gather in self.gathers]
+
+        attached = self._jacobian
+        if attached is None or self.differenced:
+
+            def weighted(*moved: Array) -> Array:
+                return np.asarray(np.einsum("nm,nm->n", weights, self._call(list(moved))))
+
+            with np.errstate(all="ignore"):
+                return self._masked(gradient_and_hessian(weighted, points, self.manifolds, together=True)[1])
 
         def slope(*moved: Array) -> Array:
-            if self._jacobian is None:
-                blocks = jacobian(lambda *p: np.asarray(self._call(list(p))), moved, self.manifolds)
-            else:
-                given = [np.asarray(block) for block in self._jacobian(*self._fill(list(moved)))]
-                blocks = given if len(given) == len(self.dims) else [given[place] for place in self._places]
+            given = [np.asarray(block) for block in attached(*self._fill(list(moved)))]
+            blocks = given if len(given) == len(self.dims) else [given[place] for place in self._places]
             return np.concatenate([np.einsum("nm,nmd->nd", weights, block) for block in blocks], axis=1)
 
-        step = 1e-4 if self._jacobian is None else 6e-6
-        second = np.concatenate(jacobian(slope, points, self.manifolds, step), axis=2)
+        second = np.concatenate(jacobian(slope, points, self.manifolds), axis=2)
         return self._masked(0.5 * (second + np.swapaxes(second, 1, 2)))
 
-    def scalar_derivatives(self, values: Values) -> tuple[Array, Array]:
-        """Gradient (n, D) and Hessian (n, D, D) of a scalar cost, zero where inactive."""
+    def scalar_derivatives(self, values: Values) -> tuple[Array, Array, Array]:
+        """Gradient (n, D), Hessian (n, D, D), rounding of the gradient (n, D) of a scalar cost, zero where inactive."""
         points = [gather(values) for gather in self.gathers]
-        gradient, hessian = gradient_and_hessian(lambda *p: np.asarray(self._call(list(p))), points, self.manifolds)
-        return self._masked(gradient), self._masked(hessian)
+        found = gradient_and_hessian(lambda *p: self._call(list(p)), points, self.manifolds)
+        gradient, hessian, rounding = (self._masked(array) for array in found)
+        return gradient, hessian, rounding
+
+    @property
+    def differenced(self) -> bool:
+        """Whether the Jacobian of a term that is no scalar cost is made of differences."""
+        if self.kernel is not None:
+            return self.kernel.differenced
+        return self._jacobian is None and not self.is_bound
 
     def layout(self, columns: Columns, parameters: int) -> Layout:
         """Where this term's numbers stand, when its parameters begin at ``parameters``."""

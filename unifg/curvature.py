@@ -1,29 +1,33 @@
 """Second derivatives that Gauss-Newton leaves out: sum of w_a times the Hessian of r_a, for every factor.
 
 The weights w are the multipliers of constraints and the whitened residuals of costs, carried back through the
-whitening. The Hessian is that of t -> r(x Exp(t)), symmetric; a kernel that does not come with it has its Jacobian
-differenced along every tangent direction.
+whitening. The Hessian is that of t -> r(x Exp(t)), symmetric. A kernel that does not come with it has its Jacobian
+differenced along every tangent direction; where that is made of differences itself, the residual is differenced twice.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from unifg.calls import call_residual, call_retraction, matrix, vector, vector_at
-from unifg.jit import compiled
+from unifg.calls import call_residual, matrix, vector, vector_at
+from unifg.jit import compiled, in_order, inlined
+from unifg.lie.scalar.so2 import wrap
 from unifg.passes import gather_variables
+from unifg.steps import ANGLE, ONE_SIDED, TURN, VECTOR, largest, move, rotation, step_for, step_of, to_body
+from unifg.steps import SECOND as TWICE
 from unifg.table import (
     ACTIVE,
     ADDRESS,
     COST,
     COUNT,
+    DIFFERENCED,
     KEEP,
     KERNEL_WIDTH,
     KIND,
-    LEAF,
-    LEAVES,
     PARAMETER,
     PARAMETERS,
+    PART,
+    PARTS,
     POSITION,
     ROW,
     ROWS,
@@ -41,8 +45,6 @@ from unifg.table import (
 from unifg.typing import Array, IntArray
 from unifg.whitening import DIAGONAL, FULL
 
-STEP = 1e-7  # truncation and rounding both near 1e-8 of the Jacobian
-
 
 @compiled
 def add_curvature(terms: Terms, values: Array, residual: Array, multipliers: Array, hessian: Array) -> None:
@@ -54,10 +56,10 @@ def add_curvature(terms: Terms, values: Array, residual: Array, multipliers: Arr
         width = max(width, fields[t, KERNEL_WIDTH])
     v, moved, step = np.empty(storage), np.empty(storage), np.empty(width)
     weights, r, gradient = np.empty(rows), np.empty(rows), np.empty(width)
-    J, second = np.empty(rows * width), np.empty(width * width)
+    J, second, R = np.empty(rows * width), np.empty(width * width), np.empty((3, 3))
     for t in range(len(fields)):
         term = fields[t]
-        if term[LEAVES] == 0 or term[ADDRESS] == 0 or (term[KIND] == COST and term[WEIGHT] >= 0):
+        if term[PARTS] == 0 or term[ADDRESS] == 0 or (term[KIND] == COST and term[WEIGHT] >= 0):
             continue
         m, full, table = term[ROWS], term[KERNEL_WIDTH], vector_at(term[TABLE], term[TABLE_SIZE])
         S = matrix(second, 0, full, full)
@@ -79,8 +81,12 @@ def add_curvature(terms: Terms, values: Array, residual: Array, multipliers: Arr
             gather_variables(term, i, terms.gather, terms.sizes, terms.parameters, values, v)
             if term[SECOND] != 0:
                 call_residual(term[SECOND], vector(v, 0, term[STORAGE]), p, table, vector(weights, 0, m), S)
+            elif term[DIFFERENCED] != 0:
+                parts = terms.parts[term[PART] : term[PART] + term[PARTS]]
+                _twice(parts, term, p, table, v, moved, step, weights, r, gradient, R, S)
             else:
-                _second(terms.leaves, term, p, table, v, moved, step, weights, r, gradient, J, S)
+                parts = terms.parts[term[PART] : term[PART] + term[PARTS]]
+                _once(parts, term, p, table, v, moved, step, weights, r, gradient, J, R, S)
             _write(terms.sizes, terms.positions, term, i, S, hessian)
 
 
@@ -102,9 +108,9 @@ def carry_back(term: IntArray, i: int, whiteners: Array, residual: Array, out: A
                 out[b] += whiteners[start + a * m + b] * residual[a]
 
 
-@compiled
-def _second(
-    leaves: IntArray,
+@in_order
+def _once(
+    parts: IntArray,
     term: IntArray,
     p: Array,
     table: Array,
@@ -115,6 +121,7 @@ def _second(
     r: Array,
     gradient: Array,
     J: Array,
+    R: Array,
     second: Array,
 ) -> None:
     """Derivative of J' w along every tangent direction of one factor, row by row."""
@@ -126,24 +133,154 @@ def _second(
             gradient[d] += weights[a] * J[a * width + d]
     for k in range(storage):
         moved[k] = v[k]
-    for leaf in range(term[LEAF], term[LEAF] + term[LEAVES]):
-        where, start, size, dim, column = leaves[leaf]
+    for k in range(width):
+        step[k] = 0.0
+    for part in range(len(parts)):
+        kind, start, size, dim, column, turn = parts[part]
         for c in range(dim):
-            for k in range(dim):
-                step[k] = STEP if k == c else 0.0
-            if where == 0:
-                for k in range(size):
-                    moved[start + k] = v[start + k] + step[k]
-            else:
-                call_retraction(where, vector(v, start, size), vector(step, 0, dim), vector(moved, start, size))
+            h = step_of(v, kind, start, dim, turn, c, ONE_SIDED)
+            step[column + c] = h
+            move(v, kind, start, dim, step, column, moved)
+            step[column + c] = 0.0
+            stepped = h if kind == TURN else (v[start + c] + h) - v[start + c]
             call_residual(term[ADDRESS], vector(moved, 0, storage), p, table, vector(r, 0, m), matrix(J, 0, m, width))
             for d in range(width):
                 total = -gradient[d]
                 for a in range(m):
                     total += weights[a] * J[a * width + d]
-                second[column + c, d] = total / STEP
+                second[column + c, d] = total / stepped
+        if turn >= 0:
+            rotation(v, turn, dim, R)
+            _turn_rows(R, dim, second, width, column)
         for k in range(start, start + size):
             moved[k] = v[k]
+
+
+@in_order
+def _twice(
+    parts: IntArray,
+    term: IntArray,
+    p: Array,
+    table: Array,
+    v: Array,
+    moved: Array,
+    step: Array,
+    weights: Array,
+    r: Array,
+    gradient: Array,
+    R: Array,
+    second: Array,
+) -> None:
+    """Second differences of w' r, from its values alone: two points for each pair of directions.
+
+    All steps are those of the largest coordinate, because that is what the residual may round.
+    """
+    width, storage = term[KERNEL_WIDTH], term[STORAGE]
+    for k in range(storage):
+        moved[k] = v[k]
+    for k in range(width):
+        step[k] = 0.0
+    size = 0.0
+    for part in range(len(parts)):
+        if parts[part, 0] == VECTOR:
+            size = largest(v, parts[part, 1], parts[part, 3], size)
+    h = step_for(size, TWICE)
+    centre = _weighted(term, p, table, moved, weights, r)
+    for first in range(len(parts)):
+        kind, start, _, dim, column, _ = parts[first]
+        for c in range(column, column + dim):
+            both = 0.0  # w' r ahead and behind, less twice that at the centre
+            for side in range(2):
+                step[c] = h if side == 0 else -h
+                _shift(v, kind, start, step, column, c, moved)
+                change = _weighted(term, p, table, moved, weights, r) - centre
+                both += change
+                gradient[c] = (change - gradient[c] if side == 1 else change) / (1.0 if side == 0 else -2.0 * h)
+            second[c, c] = both  # over h^2, when all have been found
+            for other in range(first + 1):
+                its_kind, its_start, _, its_dim, its_column, _ = parts[other]
+                for d in range(its_column, min(its_column + its_dim, c)):
+                    total = -both - second[d, d]
+                    for side in range(2):
+                        step[c] = step[d] = h if side == 0 else -h
+                        _shift(v, kind, start, step, column, c, moved)
+                        _shift(v, its_kind, its_start, step, its_column, d, moved)
+                        total += _weighted(term, p, table, moved, weights, r) - centre
+                    step[d] = 0.0
+                    _shift(v, its_kind, its_start, step, its_column, d, moved)
+                    second[c, d] = second[d, c] = total / (2.0 * h * h)
+            step[c] = 0.0
+            _shift(v, kind, start, step, column, c, moved)
+    for c in range(width):
+        second[c, c] /= h * h
+    for part in range(len(parts)):
+        _, _, _, dim, column, turn = parts[part]
+        if turn >= 0:
+            rotation(v, turn, dim, R)
+            to_body(R, dim, second, width, column)
+            _turn_rows(R, dim, second, width, column)
+            _bend(R, dim, gradient, second, column)
+
+
+@inlined
+def _shift(v: Array, kind: int, start: int, step: Array, column: int, which: int, out: Array) -> None:
+    """Write what a changed step along one direction changes of a part."""
+    if kind == VECTOR:
+        place = start + which - column
+        out[place] = v[place] + step[which]
+    elif kind == ANGLE:
+        out[start] = wrap(v[start] + step[which])
+    else:
+        move(v, kind, start, 3, step, column, out)
+
+
+@inlined
+def _weighted(term: IntArray, p: Array, table: Array, v: Array, weights: Array, r: Array) -> float:
+    """Value of w' r of one factor."""
+    m, nothing = term[ROWS], matrix(r, 0, 0, 0)
+    call_residual(term[ADDRESS], vector(v, 0, term[STORAGE]), p, table, vector(r, 0, m), nothing)
+    total = 0.0
+    for a in range(m):
+        total += weights[a] * r[a]
+    return total
+
+
+@compiled
+def _turn_rows(R: Array, dim: int, second: Array, width: int, column: int) -> None:
+    """Make the derivatives in the rows of a position those along the axes of the body: R' S, in place."""
+    for d in range(width):
+        x, y = second[column, d], second[column + 1, d]
+        z = second[column + 2, d] if dim == 3 else 0.0
+        for c in range(dim):
+            second[column + c, d] = R[0, c] * x + R[1, c] * y + (R[2, c] * z if dim == 3 else 0.0)
+
+
+@compiled
+def _bend(R: Array, dim: int, gradient: Array, second: Array, column: int) -> None:
+    """Add half of the gradient along r x t to the mixed entries of translation t and rotation r."""
+    x = y = z = 0.0
+    for k in range(dim):
+        slope = 0.5 * gradient[column + k]
+        x += R[k, 0] * slope
+        y += R[k, 1] * slope
+        z += R[k, 2] * slope if dim == 3 else 0.0
+    if dim == 2:
+        _add_pair(second, column, column + 2, y)
+        _add_pair(second, column + 1, column + 2, -x)
+    else:
+        _add_pair(second, column + 1, column + 3, z)
+        _add_pair(second, column + 2, column + 3, -y)
+        _add_pair(second, column + 2, column + 4, x)
+        _add_pair(second, column, column + 4, -z)
+        _add_pair(second, column, column + 5, y)
+        _add_pair(second, column + 1, column + 5, -x)
+
+
+@compiled
+def _add_pair(second: Array, row: int, column: int, value: float) -> None:
+    """Add to an entry and to the one across the diagonal."""
+    second[row, column] += value
+    second[column, row] += value
 
 
 @compiled

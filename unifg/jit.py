@@ -1,7 +1,8 @@
 """The one way functions are compiled here: Numba, cached on disk, with floating-point liberties that keep NaN.
 
 ``fastmath`` in full may delete the checks for NaN that solvers rely on; contraction, reassociation, signed zeros
-and reciprocals are what loops need to vectorise.
+and reciprocals are what loops need to vectorise. Differences take none of these: reassociated, (x + h) - (x - h) is 2 h
+whatever was stored, and y - x loses its digits far from the origin.
 
 Numba's own cache looks at the file a function stands in and nothing else: it would go on running old code of a
 callee in another file, and never find again a function that closes over another one. Here the stamp of a function
@@ -34,6 +35,13 @@ def compiled(function: F) -> F:
     The function may close over other compiled functions and numbers.
     """
     dispatcher = numba.njit(error_model="numpy", fastmath=LIBERTIES)(function)
+    dispatcher._cache = _Cache(function)
+    return cast(F, dispatcher)
+
+
+def in_order(function: F) -> F:
+    """Like :func:`compiled`, every operation as it is written: for functions that difference."""
+    dispatcher = numba.njit(error_model="numpy")(function)
     dispatcher._cache = _Cache(function)
     return cast(F, dispatcher)
 

@@ -45,7 +45,8 @@ class Kernel:
         name: for messages.
         linear: whether r is linear in tangent steps, so that it has no second derivatives.
         second: compiled ``second(v, p, table, w, S)`` that writes the (D, D) Hessian of t -> w' r(x Exp(t)) at
-            t = 0, for solvers that use it; differences of J take its place.
+            t = 0, for solvers that use it; differences take its place.
+        differenced: whether J is made of differences of r, or of a part of it.
     """
 
     function: Callable[..., None]
@@ -55,6 +56,7 @@ class Kernel:
     name: str = "kernel"
     linear: bool = False
     second: Callable[..., None] | None = None
+    differenced: bool = False
 
     def __post_init__(self) -> None:
         """Compiled code reads the table as it lies in memory."""

@@ -12,16 +12,27 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numba
+import numpy as np
 
-from unifg.calls import local_vector, matrix, vector
-from unifg.differentiation import FIRST_STEP
+from unifg.calls import local_matrix, local_vector, matrix, vector
 from unifg.errors import GraphError
-from unifg.jit import LIBERTIES
 from unifg.kernels import Kernel
-from unifg.lie import Manifold, Rn
-from unifg.lie.lookup import functions_of
-from unifg.lie.product import leaves
-from unifg.lie.scalar import rn
+from unifg.lie import Manifold
+from unifg.steps import (
+    FAR,
+    FIRST,
+    OTHER,
+    TURN,
+    VECTOR,
+    largest,
+    move,
+    parts_of,
+    rotation,
+    step_for,
+    step_of,
+    to_body,
+    uncertainty,
+)
 
 logger = logging.getLogger("unifg")
 
@@ -48,7 +59,9 @@ def per_factor(
         GraphError: when a manifold has no compiled retraction, or a parameter more than two axes.
     """
     names: dict[str, Any] = {"function": function, "jacobian": jacobian, "vector": vector, "matrix": matrix}
-    names |= {"local_vector": local_vector, "H": FIRST_STEP}
+    names |= {"local_vector": local_vector, "local_matrix": local_matrix}
+    names |= {"step_of": step_of, "step_for": step_for, "largest": largest, "uncertainty": uncertainty, "np": np}
+    names |= {"move": move, "rotation": rotation, "to_body": to_body}
     sizes = iter(shapes)
     at = offset = 0
     parts: list[str] = []  # of the call, {} standing for the array the variables are read from
@@ -72,11 +85,11 @@ def per_factor(
     if jacobian is not None:
         lines += _attached(call, slots, rows)
     else:
-        lines += _differences(call, slots, rows, at, names, name)
+        lines += _differences(call, slots, rows, at, name)
     exec(compile("\n".join(lines), f"<kernel of {name}>", "exec"), names)
     logger.info("compiling the residual '%s', once in this process", name)
-    kernel = numba.njit(error_model="numpy", fastmath=LIBERTIES)(names["kernel"])
-    return Kernel(kernel, tuple(arguments), rows, name=name)
+    kernel = numba.njit(error_model="numpy")(names["kernel"])  # nothing may be reordered: see unifg.jit
+    return Kernel(kernel, tuple(arguments), rows, name=name, differenced=jacobian is None)
 
 
 def _parameter(name: str, offset: int, shape: tuple[int, ...]) -> str:
@@ -104,45 +117,59 @@ def _attached(call: str, slots: Sequence[tuple[int, Manifold]], rows: int) -> It
         column += manifold.dim
 
 
-def _differences(
-    call: str, slots: Sequence[tuple[int, Manifold]], rows: int, storage: int, names: dict[str, Any], name: str
-) -> Iterator[str]:
-    """Central differences along every tangent direction of every variable."""
-    widest = max(manifold.dim for _, manifold in slots)
-    yield f"    moved, step = local_vector({storage}), local_vector({widest})"
-    yield f"    ahead, behind = local_vector({rows}), local_vector({rows})"
+def _differences(call: str, slots: Sequence[tuple[int, Manifold]], rows: int, storage: int, name: str) -> Iterator[str]:
+    """Central differences along every tangent direction of every variable; see :mod:`unifg.steps`."""
+    manifolds = [manifold for _, manifold in slots]
+    parts = list(parts_of(manifolds))
+    yield f"    moved, step = local_vector({storage}), local_vector({max(manifold.dim for manifold in manifolds)})"
+    yield f"    ahead, behind, R = local_vector({rows}), local_vector({rows}), local_matrix(3, 3)"
+    yield f"    found = local_matrix(3, {rows})"
     yield f"    for k in range({storage}):"
     yield "        moved[k] = v[k]"
-    column = 0
-    for at, manifold in slots:
-        for leaf, stored, tangent in leaves(manifold, at):
-            module = rn if isinstance(leaf, Rn) else functions_of(leaf)
-            if module is None:
-                raise GraphError(
-                    f"{name}: {leaf.name} has no compiled retraction, which a compiled residual needs for its "
-                    "derivatives; attach a compiled Jacobian, or write the residual as a batched NumPy function"
-                )
-            retract = f"retract_{leaf.name.split('(')[0]}"
-            names[retract] = module.retract
-            move = f"{retract}(vector(v, {stored}, {leaf.storage}), vector(step, 0, {leaf.dim}), "
-            move += f"vector(moved, {stored}, {leaf.storage}))"
-            yield f"    for d in range({leaf.dim}):"
-            yield f"        for k in range({leaf.dim}):"
-            yield "            step[k] = 0.0"
-            for sign, target in (("", "ahead"), ("-", "behind")):
-                yield f"        step[d] = {sign}H"
-                yield f"        {move}"
-                yield f"        function({call.format('moved')}, {target})"
-            yield f"        for a in range({rows}):"
-            yield f"            J[a, {column + tangent} + d] = (ahead[a] - behind[a]) / (2.0 * H)"
-            yield f"    for k in range({stored}, {stored + leaf.storage}):"
-            yield "        moved[k] = v[k]"
-        column += manifold.dim
+    yield "    size = 0.0"
+    for part, leaf in parts:
+        if part.kind == OTHER:
+            raise GraphError(
+                f"{name}: {leaf.name} has no compiled retraction, which a compiled residual needs for its "
+                "derivatives; attach a compiled Jacobian, or write the residual as a batched NumPy function"
+            )
+        if part.kind == VECTOR:
+            yield f"    size = largest(v, {part.start}, {part.dim}, size)"
+    yield f"    wide, estimates = step_for(size, {FIRST}), 3 if size >= {FAR} else 1"
+    for part, _ in parts:
+        kind, start, stored, dim, column, turn = part
+        yield f"    for k in range({dim}):"
+        yield "        step[k] = 0.0"
+        yield f"    for d in range({dim}):"
+        yield f"        short = step_of(v, {kind}, {start}, {dim}, {turn}, d, {FIRST})"
+        yield "        for e in range(estimates):"
+        yield "            h = short if e == 0 else e * wide"
+        for sign, target in (("", "ahead"), ("-", "behind")):
+            yield f"            step[d] = {sign}h"
+            yield f"            move(v, {kind}, {start}, {dim}, step, 0, moved)"
+            yield f"            function({call.format('moved')}, {target})"
+        yield f"            stepped = {'2.0 * h' if kind == TURN else f'(v[{start} + d] + h) - (v[{start} + d] - h)'}"
+        yield f"            for a in range({rows}):"
+        yield "                found[e, a] = (ahead[a] - behind[a]) / stepped"
+        yield "        step[d] = 0.0"
+        yield f"        for a in range({rows}):"
+        yield f"            J[a, {column} + d] = found[0, a]"
+        yield "        if estimates == 3:"
+        yield "            doubt = np.inf if short == wide else uncertainty(size, short)"
+        yield f"            for a in range({rows}):"
+        yield "                fourth = (4.0 * found[1, a] - found[2, a]) / 3.0"
+        yield "                if abs(fourth - found[0, a]) <= doubt:"
+        yield f"                    J[a, {column} + d] = fourth"
+        yield f"    for k in range({start}, {start + stored}):"
+        yield "        moved[k] = v[k]"
+        if turn >= 0:
+            yield f"    rotation(v, {turn}, {dim}, R)"
+            yield f"    to_body(R, {dim}, J, {rows}, {column})"
 
 
 def _product(shape: tuple[int, ...]) -> int:
     """Numbers in an array."""
     total = 1
-    for length in shape:
-        total *= length
+    for size in shape:
+        total *= size
     return total

@@ -232,7 +232,7 @@ class Program:
                 value = term.residual(values)
                 cost += float(value.sum())
                 norms[term.name] = float(np.abs(value).sum())
-                slope, curvature = term.scalar_derivatives(values)
+                slope, curvature, _ = term.scalar_derivatives(values)
                 columns, factor, a, b, place = self._scalars[term.name]
                 np.add.at(gradient, columns.ravel(), slope.ravel())
                 np.add.at(hessian, place, (convex := convexified(curvature))[factor, a, b])

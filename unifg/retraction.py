@@ -87,24 +87,6 @@ class Retraction:
         return moved
 
 
-def retractions(manifolds: Sequence[Manifold]) -> list[list[int]]:
-    """For every part of several variables side by side: address, start, storage, dimension, first column.
-
-    Nothing when one of them has no compiled retraction.
-    """
-    parts: list[list[int]] = []
-    storage = tangent = 0
-    for manifold in manifolds:
-        for leaf, stored, moved in leaves(manifold, storage, tangent):
-            function = _compiled_retraction(leaf)
-            if function is None:
-                return []
-            where = ADDITION if function == ADDITION else address(function, RETRACTION)  # type: ignore[arg-type]
-            parts.append([where, stored, leaf.storage, leaf.dim, moved])
-        storage, tangent = storage + manifold.storage, tangent + manifold.dim
-    return parts
-
-
 def _compiled_retraction(manifold: Manifold) -> object:
     """The compiled retraction of a manifold, ADDITION, or None when it has only a batched one."""
     if isinstance(manifold, Rn):

@@ -14,8 +14,8 @@ import numpy as np
 from unifg.columns import Columns
 from unifg.compiled import CompiledTerm
 from unifg.jit import compiled
-from unifg.retraction import retractions
 from unifg.sparse import Symmetric
+from unifg.steps import Part, as_table, compiled_parts
 from unifg.terms import Constraint, Cost
 from unifg.typing import Array, IntArray
 
@@ -45,11 +45,12 @@ from unifg.typing import Array, IntArray
     ENTRY,  # first entry of the stacked Jacobian
     COLUMN,  # first column in Terms.columns
     POSITION,  # first place in Terms.positions
-    LEAF,  # first row of Terms.leaves
-    LEAVES,  # parts of the variables that move on their own; 0: linear, or without a compiled retraction
+    PART,  # first row of Terms.parts
+    PARTS,  # of the variables; 0: linear, or without a compiled retraction
     SECOND,  # address of the kernel's second derivatives; 0: to be differenced
+    DIFFERENCED,  # whether the Jacobian is made of differences
     FIELDS,
-) = range(29)
+) = range(30)
 
 COST, CONSTRAINT, BOUND = 0, 1, 2
 
@@ -65,8 +66,7 @@ class Terms(NamedTuple):
         unknown: full column to unknown, or -1.
         positions: place of every pair (d, e <= d) of columns in the normal matrix; -1: fixed; -2 - p: the pair stands
             for both triangles, because both columns are the same unknown.
-        leaves: (L, 5) address of the retraction, start in the variables of the factor, storage, dimension, and first
-            column of the kernel's Jacobian, for every part of every variable of a term.
+        parts: (L, 6) of the variables of every term, as :class:`unifg.steps.Part` has them.
         active: flags.
         parameters: of kernels, and constants in the place of variables.
         whiteners: reciprocal standard deviations and upper triangular square roots.
@@ -79,7 +79,7 @@ class Terms(NamedTuple):
     columns: IntArray
     unknown: IntArray
     positions: IntArray
-    leaves: IntArray
+    parts: IntArray
     active: IntArray
     parameters: Array
     whiteners: Array
@@ -105,7 +105,7 @@ class Table:
         self._columns = columns
         fields = np.zeros((len(terms), FIELDS), dtype=np.int64)
         gather, sizes, tangent = [], [], []
-        leaves: list[list[int]] = []
+        parts: list[Part] = []
         starts = {"gather": 0, "sizes": 0, "tangent": 0, "positions": 0, "parameters": 0, "whiteners": 0, "active": 0}
         self.residuals = self.weights = self.constraints = self.entries = self.constraint_entries = 0
         self.scratch = 1
@@ -123,10 +123,11 @@ class Table:
                 starts["whiteners"],
             )
             row[ACTIVE], row[WEIGHT] = -1, -1
-            row[LEAF] = len(leaves)
+            row[PART] = len(parts)
             if term.kernel is not None and not term.kernel.linear:
-                leaves += retractions(term.kernel.manifolds)
-            row[LEAVES] = len(leaves) - row[LEAF]
+                parts += compiled_parts(term.kernel.manifolds)
+            row[PARTS] = len(parts) - row[PART]
+            row[DIFFERENCED] = term.differenced
             gather.append(layout.gather.ravel())
             sizes += [*layout.sizes, *(layout.keep or [])]
             tangent.append(layout.columns.ravel())
@@ -168,7 +169,7 @@ class Table:
             _joined(tangent),
             columns.unknown.astype(np.int64),
             np.empty(starts["positions"], dtype=np.int32),
-            np.array(leaves, dtype=np.int64).reshape(-1, 5),
+            as_table(parts),
             np.ones(int(counts.sum()), dtype=np.uint8),
             np.empty(max(starts["parameters"], 1)),
             np.empty(max(starts["whiteners"], 1)),
