@@ -189,7 +189,8 @@ def main(arguments: list[str] | None = None) -> int:
         problem: control_starts.measure(problem, options.starts)
         for problem in tqdm(control_starts.blocked(), unit="case")
     }
-    parts = [text, control_loops.render(loops), control_pieces.render(), control_starts.render(random, options.starts)]
+    parts = [text, control_loops.render_single(loops), control_loops.render(loops), control_pieces.render()]
+    parts.append(control_starts.render(random, options.starts))
     text = "\n\n".join(parts)
     OUT.mkdir(parents=True, exist_ok=True)
     (OUT / "control-cases.md").write_text(text + "\n", encoding="utf-8", newline="\n")

@@ -20,6 +20,22 @@ from unifg.typing import Array
 STEPS = 100
 TOLERANCE = 1e-4
 SINGLE = ("ipm, 1 iteration", "sqp, 1 iteration")
+# Time of a step of acados (one SQP iteration, default options) over that of a converged step of IPOPT, measured
+# elsewhere, both on one machine.
+ACADOS = {
+    "unicycle straight, N = 50": 0.124,
+    "unicycle straight, discs, N = 50": 0.100,
+    "unicycle behind, N = 50": 0.124,
+    "unicycle behind, discs, N = 50": 0.088,
+    "quadrotor figure8, N = 20": 0.040,
+    "quadrotor figure8, spheres, N = 20": 0.068,
+    "quadrotor goto, N = 20": 0.044,
+    "quadrotor goto, spheres, N = 20": 0.050,
+    "quadrotor figure8, N = 50": 0.051,
+    "quadrotor figure8, spheres, N = 50": 0.090,
+}
+WORSE = 0.01  # cost of one iteration a step above the converged one by which a loop is named
+CONTACT = 1e-4  # and depth in an obstacle [m]
 
 
 class Ours:
@@ -168,3 +184,42 @@ def render(results: Mapping[Problem, Mapping[str, Drive]]) -> str:
         "solver is stopped after a single one in every step."
     )
     return "\n\n".join([table(head, lines, text=2), notes])
+
+
+def render_single(results: Mapping[Problem, Mapping[str, Drive]]) -> str:
+    """One iteration a step, beside acados: a table and sentences computed from it."""
+    lines, slower, named = [], {robot: 0.0 for robot in ("unicycle", "quadrotor")}, []
+    for problem, loops in results.items():
+        name = f"{problem.robot} {problem.name}"
+        if "ipopt" not in loops or name not in ACADOS:
+            continue
+        yardstick, converged = float(np.median(loops["ipopt"].times)), loops["ipm"].cost
+        times = [float(np.median(loops[single].times)) / yardstick for single in SINGLE]
+        slower[problem.robot] = max(slower[problem.robot], times[0] / ACADOS[name])
+        depths = [1e3 * loops[single].penetration for single in SINGLE]
+        for single, depth in zip(SINGLE, depths, strict=True):
+            above = loops[single].cost / converged - 1.0
+            if above > WORSE or depth > 1e3 * CONTACT:
+                deep = f", {depth:.2g} mm deep in an obstacle" if depth > 1e3 * CONTACT else ""
+                named.append(f"`{single}` in {name} ({100.0 * above:+.1f} % cost{deep})")
+        shown = " / ".join("clear" if depth <= 0.0 else f"{depth:.4f} mm" for depth in depths)
+        lines.append(
+            (
+                name, f"{ACADOS[name]:.3f}", f"{times[0]:.2f}", f"{times[0] / ACADOS[name]:.1f}", f"{times[1]:.2f}",
+                " / ".join(f"{loops[single].cost:.5g}" for single in SINGLE), f"{converged:.5g}",
+                shown if len(problem.discs) else "none to hit",
+            )
+        )  # fmt: skip
+    if not lines:
+        return "One iteration a step is compared with acados through IPOPT, which is not installed."
+    head = (
+        "closed loop", "acados, times IPOPT", "ipm, times IPOPT", "ipm / acados", "sqp, times IPOPT",
+        "cost: ipm / sqp", "converged", "deepest in an obstacle: ipm / sqp",
+    )  # fmt: skip
+    most = " and ".join(f"{value:.1f} times as long on the {robot}" for robot, value in slower.items())
+    said = (
+        f"One iteration of the interior point takes at most {most} as acados' SQP iteration. Loops in which one "
+        f"iteration a step costs more than {100.0 * WORSE:.0f} % above the converged one, or ends deeper than "
+        f"{1e3 * CONTACT:g} mm in an obstacle: {'; '.join(named) or 'none'}."
+    )
+    return "\n\n".join([table(head, lines), said])
