@@ -119,7 +119,8 @@ class QuadrotorPeer:
                 equality += [True] * 10
             elif problem.blocked:
                 spheres.append(len(equality))
-                rows += [ca.sumsqr(x[k][:3] - s[:3]) - s[3] ** 2 for s in problem.discs]
+                axes = 2 if problem.upright else 3
+                rows += [ca.sumsqr(x[k][:axes] - s[:axes]) - s[3] ** 2 for s in problem.discs]
                 equality += [False] * len(problem.discs)
         unknowns = ca.vertcat(*(part for pair in zip(x[:-1], u, strict=True) for part in pair), x[-1])
         given = ca.vertcat(start, ca.vec(reference), ca.vec(cruise))

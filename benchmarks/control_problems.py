@@ -81,6 +81,7 @@ class Quadrotor:
     dt: ClassVar[float] = 0.05
     lower: ClassVar[Array] = np.array([-6.0, -6.0, -3.0, 2.0])
     upper: ClassVar[Array] = np.array([6.0, 6.0, 3.0, 20.0])
+    upright: ClassVar[bool] = False  # whether the obstacles have no top
 
     instance: str
     blocked: bool
@@ -196,11 +197,15 @@ class QuadrotorGraph:
         graph.constrain(quadrotor.dynamics, *motion, lower=0.0, upper=0.0, name="dynamics")
         graph.bound(u, lower=problem.lower, upper=problem.upper, name="limits")
         if problem.blocked:
-            spheres = problem.discs
-            away = x[1:].p, spheres[:, :3], spheres[:, 3]
-            graph.constrain(avoidance.sphere_clearance, *away, lower=0.0, name="spheres")
+            self.keep_off()
         first, efforts = problem.guess()
         self.guess = fg.Guess({x: first, u: efforts})
+
+    def keep_off(self) -> None:
+        """Add the clearance from every obstacle at every node."""
+        spheres = self.problem.discs
+        away = self.x[1:].p, spheres[:, :3], spheres[:, 3]
+        self.graph.constrain(avoidance.sphere_clearance, *away, lower=0.0, name="spheres")
 
     def data(self, state: Array, first: int) -> dict[fg.Data, Array]:
         """The data of closed-loop step ``first``, begun at ``state``."""

@@ -1,10 +1,16 @@
 """Augmented Lagrangian inside iterative least squares (Bazzana VI, ecg2o 4.1).
 
-The primal step is a damped Gauss-Newton step on the Powell-Hestenes-Rockafellar objective, the dual step
+The primal step is a damped Newton step on the Powell-Hestenes-Rockafellar objective, the dual step
 lambda <- lambda+. Violations are judged after the step. By default tolerances tighten as in the bound-constrained
 Lagrangian method (Conn, Gould, Toint 1991; Nocedal and Wright, algorithm 17.4); ``schedule="bazzana"`` is the
 paper's own loop: one primal step, one dual step, constant penalty. The papers' costs carry no 1/2: their rho and
 lambda are twice ours.
+
+Second derivatives are those of the Lagrangian with the multipliers that the last step's linear model predicts,
+lambda + rho (g + A d). At the point reached the first-order lambda + rho g may be far larger, where g is curved, and a
+Hessian with these converges slowly. The predicted ones are also free of what rho makes of the rounding of g, which
+far from the origin exceeds any tolerance; so of the two estimates the one that balances the gradient better is the
+next multiplier.
 """
 
 from __future__ import annotations
@@ -21,14 +27,16 @@ from unifg.solver import Run, Solver
 from unifg.solvers.damping import Damping, damped_step, largest, norm
 from unifg.solvers.least_squares import require_squares
 from unifg.solvers.least_violation import leave, settle
-from unifg.solvers.model import model_step
+from unifg.solvers.model import STRAIGHT, model_step
 from unifg.solvers.primal import Primal
 from unifg.status import Status
 from unifg.typing import Array
 
 LARGEST_PENALTY = 1e10
+LARGEST_EASY = 1e6  # up to here rho grows after subproblems of one step
 COLD_PENALTY = 10.0  # Birgin and Martinez
 FALL = 0.25  # of the change of multipliers over rho, between outer iterations; else rho grows
+FALLING = 0.9  # of the violation, between outer iterations: progress where rho cannot grow
 WARM_PENALTY = 100.0
 LONGEST, SHORTEST = 2.0, 0.5  # rows of the constraint Jacobian whose length lies between are left as stated
 LARGEST_SCALE = 1e4  # a row that hardly moves at the start says little about its scale
@@ -50,6 +58,8 @@ class AugmentedLagrangian(Solver):
             and the largest violation. A positive step_tolerance switches it on; it does not grant CONVERGED.
         inner_iterations: primal steps before the next dual step, converged or not.
         damping: initial Levenberg-Marquardt damping of the primal step.
+        hessian: "exact" (of the Lagrangian; less of its second derivatives, down to Gauss-Newton's, where it is not
+            convex) or "gauss-newton". The schedule "bazzana" and graphs without constraints have Gauss-Newton's.
     """
 
     max_iterations: int = 300
@@ -61,12 +71,15 @@ class AugmentedLagrangian(Solver):
     violation_tolerance: float = 1e-4
     inner_iterations: int = 20
     damping: float = 1e-6
+    hessian: Literal["exact", "gauss-newton"] = "exact"
 
     def __post_init__(self) -> None:
-        """Refuse unknown schedules and penalties that are not positive."""
+        """Refuse unknown words and penalties that are not positive."""
         super().__post_init__()
         if self.schedule not in ("bcl", "bazzana"):
             raise BackendError(f"{self.name}: schedule must be 'bcl' or 'bazzana', found '{self.schedule}'")
+        if self.hessian not in ("exact", "gauss-newton"):
+            raise BackendError(f"{self.name}: hessian must be 'exact' or 'gauss-newton', found '{self.hessian}'")
         if self.penalty is not None and not self.penalty > 0.0:
             raise BackendError(f"{self.name}: penalty must be positive, found {self.penalty}")
 
@@ -110,30 +123,35 @@ class AugmentedLagrangian(Solver):
 
     def _tightening(self, run: Run, primal: Primal, rho: float, weights: Array) -> Status | None:
         """Solve each subproblem only as accurately as its multipliers deserve."""
-        multipliers = run.multipliers
+        multipliers = expected = run.multipliers
         damping = Damping(self.damping)
         scale = np.sqrt(weights)
         # Goals are for scaled violations, the KKT test and the last resort for those as stated.
         heaviest = LARGEST_PENALTY / min(1.0, float(weights.min(initial=1.0)))
         least = 0.1 * self.tolerance * min(1.0, float(scale.min(initial=1.0)))
         gradient_goal, violation_goal = self._goals(run, primal, rho, weights)
-        outer = 0
+        exact = self.hessian == "exact" and len(weights) > 0
+        outer, last = 0, np.inf
         while run.status is None:
             outer += 1
             run.penalties = penalty = rho * weights
             before = len(run.history)
             stalled = False
-            while (
-                largest(primal.gradient(run.lin, multipliers, penalty)) > gradient_goal
-                and len(run.history) - before < self.inner_iterations
-            ):
-                taken = damped_step(primal, run.lin, multipliers, penalty, damping)
+            after = primal.next_multipliers(run.lin.constraints, multipliers, penalty)
+            slope = primal.slope(run.lin, after)
+            while slope > gradient_goal and len(run.history) - before < self.inner_iterations:
+                bend = primal.bend(run.lin, expected) if exact else STRAIGHT
+                taken = damped_step(primal, run.lin, multipliers, penalty, damping, bend)
                 if taken is None:
                     stalled = True
                     break
                 values, step, rejected = taken
+                expected = primal.expected_multipliers(run.lin, step, multipliers, penalty)
                 lin = run.program.linearize(values)
                 after = primal.next_multipliers(lin.constraints, multipliers, penalty)
+                slope, balance = primal.slope(lin, after), primal.slope(lin, expected)
+                if balance < slope:
+                    after, slope = expected, balance
                 run.accept(
                     lin,
                     after,
@@ -150,23 +168,29 @@ class AugmentedLagrangian(Solver):
                     return None
                 if norm(step) < self.step_tolerance:
                     break  # too short to be of use: what violation remains is for the multipliers to remove
-            after = primal.next_multipliers(run.lin.constraints, multipliers, penalty)
             change = largest(scale * (after - multipliers) / penalty)
             if len(run.history) == before:  # nothing moved: the dual step alone is this iteration
                 run.accept(run.lin, after, 0.0, 0.0, outer=outer, penalty=rho)
             if stalled and (change == 0.0 or rho >= heaviest):
                 return settle(run, Status.STALLED)
+            falling, last = run.optimality.violation <= FALLING * last, run.optimality.violation
             if change <= violation_goal:
                 multipliers = after
+                if len(run.history) - before <= 1 and not stalled:  # so easy that the next one may be harder
+                    rho = max(rho, min(rho * self.penalty_growth, LARGEST_EASY))
                 violation_goal = max(min(violation_goal / rho**0.9, FALL * change), least)
                 gradient_goal = max(0.1 * gradient_goal, 0.0 if run.program.least_squares else 0.1 * self.tolerance)
             else:
                 if run.infeasible_stationary() and (ending := leave(run)) is not None:
                     return ending
-                if rho >= heaviest:
+                if rho < heaviest:
+                    rho = min(rho * self.penalty_growth, heaviest)
+                    gradient_goal, violation_goal = self._goals(run, primal, rho, weights)
+                elif falling:  # as where constraints have no multipliers
+                    multipliers = after
+                    gradient_goal = max(0.1 * gradient_goal, 0.1 * self.tolerance)
+                else:
                     return settle(run, Status.STALLED)
-                rho = min(rho * self.penalty_growth, heaviest)
-                gradient_goal, violation_goal = self._goals(run, primal, rho, weights)
             if stalled:
                 damping = Damping(self.damping)
         return None

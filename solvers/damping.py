@@ -8,7 +8,7 @@ import numpy as np
 
 from unifg.columns import Values
 from unifg.linearization import Linearization
-from unifg.solvers.model import model_step
+from unifg.solvers.model import STRAIGHT, model_step
 from unifg.solvers.primal import Primal
 from unifg.typing import Array
 
@@ -17,6 +17,7 @@ LARGEST = 1e12
 SHRINK = 0.1
 ROUNDING = 1e-14
 SUFFICIENT = 1e-4
+LEAST_SHARE = 0.125  # of the second derivatives, before they are left out
 
 
 @dataclass
@@ -26,10 +27,12 @@ class Damping:
     Attributes:
         value: present damping, relative to the diagonal of the Hessian.
         growth: factor of the next rejection; doubles with each.
+        share: of the second derivatives that left the last model convex.
     """
 
     value: float
     growth: float = 2.0
+    share: float = 1.0
 
     def reject(self) -> None:
         """Grow, faster with every rejection in a row."""
@@ -43,9 +46,22 @@ class Damping:
 
 
 def damped_step(
-    primal: Primal, lin: Linearization, multipliers: Array, penalty: Array, damping: Damping
+    primal: Primal,
+    lin: Linearization,
+    multipliers: Array,
+    penalty: Array,
+    damping: Damping,
+    bend: Array = STRAIGHT,
 ) -> tuple[Values, Array, int] | None:
     """One accepted step on the augmented objective.
+
+    Args:
+        primal: the augmented objective and its factorisation.
+        lin: where.
+        multipliers: (M,) of the augmented objective.
+        penalty: (M,) rho of every row.
+        damping: what it begins with, and what it learns.
+        bend: (nnz,) second derivatives for the model; a share of them, or none, where they leave it indefinite.
 
     Returns:
         The new values, the tangent step and the number of rejected trials; None when no damping helps.
@@ -53,13 +69,21 @@ def damped_step(
     merit = primal.merit(lin, multipliers, penalty)
     # Least squares has no unit: what is rounding depends on the cost alone.
     slack = ROUNDING * (merit if primal.program.least_squares else max(1.0, abs(merit)))
-    rejected = 0
+    rejected, rounded = 0, False
+    damping.share = share = min(4.0 * damping.share, 1.0)
     while damping.value <= LARGEST:
-        found = model_step(primal, lin, multipliers, penalty, damping.value)
+        curved = len(bend) > 0 and share > 0.0
+        found = model_step(primal, lin, multipliers, penalty, damping.value, share * bend if curved else STRAIGHT)
+        if found is None and curved:
+            damping.share = max(0.5 * share, LEAST_SHARE)
+            share = 0.5 * share if share > LEAST_SHARE else 0.0
+            continue
         if found is not None:
             step, predicted = found
             values, evaluation = primal.trial(lin, step)
             actual = merit - primal.merit(evaluation, multipliers, penalty)
+            if not rounded and not actual >= SUFFICIENT * predicted - slack:
+                slack, rounded = max(slack, primal.rounding(lin, multipliers, penalty)), True
             if evaluation.finite and actual >= SUFFICIENT * predicted - slack:
                 damping.accept(1.0 if predicted <= slack else min(actual / predicted, 1.0))
                 return values, step, rejected

@@ -4,6 +4,9 @@ With residuals and constraints linearised, the augmented objective is convex and
 inequality joins or leaves as the step grows. Newton steps that update the active rows, with a line search, find
 its minimum in a few factorisations and without any new evaluation of the problem. A single Gauss-Newton step
 would freeze the active rows at the linearisation point and overshoot every limit it runs into.
+
+Second derivatives of residuals and constraints may join the model. They make it Newton's, and no longer convex by
+construction: a model that turns out not to be positive definite is refused.
 """
 
 from __future__ import annotations
@@ -11,13 +14,14 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.elimination.fronts import factor
-from unifg.elimination.plan import Plan
+from unifg.elimination.plan import NEGATIVE, Plan
 from unifg.elimination.substitution import solve
 from unifg.jit import compiled
 from unifg.linearization import Linearization
 from unifg.passes import add_constraints, times, transposed_times
 from unifg.solvers.phr import barrier, update
 from unifg.solvers.primal import DIAGONAL_FLOOR, Primal
+from unifg.sparse import add_times
 from unifg.table import Terms
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -25,10 +29,16 @@ NEWTON_STEPS = 12
 SHORTEST = 1e-3
 ARMIJO = 0.1
 ROUNDING = 1e-14
+STRAIGHT: Array = np.zeros(0)
 
 
 def model_step(
-    primal: Primal, lin: Linearization, multipliers: Array, penalty: Array, damping: float
+    primal: Primal,
+    lin: Linearization,
+    multipliers: Array,
+    penalty: Array,
+    damping: float,
+    bend: Array = STRAIGHT,
 ) -> tuple[Array, float] | None:
     """Minimise the damped model.
 
@@ -37,10 +47,12 @@ def model_step(
         lin: where the model is built.
         multipliers: (M,) of the augmented objective.
         penalty: (M,) rho of every row.
-        damping: relative to the diagonal of the Gauss-Newton Hessian at ``lin``.
+        damping: relative to the diagonal of the Hessian at ``lin``.
+        bend: (nnz,) what Gauss-Newton's Hessian leaves out, in the order of ``Program.normal``; empty for nothing.
 
     Returns:
-        The tangent step and the decrease the model predicts; None when a system cannot be factorised.
+        The tangent step and the decrease the model predicts; None when a system cannot be factorised, or the second
+        derivatives leave it indefinite.
     """
     program = primal.program
     primal.damping = damping
@@ -49,13 +61,15 @@ def model_step(
         program.arrays,
         primal.solver.plan,
         program.columns.free,
-        program.normal.diagonal,
+        program.normal.indptr,
+        program.normal.indices,
         program.equality,
         lin.residual,
         lin.jacobian,
         lin.constraints,
         lin.constraint_jacobian,
         lin.hessian,
+        bend,
         multipliers,
         penalty,
         damping,
@@ -70,19 +84,22 @@ def _minimize(
     terms: Terms,
     plan: Plan,
     free: IntArray,
-    diagonal: IntArray,
+    indptr: IntArray,
+    indices: IntArray,
     equality: BoolArray,
     start_residual: Array,
     jacobian: Array,
     start_constraints: Array,
     constraint_jacobian: Array,
     hessian: Array,
+    bend: Array,
     multipliers: Array,
     penalty: Array,
     damping: float,
     step: Array,
 ) -> float:
     """Newton's method on the piecewise quadratic; returns the predicted decrease, NaN when a system is singular."""
+    curved = len(bend) > 0
     lower, upper = terms.lower, terms.upper
     residual, constraints = start_residual.copy(), start_constraints.copy()
     residual_here, constraints_here = np.empty_like(residual), np.empty_like(constraints)
@@ -90,6 +107,7 @@ def _minimize(
     after, weights = np.empty_like(constraints), np.empty_like(constraints)
     full, gradient, move = np.empty(len(terms.unknown)), np.empty_like(step), np.empty_like(step)
     added, curvature, here = np.empty_like(step), np.empty_like(hessian), np.empty_like(step)
+    bent, bent_move, bow, bow_here = np.zeros_like(step), np.zeros_like(step), 0.0, 0.0  # of the second derivatives
     update(constraints, lower, upper, multipliers, penalty, after)
     for row in range(len(weights)):
         weights[row] = penalty[row] if equality[row] or after[row] != 0.0 else 0.0
@@ -100,12 +118,14 @@ def _minimize(
         transposed_times(terms, True, jacobian, residual, full)
         transposed_times(terms, False, constraint_jacobian, after, full)
         curvature[:] = hessian
+        if curved:
+            curvature += bend
         add_constraints(terms, constraint_jacobian, weights, curvature)
         if newton == 0:
-            _damping(curvature, diagonal, damping, added)
+            _damping(curvature, indptr, damping, added)
         for k in range(len(step)):
-            gradient[k] = -full[free[k]] - added[k] * step[k]
-        if not factor(plan, curvature, added):
+            gradient[k] = -full[free[k]] - added[k] * step[k] - bent[k]
+        if not factor(plan, curvature, added) or (curved and plan.state[NEGATIVE] > 0):
             return np.nan
         solve(plan, gradient, move)
         times(terms, True, jacobian, move, residual_move)
@@ -113,6 +133,9 @@ def _minimize(
         slope, length = -np.dot(gradient, move), 1.0
         if not np.isfinite(slope):
             return np.nan
+        if curved:
+            bent_move[:] = 0.0
+            add_times(indptr, indices, bend, move, bent_move)
         while True:
             for k in range(len(step)):
                 here[k] = step[k] + length * move[k]
@@ -124,10 +147,15 @@ def _minimize(
             value_here += barrier(constraints_here, lower, upper, multipliers, penalty)
             for k in range(len(step)):
                 value_here += 0.5 * added[k] * here[k] * here[k]
+            if curved:
+                bow_here = bow + length * (np.dot(bent, move) + 0.5 * length * np.dot(bent_move, move))
+                value_here += bow_here
             if value_here <= value + ARMIJO * length * slope + ROUNDING * abs(value) or length < SHORTEST:
                 break
             length *= 0.5
         step[:], residual[:], constraints[:], value = here, residual_here, constraints_here, value_here
+        bent += length * bent_move
+        bow = bow_here
         update(constraints, lower, upper, multipliers, penalty, after)
         same = True
         for row in range(len(weights)):
@@ -140,10 +168,10 @@ def _minimize(
 
 
 @compiled
-def _damping(curvature: Array, diagonal: IntArray, damping: float, added: Array) -> None:
-    """What Marquardt's damping adds to the diagonal."""
+def _damping(curvature: Array, indptr: IntArray, damping: float, added: Array) -> None:
+    """What Marquardt's damping adds to the diagonal, which is last in every column."""
     largest = 0.0
     for k in range(len(added)):
-        largest = max(largest, curvature[diagonal[k]])
+        largest = max(largest, curvature[indptr[k + 1] - 1])
     for k in range(len(added)):
-        added[k] = damping * max(curvature[diagonal[k]], DIAGONAL_FLOOR * largest + 1e-300)
+        added[k] = damping * max(curvature[indptr[k + 1] - 1], DIAGONAL_FLOOR * largest + 1e-300)

@@ -11,6 +11,7 @@ import numpy as np
 from unifg.columns import Values
 from unifg.linearization import Evaluation, Linearization
 from unifg.program import Program
+from unifg.second_order import lagrangian_hessian
 from unifg.solvers.phr import barrier, update
 from unifg.typing import Array
 
@@ -48,11 +49,42 @@ class Primal:
         after = self.next_multipliers(lin.constraints, multipliers, penalty)
         return self.program.lagrangian_gradient(lin, after)[self.program.columns.free]
 
+    def rounding(self, lin: Linearization, multipliers: Array, penalty: Array) -> float:
+        """What one unit in the last place of every coordinate is worth in :meth:`merit`.
+
+        Far from the origin, as in map coordinates, this is more than the last steps of a solve can gain.
+        """
+        program = self.program
+        after = self.next_multipliers(lin.constraints, multipliers, penalty)
+        pull = program.costs.transposed_times(np.abs(lin.jacobian), np.abs(lin.residual))
+        pull += program.constraints.transposed_times(np.abs(lin.constraint_jacobian), np.abs(after))
+        size = np.concatenate([np.repeat(np.abs(lin.values[f]).max(axis=1), f.manifold.dim) for f in program.families])
+        return float(np.finfo(np.float64).eps * (pull @ size))
+
+    def slope(self, lin: Linearization, multipliers: Array) -> float:
+        """Largest entry of the Lagrangian's gradient over the unknowns."""
+        gradient = self.program.lagrangian_gradient(lin, multipliers)
+        return float(np.abs(gradient[self.program.columns.free]).max(initial=0.0))
+
     def curvature(self, lin: Linearization, multipliers: Array, penalty: Array) -> Array:
         """Gauss-Newton Hessian entries J'J + A' diag(rho, active rows) A."""
         after = self.next_multipliers(lin.constraints, multipliers, penalty)
         active = self.program.equality | (after != 0.0)
         return self.program.normal_entries(lin, np.where(active, penalty, 0.0))
+
+    def expected_multipliers(self, lin: Linearization, step: Array, multipliers: Array, penalty: Array) -> Array:
+        """(M,) lambda+ after a step, by the linear model of the constraints."""
+        program = self.program
+        moved = lin.constraints + program.constraints.times(lin.constraint_jacobian, step)
+        return self.next_multipliers(moved, multipliers, penalty)
+
+    def bend(self, lin: Linearization, multipliers: Array) -> Array:
+        """What :meth:`curvature` leaves out of the Hessian: second derivatives of residuals and constraints.
+
+        Empty where they are not finite: a factor may have a kink or a pole there.
+        """
+        left_out: Array = lagrangian_hessian(self.program, lin, multipliers) - lin.hessian
+        return left_out if np.isfinite(left_out).all() else np.zeros(0)
 
     def direction(self, curvature: Array, gradient: Array) -> Array | None:
         """Solve H d = -gradient; None when the matrix cannot be factorised."""

@@ -43,8 +43,7 @@ UNSOLVED: dict[str, set[str]] = {
         *("HS13", "HS15", "HS17", "HS20", "HS27", "HS38", "HS58", "Freudenstein and Roth"),
         *("Jennrich and Sampson", "Wood", "discs that touch"),
     },
-    # HS13 and the discs have no multipliers; in HS27 the inner Gauss-Newton steps crawl along the constraint.
-    "AugmentedLagrangian": {"HS13", "HS27", "Jennrich and Sampson", "discs that touch"},
+    "AugmentedLagrangian": {"HS13", "Jennrich and Sampson", "discs that touch"},  # HS13, discs: no multipliers
     # Convexified costs without curvature send the first steps far away.
     "SQP": {"HS56", "HS93"},
     "SQP, exact": set(),

@@ -80,7 +80,7 @@ class Symmetric:
     def times(self, data: Array, vector: Array) -> Array:
         """The symmetric matrix with upper triangle ``data`` times a vector."""
         out = np.zeros(self.size)
-        _times(self.indptr, self.indices, data, np.ascontiguousarray(vector, dtype=np.float64), out)
+        add_times(self.indptr, self.indices, data, np.ascontiguousarray(vector, dtype=np.float64), out)
         return out
 
     def matrix(self, data: Array) -> sp.csc_matrix:
@@ -109,8 +109,8 @@ def _expand(starts: IntArray, first: IntArray, second: IntArray, indptr: IntArra
 
 
 @compiled
-def _times(indptr: IntArray, indices: IntArray, data: Array, vector: Array, out: Array) -> None:
-    """Add the product to ``out``."""
+def add_times(indptr: IntArray, indices: IntArray, data: Array, vector: Array, out: Array) -> None:
+    """Add the product of the symmetric matrix with upper triangle ``data`` and a vector to ``out``."""
     for column in range(len(out)):
         total = 0.0
         for at in range(indptr[column], indptr[column + 1]):
