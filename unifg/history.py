@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from unifg.errors import UnifgError
+from unifg.factor_norms import Deferred, FactorNorms
 from unifg.typing import Array
 from unifg.variables import Family
 
@@ -23,6 +25,7 @@ class Iteration:
         terms: residual norm of every term (for constraints, of the violation).
         details: what the backend adds: damping, penalty, QP route and iterations, ...
         values: copies of the values of every family, None unless the solver has ``keep_values``.
+        deferred: where :attr:`residuals` come from.
     """
 
     number: int
@@ -36,6 +39,26 @@ class Iteration:
     terms: dict[str, float]
     details: dict[str, float | int | str] = field(default_factory=dict)
     values: dict[Family, Array] | None = field(default=None, repr=False, compare=False)
+    deferred: Deferred | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def residuals(self) -> FactorNorms:
+        """(n,) residual norms of the factors of every term, by its name; see :mod:`unifg.factor_norms`.
+
+        They are at hand while a callback looks at the row, and stay if it asked for them. All rows keep theirs with
+        ``keep_residuals=True``; those of the last iterate are always in :attr:`unifg.Solution.residuals`.
+
+        Raises:
+            UnifgError: when they were not kept.
+        """
+        found = self.deferred() if self.deferred is not None else None
+        if found is None:
+            raise UnifgError(
+                f"the residuals of the factors in iteration {self.number} were not kept: solve with "
+                "keep_residuals=True, or ask for them in the callback",
+                index=self.number,
+            )
+        return found
 
 
 HEADER = (

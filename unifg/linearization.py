@@ -48,6 +48,8 @@ class Linearization:
         norms: each term's residual norm; for constraints the norm of the violation.
         weights: weights of reweighted losses, to be held during the line search.
         concavity: the negative curvature of scalar costs, in the order of ``Program.normal``; empty without such costs.
+        squares: squared norms of the whitened residuals of robust factors, before their loss.
+        scalars: (n,) values of each scalar cost.
     """
 
     values: Values
@@ -61,6 +63,8 @@ class Linearization:
     norms: dict[str, float]
     weights: HeldWeights = field(default_factory=dict)
     concavity: Array = field(default_factory=lambda: np.zeros(0))
+    squares: Array = field(default_factory=lambda: np.zeros(0))
+    scalars: dict[str, Array] = field(default_factory=dict)
 
     @property
     def finite(self) -> bool:

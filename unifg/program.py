@@ -206,6 +206,7 @@ class Program:
         gradient[:], hessian[:] = 0.0, 0.0
         squares, size = np.empty(table.weights), np.empty(len(table.arrays.fields))
         norms: dict[str, float] = {}
+        scalars: dict[str, Array] = {}
         weights: HeldWeights = {}
         concavity = np.zeros(self.normal.nnz if self.scalar_terms else 0)
         with np.errstate(all="ignore"):
@@ -231,7 +232,7 @@ class Program:
             for term in self.scalar_terms:
                 value = term.residual(values)
                 cost += float(value.sum())
-                norms[term.name] = float(np.abs(value).sum())
+                scalars[term.name], norms[term.name] = value, float(np.abs(value).sum())
                 slope, curvature, _ = term.scalar_derivatives(values)
                 columns, factor, a, b, place = self._scalars[term.name]
                 np.add.at(gradient, columns.ravel(), slope.ravel())
@@ -239,7 +240,7 @@ class Program:
                 np.add.at(concavity, place, (curvature - convex)[factor, a, b])
         norms |= self.norms(size)
         found = residual, jacobian, constraints, constraint_jacobian, gradient, hessian
-        return Linearization(values, cost, *found, norms, weights, concavity)
+        return Linearization(values, cost, *found, norms, weights, concavity, squares, scalars)
 
     def _weigh(
         self,

@@ -10,6 +10,7 @@ import numpy as np
 
 from unifg.covariance import Covariances
 from unifg.errors import GraphError
+from unifg.factor_norms import FactorNorms, factor_norms
 from unifg.history import HEADER, Iteration, line
 from unifg.kkt import Optimality
 from unifg.linearization import Linearization
@@ -109,6 +110,13 @@ class Solution:
     def penalties(self) -> dict[str, Array]:
         """Penalties the solve ended with, (n, m) for every constraint term; empty when the backend has none."""
         return self._by_term(self._penalties) if self._penalties.any() else {}
+
+    @property
+    def residuals(self) -> FactorNorms:
+        """(n,) residual norms of the factors of every term at the solution; see :mod:`unifg.factor_norms`."""
+        g = self._lin.constraints
+        outside = np.maximum(g - self._upper, 0.0) - np.maximum(self._lower - g, 0.0)
+        return factor_norms(self._program, self._lin, outside)
 
     @property
     def worst(self) -> tuple[str, int] | None:

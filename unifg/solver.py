@@ -13,6 +13,7 @@ import numpy as np
 
 from unifg.columns import Values
 from unifg.errors import BackendError, GraphError, NotConverged
+from unifg.factor_norms import Deferred, factor_norms
 from unifg.graph import Graph
 from unifg.history import HEADER, Iteration, line
 from unifg.kkt import infeasible_stationary, optimality
@@ -42,6 +43,7 @@ class Solver(ABC):
         time_limit: seconds before giving up, checked once an iteration.
         verbose: log one line per iteration at level INFO to the logger ``unifg``.
         keep_values: keep the values of every iterate in the history, for pictures of a solve.
+        keep_residuals: keep the residual norm of every factor in the history, one number per factor and row.
         search_iterations: the first so many steps use the search Jacobians of residuals that have one, and are taken
             in full without a merit test. Costs and KKT numbers are the true ones throughout.
     """
@@ -51,6 +53,7 @@ class Solver(ABC):
     time_limit: float = np.inf
     verbose: bool = False
     keep_values: bool = False
+    keep_residuals: bool = False
     search_iterations: int = 0
 
     def __post_init__(self) -> None:
@@ -183,6 +186,7 @@ class Run:
         """Make ``lin`` the present iterate: measure it, record a row, decide whether to go on."""
         self._move(lin, multipliers)
         self.iterations = len(self.history)
+        deferred = Deferred(lambda: factor_norms(self.program, lin, self.program.violation(lin.constraints)))
         row = Iteration(
             self.iterations,
             lin.cost,
@@ -195,7 +199,10 @@ class Run:
             lin.norms,
             dict(details),
             {family: array.copy() for family, array in lin.values.items()} if self._solver.keep_values else None,
+            deferred,
         )
+        if self._solver.keep_residuals:
+            deferred()
         self.history.append(row)
         if self._solver.verbose:
             logger.info(line(row))
@@ -203,12 +210,14 @@ class Run:
         self.status = self._decide()
         if self._callback is not None and self._callback(row) and self.status is None:
             self.status = Status.INTERRUPTED
+        deferred.close()
 
     @property
     def watched(self) -> bool:
-        """Whether somebody looks at every iteration: a callback, a log, kept values, a time limit."""
+        """Whether somebody looks at every iteration: a callback, a log, kept values or residuals, a time limit."""
         solver = self._solver
-        return bool(self._callback or solver.verbose or solver.keep_values or np.isfinite(solver.time_limit))
+        kept = solver.verbose or solver.keep_values or solver.keep_residuals
+        return bool(self._callback or kept or np.isfinite(solver.time_limit))
 
     def conclude(
         self, lin: Linearization, multipliers: Array, iterations: int, history: Callable[[], list[Iteration]]
