@@ -135,6 +135,8 @@ class Bent:
 
     def __init__(self, inner: fg.Prepared, **claims: Any) -> None:
         self.inner, self.claims = inner, claims
+        if claims.get("violation"):  # nor has it passed anything that could be driven
+            claims["history"] = []
 
     def solve(self, guess: Any, **options: Any) -> Any:
         solution = self.inner.solve(guess, **options)
