@@ -4,7 +4,8 @@
 
 A hundred parkings of a kinematic bicycle and fourteen other kinds of control problem, each stated twice
 (:mod:`benchmarks.twins`): as a graph with residuals as a user writes them, and in casadi, whose exact derivatives judge
-what every backend answers (:mod:`benchmarks.exact_judge`). Needs casadi. Writes docs/claims.md.
+what every backend answers (:mod:`benchmarks.exact_judge`). Needs casadi. Every problem is a line of
+out/benchmarks/claims.jsonl and is not solved again until the code changes. Writes docs/claims.md.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -22,7 +24,7 @@ from tqdm import tqdm
 import unifg as fg
 from benchmarks import twin_flights, twin_ground, twin_machines
 from benchmarks.exact_judge import Judge, Peer
-from benchmarks.report import CHECKOUT, OUT, machine, put_results, table
+from benchmarks.report import CHECKOUT, OUT, code_digest, machine, put_results, table
 from benchmarks.twins import Twin
 from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
 
@@ -272,34 +274,51 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--kinds", nargs="*", help="only these")
     parser.add_argument("--backends", nargs="*", help="only these")
     parser.add_argument("--quick", action="store_true", help="print, write no page")
+    parser.add_argument("--fresh", action="store_true", help="forget earlier answers of this state of the code")
+    parser.add_argument("--report", action="store_true", help="solve nothing, make the tables from what is on file")
     options = parser.parse_args(arguments)
+    whole = not (options.kinds or options.backends)
+    store, code = OUT / ("claims.jsonl" if whole else "claims-some.jsonl"), code_digest("benchmarks.claims")
+    OUT.mkdir(parents=True, exist_ok=True)
+    if options.fresh or not whole:
+        store.unlink(missing_ok=True)
+    rows = [] if not store.exists() else [json.loads(line) for line in store.read_text(encoding="utf-8").splitlines()]
+    cases = [restored(row) for row in rows if options.report or row["code"] == code]
 
     def chosen(backends: dict[str, fg.Solver]) -> dict[str, fg.Solver]:
         return {name: b for name, b in backends.items() if not options.backends or name in options.backends}
 
-    jobs: list[tuple[Callable[..., Twin], int, dict[str, fg.Solver], bool]] = []
+    jobs: list[tuple[str, Callable[..., Twin], int, dict[str, fg.Solver], bool]] = []
     for name, build in KINDS.items():
         if not options.kinds or name in options.kinds:
-            jobs += [(build, seed, chosen(BACKENDS), False) for seed in range(options.seeds)]
-            jobs += [(build, seed, chosen(EQUALITY_BACKENDS), True) for seed in range(options.seeds)]
+            jobs += [(name, build, seed, chosen(BACKENDS), False) for seed in range(options.seeds)]
+            jobs += [(name, build, seed, chosen(EQUALITY_BACKENDS), True) for seed in range(options.seeds)]
     if not options.kinds or "parking" in options.kinds:
-        jobs += [(PARKING, seed, chosen(BACKENDS), False) for seed in range(options.parkings)]
-    cases = []
-    OUT.mkdir(parents=True, exist_ok=True)
-    with (OUT / "claims.jsonl").open("w", encoding="utf-8") as store:
-        for build, seed, backends, equal in tqdm(jobs, unit="problem"):
+        jobs += [("parking", PARKING, seed, chosen(BACKENDS), False) for seed in range(options.parkings)]
+    done = {(case.kind, case.seed, case.equalities_only) for case in cases}
+    jobs = [] if options.report else [job for job in jobs if (job[0], job[2], job[4]) not in done]
+    with store.open("a", encoding="utf-8") as file:
+        for _, build, seed, backends, equal in tqdm(jobs, unit="problem"):
             case = measure(build, seed, backends, equal)
             cases.append(case)
-            store.write(json.dumps(asdict(case)) + "\n")
-            store.flush()
+            file.write(json.dumps({"code": code, **asdict(case)}) + "\n")
+            file.flush()
             for backend, result in case.answers.items():
                 if result.claim == "false":
                     tqdm.write(f"{case.kind} {seed}{' =' if equal else ''} {backend}: {result.status}: {result.reason}")
     text = render(cases)
     print(text)
-    if not (options.quick or options.kinds or options.backends):
-        put_results(CHECKOUT / "docs" / "claims.md", "What the backends claim, judged from outside", text)
+    if whole and not options.quick:
+        codes = {row["code"] for row in rows} if options.report else {code}
+        put_results(CHECKOUT / "docs" / "claims.md", "What the backends claim, judged from outside", text, codes)
     return 1 if any(a.claim == "false" for case in cases for a in case.answers.values()) else 0
+
+
+def restored(row: Mapping[str, Any]) -> Case:
+    """A case from its line of the file."""
+    answers = {name: Answer(**a) for name, a in row["answers"].items()}
+    fatrop = None if row["fatrop"] is None else Peer(**row["fatrop"])
+    return Case(row["kind"], row["seed"], row["equalities_only"], answers, Peer(**row["ipopt"]), fatrop)
 
 
 if __name__ == "__main__":
