@@ -173,10 +173,7 @@ def measure() -> dict[str, dict[str, Outcome]]:
 
 def render(results: dict[str, dict[str, Outcome]]) -> str:
     """The page."""
-    notes = (
-        f"{machine('numpy', 'scipy', 'casadi')} Default options, one "
-        "solve from the standard start of each problem."
-    )
+    notes = f"{machine('numpy', 'scipy', 'casadi')} Default options, one solve from the standard start of each problem."
     parts = [notes, _summary(results), "## What is not solved", _failures(results)]
     for title, cases in GROUPS.items():
         parts += [f"## Iterations: {title}", _iterations(results, cases)]

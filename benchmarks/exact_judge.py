@@ -260,9 +260,7 @@ class Judge:
         if set(families) != {"x", "u"} or not any(rows.moves for rows in self.twin.rows):
             return None
         x, u = families["x"], families["u"]
-        place = np.concatenate(
-            [np.repeat(2 * np.arange(f.count) + (f is u), f.manifold.dim) for f in self.twin.point]
-        )
+        place = np.concatenate([np.repeat(2 * np.arange(f.count) + (f is u), f.manifold.dim) for f in self.twin.point])
         moves = np.concatenate([np.zeros(0, bool), *(np.full(len(r.lower), r.moves) for r in self.twin.rows)])
         rows = np.lexsort((~moves, self._row_stages))
         return (np.argsort(place, kind="stable"), rows) if x.count == u.count + 1 else None

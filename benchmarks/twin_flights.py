@@ -194,9 +194,7 @@ def minimum_snap(seed: int, equalities_only: bool = False) -> Twin:
     twin.minimize(lambda u: u, lambda u: u, u, sigma=100.0, name="snap")
     twin.equal(motion, motion_exact, x[:-1], u, x[1:], name="motion", moves=True)
     for k, point in zip(knots[1:-1], points, strict=False):
-        twin.equal(
-            lambda x, p=point: x[:, :3] - p, lambda x, p=point: x[:3] - p, x[k : k + 1], name=f"through {k}"
-        )
+        twin.equal(lambda x, p=point: x[:, :3] - p, lambda x, p=point: x[:3] - p, x[k : k + 1], name=f"through {k}")
     end = np.append(points[-1], np.zeros(9))
     twin.equal(lambda x: x - end, lambda x: x - end, x[-1], name="at rest")
     for name, first, limit in (("speed", 3, 3.0), ("acceleration", 6, 9.0)):

@@ -192,9 +192,7 @@ def relay(seed: int, equalities_only: bool = False) -> Twin:
             lambda p, v, q: q - p - dt * v, lambda p, v, q: q - p - dt * v, p[:-1], v, p[1:],
             name=f"{name} motion",
         )  # fmt: skip
-        twin.require(
-            lambda v: (v**2).sum(axis=1, keepdims=True), ca.sumsqr, v, upper=1.44, name=f"{name} speed limit"
-        )
+        twin.require(lambda v: (v**2).sum(axis=1, keepdims=True), ca.sumsqr, v, upper=1.44, name=f"{name} speed limit")
         twin.require(
             SEPARATION, lambda p, m, least: ca.sumsqr(p - m) - least**2, p[1:], mast, 0.5, lower=0.0,
             name=f"{name} mast",

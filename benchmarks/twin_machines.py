@@ -79,8 +79,8 @@ def arm(seed: int, equalities_only: bool = False) -> Twin:
         first -= GRAVITY * (1.5 * np.cos(m[:, 0]) + 0.5 * np.cos(m[:, 0] + m[:, 1]))
         second = u[:, 1] - 0.5 * s * m[:, 2] ** 2 - 0.5 * GRAVITY * np.cos(m[:, 0] + m[:, 1])
         det = a * d - b * b
-        return after - x - dt * np.column_stack(
-            [m[:, 2:], (d * first - b * second) / det, (a * second - b * first) / det]
+        return (
+            after - x - dt * np.column_stack([m[:, 2:], (d * first - b * second) / det, (a * second - b * first) / det])
         )
 
     def motion_exact(x: Any, u: Any, after: Any) -> Any:

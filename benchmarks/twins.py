@@ -144,9 +144,7 @@ class Twin:
         """Require g = 0 for each factor."""
         self.require(ours, exact, *arguments, lower=0.0, upper=0.0, name=name, moves=moves)
 
-    def bound(
-        self, variable: Variable, *, lower: ArrayLike = -np.inf, upper: ArrayLike = np.inf, name: str
-    ) -> None:
+    def bound(self, variable: Variable, *, lower: ArrayLike = -np.inf, upper: ArrayLike = np.inf, name: str) -> None:
         """Limit Rn variables entry by entry."""
         if self.equalities_only:
             return

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from unifg.kkt import NEGLIGIBLE, infeasible_stationary
+from unifg.kkt import infeasible_stationary
 from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.solver import Run
@@ -110,7 +110,7 @@ def least_violation(
         if np.abs(outside).max(initial=0.0) <= tolerance or out_of_time():
             return lin
         model = ViolationModel(program, lin)
-        if model.promises_less_than(NEGLIGIBLE):
+        if model.stationary(tolerance):
             return lin
         size = np.maximum(size, model.size)
         while damping <= LARGEST_DAMPING:

@@ -93,11 +93,12 @@ def primal_graph(qp: QP) -> LinearGraph:
         if blocks and (term.active is None or term.active[_index(name)]):
             factors.append(LinearFactor(name, "cost", blocks, -lin.residual[rows], _largest(blocks)))
     factors += _scalar_costs(qp, names, first)
-    if qp.damping:
-        root = np.sqrt(qp.damping)
-        for name, size in sizes.items():
+    roots = np.sqrt(np.broadcast_to(qp.damping, program.size))
+    if roots.any():
+        for (name, size), start in zip(sizes.items(), first.tolist(), strict=True):
+            own = roots[start : start + size]
             factors.append(
-                LinearFactor(f"damping of {name}", "damping", {name: root * np.eye(size)}, np.zeros(size), root)
+                LinearFactor(f"damping of {name}", "damping", {name: np.diag(own)}, np.zeros(size), float(own.max()))
             )
     for _, name, rows, blocks in _blocks(
         program, program.constraints, program.constraint_terms, qp.jacobian, qp.lower == qp.upper

@@ -36,7 +36,7 @@ class QP:
         gradient: (n,) g.
         jacobian: entries of A in evaluation order.
         lower, upper: (M,) limits on A d.
-        damping: what H has on its diagonal beyond the model's own curvature.
+        damping: what H has on its diagonal beyond the model's own curvature, a number or (n,).
         curved_by: (M,) multipliers whose curvature H contains; None for the Hessian of Gauss-Newton.
         weights: (M,) w, zero for rows without a square; None when H needs none.
     """
@@ -49,7 +49,7 @@ class QP:
     jacobian: Array
     lower: Array
     upper: Array
-    damping: float = 0.0
+    damping: float | Array = 0.0
     curved_by: Array | None = None
     weights: Array | None = None
 
@@ -171,13 +171,13 @@ def solve_convex(route: Route, qp: QP, multipliers: Array, accuracy: float) -> Q
     return replace(answer, multipliers=dual, error=qp_error(qp, answer.step, dual))
 
 
-def subproblem(program: Program, lin: Linearization, damping: float, pattern: Symmetric | None = None) -> QP:
+def subproblem(program: Program, lin: Linearization, damping: float | Array, pattern: Symmetric | None = None) -> QP:
     """The quadratic model at ``lin``, with Gauss-Newton's Hessian and ``damping`` on its diagonal.
 
     Args:
         program: the compiled graph.
         lin: where.
-        damping: added to the diagonal of H.
+        damping: added to the diagonal of H, a number or (n,).
         pattern: of H, ``program.hessian`` (the default) or ``program.normal``.
     """
     pattern = program.hessian if pattern is None else pattern
@@ -194,7 +194,7 @@ def subproblem(program: Program, lin: Linearization, damping: float, pattern: Sy
     )
 
 
-def _gauss_newton(program: Program, lin: Linearization, pattern: Symmetric, damping: float) -> Array:
+def _gauss_newton(program: Program, lin: Linearization, pattern: Symmetric, damping: float | Array) -> Array:
     entries = lin.hessian.copy() if pattern is program.normal else program.hessian_entries(lin)
     entries[pattern.diagonal] += damping
     return entries

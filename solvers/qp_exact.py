@@ -19,6 +19,7 @@ from unifg.passes import add_constraints
 from unifg.program import Program
 from unifg.solvers.kkt_system import KktSystem, fill
 from unifg.solvers.qp import QP, QPAnswer, subproblem
+from unifg.solvers.scaling import Scaling
 from unifg.typing import Array, BoolArray
 
 SHIFT = 1e-10  # on the diagonal of the scaled KKT matrix, so that no order of elimination meets a vanishing pivot
@@ -34,13 +35,14 @@ class ExactHessian:
         self._definite = program.normal_solver()
         self._system: KktSystem | None = None
 
-    def subproblem(self, lin: Linearization, multipliers: Array, damping: float) -> QP:
+    def subproblem(self, lin: Linearization, multipliers: Array, damping: float | Array, scaling: Scaling) -> QP:
         """The quadratic model at ``lin``, in the pattern ``Program.normal``.
 
         Args:
             lin: where.
             multipliers: (M,) the Lagrangian's.
-            damping: added to the diagonal of H.
+            damping: added to the diagonal of H, a number or (n,).
+            scaling: units in which curvatures and slopes are compared.
 
         Returns:
             The exact model, with the weights that make it convex if it needs them, or Gauss-Newton's.
@@ -48,54 +50,54 @@ class ExactHessian:
         program = self.program
         simple = subproblem(program, lin, damping, program.normal)
         exact = simple.with_curvature(multipliers)
-        hessian = exact.hessian
-        if not np.isfinite(hessian).all():
+        if not np.isfinite(exact.hessian).all():
             return simple
-        if self._is_definite(hessian):
+        scaled = scaling.scaled(exact)
+        if self._is_definite(scaled.hessian):
             return exact
         held = program.equality.copy()
-        unit = self._unit(lin, hessian)
-        if not self._inertia_is_right(lin, hessian, np.zeros(len(unit))):
+        unit = self._unit(scaled)
+        if not self._inertia_is_right(scaled, np.zeros(len(unit))):
             active = active_inequalities(program, lin, multipliers)
             if not active.any() or not any(
-                self._inertia_is_right(lin, hessian, np.where(active, weight * unit, 0.0)) for weight in WEIGHTS
+                self._inertia_is_right(scaled, np.where(active, weight * unit, 0.0)) for weight in WEIGHTS
             ):
                 return simple
             held |= active
         for weight in WEIGHTS:
             weights = np.where(held, weight * unit, 0.0)
-            if self._is_definite(self._with_squares(lin, hessian, weights)):
-                return replace(exact, weights=weights)
+            if self._is_definite(self._with_squares(scaled, weights)):
+                return replace(exact, weights=weights * scaling.rows**2.0)
         return simple
 
     def _is_definite(self, hessian: Array) -> bool:
         return self._definite.factor(hessian) and self._definite.definite
 
-    def _inertia_is_right(self, lin: Linearization, hessian: Array, weights: Array) -> bool:
+    def _inertia_is_right(self, qp: QP, weights: Array) -> bool:
         """Whether H with squares of the weighted rows is positive definite where the equalities leave freedom."""
         program, n = self.program, self.program.size
         if self._system is None or not np.array_equal(self._system.equality, program.equality):
             self._system = KktSystem(program, program.equality)
         system = self._system
         data, shift = np.zeros(system.pattern.nnz), np.zeros(system.pattern.size)
-        fill(system.arrays, self._with_squares(lin, hessian, weights), lin.constraint_jacobian, data)
-        curvature = float(np.abs(hessian).max(initial=0.0)) or 1.0
-        slope = float(np.abs(lin.constraint_jacobian).max(initial=0.0)) or 1.0
+        fill(system.arrays, self._with_squares(qp, weights), qp.jacobian, data)
+        curvature = float(np.abs(qp.hessian).max(initial=0.0)) or 1.0
+        slope = float(np.abs(qp.jacobian).max(initial=0.0)) or 1.0
         shift[:n], shift[n:] = SHIFT * curvature, -SHIFT * slope**2 / curvature
         return system.factorization.factor(data, shift) and system.factorization.inertia == (n, len(shift) - n, 0)
 
-    def _with_squares(self, lin: Linearization, hessian: Array, weights: Array) -> Array:
+    def _with_squares(self, qp: QP, weights: Array) -> Array:
         """H + A' diag(weights) A."""
-        entries = hessian.copy()
-        add_constraints(self.program.arrays, lin.constraint_jacobian, weights, entries)
+        entries = qp.hessian.copy()
+        add_constraints(self.program.arrays, qp.jacobian, weights, entries)
         return entries
 
-    def _unit(self, lin: Linearization, hessian: Array) -> Array:
+    def _unit(self, qp: QP) -> Array:
         """(M,) weight at which the square of a row has the largest curvature of H; zero for rows without a slope."""
         constraints = self.program.constraints
-        entries = lin.constraint_jacobian[constraints.free]
+        entries = qp.jacobian[constraints.free]
         squares = np.bincount(constraints.free_rows, weights=entries**2, minlength=constraints.count)
-        size = float(np.abs(hessian).max(initial=0.0)) or 1.0
+        size = float(np.abs(qp.hessian).max(initial=0.0)) or 1.0
         return np.divide(size, squares, out=np.zeros(constraints.count), where=squares > 0.0)
 
 

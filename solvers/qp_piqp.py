@@ -1,6 +1,6 @@
-"""PIQP, called directly: a proximal interior point with a workspace per structure.
+"""PIQP, called directly: a proximal interior point with a workspace per solve.
 
-Takes 7-20 iterations where OSQP takes hundreds once obstacles are active, and says so when a problem is
+Takes 7-20 iterations where OSQP may take hundreds, and says so when a problem is
 infeasible. :class:`PiqpRoute` solves the subproblem, :class:`ElasticRoute` its relaxation for linearised constraints
 that contradict each other.
 """
@@ -17,7 +17,7 @@ from unifg.sparse import Symmetric
 from unifg.typing import Array, BoolArray, IntArray
 
 INFINITY = 1e30  # PIQP treats larger limits as absent
-TIGHTEST = 1e-9
+TIGHTEST = 1e-12
 LOOSEST = 1e-7
 SLACK_CURVATURE = 1e-8
 
@@ -45,7 +45,7 @@ def limited(qp: QP) -> tuple[Array, Array, Array, BoolArray]:
 class PiqpRoute:
     """The subproblem itself; equalities are eliminated from the inequalities' pattern.
 
-    When data turn an inequality into an equality the workspace is rebuilt.
+    The workspace lasts for a solve; when data turn an inequality into an equality it is rebuilt.
 
     Attributes:
         name: "piqp".
@@ -57,6 +57,10 @@ class PiqpRoute:
         """Remember the pattern; PIQP is set up with the first numbers."""
         self.program = program
         self._solver: piqp.SparseSolver | None = None
+
+    def begin(self) -> None:
+        """Drop the workspace: an update leaves roundings of earlier numbers in PIQP's scaling."""
+        self._solver = None
 
     def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
         """Solve to ``accuracy`` and measure; interior points start cold, so ``multipliers`` are not used."""
@@ -156,6 +160,10 @@ class ElasticRoute:
         )
         self._slacks = 2 * m
         self._solver: piqp.SparseSolver | None = None
+
+    def begin(self) -> None:
+        """Drop the workspace, as above."""
+        self._solver = None
 
     def solve(self, qp: QP, price: float) -> QPAnswer:
         """Solve; the error reported is zero when PIQP converged, infinite otherwise."""

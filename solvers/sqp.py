@@ -9,6 +9,7 @@ step. The Hessian is that of Gauss-Newton or of the Lagrangian (:mod:`unifg.solv
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,16 +19,18 @@ from unifg.errors import BackendError
 from unifg.linearization import Evaluation, Linearization
 from unifg.program import Program
 from unifg.solver import Run, Solver
-from unifg.solvers.damping import norm
+from unifg.solvers.damping import largest, norm
 from unifg.solvers.kkt import require_equalities
 from unifg.solvers.least_violation import leave, settle
 from unifg.solvers.qp import QP, QPAnswer, Route, solve_convex, subproblem
 from unifg.solvers.qp_elimination import EliminationRoute
 from unifg.solvers.qp_exact import ExactHessian, holds
 from unifg.solvers.qp_graph import GraphRoute
-from unifg.solvers.qp_osqp import OsqpRoute
+from unifg.solvers.qp_osqp import FINER, OsqpRoute
 from unifg.solvers.qp_piqp import ElasticRoute, PiqpRoute
+from unifg.solvers.qp_polish import Polish
 from unifg.solvers.qp_qpsolvers import QpsolversRoute
+from unifg.solvers.scaling import Scaling
 from unifg.status import Status
 from unifg.typing import Array
 
@@ -39,7 +42,11 @@ GOOD_ENOUGH = 1e-5  # QP error that is always accepted from the fallback
 USABLE = 1e-3  # QP error below which a step may still be tried
 FARTHEST = 1e4  # violation that a step may lead to, relative to the start's (Waechter and Biegler 2006, eq. 21)
 FAILURES = 4  # damped attempts at one step before giving up
-MISSES = 2  # in a row within one solve, after which the first route is no longer asked
+MISSES = 2  # in a row, after which the first route is left out: twice, then twice as often with each further miss
+LEFT = 0.3  # share of the violation that a step may leave in the linear model
+PATIENCE = 20  # iterations whose violation has not fallen
+FALLING = 0.9
+RESTING = 4  # subproblems that go straight to the fallback after a step of the first route that led nowhere
 FIRST_DAMPING = 1e-3
 DAMPING_GROWTH = 10.0
 DAMPING_DECAY = 0.9  # faster forgetting cycles between overshooting and damped steps
@@ -65,7 +72,10 @@ class SQP(Solver):
             "graph" unless "elimination" is asked for.
         fallback: "piqp" (called directly), "graph" or any name qpsolvers knows: repeats a QP which missed its accuracy.
             None leaves inaccurate answers as they are, and infeasible subproblems unsolved.
-        qp_iterations: limit for OSQP before the fallback takes over.
+        qp_iterations: limit for OSQP before the fallback takes over; None for what twenty iterations of an interior
+            point cost, in operations counted on the graph.
+        scaling: bring unknowns and rows whose units are far apart to one scale inside the solve, found at its start
+            (:mod:`unifg.solvers.scaling`). Answers and the test they have to pass stay in the units of the graph.
         second_order_correction: try to repair a full step that the merit function rejects.
         step_tolerance, violation_tolerance: stop rule on the norm of the step and the largest violation, for
             control loops. A positive step_tolerance switches it on; it does not grant CONVERGED.
@@ -76,7 +86,8 @@ class SQP(Solver):
     hessian: Literal["gauss-newton", "exact"] = "gauss-newton"
     qp: str = "osqp"
     fallback: str | None = "piqp"
-    qp_iterations: int = 200
+    qp_iterations: int | None = None
+    scaling: bool = True
     second_order_correction: bool = True
     step_tolerance: float = 0.0
     violation_tolerance: float = 1e-4
@@ -99,9 +110,9 @@ class SQP(Solver):
 
     def search_step(self, run: Run, workspace: Subproblems, lin: Linearization) -> Array | None:
         """The full step of the subproblem."""
-        workspace.start()
-        qp = subproblem(run.program, lin, SMALLEST_DAMPING, workspace.pattern)
-        answer = workspace.solve(qp, run.multipliers, self._accuracy(run))
+        workspace.start(lin)
+        qp = subproblem(run.program, lin, SMALLEST_DAMPING * workspace.scaling.metric, workspace.pattern)
+        answer = workspace.solve(qp, run.multipliers, self._accuracy(run, workspace))
         return answer.step if np.isfinite(answer.error) else None
 
     def iterate(self, run: Run, workspace: Subproblems) -> Status | None:
@@ -110,14 +121,22 @@ class SQP(Solver):
         within = run.program.within_bounds(run.values)
         if within is not run.values and not self.full_steps:
             run.begin_at(run.program.linearize(within))
-        workspace.start()
-        merit = Merit(run.program, run.multipliers, run.lin)
+        workspace.start(run.lin)
+        merit = Merit(workspace.scaling, run.multipliers, run.lin)
         damping, missing = SMALLEST_DAMPING, 0.0
         failures = 0
+        watch = Watch()
         while run.status is None:
+            if watch.calls(run) and settle(run, Status.STALLED) is Status.LOCALLY_INFEASIBLE:
+                return Status.LOCALLY_INFEASIBLE
+            if run.status is not None:
+                break
             shift = max(damping, missing)
-            qp = workspace.subproblem(run, self._bounded(run, shift) if failures == 0 else shift)
+            shift = self._bounded(run, workspace, shift) if failures == 0 else shift
+            qp = workspace.subproblem(run, shift)
             taken = self._attempt(run, workspace, merit, qp)
+            if taken is None and workspace.distrust():
+                taken = self._attempt(run, workspace, merit, qp)
             if taken is None and qp.curved_by is not None:
                 qp = qp.gauss_newton()
                 taken = self._attempt(run, workspace, merit, qp)
@@ -134,7 +153,7 @@ class SQP(Solver):
             failures = 0
             answer, after, multipliers, step, length, corrected = taken
             if qp.curved_by is None:
-                seen = missing_curvature(run.program, qp, run.lin, after, multipliers, step, qp.damping)
+                seen = missing_curvature(workspace.scaling, qp, run.lin, after, multipliers, step)
                 missing = max(seen, SECANT_DECAY * missing)
             else:
                 missing = 0.0
@@ -145,7 +164,7 @@ class SQP(Solver):
                 length,
                 qp=answer.route,
                 qp_iterations=answer.iterations,
-                damping=qp.damping,
+                damping=shift,
                 **({"correction": 1} if corrected else {}),
                 **({"hessian": _kind(qp, answer)} if self.hessian == "exact" else {}),
             )
@@ -159,7 +178,7 @@ class SQP(Solver):
         self, run: Run, workspace: Subproblems, merit: Merit, qp: QP
     ) -> tuple[QPAnswer, Linearization, Array, Array, float, bool] | None:
         """Solve the subproblem and search along its step; None when there is no answer or no length helps."""
-        accuracy = self._accuracy(run)
+        accuracy = self._accuracy(run, workspace)
         answer = workspace.solve(qp, run.multipliers, accuracy)
         if not np.isfinite(answer.error):
             return None
@@ -167,15 +186,16 @@ class SQP(Solver):
         found = self._search(run, workspace, merit, qp, answer, accuracy)
         return None if found is None else (answer, *found)
 
-    def _bounded(self, run: Run, damping: float) -> float:
+    def _bounded(self, run: Run, workspace: Subproblems, damping: float) -> float:
         """With the exact Hessian damping must vanish with the error, or convergence would be linear."""
-        return damping if self.hessian != "exact" else max(min(damping, _size(run)), SMALLEST_DAMPING)
+        return damping if self.hessian != "exact" else max(min(damping, _size(run, workspace)), SMALLEST_DAMPING)
 
-    def _accuracy(self, run: Run) -> float:
+    def _accuracy(self, run: Run, workspace: Subproblems) -> float:
         """Ask the QP for what the outer iteration can use."""
-        size = _size(run)
+        size = _size(run, workspace)
         share = min(1e-3, size) if self.hessian == "exact" else 1e-3
-        return float(np.clip(share * size, 0.1 * self.tolerance, 1e-4))
+        # Where a scaled unit is worth many of the graph's, the test of the graph needs more digits.
+        return float(np.clip(share * size, 0.1 * self.tolerance * workspace.scaling.smallest, 1e-4))
 
     def _next_damping(self, damping: float, length: float) -> float:
         """A shortened step means curvature that H does not know: damp, and forget it slowly."""
@@ -223,7 +243,7 @@ class SQP(Solver):
 
 
 def missing_curvature(
-    program: Program, qp: QP, before: Linearization, after: Linearization, multipliers: Array, step: Array, shift: float
+    scaling: Scaling, qp: QP, before: Linearization, after: Linearization, multipliers: Array, step: Array
 ) -> float:
     """Curvature of the Lagrangian along a step, by the secant, that the Hessian lacked; zero when it did not matter.
 
@@ -231,19 +251,19 @@ def missing_curvature(
     swing to and fro across the answer: the error is multiplied by 1 - (true curvature) / (that of the subproblem).
 
     Args:
-        program: the compiled graph.
-        qp: the subproblem that gave the step, with ``shift`` on its diagonal.
+        scaling: units in which the length of the step is measured.
+        qp: the subproblem that gave the step.
         before: linearisation at the start of the step.
         after: linearisation at its end.
         multipliers: (M,) at its end.
         step: (n,) tangent step.
-        shift: damping of the subproblem.
     """
-    squared = float(step @ step)
+    program = scaling.program
+    squared = float(np.square(step / scaling.columns).sum())
     if squared < SHORTEST_SECANT**2:
         return 0.0
     change = program.lagrangian_gradient(after, multipliers) - program.lagrangian_gradient(before, multipliers)
-    known = float(step @ qp.curved(step)) / squared - shift
+    known = float(step @ (qp.curved(step) - qp.damping * step)) / squared
     missing = float(step @ change[program.columns.free]) / squared - known
     return missing if missing > SECANT_MATTERS * known else 0.0
 
@@ -251,16 +271,17 @@ def missing_curvature(
 class Merit:
     """l1 merit: objective plus a price per unit of violation for every row (Powell 1978)."""
 
-    def __init__(self, program: Program, multipliers: Array, start: Linearization) -> None:
+    def __init__(self, scaling: Scaling, multipliers: Array, start: Linearization) -> None:
         """Start with the prices the multipliers suggest."""
-        self.program = program
+        self.program = scaling.program
+        self._rows = scaling.rows
         self.prices = np.abs(multipliers)
         self._worst = FARTHEST * max(1.0, self._violation(start.constraints))
 
     @property
     def price(self) -> float:
-        """The highest price, at least one."""
-        return float(self.prices.max(initial=1.0))
+        """The highest price in scaled units, at least one."""
+        return float((self.prices / self._rows).max(initial=1.0))
 
     def raise_prices(self, answer: QPAnswer) -> None:
         """Keep every price above its multiplier."""
@@ -284,7 +305,32 @@ class Merit:
         return self.value(trial) <= here + ARMIJO * length * slope + slack
 
     def _violation(self, constraints: Array) -> float:
-        return float(np.abs(self.program.violation(constraints)).sum())
+        return float((self._rows * np.abs(self.program.violation(constraints))).sum())
+
+
+class Watch:
+    """Calls for a look at the violation alone when it has not fallen for long.
+
+    Where constraints miss each other by little, every linearisation may have a solution, while steps only get shorter
+    and multipliers longer. Whether there is a feasible point, a descent on the violation tells.
+    """
+
+    def __init__(self) -> None:
+        """Begin to count."""
+        self._patience, self._waited = PATIENCE, 0
+        self._least = np.inf
+
+    def calls(self, run: Run) -> bool:
+        """Whether it is time; asked once an iteration, and after every call half as often."""
+        violation = run.optimality.violation
+        if violation <= run.tolerance or violation < FALLING * self._least:
+            self._least, self._waited = min(violation, self._least), 0
+            return False
+        self._waited += 1
+        if self._waited < self._patience:
+            return False
+        self._patience, self._waited = 2 * self._patience, 0
+        return True
 
 
 class Subproblems:
@@ -293,6 +339,7 @@ class Subproblems:
     Attributes:
         program: the compiled graph.
         pattern: of the Hessians.
+        scaling: units in which subproblems are solved, found at the start of each solve.
         elastic_asked: whether the last subproblem went to the elastic route.
     """
 
@@ -304,58 +351,93 @@ class Subproblems:
         """
         self.program = program
         self.elastic_asked = False
+        self._tolerance = options.tolerance
         self._exact = ExactHessian(program) if options.hessian == "exact" else None
         self.pattern = program.hessian if self._exact is None else program.normal
         linear = bool(program.equality.all()) and options.qp != "elimination"
-        self.fallback = None if options.fallback is None else _route(program, options.fallback, 0)
+        self.fallback = None if options.fallback is None else _route(program, options.fallback, options.qp_iterations)
         self.first = _route(program, "graph" if linear else options.qp, options.qp_iterations)
         self.elastic = None if options.fallback is None else ElasticRoute(program, self.pattern)
-        self._misses = 0
+        self._polish = Polish(program)
+        self._scaled = options.scaling and not isinstance(self.first, EliminationRoute)
+        self.scaling = Scaling.none(program)
+        self._misses = self._resting = 0
+        self._first_answered = False
 
-    def start(self) -> None:
-        """Begin a new solve: the first route is trusted again.
+    def start(self, lin: Linearization) -> None:
+        """Begin a new solve at ``lin``: the first route is trusted again, and nothing of the last one is left.
 
         Raises:
             BackendError: when new data made inequalities that the first route cannot take.
         """
-        self._misses = 0
+        self._misses = self._resting = 0
+        for route in (self.first, self.fallback, self.elastic):
+            if isinstance(route, (OsqpRoute, PiqpRoute, ElasticRoute)):
+                route.begin()
+        if self._scaled:
+            self.scaling = Scaling.of(self.program, lin)
         if isinstance(self.first, EliminationRoute):
             require_equalities(self.program, "SQP(qp='elimination')")
 
     def subproblem(self, run: Run, damping: float) -> QP:
         """The quadratic model at the present iterate."""
         if self._exact is None:
-            return subproblem(self.program, run.lin, damping, self.pattern)
-        return self._exact.subproblem(run.lin, run.multipliers, damping)
+            return subproblem(self.program, run.lin, damping * self.scaling.metric, self.pattern)
+        return self._exact.subproblem(run.lin, run.multipliers, damping * self.scaling.metric, self.scaling)
 
     def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
         """Try the first route, then the fallback, then the elastic problem."""
-        self.elastic_asked = False
+        scaling = self.scaling
+        if scaling.neutral:
+            return self._solve(qp, qp.gauss_newton, multipliers, accuracy)
+        scaled, multipliers = scaling.scaled(qp), multipliers / scaling.rows
+        answer = self._solve(scaled, lambda: scaling.scaled(qp.gauss_newton()), multipliers, accuracy)
+        if FINER * accuracy < answer.error <= USABLE and not self.elastic_asked:
+            answer = self._polish(scaled, answer)
+        return scaling.unscaled(answer)
+
+    def _solve(self, qp: QP, elastic: Callable[[], QP], multipliers: Array, accuracy: float) -> QPAnswer:
+        self.elastic_asked = self._first_answered = False
         enough = max(10.0 * accuracy, GOOD_ENOUGH)
         if self.fallback is None or self.elastic is None:
             answer = solve_convex(self.first, qp, multipliers, accuracy)
             return answer if holds(qp, answer, enough) else replace(answer, error=np.inf)
         answers = []
-        if self._misses < MISSES:
+        if self._resting:
+            self._resting -= 1
+        else:
             answers.append(solve_convex(self.first, qp, multipliers, accuracy))
             if not holds(qp, answers[-1], enough):
                 return replace(answers[-1], error=np.inf)
-            if answers[-1].error <= 10.0 * accuracy:
-                self._misses = 0
+            if answers[-1].error <= 10.0 * accuracy and not self._contradicts(qp, answers[-1]):
+                self._misses, self._first_answered = 0, True
                 return answers[-1]
             self._misses += 1
+            if self._misses >= MISSES:
+                self._resting = 2 ** (self._misses - MISSES + 1)
         if not any(answer.infeasible for answer in answers):
             answers.append(solve_convex(self.fallback, qp, multipliers, accuracy))
             if not holds(qp, answers[-1], enough):
                 return replace(answers[-1], error=np.inf)
-            if answers[-1].error <= enough:
-                return answers[-1]
         best = min(answers, key=lambda answer: answer.error)
-        if best.error <= USABLE:
+        if best.error <= USABLE and not self._contradicts(qp, best):
             return best
         # Where no step satisfies the rows, nothing says along which steps the curvature of constraints should count.
         self.elastic_asked = True
-        return self.elastic.solve(qp.gauss_newton(), max(10.0 * float(np.abs(multipliers).max(initial=0.0)), 1e3))
+        return self.elastic.solve(elastic(), max(10.0 * float(np.abs(multipliers).max(initial=0.0)), 1e3))
+
+    def _contradicts(self, qp: QP, answer: QPAnswer) -> bool:
+        """Whether an answer leaves most of the violation, as the least error of contradicting rows does."""
+        linear = qp.linear(answer.step)
+        left = largest(np.maximum(linear - qp.upper, 0.0) + np.maximum(qp.lower - linear, 0.0))
+        return left > max(LEFT * largest(np.maximum(-qp.upper, 0.0) + np.maximum(qp.lower, 0.0)), 0.1 * self._tolerance)
+
+    def distrust(self) -> bool:
+        """Leave the first route out for a while, after a step of it that led nowhere; whether it gave the last step."""
+        if not self._first_answered:
+            return False
+        self._resting = RESTING
+        return True
 
     def correct(
         self, qp: QP, answer: QPAnswer, trial: Evaluation, lin: Linearization, accuracy: float
@@ -364,14 +446,22 @@ class Subproblems:
         bend = trial.constraints - lin.constraints - qp.linear(answer.step)
         for route in (self.first, self.fallback):
             if route is not None and route.name == answer.route:
-                corrected = solve_convex(route, qp.shifted(-bend), answer.multipliers, accuracy)
-                return corrected if corrected.error <= USABLE else None
+                corrected = solve_convex(
+                    route, self.scaling.scaled(qp.shifted(-bend)), answer.multipliers / self.scaling.rows, accuracy
+                )
+                return self.scaling.unscaled(corrected) if corrected.error <= USABLE else None
         return None
 
 
-def _size(run: Run) -> float:
-    """The largest KKT number of the present iterate."""
-    return max(run.optimality.stationarity, run.optimality.violation, run.optimality.complementarity)
+def _size(run: Run, workspace: Subproblems) -> float:
+    """The largest KKT number of the present iterate, in scaled units."""
+    program, scaling = run.program, workspace.scaling
+    gradient = program.lagrangian_gradient(run.lin, run.multipliers)[program.columns.free]
+    return max(
+        largest(scaling.columns * gradient),
+        largest(scaling.rows * program.violation(run.lin.constraints)),
+        run.optimality.complementarity,
+    )
 
 
 def _kind(qp: QP, answer: QPAnswer) -> str:
@@ -381,7 +471,7 @@ def _kind(qp: QP, answer: QPAnswer) -> str:
     return "exact" if qp.weights is None else "exact, with squares"
 
 
-def _route(program: Program, name: str, osqp_iterations: int) -> Route:
+def _route(program: Program, name: str, osqp_iterations: int | None) -> Route:
     """The engine, OSQP and PIQP are called directly, everything else through qpsolvers."""
     if name == "graph":
         return GraphRoute(program)

@@ -45,7 +45,7 @@ UNSOLVED: dict[str, set[str]] = {
     },
     "AugmentedLagrangian": {"HS13", "Jennrich and Sampson", "discs that touch"},  # HS13, discs: no multipliers
     # Convexified costs without curvature send the first steps far away.
-    "SQP": {"HS56", "HS93"},
+    "SQP": {"HS93"},
     "SQP, exact": set(),
     # HS13 and the discs have no multipliers; in HS56 the cost falls without end away from the constraints.
     "InteriorPoint": {"HS13", "HS56", "discs that touch"},

@@ -20,6 +20,7 @@ from unifg.solvers.qp import subproblem
 from unifg.solvers.qp_elimination import EliminationRoute
 from unifg.solvers.qp_exact import ExactHessian
 from unifg.solvers.qp_graph import GraphRoute
+from unifg.solvers.scaling import Scaling
 
 DAMPING = 1e-6
 
@@ -104,7 +105,7 @@ def test_the_same_with_the_exact_hessian(name: str, rng: np.random.Generator) ->
     curved = 0
     for scale in (0.02, 0.1, 0.3):
         multipliers = scale * rng.standard_normal(program.constraints.count)
-        qp = exact.subproblem(lin, multipliers, DAMPING)
+        qp = exact.subproblem(lin, multipliers, DAMPING, Scaling.none(program))
         mine = route.solve(qp, multipliers, 1e-12)
         theirs = engine.solve(qp.convex(), multipliers, 1e-13)
         curved += qp.curved_by is not None

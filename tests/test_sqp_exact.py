@@ -22,6 +22,7 @@ from unifg.solvers.qp_graph import GraphRoute
 from unifg.solvers.qp_osqp import OsqpRoute
 from unifg.solvers.qp_piqp import ElasticRoute, PiqpRoute
 from unifg.solvers.qp_qpsolvers import QpsolversRoute
+from unifg.solvers.scaling import Scaling
 from unifg.typing import Array
 
 CASES = {case.name: case for case in SMALL}
@@ -137,7 +138,7 @@ def saddle_qp(equality: bool, multiplier: float, level: float = 0.3) -> tuple[Pr
     lin = program.linearize(program.values_from(guess))
     multipliers = np.zeros(program.constraints.count)
     multipliers[0] = multiplier
-    return program, ExactHessian(program).subproblem(lin, multipliers, 0.0)
+    return program, ExactHessian(program).subproblem(lin, multipliers, 0.0, Scaling.none(program))
 
 
 def full(qp: QP) -> Array:
@@ -231,10 +232,10 @@ def test_wrong_inertia_takes_gauss_newton_and_right_inertia_does_not() -> None:
     program.bind({})
     lin = program.linearize(program.values_from({x: np.array([[-0.8, 0.6]])}))
     exact = ExactHessian(program)
-    right = exact.subproblem(lin, np.array([-0.4]), 0.0)
+    right = exact.subproblem(lin, np.array([-0.4]), 0.0, Scaling.none(program))
     assert right.curved_by is not None
     np.testing.assert_allclose(full(right), 0.2 * np.eye(2), atol=1e-6)
-    wrong = exact.subproblem(lin, np.array([-2.0]), 0.0)
+    wrong = exact.subproblem(lin, np.array([-2.0]), 0.0, Scaling.none(program))
     assert wrong.curved_by is None
     np.testing.assert_allclose(full(wrong), np.eye(2), atol=1e-12)
     assert wrong.pattern is program.normal

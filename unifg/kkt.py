@@ -29,8 +29,6 @@ from unifg.relative_offset import Factored, relative_offset
 from unifg.typing import Array, IntArray
 from unifg.violation import ViolationModel
 
-NEGLIGIBLE = 1e-12  # share of the squared violation
-
 
 @dataclass(frozen=True)
 class Optimality:
@@ -134,10 +132,9 @@ def _measure(
 def infeasible_stationary(program: Program, lin: Linearization, tolerance: float) -> bool:
     """Whether the point is stationary for 1/2 |violation|^2 without being feasible, in whatever units the unknowns are.
 
-    It is where the best step of :class:`unifg.violation.ViolationModel` would take away less than 1e-12 of it, as an
-    error of 1e-6 in a residual of one would. Descent directions that satisfied bounds of the unknowns block do not
-    count.
+    It is where the best step of :class:`unifg.violation.ViolationModel` promises nothing that counts. Descent
+    directions that satisfied bounds of the unknowns block do not count.
     """
     if np.abs(program.violation(lin.constraints)).max(initial=0.0) <= tolerance:
         return False
-    return ViolationModel(program, lin).promises_less_than(NEGLIGIBLE)
+    return ViolationModel(program, lin).stationary(tolerance)

@@ -15,6 +15,8 @@ from unifg.program import Program
 from unifg.second_order import constraint_curvature
 from unifg.typing import Array, BoolArray, IntArray
 
+NEGLIGIBLE = 1e-12  # share of the squared violation, as an error of 1e-6 in a residual of one takes
+UNSEEN = 1e-3  # of the tolerance: smaller changes of a violation do not count, however small it is
 FIRST_DAMPING, LARGEST_DAMPING, GROWTH = 1e-12, 1e6, 100.0
 
 
@@ -59,9 +61,13 @@ class ViolationModel:
         entries[self._program.normal.diagonal] += damping * size
         return entries
 
-    def promises_less_than(self, share: float) -> bool:
-        """Whether the step to the minimum of the model decreases the value by less than ``share`` of it."""
-        enough = share * self.value
+    def stationary(self, tolerance: float) -> bool:
+        """Whether the step to the minimum of the model decreases the value by nothing that counts.
+
+        Args:
+            tolerance: of the violation.
+        """
+        enough = max(NEGLIGIBLE * self.value, (UNSEEN * tolerance) ** 2)
         if not np.isfinite(enough):
             return False
         normal, scale = self._program.normal, 1.0 / np.sqrt(self.size)

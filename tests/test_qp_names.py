@@ -1,0 +1,70 @@
+"""QP solvers that are no routes of ours, taken by the name qpsolvers gives them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from judge import judge
+from problems import PROBLEMS, Problem, active_bounds, short_drive
+from unifg.solvers import SQP
+from unifg.solvers.qp import qp_error, subproblem
+from unifg.solvers.qp_graph import GraphRoute
+from unifg.solvers.qp_qpsolvers import QpsolversRoute
+
+NAMES = ["quadprog", "clarabel"]  # a dense active-set method, and a sparse interior point
+CONSTRAINED = [problem for problem in PROBLEMS if problem.constrained]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("problem", CONSTRAINED, ids=lambda problem: problem.name)
+def test_solves_by_name(name: str, problem: Problem) -> None:
+    """The same optimum and multipliers as every other route finds."""
+    graph, guess = problem.build()
+    solution = SQP(qp=name).solve(graph, guess)
+    assert solution.converged, solution.report()
+    assert judge(graph, solution).worst() < 5e-6
+    if np.isfinite(problem.cost):
+        assert solution.cost == pytest.approx(problem.cost, abs=1e-5)
+    for term, expected in problem.duals.items():
+        np.testing.assert_allclose(solution.dual(term), expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_named_solver_does_the_work(name: str) -> None:
+    """By itself, without ours behind it, beside a disc; and on bounds alone, where signs show."""
+    graph, guess = short_drive()
+    solution = SQP(qp=name, fallback=None).solve(graph, guess)
+    assert solution.converged, solution.report()
+    assert {row.details["qp"] for row in solution.history[1:]} == {name}
+    graph, guess = active_bounds()
+    bounded = SQP(qp=name, fallback=None).solve(graph, guess, check=True)
+    np.testing.assert_allclose(bounded.dual("box"), [[2.0, -2.0, 0.0]], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_subproblem_is_what_the_engine_finds(name: str) -> None:
+    graph, guess = short_drive()
+    program = graph.compile()
+    first = SQP().solve(graph, guess)
+    qp = subproblem(program, program.linearize(program.values_from(first.values)), 1e-3)
+    zero = np.zeros(program.constraints.count)
+    mine = GraphRoute(program).solve(qp, zero, 1e-10)
+    theirs = QpsolversRoute(program, name).solve(qp, zero, 1e-8)
+    assert theirs.error == pytest.approx(qp_error(qp, theirs.step, theirs.multipliers))
+    assert theirs.error < 1e-6 and not theirs.infeasible
+    np.testing.assert_allclose(theirs.step, mine.step, atol=1e-5)
+    np.testing.assert_allclose(theirs.multipliers, mine.multipliers, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_contradictions_are_left_to_the_elastic_problem(name: str) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(fg.prior, x, [1.0, 1.0])
+    graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0)
+    graph.bound(x, lower=-2.0, upper=2.0)
+    solution = SQP(qp=name).solve(graph, {x: np.array([[0.01, 0.02]])})
+    assert solution.converged, solution.report()
+    assert "elastic" in {row.details["qp"] for row in solution.history[1:]}

@@ -1,0 +1,134 @@
+"""Units of unknowns and rows: SQP solves in its own, and answers in those of the graph."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from judge import judge
+from unifg.solvers import SQP
+from unifg.solvers.qp import qp_error, subproblem
+from unifg.solvers.qp_graph import GraphRoute
+from unifg.solvers.scaling import MODEST, Scaling
+from units import COST, OTHER_COST, drive
+
+UNITS: list[dict[str, float]] = [
+    {"position": 1e-8},
+    {"position": 1e-6},
+    {"position": 1e-4},
+    {"position": 1e4},
+    {"position": 1e6},
+    {"control": 1e-6},
+    {"control": 1e6},
+    {"position": 1e-6, "angle": 1e-6, "control": 1e-6},
+    {"position": 1e6, "angle": 1e6, "control": 1e6},
+    {"position": 1e-6, "control": 1e6},
+    {"dynamics": 1e-4},
+    {"dynamics": 1e6},
+    {"clearance": 1e-4},
+    {"clearance": 1e6},
+    {"position": 1e4, "dynamics": 1e-4},
+]
+
+
+def named(units: dict[str, float]) -> str:
+    return ", ".join(f"{name} {size:g}" for name, size in units.items())
+
+
+@pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
+@pytest.mark.parametrize("units", UNITS, ids=named)
+def test_units_do_not_decide_whether_sqp_converges(units: dict[str, Any], hessian: Any) -> None:
+    """The same optimum in about as many steps; the judge keeps to the units of the graph."""
+    graph, guess = drive(**units)
+    solution = SQP(hessian=hessian).solve(graph, guess)
+    assert solution.converged, solution.report()
+    assert min(abs(solution.cost / cost - 1.0) for cost in (COST, OTHER_COST)) < 1e-4, solution.report()
+    assert solution.iterations <= 25, solution.report()
+    if max(units.values()) <= 1e4:  # the judge's differences are too coarse for the others
+        assert judge(graph, solution).worst() < 2e-6
+
+
+def test_without_scaling_units_decide() -> None:
+    graph, guess = drive(position=1e-6)
+    assert not SQP(scaling=False).solve(graph, guess).converged
+    assert SQP().solve(graph, guess).converged
+
+
+def test_multipliers_come_back_in_the_units_of_the_graph() -> None:
+    plain = SQP(tolerance=1e-9).solve(*drive())
+    other = SQP().solve(*drive(position=1e-4, dynamics=1e4, clearance=1e-2, control=1e5))
+    assert abs(plain.cost - other.cost) < 1e-6
+    for name, unit in {"dynamics": 1e4, "disc": 1e-2, "limits": 1e-5}.items():
+        np.testing.assert_allclose(unit * other.dual(name), plain.dual(name), rtol=1e-3, atol=1e-5)
+
+
+def test_modest_units_are_left_alone() -> None:
+    graph, guess = drive()
+    program = graph.compile()
+    lin = program.linearize(program.values_from(guess))
+    assert Scaling.of(program, lin).neutral
+    graph, guess = drive(position=10.0 * MODEST)
+    program = graph.compile()
+    assert not Scaling.of(program, program.linearize(program.values_from(guess))).neutral
+
+
+def test_a_scaled_subproblem_is_the_same_subproblem() -> None:
+    """Its matrix is balanced, and its answer, carried back, solves the one it was made of."""
+    graph, guess = drive(position=1e-5, control=1e4, dynamics=1e3)
+    program = graph.compile()
+    lin = program.linearize(program.values_from(guess))
+    scaling = Scaling.of(program, lin)
+    qp = subproblem(program, lin, 1e-9 * scaling.metric)
+    scaled = scaling.scaled(qp)
+    matrix = np.abs(program.constraints.matrix(scaled.jacobian).toarray())
+    rows = ~program.bound_rows & (matrix.max(axis=1) > 0.0)
+    assert matrix[rows].max(axis=1).min() > 0.3 and matrix[rows].max() < 3.0
+    answer = GraphRoute(program).solve(scaled, np.zeros(program.constraints.count), 1e-9)
+    assert answer.error < 1e-8
+    carried = scaling.unscaled(answer)
+    size = max(1.0, float(np.abs(qp.gradient).max()))
+    assert qp_error(qp, carried.step, carried.multipliers) < 1e-6 * size
+    np.testing.assert_array_equal(np.log2(scaling.columns) % 1.0, 0.0)
+    none = Scaling.none(program)
+    np.testing.assert_array_equal(none.scaled(qp).hessian, qp.hessian)
+
+
+def beside_disc(gap: float) -> tuple[fg.Graph, dict[fg.Family, Any]]:
+    """A point in a disc of radius one and beyond a wall ``gap`` outside of it."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(fg.prior, x, [2.0, 0.5])
+    graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, upper=1.0, name="disc")
+    graph.constrain(lambda p: p[:, :1], x, lower=1.0 + gap, name="wall")
+    return graph, {x: np.array([[0.3, 0.2]])}
+
+
+def between_lines(gap: float) -> tuple[fg.Graph, dict[fg.Family, Any]]:
+    """Two half planes that miss each other by ``gap``."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(fg.prior, x, [2.0, 0.5])
+    graph.constrain(lambda p: p.sum(axis=1, keepdims=True), x, upper=1.0, name="below")
+    graph.constrain(lambda p: p.sum(axis=1, keepdims=True), x, lower=1.0 + gap, name="above")
+    return graph, {x: np.array([[0.3, 0.2]])}
+
+
+@pytest.mark.parametrize("gap", [1e-1, 1e-3, 1e-5, 4e-6])
+@pytest.mark.parametrize("build", [beside_disc, between_lines])
+@pytest.mark.parametrize("options", [{}, {"qp": "graph"}, {"hessian": "exact"}], ids=["osqp", "graph", "exact"])
+def test_constraints_that_miss_each_other_by_little_are_infeasible(build: Any, gap: float, options: Any) -> None:
+    solution = SQP(**options).solve(*build(gap))
+    assert solution.status is fg.Status.LOCALLY_INFEASIBLE, solution.report()
+    assert solution.iterations < 60
+    assert 0.45 * gap < solution.violation < 0.85 * gap
+
+
+@pytest.mark.parametrize("build", [beside_disc, between_lines])
+def test_constraints_that_just_meet_are_not(build: Any) -> None:
+    for gap in (-1e-5, -1e-3):
+        solution = replace(SQP()).solve(*build(gap))
+        assert solution.converged, solution.report()
