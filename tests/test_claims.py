@@ -61,12 +61,33 @@ def test_converged_is_true_without_inequalities(kind: str) -> None:
     assert (result.status, result.claim) == ("CONVERGED", "true"), result
 
 
-def test_infeasible_is_true() -> None:
-    """A way point inside the ball that must not be entered."""
-    twin, judge = stated("minimum snap", seed=1)
-    result = answer(SQP(), twin, judge)
+def out_of_reach() -> Twin:
+    """A mass that shall go 3 m from rest to rest in the time for 2 m."""
+    steps, dt = 8, 0.25
+    twin = Twin("out of reach", 0)
+    x = twin.variables("x", fg.Rn(2), np.zeros((steps + 1, 2)))
+    u = twin.variables("u", fg.Rn(1), np.zeros((steps, 1)))
+    twin.fix(x[0], [0.0, 0.0])
+    move, push, goal = np.array([[1.0, dt], [0.0, 1.0]]), np.array([[dt**2 / 2], [dt]]), np.array([3.0, 0.0])
+    twin.minimize(lambda u: u, lambda u: u, u, name="effort")
+    twin.equal(
+        lambda x, u, y: y - x @ move.T - u @ push.T, lambda x, u, y: y - move @ x - push @ u, x[:-1], u, x[1:],
+        name="motion", moves=True,
+    )  # fmt: skip
+    twin.equal(lambda x: x - goal, lambda x: x - goal, x[-1], name="there at rest")
+    twin.bound(u, lower=-2.0, upper=2.0, name="push")
+    return twin
+
+
+@pytest.mark.parametrize("name", ["alm", "sqp", "graph", "ipm"])
+def test_infeasible_is_true(name: str) -> None:
+    twin = out_of_reach()
+    judge = Judge(twin)
+    result = answer(BACKENDS[name], twin, judge)
     assert (result.status, result.claim) == ("LOCALLY_INFEASIBLE", "true"), result
     assert not judge.ipopt(twin.guess, 1e-6).solved
+    fatrop = judge.fatrop(twin.guess, 1e-6)
+    assert fatrop is not None and not fatrop.solved
 
 
 def test_parkings_make_no_false_claim() -> None:
