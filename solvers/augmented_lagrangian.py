@@ -3,7 +3,8 @@
 The primal step is a damped Newton step on the Powell-Hestenes-Rockafellar objective, the dual step
 lambda <- lambda+. Violations are judged after the step. By default tolerances tighten as in the bound-constrained
 Lagrangian method (Conn, Gould, Toint 1991; Nocedal and Wright, algorithm 17.4); ``schedule="bazzana"`` is the
-paper's own loop: one primal step, one dual step, constant penalty. The papers' costs carry no 1/2: their rho and
+paper's own loop: one primal step, one dual step, constant penalty; ``"bazzana-damped"`` damps its primal steps, as the
+library behind the paper does when asked to. The papers' costs carry no 1/2: their rho and
 lambda are twice ours.
 
 Second derivatives are those of the Lagrangian with the multipliers that the last step's linear model predicts,
@@ -52,21 +53,21 @@ class AugmentedLagrangian(Solver):
             violation at the start (Birgin and Martinez 2014).
         penalty_growth: factor on rho when the violation did not fall enough.
         scaling: weigh the penalty of each constraint by the inverse square of its gradient's length at the start, so
-            that one rho suits metres and kilometres; not in the schedule "bazzana".
-        schedule: "bcl" or "bazzana".
+            that one rho suits metres and kilometres; not in Bazzana's schedules.
+        schedule: "bcl", "bazzana" or "bazzana-damped", the same with Levenberg-Marquardt steps.
         step_tolerance, violation_tolerance: Bazzana's stop rule (section VII-D, 1e-4 there): the step's norm
             and the largest violation. A positive step_tolerance switches it on; it does not grant CONVERGED.
         inner_iterations: primal steps before the next dual step, converged or not.
         damping: initial Levenberg-Marquardt damping of the primal step.
         hessian: "exact" (of the Lagrangian; less of its second derivatives, down to Gauss-Newton's, where it is not
-            convex) or "gauss-newton". The schedule "bazzana" and graphs without constraints have Gauss-Newton's.
+            convex) or "gauss-newton". Bazzana's schedules and graphs without constraints have Gauss-Newton's.
     """
 
     max_iterations: int = 300
     penalty: float | None = None
     penalty_growth: float = 10.0
     scaling: bool = True
-    schedule: Literal["bcl", "bazzana"] = "bcl"
+    schedule: Literal["bcl", "bazzana", "bazzana-damped"] = "bcl"
     step_tolerance: float = 0.0
     violation_tolerance: float = 1e-4
     inner_iterations: int = 20
@@ -76,8 +77,9 @@ class AugmentedLagrangian(Solver):
     def __post_init__(self) -> None:
         """Refuse unknown words and penalties that are not positive."""
         super().__post_init__()
-        if self.schedule not in ("bcl", "bazzana"):
-            raise BackendError(f"{self.name}: schedule must be 'bcl' or 'bazzana', found '{self.schedule}'")
+        if self.schedule not in ("bcl", "bazzana", "bazzana-damped"):
+            words = "'bcl', 'bazzana' or 'bazzana-damped'"
+            raise BackendError(f"{self.name}: schedule must be {words}, found '{self.schedule}'")
         if self.hessian not in ("exact", "gauss-newton"):
             raise BackendError(f"{self.name}: hessian must be 'exact' or 'gauss-newton', found '{self.hessian}'")
         if self.penalty is not None and not self.penalty > 0.0:
@@ -102,6 +104,8 @@ class AugmentedLagrangian(Solver):
         rho, weights = self._first_penalties(run)
         if self.schedule == "bazzana":
             return self._literal(run, workspace, rho, weights)
+        if self.schedule == "bazzana-damped":
+            return self._damped(run, workspace, rho, weights)
         return self._tightening(run, workspace, rho, weights)
 
     def _literal(self, run: Run, primal: Primal, rho: float, weights: Array) -> Status | None:
@@ -117,6 +121,27 @@ class AugmentedLagrangian(Solver):
             after = run.program.linearize(run.program.retract(lin.values, step))
             updated = primal.next_multipliers(after.constraints, multipliers, penalty)
             run.accept(after, updated, norm(step), 1.0, penalty=rho)
+            if run.status is None and self._stop_rule(run, norm(step)):
+                return Status.STOP_RULE
+        return None
+
+    def _damped(self, run: Run, primal: Primal, rho: float, weights: Array) -> Status | None:
+        """The same with Levenberg and Marquardt's damping: a primal step has to lower the augmented objective."""
+        run.penalties = penalty = rho * weights
+        damping = Damping(self.damping)
+        while run.status is None:
+            lin, multipliers = run.lin, run.multipliers
+            taken = damped_step(primal, lin, multipliers, penalty, damping)
+            if taken is None:  # at a minimum to all digits: the dual step goes on
+                values, step, rejected = lin.values, np.zeros(run.program.size), 0
+                damping = Damping(self.damping)
+            else:
+                values, step, rejected = taken
+            after = run.program.linearize(values)
+            updated = primal.next_multipliers(after.constraints, multipliers, penalty)
+            if taken is None and np.array_equal(updated, multipliers):
+                return settle(run, Status.STALLED)
+            run.accept(after, updated, norm(step), 1.0, penalty=rho, damping=damping.value, rejected=rejected)
             if run.status is None and self._stop_rule(run, norm(step)):
                 return Status.STOP_RULE
         return None
@@ -218,7 +243,7 @@ class AugmentedLagrangian(Solver):
         The largest entry of the gradient counts, over all factors of a term: one of them may be flat by chance.
         """
         program, rows = run.program, run.program.constraints
-        if not self.scaling or self.schedule == "bazzana":
+        if not self.scaling or self.schedule != "bcl":
             return np.ones(rows.count)
         length = np.zeros(rows.count)
         np.maximum.at(length, rows.free_rows, np.abs(run.lin.constraint_jacobian[rows.free]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
@@ -15,6 +16,7 @@ from benchmarks.cylinder_flights import study
 from judge import judge
 from problems import STARTS, ecg2o, ecg2o_inequality, pose_beside_disc, short_drive
 from unifg.models import obstacles, unicycle
+from unifg.scenarios.manoeuvres import CASES, ManoeuvreSettings, state_problem
 from unifg.solvers import SQP, AugmentedLagrangian
 from unifg.typing import Array
 
@@ -191,3 +193,71 @@ def test_map_coordinates_change_nothing(hessian: Literal["exact", "gauss-newton"
         far = solver.solve(*past_discs(offset), check=True)
         assert abs(far.iterations - near.iterations) <= 2, offset
         assert far.cost == pytest.approx(near.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize("build", [lambda: ecg2o((1.0, 1.0)), lambda: short_drive(disc=True)], ids=["ecg2o", "drive"])
+def test_the_literal_loop_is_that_of_the_paper(build: Callable[[], tuple[fg.Graph, dict[fg.Family, Array]]]) -> None:
+    """Algorithm of Bazzana, section VI, with dense algebra and the form of Powell, Hestenes and Rockafellar."""
+    graph, guess = build()
+    rho, steps = 10.0, 8
+    rows = AugmentedLagrangian(
+        schedule="bazzana", penalty=rho, max_iterations=steps, keep_values=True, tolerance=1e-300
+    ).solve(graph, guess)
+    program = graph.compile()
+    values, multipliers = program.values_from(guess), np.zeros(program.constraints.count)
+    for k in range(steps + 1):
+        kept = rows.history[k].values
+        assert kept is not None
+        for family, array in kept.items():
+            np.testing.assert_allclose(values[family], array, rtol=1e-8, atol=1e-10)
+        lin = program.linearize(values)
+        jacobian = program.costs.matrix(lin.jacobian).toarray()
+        slopes = program.constraints.matrix(lin.constraint_jacobian).toarray()
+
+        def after(g: Array, old: Array = multipliers) -> Array:
+            above = np.maximum(old + rho * (g - program.upper), 0.0)
+            return np.where(np.isfinite(program.upper), above, 0.0) + np.where(
+                np.isfinite(program.lower), np.minimum(old + rho * (g - program.lower), 0.0), 0.0
+            )
+
+        ahead = after(lin.constraints)
+        active = slopes[program.equality | (ahead != 0.0)]
+        gradient = jacobian.T @ lin.residual + slopes.T @ ahead
+        step = -np.linalg.solve(jacobian.T @ jacobian + rho * active.T @ active, gradient)
+        values = program.retract(values, step)
+        multipliers = after(program.evaluate(values).constraints)
+
+
+@pytest.mark.parametrize("penalty", [1.0, 10.0, 1e2, 1e3])
+def test_the_damped_loop_of_the_paper_takes_every_start(penalty: float) -> None:
+    """Undamped it runs away from two of the six starts of ecg2o's second study, whatever its penalty."""
+    for start in STARTS:
+        graph, guess = ecg2o(start)
+        solution = AugmentedLagrangian(schedule="bazzana-damped", penalty=penalty).solve(graph, guess)
+        assert solution.converged, (start, solution.report())
+        assert judge(graph, solution).worst() < 2e-6
+        assert {row.details["penalty"] for row in solution.history[1:]} == {penalty}
+
+
+@pytest.mark.parametrize("penalty", [1.0, 3.0, 10.0, 1e3, 1e4])
+def test_the_damped_loop_of_the_paper_does_not_run_away(penalty: float) -> None:
+    """His manoeuvre: full steps diverge from a penalty of 1 to 3 on; damped ones converge where it is large enough."""
+    graph, x, _, guess = state_problem(CASES["behind"], ManoeuvreSettings())
+    solution = AugmentedLagrangian(schedule="bazzana-damped", penalty=penalty).solve(graph, guess)
+    assert solution.converged == (penalty >= 1e3), solution.report()
+    assert np.abs(solution[x][:, :2]).max() < 5.0
+    assert solution.violation < 0.5
+    if penalty >= 10.0:
+        literal = AugmentedLagrangian(schedule="bazzana", penalty=penalty).solve(graph, guess)
+        assert literal.violation > 1e3
+
+
+def test_the_damped_loop_that_cannot_move_says_so() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [0.0])
+    graph.constrain(fg.prior, x, [1.0], lower=0.0, upper=0.0, name="one")
+    graph.constrain(fg.prior, x, [2.0], lower=0.0, upper=0.0, name="two")
+    solution = AugmentedLagrangian(schedule="bazzana-damped", penalty=10.0).solve(graph, {x: [[0.0]]})
+    assert not solution.converged
+    assert solution[x].item() == pytest.approx(1.5, abs=1e-3)
