@@ -38,6 +38,7 @@ LARGEST_EASY = 1e6  # up to here rho grows after subproblems of one step
 COLD_PENALTY = 10.0  # Birgin and Martinez
 FALL = 0.25  # of the change of multipliers over rho, between outer iterations; else rho grows
 FALLING = 0.9  # of the violation, between outer iterations: progress where rho cannot grow
+PATIENCE = 3  # outer iterations in which it did not fall, before the least violation is looked for
 WARM_PENALTY = 100.0
 LONGEST, SHORTEST = 2.0, 0.5  # rows of the constraint Jacobian whose length lies between are left as stated
 LARGEST_SCALE = 1e4  # a row that hardly moves at the start says little about its scale
@@ -154,9 +155,9 @@ class AugmentedLagrangian(Solver):
         # Goals are for scaled violations, the KKT test and the last resort for those as stated.
         heaviest = LARGEST_PENALTY / min(1.0, float(weights.min(initial=1.0)))
         least = 0.1 * self.tolerance * min(1.0, float(scale.min(initial=1.0)))
-        gradient_goal, violation_goal = self._goals(run, primal, rho, weights)
+        gradient_goal, violation_goal = self._goals(run, primal, rho, multipliers, rho * weights)
         exact = self.hessian == "exact" and len(weights) > 0
-        outer, last = 0, np.inf
+        first, outer, stuck, last = rho, 0, 0, np.inf
         while run.status is None:
             outer += 1
             run.penalties = penalty = rho * weights
@@ -199,6 +200,9 @@ class AugmentedLagrangian(Solver):
             if stalled and (change == 0.0 or rho >= heaviest):
                 return settle(run, Status.STALLED)
             falling, last = run.optimality.violation <= FALLING * last, run.optimality.violation
+            stuck, here = 0 if falling else stuck + 1, run.lin
+            if stuck == PATIENCE and settle(run, Status.STALLED) is Status.LOCALLY_INFEASIBLE:
+                return Status.LOCALLY_INFEASIBLE
             if change <= violation_goal:
                 multipliers = after
                 if len(run.history) - before <= 1 and not stalled:  # so easy that the next one may be harder
@@ -208,9 +212,14 @@ class AugmentedLagrangian(Solver):
             else:
                 if run.infeasible_stationary() and (ending := leave(run)) is not None:
                     return ending
-                if rho < heaviest:
+                if run.lin is not here:  # led astray: from the new point more slowly, and without what was learned
+                    first *= self.penalty_growth**2
+                    rho, damping = min(first, heaviest), Damping(self.damping)
+                    multipliers = expected = np.zeros(len(weights))
+                    gradient_goal, violation_goal = self._goals(run, primal, rho, multipliers, rho * weights)
+                elif rho < heaviest:
                     rho = min(rho * self.penalty_growth, heaviest)
-                    gradient_goal, violation_goal = self._goals(run, primal, rho, weights)
+                    gradient_goal, violation_goal = self._goals(run, primal, rho, multipliers, rho * weights)
                 elif falling:  # as where constraints have no multipliers
                     multipliers = after
                     gradient_goal = max(0.1 * gradient_goal, 0.1 * self.tolerance)
@@ -253,11 +262,11 @@ class AugmentedLagrangian(Solver):
         wanted = np.clip(length, SHORTEST, LONGEST) / length
         return np.clip(wanted, 1.0 / LARGEST_SCALE, LARGEST_SCALE)
 
-    def _goals(self, run: Run, primal: Primal, rho: float, weights: Array) -> tuple[float, float]:
+    def _goals(self, run: Run, primal: Primal, rho: float, multipliers: Array, penalty: Array) -> tuple[float, float]:
         """First accuracy of the subproblem's gradient, and the scaled violation that earns a dual step."""
         if run.program.least_squares:  # one subproblem, and no absolute measure of its gradient
             return 0.0, 1.0
-        size = largest(primal.gradient(run.lin, run.multipliers, rho * weights))
+        size = largest(primal.gradient(run.lin, multipliers, penalty))
         return max(min(0.1 * size, 1.0), 0.1 * self.tolerance), float(max(rho**-0.1, 0.1 * self.tolerance))
 
     def _stop_rule(self, run: Run, step_norm: float) -> bool:

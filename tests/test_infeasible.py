@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 import pytest
 
 import unifg as fg
 from unifg.kkt import infeasible_stationary
+from unifg.models import obstacles, unicycle
 from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
 from unifg.solvers.least_violation import least_violation
 from unifg.typing import Array
@@ -141,3 +143,62 @@ def test_the_unit_of_an_unknown_does_not_decide_what_is_infeasible(unit: float) 
     solution = SQP().solve(graph, guess)
     assert solution.status is fg.Status.LOCALLY_INFEASIBLE
     assert solution.violation == pytest.approx(np.abs(outside).max(), rel=1e-4)
+
+
+def corridor(length: float) -> Problem:
+    """A unicycle, a goal behind two discs that close a corridor, and a straight guess through them."""
+    count, dt = 20, 0.2
+    graph = fg.Graph()
+    x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
+    graph.fix(x[0], [0.0, 0.0, 0.0])
+    graph.minimize(fg.prior, u, [0.0, 0.0], sigma=2.0)
+    graph.constrain(fg.prior, x[-1], [length, 0.0, 0.0], lower=0.0, upper=0.0, name="goal")
+    graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], dt, lower=0.0, upper=0.0, name="dynamics")
+    graph.bound(u, lower=[-1.2, -1.5], upper=[1.2, 1.5], name="limits")
+    centres, radii = np.array([[0.5 * length, 0.5], [0.5 * length, -0.5]]), np.array([0.55, 0.55])
+    graph.constrain(obstacles.disc_clearance, x[1:], centres, radii, lower=0.0, name="discs")
+    graph.constrain(lambda p: p[:, 1:2], x[1:], lower=-0.6, upper=0.6, name="walls")
+    ahead = np.linspace(0.0, 1.0, count + 1)[:, None] * [length, 0.0, 0.0]
+    return graph, {x: ahead, u: np.tile([length / (count * dt), 0.0], (count, 1))}
+
+
+@pytest.mark.parametrize("length", [2.5, 3.0, 3.5])
+@pytest.mark.parametrize("hessian", ["exact", "gauss-newton"])
+def test_a_blocked_corridor_is_told_early(hessian: Literal["exact", "gauss-newton"], length: float) -> None:
+    """Penalties that grow without end creep towards the least violation; it is looked for when they do."""
+    solution = AugmentedLagrangian(hessian=hessian).solve(*corridor(length))
+    assert solution.status is fg.Status.LOCALLY_INFEASIBLE, solution.report()
+    assert solution.iterations <= (80 if hessian == "exact" else 100)
+    assert solution.violation > 1e-2
+
+
+def shelves(seed: int) -> Problem:
+    """A robot at rest among shelves, which is a plan that violates nothing, and a goal behind some of them."""
+    count, dt = 20, 0.2
+    rng = np.random.default_rng(seed)
+    graph = fg.Graph()
+    x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
+    start = np.array([0.0, 0.0, rng.uniform(-3.0, 3.0)])
+    heading = rng.uniform(-np.pi, np.pi)
+    goal = np.array([3.0 * np.cos(heading), 3.0 * np.sin(heading), heading])
+    places = rng.uniform(-4.0, 4.0, (40, 2))
+    centres = places[np.hypot(*places.T) > 0.75]
+    graph.fix(x[0], start)
+    graph.minimize(fg.prior, u, [0.0, 0.0], sigma=1.0)
+    graph.minimize(unicycle.tracking, x[1:], goal, sigma=1.0)
+    graph.minimize(unicycle.tracking, x[-1], goal, sigma=0.1)
+    graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], dt, lower=0.0, upper=0.0, name="dynamics")
+    graph.bound(u, lower=[-0.2, -1.5], upper=[1.0, 1.5], name="limits")
+    radii = np.full(len(centres), 0.65)
+    graph.constrain(obstacles.disc_clearance, x[1:], centres, radii, lower=0.0, name="shelves")
+    return graph, {x: np.tile(start, (count + 1, 1)), u: np.zeros((count, 2))}
+
+
+@pytest.mark.parametrize("seed", [0, 14, 35, 38])
+def test_a_plan_is_found_from_one_that_violates_nothing(seed: int) -> None:
+    """Led astray through shelves, the augmented Lagrangian goes back to where it was feasible, and starts anew."""
+    graph, guess = shelves(seed)
+    assert SQP().solve(graph, guess).converged
+    solution = AugmentedLagrangian().solve(graph, guess)
+    assert solution.converged, solution.report()
+    assert solution.cost < 0.9 * solution.history[0].cost
