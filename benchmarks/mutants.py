@@ -41,11 +41,11 @@ EARLY = 60.0  # [s]
 
 # Decisions, and the tests that are to notice when they change.
 TARGETS: dict[str, tuple[str, ...]] = {
-    "unifg/check.py": ("refusals", "graph"),
-    "unifg/covariance.py": ("covariance", "graph", "kkt"),
+    "unifg/check.py": ("answers", "refusals", "graph"),
+    "unifg/covariance.py": ("answers", "covariance", "graph"),
     "unifg/kkt.py": ("kkt", "infeasible", "solvers", "refusals"),
-    "unifg/marginal.py": ("marginal_prior", "joint", "covariance"),
-    "unifg/solution.py": ("solvers", "covariance", "refusals", "kkt", "graph"),
+    "unifg/marginal.py": ("answers", "marginal_prior"),
+    "unifg/solution.py": ("answers", "residual_history", "covariance", "refusals", "graph", "kkt"),
     "unifg/solver.py": ("solvers", "refusals", "infeasible", "own_backend"),
     "solvers/augmented_lagrangian.py": ("augmented_lagrangian", "solvers", "infeasible"),
     "solvers/barrier.py": ("interior_point", "solvers", "infeasible"),

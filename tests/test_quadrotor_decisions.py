@@ -118,6 +118,49 @@ def test_what_is_kept_clear_of() -> None:
     assert np.all(obstacles.wall_limits == least)
 
 
+def test_the_nearest_movers_are_those_whose_hulls_are_nearest() -> None:
+    """More movers than slots: the large one farther off is nearer than the small one beside it."""
+    s = replace(SETTINGS, cylinders=1, movers=1)
+    here = state(9.0, y=2.0)
+    positions = np.tile(here[:3], (s.horizon + 1, 1))
+    movers = Movers(np.array([[9.0, 0.8], [9.0, 3.5], [0.5, 0.0]]), np.zeros((3, 2)), np.array([0.2, 0.9, 0.3]))
+    obstacles = Slots(s, WALLS).fill(here, positions, Landmarks.none(), movers)
+    assert obstacles.radii[1] == 0.9
+    assert np.all(obstacles.centres[:, 1] == [9.0, 3.5])
+
+
+def test_the_control_that_is_flown_is_what_the_next_one_changes_from() -> None:
+    controller, here = Controller(TARGET, WALLS, settings=SETTINGS, bounds=BOUNDS), belief(state(1.0))
+    hover = quadrotor.hover(here.parameters)
+    assert np.array_equal(controller._spent(here)[controller._last], hover)
+    plan = controller.plan(here)
+    assert not np.allclose(plan.controls[0], hover)
+    assert np.array_equal(controller._spent(here)[controller._last], plan.controls[0])
+    controller.forget()
+    assert np.array_equal(controller._spent(here)[controller._last], hover)
+
+
+def test_limits_of_the_controls_are_the_solver_s_business_not_the_clipping_s() -> None:
+    """A vehicle that sinks fast wants more thrust than there is; the plan knows that it does not get it."""
+    s = replace(SETTINGS, thrust_limits=(2.0, 12.0))
+    controller = Controller(TARGET, WALLS, settings=s, bounds=BOUNDS)
+    plan = controller.plan(belief(state(1.0, z=3.0, velocity=(1.0, 0.0, -2.5))))
+    assert plan.source == "solved" and plan.controls[:, 3].max() > 12.0 - 1e-3
+    forces = controller._guess.multipliers["control limits"]  # type: ignore[union-attr]
+    assert forces[:, 3].max() > 0.01
+    flown = quadrotor.rollout(plan.states[0], plan.controls, s.dt, quadrotor.Parameters())
+    assert np.abs(flown[:, 2] - plan.states[:, 2]).max() < 0.02
+
+
+def test_general_costs_are_stated_as_squares_for_a_solver_that_knows_no_others() -> None:
+    """Ta's potential as a general cost needs one that takes it; the augmented Lagrangian gets the same objective."""
+    general = replace(SETTINGS, avoidance="potential", general_costs=True, horizon=4)
+    for solver, squares in (("alm", True), ("ipm", False)):
+        controller = Controller(TARGET, WALLS, solver, general, BOUNDS)
+        scalar = [term.name for term in controller._run.program.scalar_terms]
+        assert (not scalar) == squares
+
+
 # ---------------------------------------------------------------- plans that may not be flown
 
 
