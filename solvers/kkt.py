@@ -13,11 +13,16 @@ shift is gone (:mod:`unifg.elimination.saddle`). H is that of Gauss-Newton.
 The paper takes every step in full. By default a step has to lower the l1 merit f + price |h| (Nocedal and Wright,
 chapter 18): the cost alone would reject steps that restore feasibility. A full step that is rejected is corrected once
 for the curvature of the constraints before it is shortened; shortened steps damp the next ones.
+
+The outlook of the paper is Levenberg-Marquardt on this system: mu times the diagonal of H is added to H, and the
+linearised constraints are to be met by a part 1 / (1 + mu). With a large mu the step is short in every direction and
+one of descent for the l1 merit, whose gain ratio mu follows.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -25,7 +30,7 @@ from unifg.errors import BackendError
 from unifg.linearization import Evaluation, Linearization
 from unifg.program import Program
 from unifg.solver import Run, Solver
-from unifg.solvers.damping import largest, norm
+from unifg.solvers.damping import LARGEST, SUFFICIENT, Damping, largest, norm
 from unifg.solvers.kkt_system import KktSystem, fill
 from unifg.solvers.least_squares import require_squares
 from unifg.solvers.least_violation import leave, settle
@@ -42,6 +47,7 @@ FAILURES = 5  # attempts with growing damping at one step
 FIRST_DAMPING, DAMPING_GROWTH, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-2, 10.0, 1e-9, 1e12
 DAMPING_DECAY = 0.9  # faster forgetting cycles between overshooting and shortened steps
 FIRST_SLACKNESS = 1e-4
+FIRST_LEVENBERG = 1e-6
 RETRY_GROWTH = 100.0
 
 
@@ -52,13 +58,24 @@ class KKT(Solver):
     Attributes:
         full_steps: take every step in full, as the paper does; no merit function and no damping.
         second_order_correction: try to repair a full step that the merit function rejects.
+        globalization: "line-search", or "levenberg-marquardt" on the KKT system, the paper's outlook.
         step_tolerance: the paper's stop rule, on the norm of the step in unknowns and multipliers together (1e-3
             there). A positive number switches it on; it does not grant CONVERGED.
     """
 
     full_steps: bool = False
     second_order_correction: bool = True
+    globalization: Literal["line-search", "levenberg-marquardt"] = "line-search"
     step_tolerance: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse unknown words, and full steps that are to be damped."""
+        super().__post_init__()
+        if self.globalization not in ("line-search", "levenberg-marquardt"):
+            words = "'line-search' or 'levenberg-marquardt'"
+            raise BackendError(f"{self.name}: globalization must be {words}, found '{self.globalization}'")
+        if self.full_steps and self.globalization == "levenberg-marquardt":
+            raise BackendError(f"{self.name}: full_steps=True leaves nothing to Levenberg-Marquardt: choose one")
 
     def require(self, program: Program) -> None:
         """Refuse scalar costs and inequalities."""
@@ -78,6 +95,8 @@ class KKT(Solver):
     def iterate(self, run: Run, workspace: Newton) -> Status | None:
         """Iterate to convergence."""
         workspace.begin(self.name)
+        if self.globalization == "levenberg-marquardt":
+            return self._damped(run, workspace)
         merit = Merit(run.program)
         damping = slackness = 0.0
         failures = 0
@@ -115,6 +134,48 @@ class KKT(Solver):
             if damping > LARGEST_DAMPING:  # steps no longer move anything
                 return settle(run, Status.STALLED)
             slackness = 0.1 * slackness if slackness > SMALLEST_DAMPING else 0.0
+        return None
+
+    def _damped(self, run: Run, workspace: Newton) -> Status | None:
+        """Levenberg and Marquardt's iteration."""
+        merit, damping = Merit(run.program), Damping(FIRST_LEVENBERG)
+        rejected, slackness = 0, 0.0
+        while run.status is None:
+            lin = run.lin
+            less = damping.value / (1.0 + damping.value)
+            found = workspace.step(lin, run.multipliers, damping.value, slackness, less)
+            reached = None
+            if found is not None:
+                linear = run.program.constraints.times(lin.constraint_jacobian, found[0])
+                predicted = merit.predicted(lin, found[0], linear)
+                here = merit.value(lin)
+                slack = ROUNDING * max(1.0, abs(here))
+                values = run.program.retract(lin.values, found[0])
+                trial = run.program.evaluate(values, lin.weights)
+                actual = here - merit.value(trial)
+                if trial.finite and actual >= SUFFICIENT * predicted - slack:
+                    damping.accept(1.0 if predicted <= slack else min(actual / predicted, 1.0))
+                    reached = run.program.linearize(values)
+            if found is None or reached is None:
+                if found is None:
+                    slackness = max(RETRY_GROWTH * slackness, FIRST_SLACKNESS)
+                damping.reject()
+                rejected += 1
+                if damping.value > LARGEST:
+                    return settle(run, Status.SINGULAR if found is None else Status.STALLED)
+                if run.infeasible_stationary() and (ending := leave(run)) is not None:
+                    return ending
+                continue
+            if slackness and predicted <= slack:  # rows that contradict each other, met by halves as well as may be
+                return settle(run, Status.STALLED)
+            step, change = found
+            details = {"damping": damping.value, "rejected": rejected, "multiplier_step": norm(change)}
+            run.accept(reached, run.multipliers + change, norm(step), 1.0, **details)
+            if run.status is None and np.hypot(norm(step), norm(change)) < self.step_tolerance:
+                return Status.STOP_RULE
+            if run.status is None and slackness and run.infeasible_stationary() and (ending := leave(run)) is not None:
+                return ending
+            rejected, slackness = 0, 0.1 * slackness if slackness > SMALLEST_DAMPING else 0.0
         return None
 
     def _search(
@@ -170,7 +231,7 @@ class Newton:
             self._structure(program)
 
     def step(
-        self, lin: Linearization, multipliers: Array, damping: float, slackness: float
+        self, lin: Linearization, multipliers: Array, damping: float, slackness: float, less: float = 0.0
     ) -> tuple[Array, Array] | None:
         """Solve for the step.
 
@@ -180,6 +241,7 @@ class Newton:
             damping: added to the diagonal of H, relative to it; turns the step towards descent.
             slackness: subtracted from the diagonal of the multipliers' block, relative to the largest A A' / H; lets
                 linearised constraints that contradict each other be met by halves.
+            less: part of the violation that the linearised constraints may keep.
 
         Returns:
             (n,) tangent step and (M,) change of the multipliers; None when the system is singular.
@@ -194,7 +256,11 @@ class Newton:
         self._data[diagonal[n:]] -= slackness * pull
         if not self.system.saddle.factor(self._data):
             return None
-        return self.resolve(lin, multipliers, np.zeros(len(multipliers)))
+        kept = np.zeros(len(multipliers))
+        if less:
+            rows = self.system.arrays.rows
+            kept[rows] = less * (self.program.lower - lin.constraints)[rows]
+        return self.resolve(lin, multipliers, kept)
 
     def resolve(self, lin: Linearization, multipliers: Array, bend: Array) -> tuple[Array, Array] | None:
         """Solve with the last factorisation, the constraints moved by ``bend`` (M,)."""
@@ -243,6 +309,11 @@ class Merit:
             if needed > self.price:
                 self.price = 1.5 * needed
         return descent - self.price * gain
+
+    def predicted(self, lin: Linearization, step: Array, linear: Array) -> float:
+        """Decrease by the model, quadratic in the cost and linear in the constraints; arguments as for `slope`."""
+        curved = float(step @ self.program.hessian.times(self.program.hessian_entries(lin), step))
+        return -self.slope(lin, step, linear) - 0.5 * curved
 
     def accepts(self, trial: Evaluation, here: float, slope: float, length: float, slack: float) -> bool:
         """Armijo's condition."""

@@ -19,6 +19,7 @@ from units import drive
 BACKENDS: dict[str, fg.Solver] = {
     "kkt": KKT(),
     "kkt-full": KKT(full_steps=True),
+    "kkt-lm": KKT(globalization="levenberg-marquardt"),
     "penalty": Penalty(),
     "alm": AugmentedLagrangian(),
     "sqp": SQP(),

@@ -260,3 +260,36 @@ def test_hard_priors_that_hold_already_are_no_obstacle(
         assert solution.converged, (seed, unit, information, solution.report())
         if full_steps or len(pinned) > 1:  # an open end swings far in the first step, and a merit function slows it
             assert solution.iterations <= 12, (seed, unit, information)
+
+
+LEVENBERG = KKT(globalization="levenberg-marquardt")
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_levenberg_marquardt_on_the_kkt_system_takes_case_study_2(start: tuple[float, float]) -> None:
+    graph, guess = ecg2o(start)
+    solution = LEVENBERG.solve(graph, guess, check=True)
+    assert judge(graph, solution).worst() < 2e-6
+    assert solution.iterations <= 13
+    assert {"damping", "rejected"} <= solution.history[1].details.keys()
+
+
+@pytest.mark.parametrize("goal", [(2.0, 0.1, 0.0), (0.0, 2.0, 0.0), (-2.0, 0.3, 3.0)])
+def test_levenberg_marquardt_brings_a_unicycle_from_afar_to_the_optimum(goal: tuple[float, float, float]) -> None:
+    graph, guess = drive(goal)
+    solution = LEVENBERG.solve(graph, guess, check=True)
+    assert judge(graph, solution).worst() < 2e-6
+    assert solution.cost == pytest.approx(KKT().solve(graph, guess, check=True).cost, rel=1e-6)
+
+
+def test_levenberg_marquardt_follows_an_open_chain() -> None:
+    """Its first step swings far out and raises the cost: a line search crawls, damping does not."""
+    graph, guess = pose_chain(fg.SE3, 40, 0, (0,))
+    assert LEVENBERG.solve(graph, guess, check=True).iterations <= 10
+
+
+def test_words_that_make_no_sense_are_refused() -> None:
+    with pytest.raises(fg.BackendError, match="globalization must be 'line-search' or 'levenberg-marquardt'"):
+        KKT(globalization="filter")  # type: ignore[arg-type]
+    with pytest.raises(fg.BackendError, match="choose one"):
+        KKT(full_steps=True, globalization="levenberg-marquardt")

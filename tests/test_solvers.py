@@ -31,9 +31,11 @@ BACKENDS: list[fg.Solver] = [
     InteriorPoint(hessian="gauss-newton"),
     KKT(),
     KKT(full_steps=True),
+    KKT(globalization="levenberg-marquardt"),
     Penalty(),
 ]
-IDS = ["gn", "lm", "dogleg", "alm", "sqp", "sqp-piqp", "sqp-graph", "ipm", "ipm-gn", "kkt", "kkt-full", "penalty"]
+IDS = ["gn", "lm", "dogleg", "alm", "sqp", "sqp-piqp", "sqp-graph", "ipm", "ipm-gn"]
+IDS += ["kkt", "kkt-full", "kkt-lm", "penalty"]
 
 
 def takes(solver: fg.Solver, problem: Problem) -> bool:
