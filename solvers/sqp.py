@@ -42,7 +42,7 @@ GOOD_ENOUGH = 1e-5  # QP error that is always accepted from the fallback
 USABLE = 1e-3  # QP error below which a step may still be tried
 FARTHEST = 1e4  # violation that a step may lead to, relative to the start's (Waechter and Biegler 2006, eq. 21)
 FAILURES = 4  # damped attempts at one step before giving up
-MISSES = 2  # in a row, after which the first route is left out: twice, then twice as often with each further miss
+MISSES = 2  # in a row, after which the first route is left out: once, then twice as often with each further miss
 LEFT = 0.3  # share of the violation that a step may leave in the linear model
 PATIENCE = 20  # iterations whose violation has not fallen
 FALLING = 0.9
@@ -414,7 +414,7 @@ class Subproblems:
                 return answers[-1]
             self._misses += 1
             if self._misses >= MISSES:
-                self._resting = 2 ** (self._misses - MISSES + 1)
+                self._resting = 2 ** (self._misses - MISSES)
         if not any(answer.infeasible for answer in answers):
             answers.append(solve_convex(self.fallback, qp, multipliers, accuracy))
             if not holds(qp, answers[-1], enough):

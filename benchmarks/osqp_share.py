@@ -1,0 +1,168 @@
+"""How much of SQP's work OSQP really does: subproblems it solves, by case and by scenario.
+
+    python -m benchmarks.osqp_share [--quick]
+
+Counted are the subproblems with inequalities of ``SQP()`` as it is by default. Those that OSQP was asked for and missed
+within its limit went to PIQP, as did those it sat out after a miss; linearisations that contradict themselves went to
+the elastic problem. Writes docs/osqp.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from unittest.mock import patch
+
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks import closed_loop, control_problems, control_starts, reference_problems
+from benchmarks.report import CHECKOUT, machine, put_results, table
+from unifg.scenarios.manoeuvres import CASES, run_manoeuvre
+from unifg.scenarios.navigation import NavigationSettings, run_navigation
+from unifg.scenarios.quadrotor.episode import FlightSettings, run_flight
+from unifg.scenarios.quadrotor.obstacles import CourseSettings, run_course
+from unifg.solvers import SQP
+from unifg.solvers.qp import QP, QPAnswer
+from unifg.solvers.qp_osqp import OsqpRoute
+from unifg.solvers.sqp import Subproblems
+from unifg.typing import Array
+
+PAGE = CHECKOUT / "docs" / "osqp.md"
+
+
+@dataclass
+class Count:
+    """What became of the subproblems of one row.
+
+    Attributes:
+        routes: name of the route that solved each.
+        asked: iterations of OSQP whenever it was asked.
+        limits: its limit then.
+    """
+
+    routes: list[str] = field(default_factory=list)
+    asked: list[int] = field(default_factory=list)
+    limits: list[int] = field(default_factory=list)
+
+    def by(self, route: str) -> int:
+        """Subproblems that a route solved."""
+        return self.routes.count(route)
+
+    @property
+    def share(self) -> float:
+        """Of OSQP."""
+        return self.by("osqp") / max(len(self.routes), 1)
+
+
+@contextmanager
+def counting() -> Iterator[Count]:
+    """Count all subproblems with inequalities that are solved inside."""
+    count = Count()
+    solve, ask = Subproblems.solve, OsqpRoute.solve
+
+    def counted(self: Subproblems, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
+        answer = solve(self, qp, multipliers, accuracy)
+        if isinstance(self.first, OsqpRoute):
+            count.routes.append(answer.route if np.isfinite(answer.error) else "none")
+        return answer
+
+    def asked(self: OsqpRoute, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
+        answer = ask(self, qp, multipliers, accuracy)
+        count.asked.append(answer.iterations)
+        count.limits.append(self.max_iterations)
+        return answer
+
+    with patch.object(Subproblems, "solve", counted), patch.object(OsqpRoute, "solve", asked):
+        yield count
+
+
+def cases(quick: bool) -> dict[str, Callable[[], object]]:
+    """Everything that is counted, by name."""
+    found: dict[str, Callable[[], object]] = {}
+    for problem in reference_problems.problems()[:: 8 if quick else 1]:
+        found[f"reference problem: {problem.name}"] = _cold(closed_loop.Formulation(problem), 1e-6)
+    for case in control_problems.problems()[:: 12 if quick else 1]:
+        found[f"control case: {case.robot} {case.name}"] = _cold(case.formulation(), 1e-4)
+    if quick:
+        return found
+    found["random starts of the control cases with obstacles, 5 each"] = _starts
+    for name, course in CASES.items():
+        found[f"scenario: manoeuvre {name}"] = lambda course=course: run_manoeuvre(course)  # type: ignore[misc]
+    for avoidance in ("potential", "hard"):
+        settings = CourseSettings(solver="sqp", avoidance=avoidance)
+        found[f"scenario: quadrotor past a cylinder, {avoidance}"] = lambda settings=settings: run_course(settings)  # type: ignore[misc]
+    for coupling in ("sequential", "joint"):
+        drive = NavigationSettings(coupling=coupling, obstacles=4, seed=1)
+        found[f"scenario: drive through a building, {coupling}"] = lambda drive=drive: run_navigation(drive)  # type: ignore[misc]
+    flight = FlightSettings(solver="sqp")
+    found["scenario: quadrotor flight, sequential"] = lambda: run_flight(flight)
+    return found
+
+
+def _cold(stated: closed_loop.Formulation, tolerance: float) -> Callable[[], object]:
+    """A solve of a problem from its guess."""
+    return lambda: SQP(tolerance=tolerance).prepare(stated.graph).solve(stated.guess)
+
+
+def _starts() -> None:
+    """From five random guesses each."""
+    for problem in control_starts.blocked():
+        stated = problem.formulation()
+        run = SQP(tolerance=1e-4).prepare(stated.graph)
+        for states, controls in control_starts.starts(problem, 5):
+            run.solve({stated.x: states, stated.u: controls})
+
+
+def render(counts: dict[str, Count]) -> str:
+    """The table and what it says."""
+    rows = [
+        (
+            name,
+            f"{len(count.routes)}",
+            f"{100.0 * count.share:.0f} %" if count.routes else "-",
+            f"{np.median(count.asked):.0f} of {count.limits[0]}" if count.asked else "-",
+            f"{len(count.asked) - count.by('osqp')}",
+            f"{count.by('piqp')}",
+            f"{count.by('elastic')}",
+        )
+        for name, count in counts.items()
+    ]
+    every = [route for count in counts.values() for route in count.routes]
+    worst = sorted((count.share, name) for name, count in counts.items() if count.routes)[:3]
+    losing = "; ".join(f"{name} ({100.0 * share:.0f} %)" for share, name in worst)
+    return "\n\n".join(
+        [
+            f"OSQP solved {every.count('osqp')} of {len(every)} subproblems, "
+            f"{100.0 * every.count('osqp') / max(len(every), 1):.0f} %. Least: {losing}.",
+            table(
+                ("what", "subproblems", "OSQP solved", "its iterations", "it missed", "PIQP solved", "elastic"), rows
+            ),
+            "Its iterations: the median over all times it was asked, and its limit. The subproblems it missed are paid "
+            "for twice.",
+            machine("unifg", "osqp", "piqp"),
+        ]
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Count, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="four cases, and no page")
+    chosen = parser.parse_args(arguments)
+    counts = {}
+    for name, run in tqdm(cases(chosen.quick).items(), unit="case"):
+        with counting() as counts[name]:
+            run()
+    text = render(counts)
+    if chosen.quick:
+        print(text)
+    else:
+        put_results(PAGE, "What OSQP solves", text)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
