@@ -8,6 +8,7 @@
 #   make stale    name the pages of docs/ whose tables were measured on other sources
 #   make release-check    the same, and fail if there are any
 #   make mutants  change decisions one at a time and see whether a test notices (hours; FILES='scenarios/joint.py')
+#   make offsets  solve the same problems with their worlds moved by up to 5000 km (minutes)
 #   make fences   run the shell commands shown in README.md and docs/
 #   make clean    remove everything made here
 #
@@ -25,7 +26,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Matrices here are small: more threads per process only make the processes wait for each other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: help demo test lint types bench results stale release-check mutants fences clean
+.PHONY: help demo test lint types bench results stale release-check mutants fences clean offsets
 .DELETE_ON_ERROR:
 
 help:
@@ -59,6 +60,9 @@ release-check: $(VENV)/ready
 
 mutants: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/python -m benchmarks.mutants $(FILES)
+
+offsets: $(VENV)/ready
+	$(ONE_THREAD) $(BIN)/python -m benchmarks.offsets
 
 fences: $(VENV)/ready
 	$(BIN)/python docs/check_shell_fences.py

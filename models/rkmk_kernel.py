@@ -178,7 +178,7 @@ def step_kernel(
                 for j in range(dim):
                     total += weight[i, j] * speed[j]
                 k[s, i] = total
-                r[i] -= share * total
+                r[i] = rn.minus(r[i], share * total)
             if len(J) == 0:
                 continue
 

@@ -16,6 +16,7 @@ from unifg.factors import difference
 from unifg.jit import compiled
 from unifg.kernels import Kernel
 from unifg.lie import SE2, Rn
+from unifg.lie.scalar.rn import minus
 from unifg.lie.scalar.so2 import wrap
 from unifg.residuals import residual
 from unifg.typing import Array, ArrayLike
@@ -96,8 +97,8 @@ def _dynamics(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
     """x_next - f(x, u) in world axes (eq. 11), heading wrapped."""
     u, dt = vector(v, 3, 2), p[0]
     cosine, sine = advance(v, u, dt, r)
-    r[0] = v[5] - r[0]
-    r[1] = v[6] - r[1]
+    r[0] = minus(minus(v[5], v[0]), dt * u[0] * cosine)
+    r[1] = minus(minus(v[6], v[1]), dt * u[0] * sine)
     r[2] = wrap(v[7] - r[2])
     if len(J):
         world_from_body(v[2], J, 0)

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from benchmarks import offsets
 from unifg.differentiation import gradient_and_hessian, jacobian
+from unifg.models import quadrotor, unicycle
 from unifg.second_order import lagrangian_hessian
 from unifg.typing import Array
 
@@ -169,3 +171,46 @@ def test_gradient_and_hessian_of_a_scalar(manifold: fg.Manifold, offset: float) 
     np.testing.assert_allclose(hessian, bent, atol=1e-4 if offset else 1e-6)
     (numerical,) = jacobian(lambda points: ahead(points)[:, None], [x + away], [manifold])
     np.testing.assert_allclose(numerical[:, 0], expected, atol=1e-8)
+
+
+def shifted(values: Array, axes: int, offset: float) -> Array:
+    result = np.array(values)
+    result[..., :axes] += offset
+    return result
+
+
+SEEN = np.array([0.3, -0.2, 0.7])
+SHIPPED: dict[str, tuple[fg.Residual, fg.Manifold, int, list[Any]]] = {  # manifold, axes of its position, parameters
+    "unicycle.dynamics": (unicycle.dynamics, fg.SE2, 2, [0.2]),
+    "between, Rn": (fg.between.on(fg.Rn(3)), fg.Rn(3), 3, [SEEN]),
+    "between, SE2": (fg.between.on(fg.SE2), fg.SE2, 2, [SEEN]),
+    "difference, SE3": (fg.difference.on(fg.SE3), fg.SE3, 3, []),
+    "quadrotor.dynamics": (quadrotor.dynamics, quadrotor.STATE, 3, [quadrotor.Parameters(1.0).packed, 0.2]),
+}
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_kernels_do_not_round_far_out(name: str) -> None:
+    """A compiler that may reorder makes y - (x + a) of (y - x) - a, which is rounded to 1e-9 m at 5e6 m."""
+    residual, manifold, axes, rest = SHIPPED[name]
+    rng = np.random.default_rng(2)
+    x, y = manifold.random(rng, (20,)), manifold.random(rng, (20,))
+    for values in (x, y):
+        values[:, :axes] = np.round(values[:, :axes] / GRID) * GRID
+    between = {"unicycle.dynamics": [rng.normal(size=(20, 2))], "quadrotor.dynamics": [rng.normal(size=(20, 4))]}
+    at = [
+        residual(shifted(x, axes, offset), *between.get(name, []), shifted(y, axes, offset), *rest)
+        for offset in (0.0, 5e6)
+    ]
+    np.testing.assert_allclose(at[1], at[0], rtol=0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("asked", ["soft", "hard goal", "obstacle"])
+def test_a_moved_world_is_the_same_problem(asked: str) -> None:
+    """A slice of ``make offsets``; a penalty's last iterations are decided by rounding."""
+    for name, kind in (("SE(2)", "shipped"), ("{p, R, v}", "shipped")):
+        case = offsets.drive_case(name, offsets.SPACES[name], kind, asked)
+        case.backends = {name: make for name, make in case.backends.items() if name not in ("Penalty", "KKT")}
+        for row in offsets.run(case):
+            assert row.same, row
+            assert set(row.status) == {"CONVERGED"}, row

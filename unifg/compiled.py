@@ -25,6 +25,7 @@ from unifg.residuals import Residual
 from unifg.terms import Constraint, Cost, Parameter, ScalarCost, Term
 from unifg.typing import Array, BoolArray, IntArray
 from unifg.variables import Data, Selection
+from unifg.vetting import as_float64, as_jacobian, require_information
 from unifg.whitening import DIAGONAL, FULL, reciprocals, square_roots
 
 Bound: TypeAlias = Mapping[Data, Array]
@@ -92,9 +93,7 @@ class CompiledTerm:
         if self.kernel is not None:
             self._require_manifolds(self.kernel)
         with np.errstate(all="ignore"):
-            trial = np.asarray(
-                self._call([np.tile(m.identity(), (self.count, 1)) for m in self.manifolds]), dtype=np.float64
-            )
+            trial = self._call([np.tile(m.identity(), (self.count, 1)) for m in self.manifolds])
         scalar = isinstance(term, ScalarCost)
         expected = "(n,)" if scalar else "(n, m)"
         if trial.ndim != (1 if scalar else 2) or len(trial) != self.count:
@@ -154,7 +153,7 @@ class CompiledTerm:
         if attached is None or numerical:
             blocks = jacobian(lambda *moved: self._call(list(moved)), points, self.manifolds)
         else:
-            blocks = [np.asarray(block, dtype=np.float64) for block in attached(*self._fill(points))]
+            blocks = [as_jacobian(self.name, block) for block in attached(*self.fill(points))]
             if len(blocks) > len(self.dims) and len(blocks) > max(self._places):
                 blocks = [blocks[place] for place in self._places]  # some of its arguments are constants here
             wanted = [(self.count, self.size, dim) for dim in self.dims]
@@ -191,7 +190,7 @@ class CompiledTerm:
                 return self._masked(gradient_and_hessian(weighted, points, self.manifolds, together=True)[1])
 
         def slope(*moved: Array) -> Array:
-            given = [np.asarray(block) for block in attached(*self._fill(list(moved)))]
+            given = [np.asarray(block) for block in attached(*self.fill(list(moved)))]
             blocks = given if len(given) == len(self.dims) else [given[place] for place in self._places]
             return np.concatenate([np.einsum("nm,nmd->nd", weights, block) for block in blocks], axis=1)
 
@@ -262,6 +261,7 @@ class CompiledTerm:
             if term.information is not None:
                 self.whitener = square_roots(self.name, resolve(term.information, data), self.count, self.size)
                 self.whitening = FULL
+                require_information(self.name, term.information, self.whitener)
             if self.whitening and len(self.whitener) > 1:
                 self.whitening |= 1
         if isinstance(term, Constraint):
@@ -276,7 +276,7 @@ class CompiledTerm:
         """Put the kernel's parameters side by side, and after them the constants in the place of variables."""
         points: list[Any] = [np.empty((1, m.storage)) for m in self.manifolds]
         try:
-            variables, parameters, _ = kernel.split(self._fill(points), self.count)
+            variables, parameters, _ = kernel.split(self.fill(points), self.count)
         except GraphError as error:
             raise GraphError(f"term '{self.name}': {error}", term=self.name) from None
         packed = side_by_side(parameters)
@@ -338,10 +338,10 @@ class CompiledTerm:
         return full
 
     def _call(self, points: list[Array]) -> Array:
-        result = self._function(*self._fill(points))
-        return result if isinstance(result, np.ndarray) else np.asarray(result, dtype=np.float64)
+        return as_float64(self.name, self._function(*self.fill(points)))
 
-    def _fill(self, points: list[Array]) -> list[Any]:
+    def fill(self, points: list[Array]) -> list[Any]:
+        """All arguments in order, variables at these points."""
         arguments = list(self._arguments)
         for place, point in zip(self._places, points, strict=True):
             arguments[place] = point

@@ -75,7 +75,8 @@ def gradient_and_hessian(
 ) -> tuple[Array, Array, Array]:
     """Gradient (n, D), symmetric Hessian (n, D, D), and rounding of the gradient (n, D), of a batched scalar function.
 
-    D is the sum of d_k. Gradient and diagonal come from four points around the centre, of fourth order. Directions of
+    D is the sum of d_k. The gradient comes from two points near the centre, and from four points further away where
+    these agree as nearly as rounding of the two lets them: they know more digits of a large value. Directions of
     different variables commute; within one variable the symmetrised second derivative of ``t -> f(x Exp(t d))`` is
     taken, which is the Hessian a Newton step along Exp needs.
 
@@ -86,7 +87,8 @@ def gradient_and_hessian(
         together: whether all steps are those of a factor's largest coordinate, for the Hessians of residuals that may
             round it.
     """
-    axes, size = _axes(points, manifolds, SECOND)
+    near, size = _axes(points, manifolds, FIRST)
+    axes, _ = _axes(points, manifolds, SECOND)
     if together:
         axes = [axis.at_least(steps_for(size, SECOND)) for axis in axes]
 
@@ -104,11 +106,17 @@ def gradient_and_hessian(
     gradient, rounding = np.empty((count, total)), np.empty((count, total))
     hessian = np.empty((count, total, total))
     centre = _copied(function, points)
+    noise = EPSILON * np.abs(centre)
     for a, axis in enumerate(axes):
-        ahead, behind, far, back = (at((axis, times)) for times in (1.0, -1.0, 2.0, -2.0))
-        gradient[:, a] = (8.0 * (ahead - behind) - (far - back)) / (12.0 * axis.half)
-        hessian[:, a, a] = (16.0 * (ahead + behind) - (far + back) - 30.0 * centre) / (12.0 * axis.half**2)
-        rounding[:, a] = 1.5 * EPSILON * np.abs(centre) / axis.half
+        first, h = near[a], axis.half
+        two = (at((first, 1.0)) - at((first, -1.0))) / (2.0 * first.half)
+        inside, outside, ahead, behind = (at((axis, times)) for times in (0.5, -0.5, 1.0, -1.0))
+        four = (8.0 * (inside - outside) - (ahead - behind)) / (6.0 * h)
+        doubt = noise / first.half + np.where(size >= FAR, uncertainties(size, first.half), 0.0)
+        believed = np.abs(four - two) <= doubt
+        gradient[:, a] = np.where(believed, four, two)
+        rounding[:, a] = np.where(believed, 3.0 * noise / h, noise / first.half)
+        hessian[:, a, a] = ((ahead - centre) + (behind - centre)) / h**2
         for b, other in enumerate(axes[:a]):
             mixed = sum(s * t * at((axis, s), (other, t)) for s, t in product((1.0, -1.0), repeat=2))
             hessian[:, a, b] = hessian[:, b, a] = mixed / (4.0 * axis.half * other.half)

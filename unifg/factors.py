@@ -21,6 +21,7 @@ from unifg.jit import compiled
 from unifg.kernels import Kernel
 from unifg.lie import LieGroup, Manifold, Rn
 from unifg.lie.lookup import functions_of
+from unifg.lie.scalar import rn
 from unifg.residuals import Residual, residual
 from unifg.typing import Array
 
@@ -112,7 +113,7 @@ def _vector_relative(v: Array, p: Array, table: Array, r: Array, J: Array) -> No
     """Y - x - p, or y - x."""
     dim = len(r)
     for i in range(dim):
-        r[i] = v[dim + i] - v[i] - (p[i] if len(p) else 0.0)
+        r[i] = rn.minus(rn.minus(v[dim + i], v[i]), p[i] if len(p) else 0.0)
         if len(J):
             for k in range(dim):
                 J[i, k] = -1.0 if i == k else 0.0

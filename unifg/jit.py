@@ -40,9 +40,12 @@ def compiled(function: F) -> F:
 
 
 def in_order(function: F) -> F:
-    """Like :func:`compiled`, every operation as it is written: for functions that difference."""
-    dispatcher = numba.njit(error_model="numpy")(function)
-    dispatcher._cache = _Cache(function)
+    """Like :func:`compiled`, every operation as it is written: for functions that difference.
+
+    Numba compiles what a function calls with the liberties of that function, unless these are refused.
+    """
+    dispatcher = numba.njit(error_model="numpy", fastmath=False)(function)
+    dispatcher._cache = _CacheInOrder(function)
     return cast(F, dispatcher)
 
 
@@ -72,6 +75,13 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         return signature, codegen.magic_tuple(), stamp(self._py_func)
 
 
+class _CacheInOrder(_Cache):
+    """Tells what is compiled without liberties from what once was compiled with them."""
+
+    def _index_key(self, signature: Any, codegen: Any) -> Any:
+        return *super()._index_key(signature, codegen), "in order"
+
+
 def stamp(function: Any) -> str:
     """Digest of the source files of a function and of every compiled function it calls or closes over."""
     digest = hashlib.sha256()
@@ -86,6 +96,8 @@ def _parts(function: Any, seen: set[int]) -> Iterator[str]:
     if id(python) in seen:
         return
     seen.add(id(python))
+    if getattr(function, "targetoptions", {}).get("fastmath") is False:
+        yield f"{python.__qualname__} in order"
     code = python.__code__
     try:
         status = os.stat(code.co_filename)

@@ -146,7 +146,7 @@ class Kernel:
         jacobian = np.empty((count, m, sum(manifold.dim for manifold in self.manifolds)) if derive else (0, 0, 0))
         if count:
             packed, shared = side_by_side(variables, count), side_by_side(parameters)
-            _batch(self.address, packed, shared, self.table, residual, jacobian)
+            evaluate_rows(self.address, packed, shared, self.table, residual, jacobian)
         return residual, jacobian
 
 
@@ -162,7 +162,9 @@ def side_by_side(parts: Sequence[Array], count: int = 1) -> Array:
 
 
 @compiled
-def _batch(where: int, variables: Array, parameters: Array, table: Array, residual: Array, jacobian: Array) -> None:
+def evaluate_rows(
+    where: int, variables: Array, parameters: Array, table: Array, residual: Array, jacobian: Array
+) -> None:
     """Run one kernel over rows of its arguments."""
     count, rows = residual.shape
     v, p, r, J = variables.ravel(), parameters.ravel(), residual.reshape(count * rows), jacobian.ravel()

@@ -12,6 +12,9 @@ Stationarity and complementarity are divided by max(1, mean|lambda| / 100); the 
 Pure least squares, a graph without constraints and scalar costs, has a zero point of cost, and with it a measure that
 does not depend on the unit of the information: there the stationarity is the relative offset of
 :mod:`unifg.relative_offset`, and the Hessian must be regular too: where it is not, some unknowns may be moved freely.
+
+A stationarity that is made of differences is known up to their rounding, :mod:`unifg.rounding`. Where that exceeds the
+tolerance nothing passes: a derivative that rounding has left nothing of looks like zero.
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from unifg.jit import compiled
 from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.relative_offset import Factored, relative_offset
+from unifg.rounding import gradient_rounding
 from unifg.typing import Array, IntArray
 from unifg.violation import ViolationModel
 
@@ -39,6 +43,7 @@ class Optimality:
         worst_row: constraint row with the largest violation, or -1 without constraints.
         finite: whether everything could be evaluated.
         determined: whether no unknown may be moved freely; looked at for least squares only.
+        rounding: by how much differences may be wrong about the stationarity.
     """
 
     stationarity: float
@@ -47,14 +52,20 @@ class Optimality:
     worst_row: int
     finite: bool
     determined: bool = True
+    rounding: float = 0.0
 
     def holds(self, tolerance: float) -> bool:
         """Whether all three numbers are within ``tolerance``."""
         return self.finite and max(self.stationarity, self.violation, self.complementarity) <= tolerance
 
     def passes(self, tolerance: float) -> bool:
-        """Whether all three numbers are within ``tolerance``, at a point that is determined."""
-        return self.determined and self.holds(tolerance)
+        """Whether all three numbers are known to be within ``tolerance``, at a point that is determined."""
+        return self.determined and self.holds(tolerance) and self.rounding <= tolerance
+
+    def blurred(self, tolerance: float) -> bool:
+        """Whether rounding above ``tolerance`` is all that differences still see of the stationarity."""
+        sound = self.finite and max(self.violation, self.complementarity) <= tolerance
+        return sound and self.stationarity <= self.rounding and self.rounding > tolerance
 
 
 def optimality(
@@ -73,7 +84,8 @@ def optimality(
         offset = relative_offset(program, lin, enough, lent)
         if not (offset.finite and np.isfinite(lin.cost)):
             return Optimality(np.inf, np.inf, np.inf, -1, False)
-        return Optimality(offset.value, 0.0, 0.0, -1, True, offset.determined)
+        rounding = _relative_rounding(program, lin, multipliers)
+        return Optimality(offset.value, 0.0, 0.0, -1, True, offset.determined, rounding)
     gradient = lin.gradient
     if program.constraints.count:
         gradient = gradient.copy()
@@ -91,7 +103,22 @@ def optimality(
     stationarity, violation, complementarity, worst, finite = measured
     if not finite or not np.isfinite(lin.cost):
         return Optimality(np.inf, np.inf, np.inf, -1, False)
-    return Optimality(stationarity, violation, complementarity, worst, True)
+    rounding = float(gradient_rounding(program, lin, multipliers).max(initial=0.0))
+    if rounding:
+        rounding /= max(1.0, float(np.abs(multipliers).mean()) / 100.0) if len(multipliers) else 1.0
+    return Optimality(stationarity, violation, complementarity, worst, True, True, rounding)
+
+
+def _relative_rounding(program: Program, lin: Linearization, multipliers: Array) -> float:
+    """By how much differences may be wrong about a relative offset."""
+    rounding = gradient_rounding(program, lin, multipliers)
+    size = float(np.linalg.norm(lin.residual))
+    if not len(rounding) or size == 0.0:
+        return 0.0
+    curvature = np.sqrt(lin.hessian[program.normal.diagonal])
+    seen = curvature > 0.0
+    with np.errstate(over="ignore"):
+        return float((rounding[seen] / curvature[seen]).max(initial=0.0)) / size
 
 
 @compiled

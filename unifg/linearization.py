@@ -50,6 +50,8 @@ class Linearization:
         concavity: the negative curvature of scalar costs, in the order of ``Program.normal``; empty without such costs.
         squares: squared norms of the whitened residuals of robust factors, before their loss.
         scalars: (n,) values of each scalar cost.
+        rounding: of the part of the gradient that scalar costs make by differences, over the full tangent space; empty
+            without such costs.
     """
 
     values: Values
@@ -65,6 +67,7 @@ class Linearization:
     concavity: Array = field(default_factory=lambda: np.zeros(0))
     squares: Array = field(default_factory=lambda: np.zeros(0))
     scalars: dict[str, Array] = field(default_factory=dict)
+    rounding: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def finite(self) -> bool:

@@ -88,7 +88,7 @@ def per_factor(
         lines += _differences(call, slots, rows, at, name)
     exec(compile("\n".join(lines), f"<kernel of {name}>", "exec"), names)
     logger.info("compiling the residual '%s', once in this process", name)
-    kernel = numba.njit(error_model="numpy")(names["kernel"])  # nothing may be reordered: see unifg.jit
+    kernel = numba.njit(error_model="numpy", fastmath=False)(names["kernel"])  # nothing may be reordered: see unifg.jit
     return Kernel(kernel, tuple(arguments), rows, name=name, differenced=jacobian is None)
 
 

@@ -30,6 +30,7 @@ from unifg.terms import Constraint, Cost, ScalarCost
 from unifg.touched import require_touched, term_columns
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 from unifg.variables import Data, Family
+from unifg.vetting import require_clean
 
 if TYPE_CHECKING:
     from unifg.graph import Graph
@@ -88,7 +89,7 @@ class Program:
         self._names = [term.name for term in stacked]
         self.scratch = np.empty(self.table.scratch)
         self._buffers = Buffers([*self.table.sizes, self.columns.width, self.normal.nnz])
-        self._binding, self._fresh = Binding(graph._data), True
+        self._binding, self._fresh, self._vetted = Binding(graph._data), True, False
         self.bind({})
 
     @property
@@ -161,7 +162,12 @@ class Program:
         Raises:
             GraphError: naming the family and index of what is missing, misshapen, NaN or off its manifold.
         """
-        return self._start(guess)
+        values = self._start(guess)
+        if not self._vetted:
+            for term in self.terms:
+                require_clean(term, values)
+            self._vetted = True
+        return values
 
     def retract(self, values: Values, step: Array) -> Values:
         """Move the unknowns by a tangent step; fixed variables stay."""
@@ -209,6 +215,7 @@ class Program:
         scalars: dict[str, Array] = {}
         weights: HeldWeights = {}
         concavity = np.zeros(self.normal.nnz if self.scalar_terms else 0)
+        rounding = np.zeros(self.columns.width if self.scalar_terms else 0)
         with np.errstate(all="ignore"):
             for term in self.batched:
                 self.rows_of(term, residual, constraints)[:] = term.residual(values)
@@ -233,14 +240,15 @@ class Program:
                 value = term.residual(values)
                 cost += float(value.sum())
                 scalars[term.name], norms[term.name] = value, float(np.abs(value).sum())
-                slope, curvature, _ = term.scalar_derivatives(values)
+                slope, curvature, doubt = term.scalar_derivatives(values)
                 columns, factor, a, b, place = self._scalars[term.name]
                 np.add.at(gradient, columns.ravel(), slope.ravel())
+                np.add.at(rounding, columns.ravel(), doubt.ravel())
                 np.add.at(hessian, place, (convex := convexified(curvature))[factor, a, b])
                 np.add.at(concavity, place, (curvature - convex)[factor, a, b])
         norms |= self.norms(size)
         found = residual, jacobian, constraints, constraint_jacobian, gradient, hessian
-        return Linearization(values, cost, *found, norms, weights, concavity, squares, scalars)
+        return Linearization(values, cost, *found, norms, weights, concavity, squares, scalars, rounding)
 
     def _weigh(
         self,

@@ -44,6 +44,7 @@ class Solution:
         cost: objective, with its 1/2.
         stationarity, violation, complementarity: KKT numbers, see :mod:`unifg.kkt`. The stationarity of pure least
             squares is its relative offset, free of the unit of cost; above the tolerance, at least this.
+        rounding: by how much numerical differentiation may be wrong about the stationarity.
         iterations: number of iterations taken.
         seconds: wall-clock time of the solve.
         solver: name of the backend.
@@ -72,6 +73,7 @@ class Solution:
         self.status = status
         self.cost = linearization.cost
         self.stationarity = measured.stationarity
+        self.rounding = measured.rounding
         self.violation = measured.violation
         self.complementarity = measured.complementarity
         self._worst_row = measured.worst_row

@@ -306,6 +306,8 @@ class Run:
             status = Status.CONVERGED
         elif measured.holds(self.tolerance) and not measured.determined:
             status = Status.UNDETERMINED
+        elif (measured.holds(self.tolerance) or measured.blurred(self.tolerance)) and status is not Status.UNBOUNDED:
+            status = Status.IMPRECISE
         elif status.converged:
             status = Status.STALLED
         return Solution(
@@ -328,8 +330,10 @@ class Run:
             return Status.UNBOUNDED
         if self.optimality.passes(self.tolerance):
             return Status.CONVERGED
-        if self.optimality.holds(self.tolerance):
+        if self.optimality.holds(self.tolerance) and not self.optimality.determined:
             return Status.UNDETERMINED
+        if self.optimality.holds(self.tolerance) or self.optimality.blurred(self.tolerance):
+            return Status.IMPRECISE
         if self.iterations >= self._solver.max_iterations:
             return Status.ITERATION_LIMIT
         if self.out_of_time:

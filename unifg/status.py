@@ -22,6 +22,10 @@ class Status(Enum):
         "The costs are stationary but do not determine every unknown: others would fit as well; run "
         "graph.check(guess), fix a variable or add priors."
     )
+    IMPRECISE = (
+        "The KKT conditions seem to hold, but differences of values as large as these cannot tell: attach Jacobians, "
+        "or state the costs in smaller numbers."
+    )
     SINGULAR = (
         "The linear system is singular: the costs do not determine every unknown; run graph.check(guess), add priors, "
         "or use a damped backend."

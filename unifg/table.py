@@ -96,6 +96,7 @@ class Table:
         constraints: number of constraint rows.
         entries, constraint_entries: lengths of the stacked Jacobians.
         scratch: how many numbers the loops need for one factor.
+        differenced: whether the Jacobian of any term is made of differences.
         robust: robust terms and their slices of weights.
     """
 
@@ -109,6 +110,7 @@ class Table:
         starts = {"gather": 0, "sizes": 0, "tangent": 0, "positions": 0, "parameters": 0, "whiteners": 0, "active": 0}
         self.residuals = self.weights = self.constraints = self.entries = self.constraint_entries = 0
         self.scratch = 1
+        self.differenced = any(term.differenced for term in terms)
         self.robust: list[tuple[CompiledTerm, slice]] = []
         for row, term in zip(fields, terms, strict=True):
             layout = term.layout(columns, starts["parameters"])

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from unifg.jit import compiled
+from unifg.jit import compiled, in_order
 from unifg.typing import Array
+
+
+@in_order
+def minus(a: float, b: float) -> float:
+    """Return ``a - b`` as it stands: of (y - x) - b a compiler would make y - (x + b), which is rounded far out."""
+    return a - b
 
 
 @compiled
@@ -38,7 +44,7 @@ def inverse(x: Array, out: Array) -> None:
 def between(x: Array, y: Array, out: Array) -> None:
     """``y - x``."""
     for i in range(len(x)):
-        out[i] = y[i] - x[i]
+        out[i] = minus(y[i], x[i])
 
 
 @compiled
@@ -52,7 +58,7 @@ def retract(x: Array, d: Array, out: Array) -> None:
 def local(x: Array, y: Array, out: Array) -> None:
     """``y - x``."""
     for i in range(len(x)):
-        out[i] = y[i] - x[i]
+        out[i] = minus(y[i], x[i])
 
 
 @compiled

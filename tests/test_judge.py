@@ -1,0 +1,235 @@
+"""Nothing is CONVERGED that is not: lying backends, lost derivatives, rounding as large as the tolerance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.solver import Run, Solver
+from unifg.solvers import (
+    KKT,
+    SQP,
+    AugmentedLagrangian,
+    DogLeg,
+    GaussNewton,
+    InteriorPoint,
+    LevenbergMarquardt,
+    Penalty,
+)
+from unifg.typing import Array
+
+EVERY: list[Solver] = [
+    GaussNewton(),
+    LevenbergMarquardt(),
+    DogLeg(),
+    Penalty(),
+    AugmentedLagrangian(),
+    KKT(),
+    InteriorPoint(),
+    SQP(),
+]
+
+
+class Liar(Solver):
+    """Says CONVERGED wherever it is told to stand, with the multipliers it is told to have."""
+
+    def __init__(self, point: float, multiplier: float) -> None:
+        super().__init__()
+        self.point, self.multiplier = point, multiplier
+
+    def workspace(self, program: Any) -> None:
+        return None
+
+    def iterate(self, run: Run, workspace: Any) -> fg.Status:
+        moved = run.program.retract(run.values, np.array([self.point]) - run.values.flat)
+        run.accept(run.program.linearize(moved), np.array([self.multiplier]), 1.0, 1.0)
+        run.status = fg.Status.CONVERGED
+        return fg.Status.CONVERGED
+
+
+def limited() -> tuple[fg.Graph, fg.Family]:
+    """Minimise 1/2 (x - 3)^2 with x <= 1: x = 1, multiplier 2."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [3.0])
+    graph.constrain(lambda p: p, x, upper=1.0, name="limit")
+    return graph, x
+
+
+@pytest.mark.parametrize(
+    ("point", "multiplier", "believed"),
+    [(1.0, 2.0, True), (0.5, 0.0, False), (2.0, 1.0, False), (1.0, -2.0, False), (1.0, 0.0, False), (5.0, -2.0, False)],
+    ids=["true", "not stationary", "outside", "wrong sign", "no multiplier", "wrong sign, stationary"],
+)
+def test_a_backend_is_not_believed(point: float, multiplier: float, believed: bool) -> None:
+    graph, x = limited()
+    solution = Liar(point, multiplier).solve(graph, {x: np.zeros((1, 1))})
+    assert solution.converged is believed
+    assert (solution.status is fg.Status.CONVERGED) is believed
+
+
+@pytest.mark.parametrize("solver", [InteriorPoint(max_iterations=300), SQP(max_iterations=300)], ids=lambda s: s.name)
+def test_no_minimum_is_found_where_there_is_none(solver: Solver) -> None:
+    """Far out an absolute step is lost, and every difference looks like zero."""
+    graph = fg.Graph()
+    x, y = graph.variables("x", fg.Rn(1), 1), graph.variables("y", fg.Rn(1), 1)
+    graph.minimize_scalar(lambda a, b: -(a + b)[:, 0], x, y)
+    graph.constrain(lambda a, b: a - b, x, y, lower=0.0, upper=0.0)
+    assert not solver.solve(graph, {x: [[1.0]], y: [[2.0]]}).converged
+
+    saddle = fg.Graph()
+    x, y = saddle.variables("x", fg.Rn(1), 1), saddle.variables("y", fg.Rn(1), 1)
+    saddle.minimize_scalar(lambda a, b: (b**2 - a**2)[:, 0], x, y)
+    saddle.bound(y, lower=-1.0, upper=1.0)
+    assert not solver.solve(saddle, {x: [[1.0]], y: [[0.5]]}).converged
+
+
+@pytest.mark.parametrize("size", [7e10, 1e15, 1e27])
+def test_derivatives_do_not_vanish_far_out(size: float) -> None:
+    """The point itself is judged, whatever a backend would do there."""
+    graph = fg.Graph()
+    x, y = graph.variables("x", fg.Rn(1), 1), graph.variables("y", fg.Rn(1), 1)
+    graph.minimize_scalar(lambda a, b: -(a + b)[:, 0], x, y)
+    graph.minimize(lambda a, b: 1e-3 * (a - b), x, y)
+    lin = graph.compile().linearize({x: np.array([[size]]), y: np.array([[size]])})
+    np.testing.assert_allclose(lin.gradient, -1.0, rtol=1e-4)
+    np.testing.assert_allclose(lin.jacobian, [1e-3, -1e-3], rtol=1e-4)
+
+
+@pytest.mark.parametrize("solver", [InteriorPoint(), SQP()], ids=lambda s: s.name)
+@pytest.mark.parametrize("scale", [1.0, 1e8])
+def test_rounding_above_the_tolerance_is_said(solver: Solver, scale: float) -> None:
+    """Of 1e8 cosh(x - 1) differences know the slope to 1e-4: 1e-6 cannot be claimed."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize_scalar(lambda p: scale * np.cosh(p[:, 0] - 1.0), x)
+    solution = solver.solve(graph, {x: np.full((1, 1), 1.3)})
+    assert solution[x][0, 0] == pytest.approx(1.0, abs=1e-5)
+    assert solution.converged is (scale == 1.0)
+    assert (solution.rounding > solver.tolerance) is (scale != 1.0)
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def far_above(p: Array, r: Array) -> None:
+    r[0] = 1e6 * np.cosh(p[0] - 1.0)
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def far_above_slope(p: Array, J: Array) -> None:
+    J[0, 0] = 1e6 * np.sinh(p[0] - 1.0)
+
+
+@pytest.mark.parametrize("stated", ["njit", "NumPy", "attached"])
+def test_rounding_of_residuals(stated: str) -> None:
+    """A residual of 1e6 at the solution, beside a constraint; with its Jacobian attached it is as good as any."""
+    residuals: dict[str, Any] = {
+        "njit": fg.residual(far_above, rows=1),
+        "NumPy": lambda p: 1e6 * np.cosh(p - 1.0),
+        "attached": fg.residual(far_above, far_above_slope, rows=1),
+    }
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(residuals[stated], x)
+    graph.constrain(fg.prior, x, [0.0], upper=1.0)
+    solution = InteriorPoint().solve(graph, {x: np.full((1, 1), 1.0)})
+    assert solution.converged is (stated == "attached")
+    assert solution.status is (fg.Status.CONVERGED if stated == "attached" else fg.Status.IMPRECISE)
+
+
+@pytest.mark.parametrize("solver", EVERY, ids=lambda s: s.name)
+def test_a_residual_may_use_the_same_memory_at_each_call(solver: Solver) -> None:
+    graph, buffer = fg.Graph(), np.empty((1, 1))
+    x = graph.variables("x", fg.Rn(1), 1)
+
+    def same(p: Array) -> Array:
+        np.subtract(p, 2.0, out=buffer)
+        return buffer
+
+    graph.minimize(same, x)
+    solution = solver.solve(graph, {x: np.zeros((1, 1))})
+    assert solution.converged
+    assert solution[x][0, 0] == pytest.approx(2.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.int64, np.complex128])
+@pytest.mark.parametrize("scalar", [False, True])
+def test_results_are_float64(kind: type, scalar: bool) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    state: Callable[..., Any] = graph.minimize_scalar if scalar else graph.minimize
+    state(lambda p: (p[:, 0] if scalar else p).astype(kind), x, name="coarse")
+    with pytest.raises(fg.GraphError, match=rf"'coarse'.*{np.dtype(kind)}.*float64"):
+        graph.compile()
+
+
+def test_jacobians_are_float64() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.residual(lambda p: p, lambda p: [np.ones((1, 1, 1), dtype=np.float32)]), x, name="coarse")
+    with pytest.raises(fg.GraphError, match=r"'coarse'.*Jacobian.*float32"):
+        GaussNewton().solve(graph, {x: np.ones((1, 1))})
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def wraps(p: Array, r: Array) -> None:
+    p[0] = p[0] % 2.0
+    r[0] = p[0]
+
+
+def batched_wraps(p: Array) -> Array:
+    p %= 2.0
+    return p - 1.0
+
+
+def batched_scales(p: Array, factor: Array) -> Array:
+    factor *= 2.0
+    return p * factor
+
+
+def test_a_residual_that_changes_its_arguments_is_named() -> None:
+    cases: list[tuple[Any, tuple[Array, ...]]] = [
+        (fg.residual(wraps, rows=1), ()),
+        (batched_wraps, ()),
+        (batched_scales, (np.array([[3.0]]),)),
+    ]
+    for residual, constants in cases:
+        graph = fg.Graph()
+        x = graph.variables("x", fg.Rn(1), 1)
+        graph.minimize(residual, x, *constants, name="wrapped")
+        with pytest.raises(fg.GraphError, match=r"'wrapped'.*changes its argument"):
+            GaussNewton().solve(graph, {x: np.full((1, 1), 5.0)})
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def forgets(p: Array, r: Array) -> None:
+    r[0] = p[0]
+
+
+def test_a_compiled_residual_that_leaves_rows_out_is_named() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.residual(forgets, rows=2), x, name="short")
+    with pytest.raises(fg.GraphError, match=r"'short'.*row 1"):
+        GaussNewton().solve(graph, {x: np.ones((1, 1))})
+
+
+def test_information_of_zero_is_not_silent(caplog: pytest.LogCaptureFixture) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(fg.prior, x, [1.0, 1.0], information=np.zeros((2, 2)), name="nothing")
+    with pytest.raises(fg.GraphError, match=r"'nothing'.*information is zero"):
+        graph.compile()
+
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    weight = graph.data("weight", np.eye(2))
+    graph.minimize(fg.prior, x, [1.0, 1.0], information=weight, name="switched")
+    graph.minimize(fg.prior, x, [0.0, 0.0])
+    assert GaussNewton().solve(graph, {x: np.ones((1, 2))}, data={weight: np.zeros((2, 2))}).converged
+    assert "'switched'" in caplog.text
+    assert "active=" in caplog.text

@@ -1,0 +1,105 @@
+"""What rounding leaves of a gradient whose residuals are differenced: no test can ask for more.
+
+A function value f of a few operations is wrong by eps |f|, and a difference over h makes eps |f| / h of that. Summed
+over the factors that touch an unknown, with the weight w of each row in the gradient of the Lagrangian, this is
+
+    sum eps |w_a r_a| / h:
+
+w r of a whitened cost is |W r|^2, of a constraint lambda g. Terms with attached Jacobians and kernels with their own
+add nothing. Roundings inside a function are not seen from outside; :mod:`unifg.steps` chooses steps that keep them
+small.
+"""
+
+from __future__ import annotations
+
+import math
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from unifg.jit import compiled
+from unifg.linearization import Linearization
+from unifg.program import Program
+from unifg.steps import EPSILON, FIRST, OTHER, TURN, parts_of, step_for
+from unifg.table import COLUMN, COST, COUNT, DIFFERENCED, KIND, ROW, ROWS, WIDTH, Terms
+from unifg.typing import Array, IntArray
+
+
+def gradient_rounding(program: Program, lin: Linearization, multipliers: Array) -> Array:
+    """(size,) by how much the entries of the gradient of the Lagrangian may be wrong; empty without differences.
+
+    Args:
+        program: the compiled graph.
+        lin: where.
+        multipliers: (M,) one per constraint row.
+    """
+    if not (program.scalar_terms or program.table.differenced):
+        return np.zeros(0)
+    total = np.zeros(program.columns.width)
+    if program.table.differenced:
+        first, last = _extents(program)
+        _add(
+            program.arrays,
+            lin.residual,
+            lin.constraints,
+            multipliers,
+            total,
+            program.columns.values(lin.values).flat,
+            first,
+            last,
+        )
+    if program.scalar_terms:
+        total += lin.rounding
+    return total[program.columns.free]
+
+
+_known: WeakKeyDictionary[Program, tuple[IntArray, IntArray]] = WeakKeyDictionary()
+
+
+def _extents(program: Program) -> tuple[IntArray, IntArray]:
+    """Storage whose largest number rules the step along each tangent coordinate; none for quaternions."""
+    if program not in _known:
+        columns = program.columns
+        first, last = np.zeros(columns.width, dtype=np.int64), np.zeros(columns.width, dtype=np.int64)
+        for family in columns.families:
+            for part, _ in parts_of([family.manifold]):
+                shared = part.turn >= 0 or part.kind == OTHER
+                for axis in range(part.dim if part.kind != TURN else 0):
+                    members = np.arange(family.count)
+                    column = columns.offsets[family] + members * family.manifold.dim + part.column + axis
+                    start = columns.storage[family] + members * family.manifold.storage + part.start
+                    first[column] = start if shared else start + axis
+                    last[column] = start + part.storage if shared else start + axis + 1
+        _known[program] = first, last
+    return _known[program]
+
+
+@compiled
+def _add(
+    terms: Terms,
+    residual: Array,
+    constraints: Array,
+    multipliers: Array,
+    total: Array,
+    values: Array,
+    first: IntArray,
+    last: IntArray,
+) -> None:
+    """Add the rounding of every differenced term over the full tangent space."""
+    fields, columns = terms.fields, terms.columns
+    for t in range(len(fields)):
+        term = fields[t]
+        if term[DIFFERENCED] == 0:
+            continue
+        m, width = term[ROWS], term[WIDTH]
+        for i in range(term[COUNT]):
+            row, size = term[ROW] + i * m, 0.0
+            for a in range(row, row + m):
+                size += residual[a] ** 2 if term[KIND] == COST else abs(multipliers[a] * constraints[a])
+            if size == 0.0 or not math.isfinite(size):
+                continue
+            for d in range(width):
+                column, largest = columns[term[COLUMN] + i * width + d], 0.0
+                for k in range(first[column], last[column]):
+                    largest = max(largest, abs(values[k]))
+                total[column] += EPSILON * size / step_for(largest, FIRST)
