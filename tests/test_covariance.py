@@ -11,7 +11,7 @@ from scipy.linalg import null_space
 
 import unifg as fg
 from test_kkt import chain
-from unifg.solvers import KKT, SQP
+from unifg.solvers import KKT, SQP, InteriorPoint
 from unifg.typing import Array
 
 
@@ -91,3 +91,62 @@ def test_the_kept_structure_goes_with_its_graph() -> None:
     del graph, guess, solution
     gc.collect()
     assert program() is None
+
+
+INFORMATION = np.array([[4.0, 1.0, 0.5], [1.0, 3.0, -0.5], [0.5, -0.5, 2.0]])
+
+
+def pressed(limit: float) -> tuple[fg.Graph, fg.Family, fg.Data]:
+    """A point that wants to be at (2, 1, 3), below a plane whose height is data, under a bound and above another."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(3), 1)
+    height = graph.data("height", limit)
+    graph.minimize(fg.prior, x, [2.0, 1.0, 3.0], information=INFORMATION)
+    graph.constrain(lambda p: p[:, :1] + 2.0 * p[:, 1:2], x, upper=height, name="plane")
+    graph.bound(x, lower=[-9.0, -9.0, -9.0], upper=[9.0, 9.0, 2.5])
+    return graph, x, height
+
+
+@pytest.mark.parametrize("solver", [SQP(), InteriorPoint()], ids=lambda s: s.name)
+def test_an_active_inequality_forbids_a_direction_and_an_inactive_one_none(solver: fg.Solver) -> None:
+    """Left out of the covariance, an active limit would leave the uncertainty it removes."""
+    graph, x, height = pressed(1.0)
+    run = solver.prepare(graph)
+    active = np.array([[1.0, 2.0, 0.0], [0.0, 0.0, 1.0]])  # the plane and the upper bound of the third coordinate
+    for limit, rows in ((1.0, active), (50.0, active[1:])):
+        solution = run.solve({x: np.zeros((1, 3))}, data={height: limit}, check=True)
+        Z = null_space(rows)
+        expected = Z @ np.linalg.solve(Z.T @ INFORMATION @ Z, Z.T)
+        np.testing.assert_allclose(solution.covariance(x), expected, atol=1e-8)
+        np.testing.assert_allclose(solution.marginals(x)[0], expected, atol=1e-8)
+        np.testing.assert_allclose(rows @ solution.covariance(x), 0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize("constrained", [False, True])
+def test_what_is_fixed_is_known(constrained: bool) -> None:
+    """Zeros for fixed members and components; it used to be an error that named the first of them."""
+    graph = fg.Graph()
+    state = fg.Product(p=fg.Rn(2), v=fg.Rn(1))
+    x = graph.variables("x", state, 4)
+    graph.fix(x[0], [[1.0, 2.0, 0.5]])
+    graph.fix(x[2].v, [[0.25]])
+    rng = np.random.default_rng(4)
+    roots = rng.normal(size=(3, 3, 3)) + 3.0 * np.eye(3)
+    graph.minimize(lambda a, b: b - a - 0.1, x[:-1], x[1:], information=np.einsum("nij,nkj->nik", roots, roots))
+    if constrained:
+        graph.constrain(lambda a: a[:, :1], x[3], lower=2.0, upper=2.0, name="wall")
+    solution = SQP().solve(graph, {x: np.full((4, 3), 0.5)}, check=True)
+    program, lin = solution._program, solution._lin
+    free = program.columns.free
+    upper = program.normal.matrix(lin.hessian).toarray()
+    H = upper + upper.T - np.diag(upper.diagonal())
+    A = program.constraints.matrix(lin.constraint_jacobian).toarray()
+    Z = null_space(A) if constrained else np.eye(len(free))
+    expected = np.zeros((12, 12))
+    expected[np.ix_(free, free)] = Z @ np.linalg.solve(Z.T @ H @ Z, Z.T)
+    np.testing.assert_allclose(solution.covariance(x), expected, atol=1e-9)
+    for k, block in enumerate(solution.marginals(x)):
+        np.testing.assert_allclose(block, expected[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], atol=1e-9)
+    np.testing.assert_array_equal(solution.covariance(x[0]), np.zeros((3, 3)))
+    np.testing.assert_array_equal(solution.covariance(x[2].v), np.zeros((1, 1)))
+    np.testing.assert_array_equal(solution.marginals(x[0].p), np.zeros((1, 2, 2)))

@@ -53,40 +53,42 @@ class Covariances:
             raise GraphError(UNDETERMINED)
 
     def joint(self, columns: IntArray) -> Array:
-        """(k, k) covariance over full tangent columns.
+        """(k, k) covariance over full tangent columns, zero for fixed ones, which are known.
 
         Raises:
-            GraphError: when one of them is fixed, or not determined.
+            GraphError: when one of them is not determined.
         """
-        chosen = self._unknowns(columns)
+        chosen = self._program.columns.unknown[columns]
+        free = np.flatnonzero(chosen >= 0)
+        result = np.zeros((len(columns), len(columns)))
+        if not len(free):
+            return result
         if self._held is None:
-            return self._factorization.inverse_block(chosen)
-        self._held.factor(self._data)
-        return self._held.block(chosen)
+            result[np.ix_(free, free)] = self._factorization.inverse_block(chosen[free])
+        else:
+            self._held.factor(self._data)
+            result[np.ix_(free, free)] = self._held.block(chosen[free])
+        return result
 
     def blocks(self, columns: IntArray) -> Array:
-        """(n, d, d) marginal covariance of each row of (n, d) full tangent columns.
+        """(n, d, d) marginal covariance of each row of (n, d) full tangent columns, zero for fixed ones.
 
         Raises:
-            GraphError: when one of them is fixed, or not determined.
+            GraphError: when one of them is not determined.
         """
         if self._held is not None:
             return np.array([self.joint(row) for row in columns])
-        chosen = self._unknowns(columns.ravel()).reshape(columns.shape)
+        chosen = self._program.columns.unknown[columns]
         _, first, node = np.unique(self._program.blocks, return_index=True, return_inverse=True)
         every = self._factorization.diagonal_blocks()
-        result = np.empty((*columns.shape, columns.shape[1]))
+        result = np.zeros((*columns.shape, columns.shape[1]))
         for k, row in enumerate(chosen):
-            place = row - first[node[row[0]]]
-            result[k] = every[node[row[0]]][np.ix_(place, place)]
+            free = np.flatnonzero(row >= 0)
+            if len(free):
+                own = node[row[free[0]]]
+                place = row[free] - first[own]
+                result[k][np.ix_(free, free)] = every[own][np.ix_(place, place)]
         return result
-
-    def _unknowns(self, columns: IntArray) -> IntArray:
-        chosen = self._program.columns.unknown[columns]
-        if (chosen < 0).any():
-            family, index = self._program.columns.name(int(columns[np.argmax(chosen < 0)]))
-            raise GraphError(f"{family}[{index}] is fixed: it has no covariance", family=family, index=index)
-        return chosen
 
 
 class Held:

@@ -177,10 +177,12 @@ class Solution:
         return Guess(values, multipliers, penalties)
 
     def covariance(self, *variables: Variable) -> Array:
-        """(k, k) joint covariance of the selected unknowns, in their tangent spaces, in the order given.
+        """(k, k) joint covariance of the selected variables, in their tangent spaces, in the order given.
+
+        What is fixed is known: its rows and columns are zero, as are directions that an active constraint forbids.
 
         Raises:
-            GraphError: when a selected variable is fixed, or the system is singular.
+            GraphError: when the system is singular.
         """
         for variable in variables:
             self._require(as_selection(variable))
@@ -188,10 +190,12 @@ class Solution:
         return self._covariances.joint(np.concatenate(columns))
 
     def marginals(self, variable: Variable) -> Array:
-        """(n, d, d) covariance of each selected unknown by itself, all of them at about the cost of one solve.
+        """(n, d, d) covariance of each selected variable by itself, all of them at about the cost of one solve.
+
+        Members that are fixed are known: their blocks are zero.
 
         Raises:
-            GraphError: when a selected variable is fixed, or the system is singular.
+            GraphError: when the system is singular.
         """
         self._require(as_selection(variable))
         return self._covariances.blocks(self._program.columns.of(as_selection(variable)))
