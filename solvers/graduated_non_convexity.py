@@ -1,9 +1,16 @@
 """Graduated non-convexity: robust estimation without a good start (Yang et al. 2020).
 
 A robust loss that ignores outliers has many minima. Its surrogates begin nearly quadratic, where a global minimum is
-within reach, and sharpen step by step; each problem starts from the solution of the one before. By the duality of
+within reach, and sharpen step by step. By the duality of
 Black and Rangarajan the weights of a surrogate are those its reweighted least squares would find, so any least-squares
 backend does.
+
+Each surrogate is solved from the guess and from the solution of the one before, and the cheaper answer counts: a wrong
+measurement that was believed once bends the trajectory, and everything that started from there would stay bent; where
+odometry is weak, the guess alone misses what the surrogates found step by step. In the end two things are compared
+with the answer by the cost of the graph as stated. Dynamic covariance scaling, a loss with the same bound, takes a few
+iterations from the guess and sometimes finds what graduation did not. And measurements that were left out are taken
+back where they agree with the rest (:mod:`unifg.solvers.gating`), if the cost falls.
 
 H. Yang, P. Antonante, V. Tzoumas, L. Carlone, "Graduated non-convexity for robust spatial perception: from non-minimal
 solvers to global outlier rejection", IEEE RA-L 5(2), 2020.
@@ -11,6 +18,7 @@ solvers to global outlier rejection", IEEE RA-L 5(2), 2020.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping
 from copy import copy
@@ -21,16 +29,42 @@ import numpy as np
 from unifg.errors import BackendError, NotConverged
 from unifg.graph import Graph
 from unifg.history import Iteration
-from unifg.robust import Graduated, Loss
+from unifg.linearization import Linearization
+from unifg.robust import DCS, Graduated, Loss
 from unifg.solution import Solution
 from unifg.solver import Callback, Prepared, Solver, Start
+from unifg.solvers.gating import Innovations
+from unifg.solvers.gauss_newton import GaussNewton
 from unifg.solvers.levenberg_marquardt import LevenbergMarquardt
 from unifg.status import Status
 from unifg.terms import Cost
 from unifg.typing import Array, ArrayLike
 from unifg.variables import Data
 
+logger = logging.getLogger("unifg")
+
+FAR = 1e30  # a squared residual that no loss believes
+FEWER = 0.7  # share of the measurements to take back where all were too many
+HALF = 0.5  # smaller weights mean that a measurement was left out
+LESS = 1e-9  # share of the cost by which a solution must be better
+ROUGH = 1e-2  # tolerance of the stages: a share of 1e-4 of the cost
+ROUNDS = 10  # of gating
 DECIDED = 1e-3  # a truncated loss is done when every weight is this close to zero or one
+
+
+class _Held:
+    """Weights that were chosen."""
+
+    held = False
+
+    def __init__(self, weights: Array) -> None:
+        self.weights = weights
+
+    def value(self, squared: Array) -> Array:
+        return self.weights * squared
+
+    def weight(self, squared: Array) -> Array:
+        return self.weights
 
 
 class _Square:
@@ -75,19 +109,22 @@ class _Stage:
 class GraduatedNonConvexity:
     """Solves graphs with `unifg.TruncatedLeastSquares` or `unifg.GemanMcClure` in one or more terms.
 
+    The answer has the lowest cost found, not the lowest there is: no local method knows that. CONVERGED says that it is
+    stationary.
+
     It is called like a backend. Terms with other losses, or none, take part as they are: measurements that can be
     trusted, such as odometry, are stated without a loss.
 
     Attributes:
         solver: the least-squares backend inside. Its options hold for the first solve, without the losses, and for the
-            last one, with the losses themselves.
+            last ones, with the losses themselves. Damping does not help here: from odometry far off it ends early.
         growth: how much sharper each surrogate is than the one before (1.4 in the paper).
-        stage_iterations: iterations of the backend for each surrogate.
+        stage_iterations: iterations of the backend for each surrogate, at most; a rough answer will do.
     """
 
-    solver: Solver = field(default_factory=LevenbergMarquardt)
+    solver: Solver = field(default_factory=GaussNewton)
     growth: float = 1.4
-    stage_iterations: int = 5
+    stage_iterations: int = 20
 
     def __post_init__(self) -> None:
         """Refuse options no solve could honour."""
@@ -114,7 +151,7 @@ class GraduatedNonConvexity:
 
         Args:
             graph: the problem.
-            guess: values per family.
+            guess: values per family, where every surrogate starts.
             data: values of data for this solve.
             check: raise instead of returning a solution that did not converge.
             callback: called with every row of the history; returning True ends the solve.
@@ -135,25 +172,9 @@ class GraduatedNonConvexity:
                 f"{self.name}: no term has a loss with surrogates; use robust=TruncatedLeastSquares(...) or "
                 f"GemanMcClure(...), or give the graph to {self.solver.name}"
             )
-        history = _History(callback)
-        solution = history.add(self.solver.prepare(staged), guess, data)
-        # The largest residual on the way from the guess: the solution without losses may hide an outlier by spreading
-        # it over many weak measurements.
-        paths = [stage.goal.surrogates(stage.largest, self.growth) for stage in stages]
-        run = replace(self.solver, max_iterations=self.stage_iterations).prepare(staged)
-        for stage, path in zip(stages, paths, strict=True):
-            stage.now = next(path)
-        while any(stage.now is not stage.goal for stage in stages) and solution.status is not Status.INTERRUPTED:
-            solution = history.add(run, solution, data)
-            if all(stage.decided for stage in stages):
-                break
-            for stage, path in zip(stages, paths, strict=True):
-                stage.now = next(path, stage.goal)
-        interrupted = solution.status is Status.INTERRUPTED
-        last = replace(self.solver, max_iterations=0) if interrupted else self.solver
-        solution = history.add(last.prepare(graph), solution.values, data)
-        if interrupted:
-            solution.status = Status.INTERRUPTED
+        search = _Search(self, graph, staged, stages, data, callback)
+        solution = search.best(guess)
+        history = search.history
         solution.history, solution.iterations = history.rows, history.rows[-1].number
         solution.seconds, solution.solver = time.perf_counter() - started, f"{self.name} ({self.solver.name})"
         if check and not solution.converged:
@@ -161,27 +182,183 @@ class GraduatedNonConvexity:
         return solution
 
 
+class _Search:
+    """One solve: candidates from the surrogates and from the rival, the best of them gated."""
+
+    def __init__(
+        self,
+        options: GraduatedNonConvexity,
+        graph: Graph,
+        staged: Graph,
+        stages: list[_Stage],
+        data: Mapping[Data, ArrayLike] | None,
+        callback: Callback | None,
+    ) -> None:
+        self._options, self._stages, self._data = options, stages, data
+        self.history = _History(callback)
+        solver = options.solver
+        self._plain = solver.prepare(staged)
+        rough = max(solver.tolerance, ROUGH)
+        self._run = replace(solver, max_iterations=options.stage_iterations, tolerance=rough).prepare(staged)
+        self._last = solver.prepare(graph)
+        self._damped: Prepared | None = None
+
+    def best(self, guess: Start) -> Solution:
+        """The best answer found, judged with the losses themselves."""
+        graduated = self._graduated(guess)
+        if graduated.status is Status.INTERRUPTED:
+            return self._interrupted(graduated)
+        solution = self._stated(graduated)
+        for stage in self._stages:
+            stage.now = _rival(stage.goal)
+        rival = self._stated(self._from(guess))
+        if rival.status is not Status.INTERRUPTED and rival.cost < (1.0 - LESS) * solution.cost:
+            losses = ", ".join(str(stage.now) for stage in self._stages)
+            found, missed = rival.cost, solution.cost
+            logger.info("%s: %s led to cost %g, the surrogates to %g", self._options.name, losses, found, missed)
+            solution = rival
+        solution = self._gated(solution)
+        return self._stated(solution)
+
+    def _graduated(self, guess: Start) -> Solution:
+        """Through the surrogates, each from the guess."""
+        stages = self._stages
+        solution = self.history.add(self._plain, guess, self._data, restart=True)
+        # The largest residual on the way from the guess: the solution without losses may hide an outlier by spreading
+        # it over many weak measurements.
+        paths = [stage.goal.surrogates(stage.largest, self._options.growth) for stage in stages]
+        for stage, path in zip(stages, paths, strict=True):
+            stage.now = next(path)
+        while any(stage.now is not stage.goal for stage in stages) and solution.status is not Status.INTERRUPTED:
+            solution = self._better(guess, solution)
+            if all(stage.decided for stage in stages):
+                break
+            for stage, path in zip(stages, paths, strict=True):
+                stage.now = next(path, stage.goal)
+        return solution
+
+    def _better(self, guess: Start, before: Solution) -> Solution:
+        """Solve the present surrogate from the guess and from the solution of the one before."""
+        anew = self._from(guess)
+        seen = [stage.squared for stage in self._stages]
+        on = self._from(before.values)
+        if Status.INTERRUPTED in (anew.status, on.status):
+            return on
+        if anew.cost <= on.cost:
+            for stage, squared in zip(self._stages, seen, strict=True):
+                stage.squared = squared
+            return anew
+        return on
+
+    def _from(self, start: Start) -> Solution:
+        """Solve the present stage; with damping, where weights of zero leave something undetermined."""
+        found = self.history.add(self._run, start, self._data, restart=True)
+        if found.status is not Status.SINGULAR:
+            return found
+        if self._damped is None:
+            limit, tolerance = self._run.solver.max_iterations, self._run.solver.tolerance
+            damped = LevenbergMarquardt(max_iterations=limit, tolerance=tolerance)
+            self._damped = damped.prepare(self._run.program.graph)
+        return self.history.add(self._damped, found.values, self._data, restart=True)
+
+    def _stated(self, found: Solution) -> Solution:
+        """Go on from there with the losses themselves."""
+        return self.history.add(self._last, found.values, self._data)
+
+    def _interrupted(self, found: Solution) -> Solution:
+        last = replace(self._options.solver, max_iterations=0).prepare(self._last.program.graph)
+        solution = self.history.add(last, found.values, self._data)
+        solution.status = Status.INTERRUPTED
+        return solution
+
+    def _gated(self, solution: Solution) -> Solution:
+        """Take back what was left out but agrees with the rest, as long as the cost falls."""
+        program = self._last.program
+        factorization = program.normal_solver()
+        for _ in range(ROUNDS):
+            plain, lin = self._views(solution)
+            innovations = Innovations(program, factorization, lin.hessian)
+            if not innovations.determined:
+                return solution
+            better = self._taken_back(solution, innovations, plain)
+            if better is None:
+                return solution
+            solution = better
+        return solution
+
+    def _taken_back(self, solution: Solution, innovations: Innovations, plain: Linearization) -> Solution | None:
+        """A better solution with more measurements in it, or None."""
+        robust = [term for term, _ in self._run.program.table.robust]
+        scores = []
+        staged = [t for t in robust if isinstance(t.term, Cost) and any(t.term.robust is s for s in self._stages)]
+        for term, stage in zip(staged, self._stages, strict=True):
+            out = stage.goal.weight(stage.squared) < HALF
+            if term.active is not None:
+                out &= term.active
+            score = np.full(len(out), np.inf)
+            score[out] = innovations.squared(term, plain, out)
+            scores.append(score / _bound(stage.goal))
+        passing = np.sort(np.concatenate(scores))
+        passing = passing[passing <= 1.0]
+        weights = [stage.goal.weight(stage.squared) for stage in self._stages]
+        while len(passing):
+            limit = passing[-1]
+            for stage, weight, score in zip(self._stages, weights, scores, strict=True):
+                stage.now = _Held(np.where(score <= limit, 1.0, weight))
+            taken = self._stated(self.history.add(self._run, solution.values, self._data))
+            if taken.cost < (1.0 - LESS) * solution.cost:
+                return taken
+            passing = passing[: int(FEWER * len(passing))]
+        return None
+
+    def _views(self, solution: Solution) -> tuple[Linearization, Linearization]:
+        """The graph linearised at a solution without the losses, and with them."""
+        for stage in self._stages:
+            stage.now = _Square()
+        values = solution.values
+        return self._run.program.linearize(values), self._last.program.linearize(values)
+
+
 class _History:
-    """Rows of several solves, numbered through; each solve after the first repeats the last row of the one before."""
+    """Rows of several solves, numbered through.
+
+    A solve that goes on from the one before repeats its last row; one that starts anew has no row for its start.
+    """
 
     def __init__(self, callback: Callback | None) -> None:
         self.rows: list[Iteration] = []
         self._callback = callback
         self._stage = -1
+        self._restart = False
 
-    def add(self, run: Prepared, start: Start, data: Mapping[Data, ArrayLike] | None) -> Solution:
+    def add(
+        self, run: Prepared, start: Start, data: Mapping[Data, ArrayLike] | None, *, restart: bool = False
+    ) -> Solution:
         """Solve and keep the rows."""
         self._stage += 1
+        self._restart = restart
         return run.solve(start, data=data, callback=self._row)
 
     def _row(self, row: Iteration) -> bool | None:
         before = self.rows[-1].number if self.rows else 0
         number = before + (1 if row.number else 0)
-        row = replace(row, number=number, details={**row.details, "stage": self._stage})
-        if self.rows and number == before:
+        if self.rows and not row.number:
+            if self._restart:
+                return None
             self.rows.pop()  # the same point, seen through the next loss
+        row = replace(row, number=number, details={**row.details, "stage": self._stage})
         self.rows.append(row)
         return None if self._callback is None else self._callback(row)
+
+
+def _bound(loss: Loss) -> float:
+    """What the loss of a measurement tends to when it is left out altogether."""
+    return float(loss.value(np.array([FAR]))[0])
+
+
+def _rival(loss: Loss) -> Loss:
+    """Dynamic covariance scaling with the same bound."""
+    return DCS(_bound(loss) / 3.0)
 
 
 def _staged(graph: Graph) -> tuple[Graph, list[_Stage]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -10,12 +12,14 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from benchmarks.wrong_closures import Claim, with_wrong_closures
 from unifg.errors import BackendError, GraphError, NotConverged
 from unifg.files.g2o import read_g2o
 from unifg.history import Iteration
 from unifg.pose_graphs import manhattan, sphere
 from unifg.robust import Graduated, Loss
-from unifg.solvers import GaussNewton, GraduatedNonConvexity, LevenbergMarquardt
+from unifg.solvers import GaussNewton, GraduatedNonConvexity, LevenbergMarquardt, graduated_non_convexity
+from unifg.solvers.gating import Innovations
 from unifg.typing import Array, BoolArray
 
 LOSSES: list[Loss] = [
@@ -118,7 +122,7 @@ def test_graduation_finds_what_a_plain_robust_solve_misses() -> None:
     stages = [int(row.details["stage"]) for row in solution.history]
     assert stages == sorted(stages) and stages[-1] > 10
     assert history[-1].number == solution.iterations
-    assert solution.solver == "GraduatedNonConvexity (LevenbergMarquardt)"
+    assert solution.solver == "GraduatedNonConvexity (GaussNewton)"
     assert graph.terms[0].robust == fg.TruncatedLeastSquares(3.0)  # type: ignore[attr-defined]
 
 
@@ -193,3 +197,82 @@ def test_wrong_loop_closures_between_weak_odometry(shared_data: Path) -> None:
         weights = loss.weight(graph.with_poses(solution[x]).squared_errors())
         assert closed[weights[closed] > 0.0].tolist() == kept.tolist()
         assert solution.cost == pytest.approx(cost, abs=1e-3)
+
+
+def test_innovations_are_those_of_dense_algebra() -> None:
+    """r' (I + J S J')^-1 r of what is left out, S from what counts."""
+    sim = manhattan(60, seed=3, outliers=0.3)
+    pose_graph = sim.pose_graph.with_poses(sim.truth)
+    graph, _, guess = pose_graph.graph(robust=fg.TruncatedLeastSquares(3.4))
+    program = graph.compile()
+    program.bind({})
+    lin = program.linearize(guess)
+    plain_graph, _, same = pose_graph.graph()
+    plain = plain_graph.compile().linearize(same)
+    term = next(term for term, _ in program.table.robust)
+    out = lin.residual.reshape(-1, 3)[-term.count :].any(axis=1) == 0
+    assert 3 < out.sum() < term.count - 1
+    innovations = Innovations(program, program.normal_solver(), lin.hessian)
+    assert innovations.determined
+    found = innovations.squared(term, plain, out)
+    upper = program.normal.matrix(lin.hessian).toarray()
+    covariance = np.linalg.inv(upper + upper.T - np.diag(upper.diagonal()))
+    jacobian = program.costs.matrix(plain.jacobian).toarray().reshape(-1, 3, program.size)[-term.count :][out]
+    residual = plain.residual.reshape(-1, 3)[-term.count :][out]
+    expected = [
+        r @ np.linalg.solve(np.eye(3) + J @ covariance @ J.T, r) for J, r in zip(jacobian, residual, strict=True)
+    ]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_right_closures_left_out_by_drift_are_taken_back(seed: int) -> None:
+    """From odometry the loss itself leaves right closures out; each agrees with what the others allow."""
+    sim = manhattan(150, seed)
+    loss = fg.TruncatedLeastSquares(3.4)
+    graph, x, guess = sim.pose_graph.graph(robust=loss)
+    plain = GaussNewton().solve(graph, guess)
+    staged, stages = graduated_non_convexity._staged(graph)
+    search = graduated_non_convexity._Search(GraduatedNonConvexity(), graph, staged, stages, None, None)
+    gated = search._gated(search._stated(plain))
+    kept = [loss.weight(sim.pose_graph.with_poses(s[x]).squared_errors()).mean() for s in (plain, gated)]
+    assert kept[0] < 0.95 < 0.98 < kept[1]
+    assert gated.converged and gated.cost < 0.9 * plain.cost
+
+
+class Abrupt(fg.TruncatedLeastSquares):
+    """A loss whose only surrogate is itself: graduation then starts from the bent solution without losses."""
+
+    def surrogates(self, largest: float, growth: float) -> Iterator[Loss]:
+        """Nothing in between."""
+        yield self
+
+
+def test_a_rival_loss_is_named_where_it_finds_more(caplog: pytest.LogCaptureFixture) -> None:
+    """Without surrogates, graduation misses what dynamic covariance scaling finds."""
+    sim = manhattan(200, 0, outliers=0.5)
+    loss = Abrupt(3.4)
+    graph, x, guess = sim.pose_graph.graph(robust=loss)
+    with caplog.at_level(logging.INFO, logger="unifg"):
+        solution = GraduatedNonConvexity().solve(graph, guess, check=True)
+    assert "DCS(phi=3.85" in caplog.text
+    weights = loss.weight(sim.pose_graph.with_poses(solution[x]).squared_errors())
+    assert weights[sim.outliers].max() == 0.0 and weights[~sim.outliers].mean() > 0.98
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("seed", "claim"), [(2, "anywhere")])
+def test_a_third_of_the_closures_of_a_real_drive_wrong(shared_data: Path, seed: int, claim: Claim) -> None:
+    """From the bent solution of the stage before it ended 25 m off, CONVERGED."""
+    clean = read_g2o(shared_data / "pose_graphs" / "intel.g2o.gz")
+    dirty, wrong = with_wrong_closures(clean, 0.3, seed, claim)
+    graph, x, guess = clean.graph()
+    right = GaussNewton().solve(graph, guess, check=True)[x]
+    loss = fg.TruncatedLeastSquares(3.37)
+    graph, x, guess = dirty.graph(robust=loss)
+    solution = GraduatedNonConvexity().solve(graph, guess, check=True)
+    assert np.linalg.norm(solution[x][:, :2] - right[:, :2], axis=1).max() < 1e-3
+    weights = loss.weight(dirty.with_poses(solution[x]).squared_errors())
+    assert weights[wrong].max() == 0.0
+    assert weights[~wrong].min() == 1.0
+    assert solution.cost <= GaussNewton().solve(graph, {x: right}).cost * (1.0 + 1e-9)
