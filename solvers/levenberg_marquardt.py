@@ -36,12 +36,15 @@ class LevenbergMarquardt(LeastSquares):
         none, run.lent = np.zeros(0), workspace
         damping = Damping(self.damping)
         while run.status is None:
-            used = damping.value
+            used, workspace.hopeful, workspace.reached = damping.value, True, None
             taken = damped_step(workspace, run.lin, none, none, damping)
             if taken is None:
                 return Status.STALLED
             values, step, rejected = taken
-            run.accept(run.program.linearize(values), none, norm(step), 1.0, damping=used, rejected=rejected)
+            # Rejected steps are the exception: the first trial is linearised at once, later ones are evaluated first.
+            lin = workspace.reached if rejected == 0 else None
+            lin = run.program.linearize(values) if lin is None else lin
+            run.accept(lin, none, norm(step), 1.0, damping=used, rejected=rejected)
             if run.status is None and norm(step) < self.step_tolerance:
                 return Status.STOP_RULE
         return None

@@ -25,6 +25,8 @@ class Primal:
         program: the compiled graph.
         solver: factorisation of the normal equations.
         damping: what was added to the diagonal of the matrix factorised last, relative to it.
+        hopeful: whether the next trial is linearised at once, since it will probably be taken.
+        reached: what came of that.
     """
 
     def __init__(self, program: Program) -> None:
@@ -32,6 +34,8 @@ class Primal:
         self.program = program
         self.solver = program.normal_solver()
         self.damping = 0.0
+        self.hopeful = False
+        self.reached: Linearization | None = None
 
     def next_multipliers(self, constraints: Array, multipliers: Array, penalty: Array) -> Array:
         """(M,) lambda+: the first-order dual update, zero for inactive rows."""
@@ -94,7 +98,10 @@ class Primal:
         step = -self.solver.solve(gradient)
         return step if np.isfinite(step).all() else None
 
-    def trial(self, lin: Linearization, step: Array) -> tuple[Values, Evaluation]:
+    def trial(self, lin: Linearization, step: Array) -> tuple[Values, Evaluation | Linearization]:
         """Values after ``step`` and what they cost, with the weights of ``lin`` held."""
         values = self.program.retract(lin.values, step)
+        if self.hopeful and not lin.weights:
+            self.hopeful, self.reached = False, self.program.linearize(values)
+            return values, self.reached
         return values, self.program.evaluate(values, lin.weights)
