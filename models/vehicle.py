@@ -80,10 +80,20 @@ def _dynamics(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
         J[0, 2] = 1.0
 
 
+@compiled
+def _dynamics_second(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
+    """The drag alone bends."""
+    for i in range(len(S)):
+        for k in range(len(S)):
+            S[i, k] = 0.0
+    S[0, 0] = w[0] * p[0] / table[0] * 2.0 * table[3]
+
+
 def dynamics(vehicle: Vehicle) -> Residual:
     """The residual ``f(v, force, v_next, dt, slope)``: v_next minus the speed predicted, (n, 1) [m/s]."""
     w = vehicle
     table = np.array(
         [w.equivalent_mass, w.mass, w.rolling, w.drag, w.drag_constant, w.drag_linear, w.gravity], dtype=np.float64
     )
-    return residual(Kernel(_dynamics, (SPEED, FORCE, SPEED, 0, 0), 1, table, name="vehicle.dynamics"))
+    arguments = SPEED, FORCE, SPEED, 0, 0
+    return residual(Kernel(_dynamics, arguments, 1, table, name="vehicle.dynamics", second=_dynamics_second))

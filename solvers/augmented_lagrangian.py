@@ -174,10 +174,11 @@ class AugmentedLagrangian(Solver):
                 values, step, rejected = taken
                 expected = primal.expected_multipliers(run.lin, step, multipliers, penalty)
                 lin = run.program.linearize(values)
-                after = primal.next_multipliers(lin.constraints, multipliers, penalty)
-                slope, balance = primal.slope(lin, after), primal.slope(lin, expected)
-                if balance < slope:
-                    after, slope = expected, balance
+                after, slope = expected, primal.slope(lin, expected)
+                if not slope <= gradient_goal:
+                    plus = primal.next_multipliers(lin.constraints, multipliers, penalty)
+                    if not slope < (balance := primal.slope(lin, plus)):
+                        after, slope = plus, balance
                 run.accept(
                     lin,
                     after,
@@ -210,7 +211,7 @@ class AugmentedLagrangian(Solver):
                 violation_goal = max(min(violation_goal / rho**0.9, FALL * change), least)
                 gradient_goal = max(0.1 * gradient_goal, 0.0 if run.program.least_squares else 0.1 * self.tolerance)
             else:
-                if run.infeasible_stationary() and (ending := leave(run)) is not None:
+                if not falling and run.infeasible_stationary() and (ending := leave(run)) is not None:
                     return ending
                 if run.lin is not here:  # led astray: from the new point more slowly, and without what was learned
                     first *= self.penalty_growth**2

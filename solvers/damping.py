@@ -73,7 +73,8 @@ def damped_step(
     damping.share = share = min(4.0 * damping.share, 1.0)
     while damping.value <= LARGEST:
         curved = len(bend) > 0 and share > 0.0
-        found = model_step(primal, lin, multipliers, penalty, damping.value, share * bend if curved else STRAIGHT)
+        chosen = (bend if share == 1.0 else share * bend) if curved else STRAIGHT
+        found = model_step(primal, lin, multipliers, penalty, damping.value, chosen)
         if found is None and curved:
             damping.share = max(0.5 * share, LEAST_SHARE)
             share = 0.5 * share if share > LEAST_SHARE else 0.0

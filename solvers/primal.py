@@ -9,11 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.columns import Values
+from unifg.jit import compiled
 from unifg.linearization import Evaluation, Linearization
+from unifg.passes import transposed_times
 from unifg.program import Program
 from unifg.second_order import lagrangian_hessian
 from unifg.solvers.phr import barrier, update
-from unifg.typing import Array
+from unifg.table import Terms
+from unifg.typing import Array, IntArray
 
 DIAGONAL_FLOOR = 1e-9  # of the largest diagonal entry: damping must act on unknowns with little curvature too
 
@@ -67,8 +70,8 @@ class Primal:
 
     def slope(self, lin: Linearization, multipliers: Array) -> float:
         """Largest entry of the Lagrangian's gradient over the unknowns."""
-        gradient = self.program.lagrangian_gradient(lin, multipliers)
-        return float(np.abs(gradient[self.program.columns.free]).max(initial=0.0))
+        program = self.program
+        return float(_slope(program.arrays, program.columns.free, lin.gradient, lin.constraint_jacobian, multipliers))
 
     def curvature(self, lin: Linearization, multipliers: Array, penalty: Array) -> Array:
         """Gauss-Newton Hessian entries J'J + A' diag(rho, active rows) A."""
@@ -85,10 +88,11 @@ class Primal:
     def bend(self, lin: Linearization, multipliers: Array) -> Array:
         """What :meth:`curvature` leaves out of the Hessian: second derivatives of residuals and constraints.
 
-        Empty where they are not finite: a factor may have a kink or a pole there.
+        Empty where there are none, and where they are not finite: a factor may have a kink or a pole there.
         """
-        left_out: Array = lagrangian_hessian(self.program, lin, multipliers) - lin.hessian
-        return left_out if np.isfinite(left_out).all() else np.zeros(0)
+        left_out: Array = lagrangian_hessian(self.program, lin, multipliers)
+        left_out -= lin.hessian
+        return left_out if left_out.any() and np.isfinite(left_out.sum()) else np.zeros(0)
 
     def direction(self, curvature: Array, gradient: Array) -> Array | None:
         """Solve H d = -gradient; None when the matrix cannot be factorised."""
@@ -105,3 +109,15 @@ class Primal:
             self.hopeful, self.reached = False, self.program.linearize(values)
             return values, self.reached
         return values, self.program.evaluate(values, lin.weights)
+
+
+@compiled
+def _slope(terms: Terms, free: IntArray, gradient: Array, entries: Array, multipliers: Array) -> float:
+    """Max |gradient + A' multipliers| over the unknowns; NaN where one is."""
+    full, largest = gradient.copy(), 0.0
+    transposed_times(terms, False, entries, multipliers, full)
+    for k in range(len(free)):
+        size = abs(full[free[k]])
+        if not size <= largest:
+            largest = size
+    return largest

@@ -9,7 +9,7 @@ import pytest
 
 import unifg as fg
 from unifg.lie import Manifold
-from unifg.models import avoidance, landmarks, obstacles, quadrotor, unicycle
+from unifg.models import avoidance, landmarks, obstacles, quadrotor, unicycle, vehicle
 from unifg.residuals import Residual, residual
 from unifg.second_order import lagrangian_hessian
 from unifg.solvers import InteriorPoint
@@ -60,6 +60,11 @@ CASES: dict[str, tuple[Residual, list[tuple[Manifold, Array] | Array | float], f
     "1/d of a landmark": (avoidance.inverse_distance_root(avoidance.landmark_clearance), [PLACES, MARKS, 0.2], 1e-4),
     "bearing and range": (
         landmarks.bearing_range, [(quadrotor.STATE, STATES), MARKS, RNG.standard_normal((4, 2))], 1e-5,
+    ),
+    "car": (
+        vehicle.dynamics(vehicle.Vehicle(drag=900.0)),
+        [(fg.Rn(1), MARKS[1][:, :1]), (fg.Rn(1), MARKS[1][:, 1:]), (fg.Rn(1), MARKS[1][:, 1:]), 1.0, 0.1],
+        1e-6,
     ),
     "tilt": (landmarks.tilt, [(fg.SO3, STATES[:, 3:7]), RNG.standard_normal(3)], 1e-6),
 }  # fmt: skip
