@@ -169,7 +169,7 @@ def test_a_blocked_corridor_is_told_early(hessian: Literal["exact", "gauss-newto
     """Penalties that grow without end creep towards the least violation; it is looked for when they do."""
     solution = AugmentedLagrangian(hessian=hessian).solve(*corridor(length))
     assert solution.status is fg.Status.LOCALLY_INFEASIBLE, solution.report()
-    assert solution.iterations <= (80 if hessian == "exact" else 100)
+    assert solution.iterations <= (80 if hessian == "exact" else 120)
     assert solution.violation > 1e-2
 
 
