@@ -189,7 +189,7 @@ def summary(cases: list[Case], names: Iterable[str]) -> str:
     for name in names:
         mine = [(case, case.answers[name]) for case in cases if name in case.answers]
         solved = [(case, a) for case, a in mine if a.status == "CONVERGED"]
-        worst = max((max(a.stationarity, a.violation, a.complementarity) for _, a in solved), default=np.nan)
+        worst = [max(a.stationarity, a.violation, a.complementarity) for _, a in solved]
         both = [a.cost / case.ipopt.cost - 1.0 for case, a in solved if case.ipopt.solved]
         dead = Counter(a.claim for _, a in mine if a.status == "LOCALLY_INFEASIBLE")
         rows.append(
@@ -197,12 +197,12 @@ def summary(cases: list[Case], names: Iterable[str]) -> str:
                 name,
                 f"{len(solved)} / {len(mine)}",
                 str(sum(a.claim == "false" for _, a in solved)),
-                f"{worst:.2e}",
+                f"{max(worst):.2e}" if worst else "-",
                 f"{dead['true']} / {dead['saddle']} / {dead['false']}",
                 str(sum(lost(case, name) for case, _ in mine)),
                 str(sum(not case.ipopt.solved for case, _ in solved)),
                 f"{sum(b < -SAME for b in both)} / {sum(abs(b) <= SAME for b in both)} / {sum(b > SAME for b in both)}",
-                f"{np.median([float(a.iterations) for _, a in solved] or [np.nan]):.0f}",
+                f"{np.median([a.iterations for _, a in solved]):.0f}" if solved else "-",
                 f"{np.median([a.seconds for _, a in mine]):.2f}",
             )
         )
@@ -234,10 +234,11 @@ def render(cases: list[Case]) -> str:
         ("The other kinds, equalities only", [c for c in cases if c.equalities_only]),
     ):
         if chosen:
-            solved, staged = sum(c.ipopt.solved for c in chosen), [c.fatrop for c in chosen if c.fatrop is not None]
+            staged = [c.fatrop for c in chosen if c.fatrop is not None]
+            solved = [c.ipopt.iterations for c in chosen if c.ipopt.solved]
+            often = f", in {np.median(solved):.0f} iterations in the median" if solved else ""
             parts.append(
-                f"{title}: {len(chosen)} problems. IPOPT solves {solved} of them, in "
-                f"{np.median([c.ipopt.iterations for c in chosen if c.ipopt.solved]):.0f} iterations in the median; "
+                f"{title}: {len(chosen)} problems. IPOPT solves {len(solved)} of them{often}; "
                 f"fatrop {sum(peer.solved for peer in staged)} of the {len(staged)} that have its form."
             )
             parts.append(summary(chosen, [n for n in names if any(n in c.answers for c in chosen)]))
