@@ -188,7 +188,7 @@ class KKT(Solver):
         linear = program.constraints.times(lin.constraint_jacobian, step)
         slope = merit.slope(lin, step, linear)
         here = merit.value(lin)
-        slack = ROUNDING * max(1.0, abs(here))
+        slack = ROUNDING * max(1.0, abs(here)) + merit.rounding(lin)
         if not slope <= slack:
             return None
         values = program.retract(lin.values, step)
@@ -291,6 +291,11 @@ class Merit:
     def value(self, point: Linearization | Evaluation) -> float:
         """Merit at a point."""
         return point.cost + self.price * self._violation(point.constraints)
+
+    def rounding(self, lin: Linearization) -> float:
+        """What the merit owes to coordinates that are rounded where they are stored, by half a spacing in every row."""
+        largest = float(np.abs(self.program.columns.values(lin.values).flat).max(initial=0.0))
+        return self.price * 0.5 * float(np.spacing(largest)) * len(lin.constraints)
 
     def slope(self, lin: Linearization, step: Array, linear: Array) -> float:
         """Bound of the merit's derivative along a step, after the price was raised to make it one of descent.

@@ -306,7 +306,9 @@ class Run:
             status = Status.CONVERGED
         elif measured.holds(self.tolerance) and not measured.determined:
             status = Status.UNDETERMINED
-        elif (measured.holds(self.tolerance) or measured.blurred(self.tolerance)) and status is not Status.UNBOUNDED:
+        elif measured.holds(self.tolerance) and status is not Status.UNBOUNDED:
+            status = Status.IMPRECISE
+        elif measured.blurred(self.tolerance) and status in (Status.STALLED, Status.ITERATION_LIMIT):
             status = Status.IMPRECISE
         elif status.converged:
             status = Status.STALLED
@@ -332,7 +334,7 @@ class Run:
             return Status.CONVERGED
         if self.optimality.holds(self.tolerance) and not self.optimality.determined:
             return Status.UNDETERMINED
-        if self.optimality.holds(self.tolerance) or self.optimality.blurred(self.tolerance):
+        if self.optimality.holds(self.tolerance):
             return Status.IMPRECISE
         if self.iterations >= self._solver.max_iterations:
             return Status.ITERATION_LIMIT
