@@ -95,6 +95,19 @@ def test_a_solution_remembers_which_constraints_were_equalities() -> None:
         assert (caught.value.term, caught.value.index) == ("same", 0)
 
 
+def test_one_inequality_among_equalities_is_refused_and_named() -> None:
+    graph = fg.Graph()
+    x, y = graph.variables("x", fg.Rn(1), 2), graph.variables("y", fg.Rn(1), 2)
+    graph.minimize(fg.prior, x, np.zeros(1), name="prior")
+    graph.minimize(fg.prior, y, np.zeros(1), name="rest")
+    limit = np.array([[0.0], [1.0]])
+    graph.constrain(lambda a, b: b - a, x, y, lower=-limit, upper=limit, name="tie")
+    solution = SQP().solve(graph, {x: np.ones((2, 1)), y: np.ones((2, 1))}, check=True)
+    with pytest.raises(fg.GraphError, match=r"'tie' \(factor 1\) is an inequality") as caught:
+        solution.marginal_prior(["prior", "tie"], x, y)
+    assert (caught.value.term, caught.value.index) == ("tie", 1)
+
+
 def test_the_first_unknown_of_a_graph_is_one_like_all_others() -> None:
     graph = fg.Graph()
     x = graph.variables("x", fg.Rn(1), 3)

@@ -203,10 +203,11 @@ def test_only_a_solve_that_ended_moves_the_past(field: DistanceMap, claims: dict
         assert np.array_equal(window.departure[0], alone[0][0]) and np.array_equal(window.departure[1], alone[1])
 
 
-def test_registering_goes_on_until_the_beams_are_found(field: DistanceMap) -> None:
+@pytest.mark.parametrize("off", [(0.35, -0.3, 0.1), (0.0, 0.45, 0.0)], ids=str)
+def test_registering_goes_on_until_the_beams_are_found(field: DistanceMap, off: tuple[float, float, float]) -> None:
     """From half a metre away the beams that count change from round to round; at rest one round is enough."""
     world = World(room(), OPEN, rng=np.random.default_rng(3))
-    window = Window(2, OPEN + np.array([0.35, -0.3, 0.1]), np.diag([0.3, 0.3, 0.1]), world.lidar.beams)
+    window = Window(2, OPEN + np.array(off), np.diag([0.3, 0.3, 0.1]), world.lidar.beams)
     controller = JointController(field, "sqp", SETTINGS, window)
     window.look(world.scan())
     solves: list[int] = []

@@ -15,7 +15,7 @@ import numpy as np
 
 from unifg.columns import Columns, Values
 from unifg.differentiation import gradient_and_hessian, jacobian
-from unifg.errors import GraphError
+from unifg.errors import GraphError, name_term
 from unifg.gather import Gather
 from unifg.jit import is_compiled
 from unifg.kernels import Kernel, side_by_side
@@ -338,7 +338,12 @@ class CompiledTerm:
         return full
 
     def _call(self, points: list[Array]) -> Array:
-        return as_float64(self.name, self._function(*self.fill(points)))
+        try:
+            result = self._function(*self.fill(points))
+        except Exception as error:
+            name_term(error, self.name)
+            raise
+        return as_float64(self.name, result)
 
     def fill(self, points: list[Array]) -> list[Any]:
         """All arguments in order, variables at these points."""

@@ -37,6 +37,14 @@ class UnifgError(ValueError):
         self.index = index
 
 
+def name_term(error: Exception, term: str) -> None:
+    """Say in which term a function raised: in the message of an error of ours, in a note to any other."""
+    if not isinstance(error, UnifgError):
+        error.add_note(f"raised by the function of term '{term}'")
+    elif error.term is None:
+        error.term, error.args = term, (f"term '{term}': {error}",)
+
+
 class GraphError(UnifgError):
     """The graph, its guess or its data cannot be solved as given."""
 
