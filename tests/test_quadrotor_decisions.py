@@ -140,6 +140,16 @@ def test_the_control_that_is_flown_is_what_the_next_one_changes_from() -> None:
     assert np.array_equal(controller._spent(here)[controller._last], hover)
 
 
+def test_the_first_control_does_not_leap_from_the_last() -> None:
+    """Two vehicles in the same state, one of which has just been pushed up harder."""
+    thrust = []
+    for more in (0.0, 4.0):
+        controller, here = Controller(TARGET, WALLS, settings=SETTINGS, bounds=BOUNDS), belief(state(1.0))
+        controller._applied = quadrotor.hover(here.parameters) + [0.0, 0.0, 0.0, more]
+        thrust.append(controller.plan(here).controls[0, 3])
+    assert thrust[1] > thrust[0] + 0.1
+
+
 def test_limits_of_the_controls_are_the_solver_s_business_not_the_clipping_s() -> None:
     """A vehicle that sinks fast wants more thrust than there is; the plan knows that it does not get it."""
     s = replace(SETTINGS, thrust_limits=(2.0, 12.0))
