@@ -145,7 +145,7 @@ def test_the_first_control_does_not_leap_from_the_last() -> None:
     thrust = []
     for more in (0.0, 4.0):
         controller, here = Controller(TARGET, WALLS, settings=SETTINGS, bounds=BOUNDS), belief(state(1.0))
-        controller._applied = quadrotor.hover(here.parameters) + [0.0, 0.0, 0.0, more]
+        controller._applied = quadrotor.hover(here.parameters) + np.array([0.0, 0.0, 0.0, more])
         thrust.append(controller.plan(here).controls[0, 3])
     assert thrust[1] > thrust[0] + 0.1
 
