@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -90,6 +92,13 @@ def by_gtsam(pose_graph: PoseGraph) -> Array:
     return np.array([[pose.x(), pose.y(), pose.theta()] for pose in poses])
 
 
+def solved(
+    solver: fg.Solver | GraduatedNonConvexity, graph: fg.Graph, guess: Mapping[fg.Family, Array], x: fg.Family
+) -> Array:
+    """Poses by one of ours."""
+    return solver.solve(graph, guess)[x]
+
+
 def main() -> None:
     """Print one line per graph, share, claim, seed and method."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -110,12 +119,12 @@ def main() -> None:
                 graph, x, guess = dirty.graph(robust=loss)
                 best = GaussNewton().solve(graph, {x: right}).cost
                 scaled, y, begin = dirty.graph(robust=fg.DCS(THRESHOLD**2 / 3.0))
-                methods = {
-                    "GNC": lambda g=graph, v=x, b=guess: GraduatedNonConvexity().solve(g, b)[v],
-                    "DCS": lambda g=scaled, v=y, b=begin: GaussNewton().solve(g, b)[v],
+                methods: dict[str, Callable[[], Array]] = {
+                    "GNC": partial(solved, GraduatedNonConvexity(), graph, guess, x),
+                    "DCS": partial(solved, GaussNewton(), scaled, begin, y),
                 }
                 if options.gtsam and available():
-                    methods["GTSAM"] = lambda d=dirty: by_gtsam(d)
+                    methods["GTSAM"] = partial(by_gtsam, dirty)
                 for method, solve in methods.items():
                     started = time.process_time()
                     found = solve()
