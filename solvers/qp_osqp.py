@@ -36,7 +36,7 @@ DIGITS = 1e-2  # accuracy asked for at first
 FINER = 0.01  # than the accuracy asked for, as the interior points are; a polish gives it or fails
 FINEST = 1e-9  # asked of the iterations; what lies beyond is left to the polish
 EVERY = 10  # iterations between looks at it
-WORTH = 20.0  # iterations of an interior point
+WORTH = 30.0  # iterations of an interior point
 SOLVED = (osqp.SolverStatus.OSQP_SOLVED, osqp.SolverStatus.OSQP_SOLVED_INACCURATE)
 UNFINISHED = osqp.SolverStatus.OSQP_MAX_ITER_REACHED
 INFEASIBLE = (osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE, osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE_INACCURATE)
@@ -56,7 +56,7 @@ class OsqpRoute:
 
         Args:
             program: the compiled graph.
-            max_iterations: per subproblem; None for what twenty iterations of an interior point cost.
+            max_iterations: per subproblem; None for what thirty iterations of an interior point cost.
         """
         self.program = program
         self._limit = max_iterations

@@ -21,7 +21,7 @@ from unifg.solvers.qp import QP, QPAnswer
 from unifg.sparse import Symmetric
 from unifg.typing import Array, IntArray
 
-PASSES = 12  # each halves what is left in the exponents
+PASSES, NEAR = 12, 1.5  # each pass halves what is left in the exponents; factors are rounded anyway
 LARGEST = 2.0**40
 MODEST = 2.0**10  # factors up to this change little in double precision, and are left alone
 
@@ -76,7 +76,7 @@ class Scaling:
 
     def hessian(self, pattern: Symmetric, entries: Array) -> Array:
         """Entries of a scaled Hessian."""
-        scaled: Array = entries * self.columns[pattern.indices] * self.columns[_columns(pattern)]
+        scaled: Array = entries * self.columns[pattern.indices] * self.columns[pattern.columns]
         return scaled
 
     def jacobian(self, entries: Array) -> Array:
@@ -134,12 +134,8 @@ def equilibrate(program: Program, pattern: Symmetric, hessian: Array, jacobian: 
 
 
 def _rounded(factors: Array) -> Array:
-    rounded: Array = np.clip(np.exp2(np.round(np.log2(factors))), 1.0 / LARGEST, LARGEST)
+    rounded: Array = np.exp2(np.round(np.log2(np.minimum(np.maximum(factors, 1.0 / LARGEST), LARGEST))))
     return rounded
-
-
-def _columns(pattern: Symmetric) -> IntArray:
-    return np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
 
 
 @compiled
@@ -156,6 +152,7 @@ def _equilibrate(
     """Ruiz' passes; entries must not be negative, and those that are not finite do not count."""
     of_columns, of_rows = np.empty(len(column_factors)), np.empty(len(row_factors))
     for _ in range(PASSES):
+        furthest = 1.0
         of_columns[:], of_rows[:] = 0.0, 0.0
         for column in range(len(column_factors)):
             for at in range(indptr[column], indptr[column + 1]):
@@ -172,6 +169,10 @@ def _equilibrate(
         for k in range(len(column_factors)):
             if of_columns[k] > 0.0:
                 column_factors[k] /= np.sqrt(of_columns[k])
+                furthest = max(furthest, of_columns[k], 1.0 / of_columns[k])
         for k in range(len(row_factors)):
             if of_rows[k] > 0.0:
                 row_factors[k] /= np.sqrt(of_rows[k])
+                furthest = max(furthest, of_rows[k], 1.0 / of_rows[k])
+        if furthest < NEAR:
+            break

@@ -72,7 +72,7 @@ class SQP(Solver):
             "graph" unless "elimination" is asked for.
         fallback: "piqp" (called directly), "graph" or any name qpsolvers knows: repeats a QP which missed its accuracy.
             None leaves inaccurate answers as they are, and infeasible subproblems unsolved.
-        qp_iterations: limit for OSQP before the fallback takes over; None for what twenty iterations of an interior
+        qp_iterations: limit for OSQP before the fallback takes over; None for what thirty iterations of an interior
             point cost, in operations counted on the graph.
         scaling: bring unknowns and rows whose units are far apart to one scale inside the solve, found at its start
             (:mod:`unifg.solvers.scaling`). Answers and the test they have to pass stay in the units of the graph.

@@ -75,7 +75,7 @@ class Symmetric:
 
     def positions(self, rows: IntArray, columns: IntArray) -> IntArray:
         """Where the given entries are stored."""
-        return np.searchsorted(self._columns * self.size + self.indices, columns * self.size + rows)
+        return np.searchsorted(self.columns * self.size + self.indices, columns * self.size + rows)
 
     def times(self, data: Array, vector: Array) -> Array:
         """The symmetric matrix with upper triangle ``data`` times a vector."""
@@ -88,7 +88,7 @@ class Symmetric:
         return sp.csc_matrix((data, self.indices, self.indptr), shape=(self.size, self.size))
 
     @cached_property
-    def _columns(self) -> IntArray:
+    def columns(self) -> IntArray:
         """(nnz,) column of every entry."""
         return np.repeat(np.arange(self.size), np.diff(self.indptr))
 
