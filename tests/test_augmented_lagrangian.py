@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -19,6 +19,7 @@ from unifg.models import obstacles, unicycle
 from unifg.scenarios.manoeuvres import CASES, ManoeuvreSettings, state_problem
 from unifg.solvers import SQP, AugmentedLagrangian
 from unifg.typing import Array
+from units import drive
 
 
 def beside_a_disc(scale: float) -> tuple[fg.Graph, dict[fg.Family, Array]]:
@@ -261,3 +262,16 @@ def test_the_damped_loop_that_cannot_move_says_so() -> None:
     solution = AugmentedLagrangian(schedule="bazzana-damped", penalty=10.0).solve(graph, {x: [[0.0]]})
     assert not solution.converged
     assert solution[x].item() == pytest.approx(1.5, abs=1e-3)
+
+
+UNITS = [("position", 1e6), ("position", 1e-6), ("angle", 1e4), ("control", 1e6), ("dynamics", 1e4), ("clearance", 1e4)]
+
+
+@pytest.mark.parametrize(("what", "unit"), UNITS)
+def test_units_of_variables_and_rows_are_free(what: str, unit: float) -> None:
+    """Newton's steps and Marquardt's damping have no unit; the goals of a subproblem do, and cost iterations."""
+    units: dict[str, Any] = {what: unit}
+    solution = AugmentedLagrangian().solve(*drive(**units))
+    assert solution.converged, solution.report()
+    assert solution.cost == pytest.approx(1.70, abs=0.01)
+    assert solution.iterations <= 120
