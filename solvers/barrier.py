@@ -26,6 +26,10 @@ is at its price; where one is, the price is raised, until the pull of the object
 constraints exert on each other. Then violation is what is left to minimise, and whoever runs the loop has to find out
 whether less of it is to be had (`VIOLATED`); compare Curtis, Schenk and Waechter, SIAM J. Optim. 20 (2010), and Thierry
 and Biegler, Optim. Methods Softw. 35 (2020).
+
+s y and e z are the same in any unit of a row. Units (`_find_units`) therefore enter only where numbers of different
+rows or unknowns meet: prices, first slacks, sums of violations, shifts of the diagonals, and the error of a barrier
+problem.
 """
 
 from __future__ import annotations
@@ -49,6 +53,7 @@ from unifg.solvers.barrier_state import (
     CORRECT,
     CORRECTED,
     COST,
+    COST_UNIT,
     DE,
     DELTA,
     DESCENT,
@@ -60,6 +65,7 @@ from unifg.solvers.barrier_state import (
     FAILURES,
     FILTER,
     FILTERED,
+    FORCE,
     GAP,
     GAUSS_NEWTON,
     ITERATION,
@@ -72,7 +78,9 @@ from unifg.solvers.barrier_state import (
     MOST,
     MU,
     NOT_FINITE,
+    PAID,
     PHI,
+    RAISES,
     RELAX,
     REST,
     RESTORE,
@@ -86,6 +94,7 @@ from unifg.solvers.barrier_state import (
     SAVED_DY,
     SAVED_SLOPE,
     SCALE,
+    SCALING,
     SHORT_STEPS,
     SIDES,
     SIGN,
@@ -114,7 +123,8 @@ from unifg.table import BOUND, COLUMN, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, Ter
 from unifg.typing import Array, IntArray
 
 OBJECTIVE = 0  # table.COST
-KAPPA = 10.0  # a barrier problem is solved when its error is below KAPPA mu
+KAPPA = 50.0  # mu is lowered when the error of the barrier problem is below KAPPA mu
+SOLVED = 50.0  # prices are looked at when it is below SOLVED mu
 ARMIJO = 1e-4
 GAMMA_THETA, GAMMA_PHI = 1e-5, 1e-8
 HALVINGS = 20
@@ -124,7 +134,11 @@ RELAXED_MU = 1e-2  # of price times violation: first mu with elastic equalities
 LATE_MU = 1e-3  # the same: largest mu at which a violation is taken seriously
 AT_PRICE = 0.9  # share of the price from which on a multiplier is at it
 SMALL_PULL = 1e-2  # share of the constraints' forces below which the objective's force counts for nothing
-HIGHEST_PRICE = 1e9
+MOST_RAISES = 6  # of prices, tenfold each
+LARGE_PULL = 1e3  # force of the objective from which on mu and prices are in proportion to it
+FAR = 100.0  # from one: largest entry of a row that calls for other units
+SWEEPS = 8
+BOTTOMLESS = -1e12  # an objective below it, while constraints are violated
 FIRST_SLACK = 1e-2  # smallest slack of a cold start
 WARM_MU = 1e-5  # largest first mu of a start with multipliers: what is active has been found
 
@@ -137,6 +151,7 @@ def _merit(
     side_row: IntArray,
     pairs: Array,
     prices: Array,
+    row_units: Array,
     rows: IntArray,
     lower: Array,
     cost: float,
@@ -149,7 +164,7 @@ def _merit(
         s, e = sides[S, k] + alpha * sides[DS, k], sides[E, k] + alpha * sides[DE, k]
         row = side_row[k]
         c = sides[SIGN, k] * (constraints[row] - sides[BORDER, k])
-        theta += abs(c + e - s)
+        theta += abs(c + e - s) / row_units[row]
         elastic += prices[row] * e
         product *= s * e
         if k & 3 == 3:  # one logarithm for eight factors, each of moderate size
@@ -158,12 +173,12 @@ def _merit(
     logarithms += math.log(product)
     if counts[ELASTIC] == 0:
         for row in rows:
-            theta += abs(constraints[row] - lower[row])
+            theta += abs(constraints[row] - lower[row]) / row_units[row]
     else:
         product = 1.0
         for k in range(len(rows)):
             row, p, n = rows[k], pairs[P, k] + alpha * pairs[DP, k], pairs[N, k] + alpha * pairs[DN, k]
-            theta += abs(constraints[row] - lower[row] - p + n)
+            theta += abs(constraints[row] - lower[row] - p + n) / row_units[row]
             elastic += prices[row] * (p + n)
             product *= p * n
             if k & 3 == 3:
@@ -189,7 +204,8 @@ def measure(address: int) -> None:
     """KKT numbers of the problem at the present iterate, and what the error of the barrier problem is made of."""
     constraint_jacobian, constraints, counts, free = parts(address, "constraint_jacobian constraints counts free")
     full, gradient, multipliers, numbers, side_row = parts(address, "full gradient multipliers numbers side_row")
-    pairs, prices, rows, sides, terms = parts(address, "pairs prices rows sides terms")
+    pairs, prices, row_units, rows, sides = parts(address, "pairs prices row_units rows sides")
+    terms, units = parts(address, "terms units")
     lower, upper, constraints, full = terms.lower, terms.upper, constraints, full
     gap, least, most = 0.0, math.inf, -math.inf
     for k in range(counts[SIDES]):
@@ -200,7 +216,7 @@ def measure(address: int) -> None:
         sy, ez = sides[S, k] * y, sides[E, k] * (prices[row] - y)
         least, most = min(least, min(sy, ez)), max(most, max(sy, ez))
         c = sides[SIGN, k] * (constraints[row] - sides[BORDER, k])
-        gap = max(gap, abs(c + sides[E, k] - sides[S, k]))
+        gap = max(gap, abs(c + sides[E, k] - sides[S, k]) / row_units[row])
     for k in range(len(full)):
         full[k] = gradient[k]
     fields, columns, jacobian = terms.fields, terms.columns, constraint_jacobian
@@ -222,39 +238,42 @@ def measure(address: int) -> None:
                 entry += width
             row += m
             column += width
-    stationarity = violation = complementarity = size = 0.0
+    stationarity = force = violation = paid = complementarity = size = 0.0
     for column in free:
         if not abs(full[column]) <= stationarity:  # NaN stays
             stationarity = abs(full[column])
+        force = max(force, abs(full[column]) * units[column])
     for row in range(len(constraints)):
         value, multiplier = constraints[row], multipliers[row]
         size += abs(multiplier)
         outside = max(value - upper[row], lower[row] - value)
         if not outside <= violation:
             violation = outside
+        paid = max(paid, outside * prices[row])
         if lower[row] != upper[row]:
             limit = upper[row] if multiplier > 0.0 else lower[row]
             slack = abs(value - limit) if math.isfinite(limit) else 1.0
             complementarity = max(complementarity, abs(multiplier) * slack)
     if counts[ELASTIC] == 0:
         for row in rows:
-            gap = max(gap, abs(constraints[row] - lower[row]))
+            gap = max(gap, abs(constraints[row] - lower[row]) / row_units[row])
     else:
         for k in range(len(rows)):
             row, p, n = rows[k], pairs[P, k], pairs[N, k]
             pz, nz = p * (prices[row] - multipliers[row]), n * (prices[row] + multipliers[row])
             least, most = min(least, min(pz, nz)), max(most, max(pz, nz))
-            gap = max(gap, abs(constraints[row] - lower[row] - p + n))
+            gap = max(gap, abs(constraints[row] - lower[row] - p + n) / row_units[row])
     scale = max(1.0, size / max(1, len(constraints)) / 100.0)
     numbers[SCALE], numbers[STATIONARITY], numbers[VIOLATION] = scale, stationarity / scale, violation
     numbers[COMPLEMENTARITY], numbers[GAP], numbers[LEAST], numbers[MOST] = complementarity / scale, gap, least, most
+    numbers[FORCE], numbers[PAID] = force / scale, paid
 
 
 @compiled
 def _error(numbers: Array) -> float:
     """Error of the barrier problem."""
     centring = max(numbers[MOST] - numbers[MU], numbers[MU] - numbers[LEAST]) / numbers[SCALE]
-    error: float = max(max(numbers[STATIONARITY], numbers[GAP]), centring)
+    error: float = max(max(numbers[FORCE], numbers[GAP]), centring)
     return error
 
 
@@ -286,11 +305,63 @@ def _forces(
     return pull, push
 
 
+@compiled
+def _find_units(
+    terms: Terms, jacobian: Array, row_units: Array, units: Array, row_size: Array, column_size: Array
+) -> None:
+    """Units of rows and unknowns in which the largest entries of the constraint Jacobian are near one (Ruiz 2001).
+
+    They are one where no row has its largest entry far from one.
+    """
+    fields, columns, unknowns = terms.fields, terms.columns, terms.unknown
+    for row in range(len(row_units)):
+        row_units[row] = 1.0
+    for column in range(len(units)):
+        units[column] = 1.0
+    for sweep in range(SWEEPS):
+        for row in range(len(row_size)):
+            row_size[row] = 0.0
+        for column in range(len(column_size)):
+            column_size[column] = 0.0
+        for t in range(len(fields)):
+            term = fields[t]
+            if term[KIND] == OBJECTIVE:
+                continue
+            m, width, entry = term[ROWS], term[WIDTH], term[ENTRY]
+            for i in range(term[COUNT]):
+                for a in range(m):
+                    row = term[ROW] + i * m + a
+                    largest = 0.0
+                    for d in range(width):
+                        column = columns[term[COLUMN] + i * width + d]
+                        if unknowns[column] >= 0:
+                            size = 1.0 if term[KIND] == BOUND else abs(jacobian[entry + (i * m + a) * width + d])
+                            size *= units[column] / row_units[row]
+                            largest = max(largest, size)
+                            column_size[column] = max(column_size[column], size)
+                    row_size[row] = largest
+        far = sweep > 0
+        for row in range(len(row_size)):
+            far = far or not (FAR > row_size[row] > 1.0 / FAR or row_size[row] == 0.0)
+        if not far:
+            return
+        for row in range(len(row_size)):
+            if 0.0 < row_size[row] < math.inf:
+                row_units[row] *= math.sqrt(row_size[row])
+        for column in range(len(column_size)):
+            if 0.0 < column_size[column] < math.inf:
+                units[column] /= math.sqrt(column_size[column])
+
+
 @linked
 def begin(address: int) -> None:
     """Find the sides; choose mu, slacks and multipliers of a start that has been linearised."""
     constraints, counts, links, multipliers, numbers = parts(address, "constraints counts links multipliers numbers")
-    pairs, prices, rows, side_row, sides, terms = parts(address, "pairs prices rows side_row sides terms")
+    constraint_jacobian, free, gradient, pairs, prices = parts(
+        address, "constraint_jacobian free gradient pairs prices"
+    )
+    full, row_units, rows, side_row, sides = parts(address, "full row_units rows side_row sides")
+    terms, units = parts(address, "terms units")
     lower, upper = terms.lower, terms.upper
     count = 0
     for row in range(len(lower)):
@@ -301,37 +372,49 @@ def begin(address: int) -> None:
                     side_row[count] = row
                     sides[SIGN, count], sides[BORDER, count] = 1.0 - 2.0 * which, limit
                     count += 1
-    counts[SIDES], counts[ELASTIC] = count, 0
+    counts[SIDES], counts[ELASTIC] = count, 0 if len(rows) else 1
+    numbers[COST_UNIT] = 1.0
+    if counts[SCALING] == 1:
+        _find_units(terms, constraint_jacobian, row_units, units, prices, full)
+        pull = 0.0
+        for column in free:
+            pull = max(pull, abs(gradient[column]) * units[column])
+        if pull > LARGE_PULL:
+            unit = numbers[COST_UNIT] = pull / LARGE_PULL
+            numbers[RHO] *= unit
+            numbers[MU] *= unit
     largest = 0.0
     for row in range(len(lower)):
-        largest = max(largest, abs(multipliers[row]))
-    warm, rho = largest > 0.0, numbers[RHO]
+        largest = max(largest, abs(multipliers[row]) * row_units[row])
+    warm = largest > 0.0
     counts[COLD] = 0 if warm else 1
-    if largest > 0.5 * rho:
-        rho = numbers[RHO] = 10.0 * largest
+    if largest > 0.5 * numbers[RHO]:
+        numbers[RHO] = 10.0 * largest
     for row in range(len(lower)):
-        prices[row] = rho
+        prices[row] = numbers[RHO] / row_units[row]
     if warm:
         for k in range(count):
             c = sides[SIGN, k] * (constraints[side_row[k]] - sides[BORDER, k])
-            y = min(max(-sides[SIGN, k] * multipliers[side_row[k]], 0.0), 0.9 * rho)
+            y = min(max(-sides[SIGN, k] * multipliers[side_row[k]], 0.0), 0.9 * prices[side_row[k]])
             sides[Y, k], sides[S, k], sides[E, k] = y, c, 0.0
         run(links[MEASURE], (address,))
         error = max(max(numbers[STATIONARITY], numbers[VIOLATION]), numbers[COMPLEMENTARITY])
         numbers[MU] = max(min(0.1 * error, WARM_MU), 0.1 * numbers[TOLERANCE])
     mu = numbers[MU]
     for k in range(count):
-        c = sides[SIGN, k] * (constraints[side_row[k]] - sides[BORDER, k])
+        row = side_row[k]
+        unit, price = row_units[row], prices[row]
+        c = sides[SIGN, k] * (constraints[row] - sides[BORDER, k])
         if warm:
-            s = max(c, min(mu / max(sides[Y, k], 1e-3 * mu), FIRST_SLACK))
+            s = max(c, min(mu / max(sides[Y, k], 1e-3 * mu / unit), FIRST_SLACK * unit))
             y = max(sides[Y, k], mu / s)
         else:
-            s = max(c, FIRST_SLACK)
+            s = max(c, FIRST_SLACK * unit)
             y = mu / s
-        y = min(y, 0.9 * rho)
-        sides[Y, k], sides[S, k], sides[E, k] = y, s, mu / (rho - y)
+        y = min(y, 0.9 * price)
+        sides[Y, k], sides[S, k], sides[E, k] = y, s, mu / (price - y)
         sides[DS, k] = sides[DE, k] = sides[DY, k] = 0.0
-    theta = _merit(numbers, counts, sides, side_row, pairs, prices, rows, lower, 0.0, constraints, 0.0)[1]
+    theta = _merit(numbers, counts, sides, side_row, pairs, prices, row_units, rows, lower, 0.0, constraints, 0.0)[1]
     numbers[THETA_SMALL], numbers[THETA_LARGE] = 1e-4 * max(1.0, theta), 1e4 * max(1.0, theta)
     counts[FILTERED] = counts[FAILURES] = counts[SHORT_STEPS] = 0
     numbers[DELTA] = numbers[LAST_DELTA] = numbers[STEP] = numbers[TAKEN] = 0.0
@@ -343,7 +426,8 @@ def test(address: int) -> None:
     """Test the iterate; if there is to be a step, lower mu and measure what the line search compares with."""
     constraints, counts, links, log, numbers, rows = parts(address, "constraints counts links log numbers rows")
     constraint_jacobian, free, full, gradient, kept = parts(address, "constraint_jacobian free full gradient kept")
-    multipliers, pairs, prices, side_row, sides = parts(address, "multipliers pairs prices side_row sides")
+    multipliers, pairs, prices, row_units = parts(address, "multipliers pairs prices row_units")
+    side_row, sides = parts(address, "side_row sides")
     terms, values = parts(address, "terms values")
     if counts[FAILURES] == 0:
         row = log[min(counts[ITERATION], len(log) - 1)]
@@ -355,7 +439,8 @@ def test(address: int) -> None:
     if not math.isfinite(numbers[STATIONARITY] + numbers[VIOLATION] + numbers[COST]):
         counts[ANSWER] = NOT_FINITE
         return
-    if worst <= tolerance:
+    guessed = counts[COLD] == 1 and counts[ITERATION] == 0 and counts[SIDES] > 0  # large multipliers hide forces
+    if worst <= tolerance and not guessed:
         counts[ANSWER] = CONVERGED
         return
     if numbers[VIOLATION] <= tolerance:
@@ -365,13 +450,18 @@ def test(address: int) -> None:
     if counts[ITERATION] >= counts[LIMIT]:
         counts[ANSWER] = LIMIT_REACHED
         return
+    if numbers[COST] < BOTTOMLESS * numbers[COST_UNIT] and numbers[VIOLATION] > tolerance:
+        counts[ANSWER] = STALLED  # no price holds back an objective that falls faster than violation grows
+        return
     if counts[SHORT_STEPS] >= MOST_SHORT_STEPS and counts[ELASTIC] == 0 and numbers[VIOLATION] > tolerance:
         run(links[RELAX], (address,))
     smallest = 0.1 * tolerance
-    if _error(numbers) <= KAPPA * numbers[MU] and numbers[VIOLATION] > tolerance:
-        last = numbers[MU] <= smallest
-        bound = last  # whether something is violated because its price is too low, or because it has to be
-        if numbers[MU] <= LATE_MU * numbers[RHO] * min(numbers[VIOLATION], 1.0):
+    bound = False
+    if _error(numbers) <= SOLVED * numbers[MU] and numbers[VIOLATION] > tolerance:
+        bound = (
+            numbers[MU] <= smallest
+        )  # whether something is violated because its price is too low, or because it has to be
+        if numbers[MU] <= LATE_MU * min(numbers[PAID], numbers[RHO]):
             for k in range(counts[SIDES]):
                 bound = bound or (sides[Y, k] > AT_PRICE * prices[side_row[k]] and sides[E, k] > tolerance)
             for k in range(len(rows) if counts[ELASTIC] == 1 else 0):
@@ -380,23 +470,25 @@ def test(address: int) -> None:
         if bound:
             pull, push = _forces(terms, free, gradient, multipliers, constraint_jacobian, full)
             run(links[MEASURE], (address,))  # it was written over
-            highest = numbers[RHO] >= HIGHEST_PRICE
+            highest = counts[RAISES] >= MOST_RAISES
             if numbers[ASKED] < numbers[RHO] and (highest or pull <= SMALL_PULL * push):
                 numbers[ASKED], counts[ANSWER] = numbers[RHO], VIOLATED
                 return
             if highest:
                 counts[ANSWER] = STALLED
                 return
+            counts[RAISES] += 1
             numbers[RHO] *= 10.0
             for row in range(len(prices)):
                 prices[row] *= 10.0
+            numbers[PAID] *= 10.0
             run(links[RELAX], (address,))
-    while _error(numbers) <= KAPPA * numbers[MU] and numbers[MU] > smallest:
+    while not bound and _error(numbers) <= KAPPA * numbers[MU] and numbers[MU] > smallest:
         less = min(0.2 * numbers[MU], numbers[MU] ** 1.5)
         numbers[MU] = less if less > tolerance else smallest
         counts[FILTERED] = 0
     cost, lower = numbers[COST], terms.lower
-    phi, theta = _merit(numbers, counts, sides, side_row, pairs, prices, rows, lower, cost, constraints, 0.0)
+    phi, theta = _merit(numbers, counts, sides, side_row, pairs, prices, row_units, rows, lower, cost, constraints, 0.0)
     numbers[PHI], numbers[THETA] = phi, theta
     counts[TRIALS], counts[CORRECTED], counts[ANSWER] = 0, 0, TRY
 
@@ -405,16 +497,16 @@ def test(address: int) -> None:
 def judge(address: int) -> None:
     """Filter test of a trial point: accept it, shorten the step, correct it, or ask for another direction."""
     counts, filter, links, numbers, rows, side_row = parts(address, "counts filter links numbers rows side_row")
-    pairs, prices, sides, terms = parts(address, "pairs prices sides terms")
+    pairs, prices, row_units, sides, terms = parts(address, "pairs prices row_units sides terms")
     (constraints,) = parts(address, "trial_constraints")
     alpha, theta, phi, slope = numbers[ALPHA], numbers[THETA], numbers[PHI], numbers[SLOPE]
     cost, lower = numbers[TRIAL_COST], terms.lower
     phi_trial, theta_trial = _merit(
-        numbers, counts, sides, side_row, pairs, prices, rows, lower, cost, constraints, alpha
+        numbers, counts, sides, side_row, pairs, prices, row_units, rows, lower, cost, constraints, alpha
     )
     finite = math.isfinite(phi_trial) and math.isfinite(theta_trial)
     slack = 1e-13 * max(1.0, abs(phi))
-    switch = slope < 0.0 and alpha * (-slope) ** 2.3 > theta**1.1 and theta <= numbers[THETA_SMALL]
+    switch = slope < 0.0 and alpha * (-slope / numbers[COST_UNIT]) ** 2.3 > theta**1.1 and theta <= numbers[THETA_SMALL]
     armijo = phi_trial <= phi + ARMIJO * alpha * slope + slack
     good = finite and theta_trial <= numbers[THETA_LARGE]
     if good:
@@ -535,10 +627,11 @@ def accept(address: int) -> None:
 def relax(address: int) -> None:
     """Make the equalities elastic: what the iterate violates is paid for, and the path to the answer begins anew."""
     constraints, counts, links, multipliers, numbers = parts(address, "constraints counts links multipliers numbers")
-    pairs, prices, rows, side_row, sides, terms = parts(address, "pairs prices rows side_row sides terms")
+    pairs, prices, row_units, rows, side_row = parts(address, "pairs prices row_units rows side_row")
+    sides, terms = parts(address, "sides terms")
     counts[ELASTIC], counts[FILTERED], counts[FAILURES], counts[SHORT_STEPS] = 1, 0, 0, 0
     numbers[DELTA] = numbers[LAST_DELTA] = 0.0
-    mu = numbers[MU] = max(numbers[MU], RELAXED_MU * numbers[RHO] * min(numbers[VIOLATION], 1.0))
+    mu = numbers[MU] = max(numbers[MU], RELAXED_MU * min(numbers[PAID], numbers[RHO]))
     for k in range(counts[SIDES]):
         row = side_row[k]
         c = sides[SIGN, k] * (constraints[row] - sides[BORDER, k])
@@ -552,5 +645,7 @@ def relax(address: int) -> None:
         multipliers[row] = prices[row] - mu / p if p > n else mu / n - prices[row]
         pairs[P, k], pairs[N, k], pairs[DP, k], pairs[DN, k] = p, n, 0.0, 0.0
     run(links[MEASURE], (address,))
-    theta = _merit(numbers, counts, sides, side_row, pairs, prices, rows, terms.lower, 0.0, constraints, 0.0)[1]
+    theta = _merit(
+        numbers, counts, sides, side_row, pairs, prices, row_units, rows, terms.lower, 0.0, constraints, 0.0
+    )[1]
     numbers[THETA_LARGE] = max(numbers[THETA_LARGE], 1e4 * max(1.0, theta))

@@ -17,6 +17,7 @@ from unifg.solvers.barrier_state import (
     ANSWER,
     BORDER,
     COLD,
+    COST_UNIT,
     DE,
     DELTA,
     DN,
@@ -145,7 +146,8 @@ def direct(address: int) -> None:
     curvature, data, doubles, entries, free, hessian = parts(address, "curvature data doubles entries free hessian")
     links, numbers, plan, rests, row_weights, rows = parts(address, "links numbers plan rests row_weights rows")
     pairs, prices, shift, side_row, sides = parts(address, "pairs prices shift side_row sides")
-    multipliers, step, terms, unequal = parts(address, "multipliers step terms unequal")
+    multipliers, row_units, step, terms, unequal = parts(address, "multipliers row_units step terms unequal")
+    (units,) = parts(address, "units")
     n, equalities, normal = len(free), len(rows), len(hessian)
     for row in range(len(row_weights)):
         row_weights[row] = 0.0
@@ -155,9 +157,10 @@ def direct(address: int) -> None:
         sides[WEIGHT, k] = weight
         row_weights[row] += weight
         sides[REST, k] = sides[SIGN, k] * (constraints[row] - sides[BORDER, k]) + sides[E, k] - sides[S, k]
+    dual, unit = DUAL_SHIFT / numbers[COST_UNIT], numbers[COST_UNIT]
     for k in range(equalities):
         row = rows[k]
-        rests[row], shift[n + k] = constraints[row] - terms.lower[row], -DUAL_SHIFT
+        rests[row], shift[n + k] = constraints[row] - terms.lower[row], -dual * row_units[row] ** 2
         if counts[ELASTIC] == 1:
             p, q, multiplier = pairs[P, k], pairs[N, k], multipliers[row]
             rests[row] += q - p
@@ -179,7 +182,7 @@ def direct(address: int) -> None:
     while True:
         counts[GAUSS_NEWTON] = 1 if share == 0.0 else 0
         for k in range(n):
-            shift[k] = delta
+            shift[k] = delta * unit / units[free[k]] ** 2
         factorised = holds(links[FACTOR], (plan, data, shift))
         if factorised and plan.state[NEGATIVE] == equalities:
             run(links[STEER], (address,))

@@ -39,8 +39,11 @@ from unifg.typing import Array, IntArray
     SAVED_ALPHA,
     SAVED_DUAL,
     ASKED,  # price at which it was asked whether the violation is the least
+    PAID,  # largest violation of a row times its price
+    FORCE,  # stationarity in the units of the unknowns
+    COST_UNIT,  # what the objective is measured in
     FLOATS,
-) = range(28)
+) = range(31)
 # Places in Work.counts.
 (
     ANSWER,  # of the last call, one of the words below
@@ -59,8 +62,10 @@ from unifg.typing import Array, IntArray
     GOING_ON,  # whether slacks and multipliers are there: the solve goes on where it was
     KEPT,  # whether an iterate kept all constraints
     SHORT_STEPS,  # in a row
+    SCALING,  # whether units are to be found
+    RAISES,  # of the prices
     INTEGERS,
-) = range(17)
+) = range(19)
 # Rows of Work.sides.
 (
     SIGN,  # +1 for a lower limit, -1 for an upper one
@@ -138,6 +143,7 @@ class Work(NamedTuple):
         side_row: (2 M,) its row.
         pairs: (PAIR_ROWS, E) one column for each equality row.
         prices: (M,) of the elastic variables of a row.
+        row_units, units: (M,) what a row, and (width,) what an unknown, is measured in.
         kept: stored values of the last iterate that kept all constraints.
         values, trial: stored values of the present iterate and of a trial.
         move: (n,) tangent step to the trial.
@@ -165,6 +171,8 @@ class Work(NamedTuple):
     side_row: IntArray
     pairs: Array
     prices: Array
+    row_units: Array
+    units: Array
     kept: Array
     values: Array
     trial: Array
@@ -222,6 +230,8 @@ def empty_work(
         side_row=np.zeros(max(2 * constraints, 1), dtype=np.int64),
         pairs=np.zeros((PAIR_ROWS, max(equalities, 1))),
         prices=np.zeros(constraints),
+        row_units=np.ones(constraints),
+        units=np.ones(width),
         kept=np.zeros(stored),
         values=np.zeros(stored),
         trial=np.zeros(stored),

@@ -49,13 +49,17 @@ class InteriorPoint(Solver):
         max_iterations: Newton steps before giving up.
         hessian: "exact" (of the Lagrangian; Gauss-Newton where its inertia is wrong) or "gauss-newton".
         barrier: first mu of a cold start; a start with multipliers finds its own.
-        price: first rho of the elastic variables; raised when inequalities stay violated.
+        price: first rho of the elastic variables; raised when constraints stay violated.
+        scaling: measure rows and unknowns in units that make the largest entries of the constraint Jacobian near one,
+            where they are far from it, and prices and mu in proportion to a large gradient. Inside only: tolerances and
+            multipliers are those of the problem as stated.
     """
 
     max_iterations: int = 300
     hessian: Literal["exact", "gauss-newton"] = "exact"
     barrier: float = 0.3
     price: float = 1e3
+    scaling: bool = True
 
     def __post_init__(self) -> None:
         """Refuse options that mean nothing."""
@@ -234,8 +238,9 @@ class Workspace:
         numbers, counts = work.numbers, work.counts
         # The test of least squares has no absolute tolerance.
         numbers[state.TOLERANCE] = 0.0 if run.program.least_squares else run.tolerance
-        numbers[state.RHO], numbers[state.ASKED] = options.price, 0.0
-        counts[state.ITERATION], counts[state.KEPT] = 0, 0
+        numbers[state.ASKED], counts[state.SCALING] = 0.0, options.scaling
+        counts[state.ITERATION], counts[state.KEPT], counts[state.RAISES] = 0, 0, 0
+        work.row_units[:] = work.units[:] = 1.0
         counts[state.LIMIT], counts[state.EXACT] = options.max_iterations, options.hessian == "exact"
         self.begin_at(run.values.flat, options)
         work.multipliers[:] = run.multipliers
@@ -246,6 +251,7 @@ class Workspace:
         work = self.work
         work.values[:], work.multipliers[:] = values, 0.0
         work.numbers[state.MU], work.counts[state.GOING_ON] = options.barrier, 0
+        work.numbers[state.RHO] = options.price * 10.0 ** int(work.counts[state.RAISES])
 
     def found(self) -> Linearization:
         """The linearisation at which the compiled loop ended."""

@@ -47,8 +47,8 @@ UNSOLVED: dict[str, set[str]] = {
     # Convexified costs without curvature send the first steps far away.
     "SQP": {"HS93"},
     "SQP, exact": set(),
-    # HS13 and the discs have no multipliers; in HS56 the cost falls without end away from the constraints.
-    "InteriorPoint": {"HS13", "HS56", "discs that touch"},
+    # HS13 and the discs have no multipliers.
+    "InteriorPoint": {"HS13", "discs that touch"},
 }
 # Solved or not, by the version of the QP solver: with PIQP 0.7 the first ends 4e-5 short of stationarity, with 0.6 it
 # converges. What is claimed must be true all the same.
