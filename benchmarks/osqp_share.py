@@ -102,9 +102,7 @@ def cases(quick: bool) -> dict[str, Callable[[], object]]:
     return found
 
 
-def _cold(
-    stated: closed_loop.Formulation | control_problems.QuadrotorGraph, tolerance: float
-) -> Callable[[], object]:
+def _cold(stated: closed_loop.Formulation | control_problems.QuadrotorGraph, tolerance: float) -> Callable[[], object]:
     """A solve of a problem from its guess."""
     return lambda: SQP(tolerance=tolerance).prepare(stated.graph).solve(stated.guess)
 

@@ -1,4 +1,4 @@
-"""Parallel parkings of a kinematic bicycle from rest into random gaps, with the final state prescribed.
+"""Parallel parkings of a kinematic bicycle from rest into random gaps; run by :mod:`benchmarks.hard_guesses`.
 
 A car that stands still cannot move sideways, and at rest its wheels steer nothing: the linearised dynamics of the guess
 (the car stands where it is, or slides along a straight line) do not reach the goal. A solver has to find its way from

@@ -9,7 +9,7 @@ import pytest
 import scipy.optimize
 
 import unifg as fg
-from benchmarks import parkings
+from benchmarks import disc_fields, parkings
 from out_of_reach import Stated, blocked_corridor, goal_too_far, wall_too_close
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array
@@ -90,3 +90,11 @@ def test_a_watched_solve_takes_the_same_steps_with_elastic_equalities() -> None:
     graph, guess = goal_too_far(0.01)
     told = InteriorPoint().solve(graph, guess, callback=lambda row: None)
     assert told.status is fg.Status.LOCALLY_INFEASIBLE
+
+
+def test_fields_of_discs_take_few_iterations() -> None:
+    """A slice of the study, of which IPOPT and fatrop solve 21 in a median of 35 and 34 iterations."""
+    stated = disc_fields.Ours(InteriorPoint())
+    found = [stated.solve(disc_fields.layout(seed)) for seed in range(300, 325)]
+    assert sum(solution.converged for solution in found) >= 21
+    assert np.median([solution.iterations for solution in found]) <= 35
