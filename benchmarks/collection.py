@@ -106,7 +106,7 @@ def verdict(case: Problem, graph: fg.Graph, solution: fg.Solution) -> str:
     """Name what a solution is."""
     if solution.status is fg.Status.LOCALLY_INFEASIBLE and not case.feasible:
         return INFEASIBLE_POINT
-    if not solution.converged:
+    if not (solution.converged or (solution.status is fg.Status.UNDETERMINED and not case.determined)):
         return solution.status.name.lower().replace("_", " ")
     if judge(graph, solution).worst() > case.judged:
         return "disproved"

@@ -83,7 +83,9 @@ class Penalty(Solver):
             if run.status is not None:
                 return None
             if not self._violated(run):  # a heavier weight would not help
-                return Status.STALLED
+                if stalled:
+                    return Status.STALLED
+                continue
             if rho >= last:
                 return settle(run, Status.STALLED if stalled else Status.STOP_RULE)
             rho = min(rho * self.penalty_growth, last)

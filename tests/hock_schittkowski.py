@@ -44,6 +44,7 @@ class Case:
         qualified: whether the constraints have multipliers at the answer; where they have none, the KKT conditions hold
             to a tolerance at points nearby, and the objective is compared to 1e-2 only.
         judged: largest KKT residual that the judge's finite differences can confirm.
+        determined: whether the Hessian is regular at the answer.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Case:
     upper: Limits = INF
     qualified: bool = True
     judged: float = 2e-6
+    determined: bool = True
 
     @property
     def feasible(self) -> bool:

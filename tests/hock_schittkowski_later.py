@@ -144,7 +144,7 @@ LATER = [
         ],
     ),
     Case(
-        name="HS56", start=(1, 1, 1, ARC, ARC, ARC, math.asin(math.sqrt(5 / 7.2))), best=-3.456,
+        name="HS56", start=(1, 1, 1, ARC, ARC, ARC, math.asin(math.sqrt(5 / 7.2))), best=-3.456, others=(0.0,),
         cost=lambda *x: -x[0] * x[1] * x[2],
         equal=lambda *x: [
             *(x[k] - 4.2 * sin(x[3 + k]) ** 2 for k in range(3)),

@@ -17,6 +17,8 @@ from unifg.typing import Array
 from unifg.variables import Data, Selection
 
 STEP = 1e-5
+WIDE = 2e-4  # of second differences
+FLAT = 1e-5  # singular values below it, relative to the largest, are as good as none
 ROUNDING = 1e-12  # of the residuals of graphs that fit exactly, numbers of order one
 
 
@@ -78,8 +80,35 @@ def _relative_offset(
     ]
     jacobian = np.sqrt(weights)[:, None] * np.array(columns).T / (2.0 * STEP)
     here = np.sqrt(weights) * here
+    lengths = np.linalg.norm(jacobian, axis=0)
+    singular = np.linalg.svd(jacobian / np.where(lengths > 0.0, lengths, 1.0), compute_uv=False)
+    if len(singular) and singular[-1] < FLAT * singular[0] and np.linalg.norm(here) > ROUNDING:
+        hessian = _second(graph, values, moved, data)
+        if np.linalg.eigvalsh(hessian / np.outer(lengths, lengths))[0] > FLAT:  # curvature determines what slopes do not
+            gradient = jacobian.T @ here
+            promised = max(float(gradient @ np.linalg.solve(hessian, gradient)), 0.0)
+            return float(np.sqrt(promised) / np.linalg.norm(here))
     share = float(np.linalg.norm(jacobian @ np.linalg.lstsq(jacobian, here, rcond=None)[0]))
     return 0.0 if share <= ROUNDING else share / float(np.linalg.norm(here))
+
+
+def _second(
+    graph: fg.Graph,
+    values: dict[fg.Family, Array],
+    moved: list[tuple[fg.Family, int, int]],
+    data: dict[Data, Array],
+) -> Array:
+    """Dense Hessian of the cost by differences."""
+    result = np.empty((len(moved), len(moved)))
+    for i, first in enumerate(moved):
+        for j, second in enumerate(moved[: i + 1]):
+            corners = [
+                a * b * _f(graph, _at(_at(values, first, a * WIDE), second, b * WIDE), data)
+                for a in (1.0, -1.0)
+                for b in (1.0, -1.0)
+            ]
+            result[i, j] = result[j, i] = sum(corners) / (4.0 * WIDE**2)
+    return result
 
 
 def _whitened(graph: fg.Graph, values: dict[fg.Family, Array], data: dict[Data, Array]) -> tuple[Array, Array]:

@@ -28,7 +28,7 @@ class LieCase:
         best: the known minimum; NaN when no point satisfies the constraints.
         others: objective at other KKT points, each verified.
         answer: (count, storage) by family name, where the minimiser is unique.
-        qualified, judged: as for :class:`hock_schittkowski.Case`.
+        qualified, judged, determined: as for :class:`hock_schittkowski.Case`.
     """
 
     name: str
@@ -38,6 +38,7 @@ class LieCase:
     answer: Mapping[str, ArrayLike] = field(default_factory=dict)
     qualified: bool = True
     judged: float = 2e-6
+    determined: bool = True
 
     @property
     def feasible(self) -> bool:

@@ -41,7 +41,7 @@ SQUARES = [
         squares=lambda x, y: [x - 13 + ((5 - y) * y - 2) * y, x - 29 + ((y + 1) * y - 14) * y],
     ),
     Case(
-        name="Powell's singular function", start=(3, -1, 0, 1), best=0.0,
+        name="Powell's singular function", start=(3, -1, 0, 1), best=0.0, determined=False,
         squares=lambda a, b, c, d: [a + 10 * b, math.sqrt(5) * (c - d), (b - 2 * c) ** 2, math.sqrt(10) * (a - d) ** 2],
     ),
     Case(name="helical valley", start=(-1, 0, 0), best=0.0, squares=helix),

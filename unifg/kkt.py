@@ -69,7 +69,12 @@ class Optimality:
 
 
 def optimality(
-    program: Program, lin: Linearization, multipliers: Array, enough: float = 0.0, lent: Factored | None = None
+    program: Program,
+    lin: Linearization,
+    multipliers: Array,
+    enough: float = 0.0,
+    lent: Factored | None = None,
+    guess: Array | None = None,
 ) -> Optimality:
     """Measure the KKT conditions at a linearised point.
 
@@ -79,9 +84,10 @@ def optimality(
         multipliers: (M,) one per constraint row.
         enough: of least squares, a relative offset above this may be a lower bound, which takes no factorisation.
         lent: of least squares, a backend's factorisation near this point.
+        guess: of least squares, the stored values that the solve began with.
     """
     if program.least_squares:
-        offset = relative_offset(program, lin, enough, lent)
+        offset = relative_offset(program, lin, enough, lent, guess)
         if not (offset.finite and np.isfinite(lin.cost)):
             return Optimality(np.inf, np.inf, np.inf, -1, False)
         rounding = _relative_rounding(program, lin, multipliers)

@@ -8,7 +8,11 @@ squares", Technometrics 23(2), 1981). With robust losses r and J carry the squar
 the true gradient and H is never indefinite.
 
 Where residuals vanish at the solution, |P r| is compared with the rounding errors of r instead: those of numbers as
-large as the variables, seen through J.
+large as the variables, or as they were at the guess, seen through J.
+
+Where H is singular, the curvature of the residuals may still determine every unknown: the solution of n equations that
+cannot be met has a singular J. There the Hessian with that curvature takes the place of H, and what its Newton step
+promises to remove is measured. Only where it is singular too is a point undetermined.
 
 No matrix is factorised for a point that is far from stationary: the largest cosine between r and one column of J is a
 lower bound. Near the end the factor of the last linearisation serves as preconditioner of a few conjugate-gradient
@@ -30,6 +34,7 @@ from unifg.jit import compiled
 from unifg.lie import SE2, SE3, SO2, SO3, Manifold, Product, Rn
 from unifg.linearization import Linearization
 from unifg.program import Program
+from unifg.second_order import lagrangian_hessian
 from unifg.touched import term_columns
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -37,6 +42,7 @@ EPS = 2.0**-52
 LARGEST = 1e308
 ROUNDING = 4.0  # roundings in a residual, each of a number as large as the variables
 WEAK = 1e-13  # pivots below this, relative to the diagonal, are rounding errors
+FLAT = 1e-6  # the same of a Hessian whose second derivatives are differences
 STEPS = 4  # conjugate-gradient steps before a new factor is cheaper
 SAME = 1e-4  # remainder, relative to the energy, at which an old factor is as good as a new one
 SINGULAR_SHIFT = 1e-9  # of the diagonal: makes a singular Hessian a preconditioner
@@ -72,7 +78,13 @@ class Offset:
     finite: bool
 
 
-def relative_offset(program: Program, lin: Linearization, enough: float = 0.0, lent: Factored | None = None) -> Offset:
+def relative_offset(
+    program: Program,
+    lin: Linearization,
+    enough: float = 0.0,
+    lent: Factored | None = None,
+    guess: Array | None = None,
+) -> Offset:
     """Measure |P r| / |r| at a linearised point.
 
     Args:
@@ -80,8 +92,9 @@ def relative_offset(program: Program, lin: Linearization, enough: float = 0.0, l
         lin: linearisation at the point.
         enough: a value above this need not be exact: nobody asks how far a point is from passing.
         lent: factorisation of a backend that may be reused, and overwritten.
+        guess: stored values that the solve began with; unknowns that have shrunk since count as large as they were.
     """
-    return _structure(program).measure(program, lin, enough, lent)
+    return _structure(program).measure(program, lin, enough, lent, guess)
 
 
 class Structure:
@@ -99,8 +112,11 @@ class Structure:
         self.first, self.last, self.least = _extents(program)
         self._own: Factorization | None = None
 
-    def measure(self, program: Program, lin: Linearization, enough: float, lent: Factored | None) -> Offset:
+    def measure(
+        self, program: Program, lin: Linearization, enough: float, lent: Factored | None, guess: Array | None
+    ) -> Offset:
         """See :func:`relative_offset`."""
+        values = program.columns.values(lin.values).flat
         size, cosine, rounding = _bounds(
             lin.residual,
             self.counted,
@@ -111,7 +127,7 @@ class Structure:
             self.first,
             self.last,
             self.least,
-            program.columns.values(lin.values).flat,
+            values if guess is None else np.maximum(np.abs(values), np.abs(guess)),
         )
         if math.isnan(cosine):
             return Offset(np.inf, True, False)
@@ -149,8 +165,19 @@ class Structure:
             return 0.0, False
         if not solver.factor(lin.hessian, SINGULAR_SHIFT * np.maximum(diagonal, 1e-9 * largest)):
             return np.inf, False
+        bent = self._bent(program, lin)
+        if bent is not None:
+            return float(gradient @ bent.solve(gradient)), True
         energy, _ = _climb(program, lin.hessian, gradient, solver, limit)
         return energy, False
+
+    def _bent(self, program: Program, lin: Linearization) -> Factorization | None:
+        """The Hessian with the curvature of the residuals, factorised; None where that is singular or indefinite."""
+        hessian = lagrangian_hessian(program, lin, np.zeros(0))
+        diagonal = hessian[program.normal.diagonal]
+        solver = self._solver(program)
+        regular = bool((diagonal > 0.0).all()) and solver.factor(hessian)
+        return solver if regular and _sound(solver, diagonal, program.size, FLAT) else None
 
     def _regular(self, program: Program, hessian: Array, diagonal: Array, lent: Factored) -> bool:
         """Whether a factor near the Hessian shows that every direction is determined."""
@@ -199,12 +226,12 @@ def _climb(
     return energy, False
 
 
-def _sound(solver: Factorization, diagonal: Array, size: int) -> bool:
+def _sound(solver: Factorization, diagonal: Array, size: int, weak: float = WEAK) -> bool:
     """Whether all pivots stand out from rounding errors."""
     if not solver.definite:
         return False
     order = solver.plan.order[:size]
-    return bool((solver.pivots() > WEAK * diagonal[order]).all())
+    return bool((solver.pivots() > weak * diagonal[order]).all())
 
 
 def _counted(program: Program) -> BoolArray:
