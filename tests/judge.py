@@ -84,7 +84,8 @@ def _relative_offset(
     singular = np.linalg.svd(jacobian / np.where(lengths > 0.0, lengths, 1.0), compute_uv=False)
     if len(singular) and singular[-1] < FLAT * singular[0] and np.linalg.norm(here) > ROUNDING:
         hessian = _second(graph, values, moved, data)
-        if np.linalg.eigvalsh(hessian / np.outer(lengths, lengths))[0] > FLAT:  # curvature determines what slopes do not
+        # Curvature may determine what slopes do not.
+        if np.linalg.eigvalsh(hessian / np.outer(lengths, lengths))[0] > FLAT:
             gradient = jacobian.T @ here
             promised = max(float(gradient @ np.linalg.solve(hessian, gradient)), 0.0)
             return float(np.sqrt(promised) / np.linalg.norm(here))
