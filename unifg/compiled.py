@@ -25,7 +25,7 @@ from unifg.residuals import Residual
 from unifg.terms import Constraint, Cost, Parameter, ScalarCost, Term
 from unifg.typing import Array, BoolArray, IntArray
 from unifg.variables import Data, Selection
-from unifg.vetting import as_float64, as_jacobian, require_information
+from unifg.vetting import as_float64, as_jacobian, notice_no_information
 from unifg.whitening import DIAGONAL, FULL, reciprocals, square_roots
 
 Bound: TypeAlias = Mapping[Data, Array]
@@ -261,7 +261,7 @@ class CompiledTerm:
             if term.information is not None:
                 self.whitener = square_roots(self.name, resolve(term.information, data), self.count, self.size)
                 self.whitening = FULL
-                require_information(self.name, term.information, self.whitener)
+                notice_no_information(self.name, self.whitener)
             if self.whitening and len(self.whitener) > 1:
                 self.whitening |= 1
         if isinstance(term, Constraint):

@@ -165,11 +165,9 @@ class Structure:
             return 0.0, False
         if not solver.factor(lin.hessian, SINGULAR_SHIFT * np.maximum(diagonal, 1e-9 * largest)):
             return np.inf, False
-        bent = self._bent(program, lin)
-        if bent is not None:
-            return float(gradient @ bent.solve(gradient)), True
         energy, _ = _climb(program, lin.hessian, gradient, solver, limit)
-        return energy, False
+        bent = self._bent(program, lin)
+        return (energy, False) if bent is None else (float(gradient @ bent.solve(gradient)), True)
 
     def _bent(self, program: Program, lin: Linearization) -> Factorization | None:
         """The Hessian with the curvature of the residuals, factorised; None where that is singular or indefinite."""

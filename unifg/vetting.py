@@ -12,7 +12,6 @@ from unifg.jit import is_compiled
 from unifg.kernels import Kernel, evaluate_rows, side_by_side
 from unifg.terms import ScalarCost
 from unifg.typing import Array
-from unifg.variables import Data
 
 if TYPE_CHECKING:
     from unifg.columns import Values
@@ -50,18 +49,14 @@ def as_jacobian(name: str, block: Any) -> Array:
     return np.asarray(array, dtype=np.float64)
 
 
-def require_information(name: str, given: object, whitener: Array) -> None:
-    """Refuse an information matrix that is zero for every factor; of data, which may switch a term off, say so.
-
-    Raises:
-        GraphError: naming the term.
-    """
-    if whitener.any() or not whitener.size:
-        return
-    message = f"term '{name}': its information is zero for every factor, so it counts for nothing"
-    if not isinstance(given, Data):
-        raise GraphError(f"{message}; leave the term out, or switch factors with active=", term=name)
-    logger.warning("%s; active= switches factors off without this warning", message)
+def notice_no_information(name: str, whitener: Array) -> None:
+    """Say that a term counts for nothing: an infinite sigma may be meant, and a matrix that was never filled is not."""
+    if whitener.size and not whitener.any():
+        logger.warning(
+            "term '%s': its information is zero for every factor, so it counts for nothing; active= switches factors "
+            "off without this warning",
+            name,
+        )
 
 
 def require_clean(term: CompiledTerm, values: Values) -> None:
