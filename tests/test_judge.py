@@ -116,20 +116,20 @@ def test_rounding_above_the_tolerance_is_said(solver: Solver, scale: float) -> N
 
 @numba.njit  # type: ignore[untyped-decorator]
 def far_above(p: Array, r: Array) -> None:
-    r[0] = 1e6 * np.cosh(p[0] - 1.0)
+    r[0] = 1e3 * np.cosh(p[0] - 1.0)
 
 
 @numba.njit  # type: ignore[untyped-decorator]
 def far_above_slope(p: Array, J: Array) -> None:
-    J[0, 0] = 1e6 * np.sinh(p[0] - 1.0)
+    J[0, 0] = 1e3 * np.sinh(p[0] - 1.0)
 
 
 @pytest.mark.parametrize("stated", ["njit", "NumPy", "attached"])
 def test_rounding_of_residuals(stated: str) -> None:
-    """A residual of 1e6 at the solution, beside a constraint; with its Jacobian attached it is as good as any."""
+    """A residual of 1e3 at the solution, beside a constraint; with its Jacobian attached it is as good as any."""
     residuals: dict[str, Any] = {
         "njit": fg.residual(far_above, rows=1),
-        "NumPy": lambda p: 1e6 * np.cosh(p - 1.0),
+        "NumPy": lambda p: 1e3 * np.cosh(p - 1.0),
         "attached": fg.residual(far_above, far_above_slope, rows=1),
     }
     graph = fg.Graph()

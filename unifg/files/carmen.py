@@ -155,7 +155,7 @@ def _front_laser(words: list[str], groups: dict[tuple[float | str, ...], _Group]
 
 
 def _robot_laser(words: list[str], groups: dict[tuple[float | str, ...], _Group]) -> None:
-    start, _, step, maximum = (_number(word) for word in words[2:6])
+    start, _, step, maximum = (_number(words[k]) for k in (2, 3, 4, 5))
     count = _count(words[8])
     remissions = _count(words[9 + count])
     poses = 10 + count + remissions
