@@ -306,19 +306,40 @@ def _forces(
 
 
 @compiled
+def _far_from_one(terms: Terms, jacobian: Array) -> bool:
+    """Whether some row of the constraint Jacobian has its largest entry far from one."""
+    fields = terms.fields
+    for t in range(len(fields)):
+        term = fields[t]
+        if term[KIND] == OBJECTIVE or term[KIND] == BOUND:
+            continue
+        width, entry = term[WIDTH], term[ENTRY]
+        for _ in range(term[COUNT] * term[ROWS]):
+            largest = 0.0
+            for d in range(width):
+                largest = max(largest, abs(jacobian[entry + d]))
+            if not (FAR > largest > 1.0 / FAR or largest == 0.0):
+                return True
+            entry += width
+    return False
+
+
+@compiled
 def _find_units(
     terms: Terms, jacobian: Array, row_units: Array, units: Array, row_size: Array, column_size: Array
 ) -> None:
     """Units of rows and unknowns in which the largest entries of the constraint Jacobian are near one (Ruiz 2001).
 
-    They are one where no row has its largest entry far from one.
+    They are one where no row has its largest entry far from one, those of fixed variables included.
     """
     fields, columns, unknowns = terms.fields, terms.columns, terms.unknown
     for row in range(len(row_units)):
         row_units[row] = 1.0
     for column in range(len(units)):
         units[column] = 1.0
-    for sweep in range(SWEEPS):
+    if not _far_from_one(terms, jacobian):
+        return
+    for _ in range(SWEEPS):
         for row in range(len(row_size)):
             row_size[row] = 0.0
         for column in range(len(column_size)):
@@ -340,11 +361,6 @@ def _find_units(
                             largest = max(largest, size)
                             column_size[column] = max(column_size[column], size)
                     row_size[row] = largest
-        far = sweep > 0
-        for row in range(len(row_size)):
-            far = far or not (FAR > row_size[row] > 1.0 / FAR or row_size[row] == 0.0)
-        if not far:
-            return
         for row in range(len(row_size)):
             if 0.0 < row_size[row] < math.inf:
                 row_units[row] *= math.sqrt(row_size[row])
@@ -458,9 +474,9 @@ def test(address: int) -> None:
     smallest = 0.1 * tolerance
     bound = False
     if _error(numbers) <= SOLVED * numbers[MU] and numbers[VIOLATION] > tolerance:
-        bound = (
-            numbers[MU] <= smallest
-        )  # whether something is violated because its price is too low, or because it has to be
+        # Whether something is violated because its price is too low, or because it has to be. With the least mu that
+        # is told by a solved problem: a step before, equalities without a price may still be on their way.
+        bound = numbers[MU] <= smallest and _error(numbers) <= tolerance
         if numbers[MU] <= LATE_MU * min(numbers[PAID], numbers[RHO]):
             for k in range(counts[SIDES]):
                 bound = bound or (sides[Y, k] > AT_PRICE * prices[side_row[k]] and sides[E, k] > tolerance)

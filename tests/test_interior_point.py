@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from benchmarks.control_problems import Unicycle
+from benchmarks.control_problems import Quadrotor, Unicycle
 from problems import short_drive
 from unifg.solvers import SQP, InteriorPoint
 from unifg.solvers.interior_point import Workspace
@@ -159,3 +159,19 @@ def test_control_c_before_the_compiled_loop_is_passed_on(monkeypatch: pytest.Mon
     again = run.solve(stated.guess, check=True)
     assert again.cost == before.cost
     assert again.iterations == before.iterations
+
+
+def test_a_warm_tick_on_its_way_raises_no_price() -> None:
+    """One step before the end, hard equalities still miss the tolerance: no elastic variable was too cheap."""
+    problem = Quadrotor("figure8", False, 20)
+    stated = problem.formulation()
+    run = InteriorPoint(tolerance=1e-4).prepare(stated.graph)
+    solution = run.solve(stated.guess, data=stated.data(problem.start, 0))
+    iterations = []
+    for tick in range(1, 41):
+        state = solution[stated.x][1]
+        solution = run.solve(solution.shifted(stated.x, stated.u), data=stated.data(state, tick))
+        iterations.append(solution.iterations)
+        assert solution.converged
+        assert all(float(row.details["mu"]) <= 1e-5 for row in solution.history[1:])
+    assert max(iterations) <= 3

@@ -90,7 +90,7 @@ def optimality(
         offset = relative_offset(program, lin, enough, lent, guess)
         if not (offset.finite and np.isfinite(lin.cost)):
             return Optimality(np.inf, np.inf, np.inf, -1, False)
-        rounding = _relative_rounding(program, lin, multipliers)
+        rounding = _relative_rounding(program, lin, multipliers) if program.differenced else 0.0
         return Optimality(offset.value, 0.0, 0.0, -1, True, offset.determined, rounding)
     gradient = lin.gradient
     if program.constraints.count:
@@ -109,8 +109,9 @@ def optimality(
     stationarity, violation, complementarity, worst, finite = measured
     if not finite or not np.isfinite(lin.cost):
         return Optimality(np.inf, np.inf, np.inf, -1, False)
-    rounding = float(gradient_rounding(program, lin, multipliers).max(initial=0.0))
-    if rounding:
+    rounding = 0.0
+    if program.differenced:
+        rounding = float(gradient_rounding(program, lin, multipliers).max(initial=0.0))
         rounding /= max(1.0, float(np.abs(multipliers).mean()) / 100.0) if len(multipliers) else 1.0
     return Optimality(stationarity, violation, complementarity, worst, True, True, rounding)
 

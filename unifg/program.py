@@ -98,6 +98,11 @@ class Program:
         return bool(self.cost_terms) and not (self.scalar_terms or self.constraint_terms)
 
     @property
+    def differenced(self) -> bool:
+        """Whether some derivative comes from differences, which round."""
+        return bool(self.scalar_terms or self.table.differenced)
+
+    @property
     def fully_compiled(self) -> bool:
         """Whether a compiled loop can do without Python: every term a kernel, no robust loss, compiled retractions."""
         return not (self.batched or self.scalar_terms or self.table.robust) and self.retraction.compiled

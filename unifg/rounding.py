@@ -33,7 +33,7 @@ def gradient_rounding(program: Program, lin: Linearization, multipliers: Array) 
         lin: where.
         multipliers: (M,) one per constraint row.
     """
-    if not (program.scalar_terms or program.table.differenced):
+    if not program.differenced:
         return np.zeros(0)
     total = np.zeros(program.columns.width)
     if program.table.differenced:
