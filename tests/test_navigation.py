@@ -274,6 +274,12 @@ def test_of_a_solve_that_settled_its_end_is_driven() -> None:
     assert controller._drivable(ended, data) is ended
 
 
+@pytest.mark.parametrize("coupling", ["sequential", "joint"])
+def test_a_drive_has_nothing_to_warn_of(coupling: str, caplog: pytest.LogCaptureFixture) -> None:
+    drive(Episode(replace(CORNER, coupling=coupling)), 5)
+    assert [record.message for record in caplog.records if "compiles its kernels" not in record.message] == []
+
+
 def test_failure_on_the_first_tick_stands_still(monkeypatch: pytest.MonkeyPatch) -> None:
     episode = Episode(CORRIDOR)
     replace_solver(monkeypatch, episode, Failing(episode.pilot.controller._run, 0))

@@ -105,6 +105,8 @@ class CompiledTerm:
         self.size = 1 if scalar else trial.shape[1]
         self.shape = trial.shape
         self._bind_parameters({})
+        if isinstance(self.term, Cost) and isinstance(self.term.information, np.ndarray):
+            notice_no_information(self.name, self.whitener)
 
     def bind(self, data: Bound) -> None:
         """Take the present value of every data argument."""
@@ -261,7 +263,6 @@ class CompiledTerm:
             if term.information is not None:
                 self.whitener = square_roots(self.name, resolve(term.information, data), self.count, self.size)
                 self.whitening = FULL
-                notice_no_information(self.name, self.whitener)
             if self.whitening and len(self.whitener) > 1:
                 self.whitening |= 1
         if isinstance(term, Constraint):

@@ -50,13 +50,12 @@ def as_jacobian(name: str, block: Any) -> Array:
 
 
 def notice_no_information(name: str, whitener: Array) -> None:
-    """Say that a term counts for nothing: an infinite sigma may be meant, and a matrix that was never filled is not."""
+    """Say that a term counts for nothing: an infinite sigma may be meant, and a matrix that was never filled is not.
+
+    Of constants only: data switch terms off and on, and the status of a solve says whether anything is missing then.
+    """
     if whitener.size and not whitener.any():
-        logger.warning(
-            "term '%s': its information is zero for every factor, so it counts for nothing; active= switches factors "
-            "off without this warning",
-            name,
-        )
+        logger.warning("term '%s': its information is zero for every factor, so it counts for nothing", name)
 
 
 def require_clean(term: CompiledTerm, values: Values) -> None:
