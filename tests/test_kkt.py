@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -268,6 +269,47 @@ def test_hard_priors_that_hold_already_are_no_obstacle(
         assert solution.converged, (seed, unit, information, solution.report())
         if full_steps or len(pinned) > 1:  # an open end swings far in the first step, and a merit function slows it
             assert solution.iterations <= 12, (seed, unit, information)
+
+
+def mover(steps: int, dt: float, dimension: int, seen: int | None) -> tuple[fg.Graph, dict[fg.Family, Array]]:
+    """Places that only speeds and their changes pay for: every place has rows of exact ones and no curvature."""
+    graph = fg.Graph()
+    p, v = graph.variables("p", fg.Rn(dimension), steps + 1), graph.variables("v", fg.Rn(dimension), steps)
+    graph.fix(p[0], np.zeros(dimension))
+    graph.minimize(lambda v: v, v, sigma=1.5, name="effort")
+    graph.minimize(lambda a, b: b - a, v[:-1], v[1:], sigma=0.5, name="smooth")
+    if seen is not None:
+        graph.minimize(fg.prior, p[seen], np.ones(dimension), sigma=0.1, name="seen")
+    graph.constrain(lambda p, v, q: q - p - dt * v, p[:-1], v, p[1:], lower=0.0, upper=0.0, name="motion")
+    rng = np.random.default_rng(steps)
+    return graph, {f: rng.normal(size=(f.count, dimension)) for f in (p, v)}
+
+
+@pytest.mark.parametrize("globalization", ["line-search", "levenberg-marquardt"])
+@pytest.mark.parametrize("seen", [None, 1])
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dt", [0.1, 0.25, 1.0])
+@pytest.mark.parametrize("steps", [3, 40])
+def test_unknowns_without_curvature_between_exact_ones_are_no_obstacle(
+    steps: int,
+    dt: float,
+    dimension: int,
+    seen: int | None,
+    globalization: Literal["line-search", "levenberg-marquardt"],
+) -> None:
+    """All that their pivots have is the shift, and its inverse must not take the shift of others."""
+    graph, guess = mover(steps, dt, dimension, seen)
+    solution = KKT(globalization=globalization).solve(graph, guess, check=True)
+    assert solution.iterations <= (1 if globalization == "line-search" else 2)
+    assert float(solution.history[-1].details.get("damping", 0.0)) < 1e-6
+    # The last place is dt times the sum of the speeds, whose information is known.
+    change, first = np.diff(np.eye(steps), axis=0) / 0.5, np.eye(steps)[0] * dt / 0.1
+    information = np.eye(steps) / 1.5**2 + change.T @ change + (np.outer(first, first) if seen == 1 else 0.0)
+    variance = dt**2 * np.linalg.inv(information).sum()
+    places = next(family for family in guess if family.name == "p")
+    np.testing.assert_allclose(
+        solution.covariance(places[steps]), variance * np.eye(dimension), rtol=1e-9, atol=1e-9 * variance
+    )
 
 
 LEVENBERG = KKT(globalization="levenberg-marquardt")

@@ -5,6 +5,11 @@ methods for sparse least squares: the benefits of regularization", 1996), and re
 all rows would be lost in the rounding of some and outweigh others, so every row gets its own: a small part of one in
 the matrix equilibrated by a diagonal D, D K D, whose rows all have a largest entry near one (D. Ruiz, "A scaling
 algorithm to equilibrate both rows and columns norms in matrices", RAL-TR-2001-034). Residuals are measured there too.
+
+Where an unknown without curvature is eliminated first, its shift s is its pivot: its rows of A get 1 / s on their
+diagonals and between each other, and cancel down to terms of size one, or to the shift, where several of them share it.
+Doubles keep the former for any s above their spacing, the latter only for s above the root of the spacing. So a
+factorisation that breaks down, or whose refined solution is not accurate, is repeated with such a shift.
 """
 
 from __future__ import annotations
@@ -19,6 +24,8 @@ from unifg.jit import compiled
 from unifg.typing import Array, IntArray
 
 SHIFT = 1e-12  # on the diagonal of the equilibrated matrix
+SAFE_SHIFT = 2.0**-24  # not lost beside its own inverse; leaves more to refinement
+ACCURATE = 1e-8  # residual above which a factorisation with the small shift counts as spoilt by rounding
 SWEEPS = 4
 CORRECTIONS = 12
 
@@ -42,9 +49,12 @@ class SaddlePoint:
         self._indices = factorization.pattern.indices.astype(np.int64)
         self._data: Array = np.zeros(factorization.pattern.nnz)
         self._added: Array = np.zeros(size)
+        self._shift = SHIFT
 
     def factor(self, data: Array) -> bool:
         """Equilibrate, shift and factorise; False when an entry is not finite.
+
+        Where a pivot vanishes all the same, because rounding took the shift, the larger shift is tried.
 
         Args:
             data: (nnz,) entries in the order of the pattern, kept until the next call.
@@ -54,10 +64,14 @@ class SaddlePoint:
         """
         self._data = data
         equilibrate(self._indptr, self._indices, data, self.scale, self._added, SWEEPS)
-        np.divide(SHIFT, self.scale, out=self._added)
+        return self._factor(SHIFT) or self._factor(SAFE_SHIFT)
+
+    def _factor(self, shift: float) -> bool:
+        self._shift = shift
+        np.divide(shift, self.scale, out=self._added)
         self._added /= self.scale
         self._added[self.unknowns :] *= -1.0
-        return self.factorization.factor(data, self._added)
+        return self.factorization.factor(self._data, self._added)
 
     def solve(self, right: Array) -> tuple[Array, float]:
         """Solve the system that was factorised, without its shift.
@@ -70,6 +84,16 @@ class SaddlePoint:
             larger one of the unknowns' rows and of the multipliers' rows, each relative to its own size: multipliers
             that blow up do not hide that constraints contradict each other.
         """
+        out, error = self._refine(right)
+        if error <= ACCURATE or self._shift == SAFE_SHIFT:
+            return out, error
+        if not self._factor(SAFE_SHIFT):
+            self._factor(SHIFT)
+            return out, error
+        again, less = self._refine(right)
+        return (again, less) if less < error else (out, error)
+
+    def _refine(self, right: Array) -> tuple[Array, float]:
         out = np.empty(len(right))
         error = substitution.refine(
             self.factorization.plan,
