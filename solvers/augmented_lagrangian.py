@@ -11,7 +11,8 @@ Second derivatives are those of the Lagrangian with the multipliers that the las
 lambda + rho (g + A d). At the point reached the first-order lambda + rho g may be far larger, where g is curved, and a
 Hessian with these converges slowly. The predicted ones are also free of what rho makes of the rounding of g, which
 far from the origin exceeds any tolerance; so of the two estimates the one that balances the gradient better is the
-next multiplier.
+next multiplier. Steps along curved constraints are corrected to second order (:func:`damped_step`), so that they may
+be long where rho is large.
 """
 
 from __future__ import annotations
@@ -158,6 +159,7 @@ class AugmentedLagrangian(Solver):
         gradient_goal, violation_goal = self._goals(run, primal, rho, multipliers, rho * weights)
         exact = self.hessian == "exact" and len(weights) > 0
         first, outer, stuck, last = rho, 0, 0, np.inf
+        recent: list[float] = []  # violations after the last subproblems
         while run.status is None:
             outer += 1
             run.penalties = penalty = rho * weights
@@ -172,7 +174,7 @@ class AugmentedLagrangian(Solver):
                     stalled = True
                     break
                 values, step, rejected = taken
-                expected = primal.expected_multipliers(run.lin, step, multipliers, penalty)
+                expected = primal.expected_multipliers(run.lin, step, multipliers, penalty, damping.base)
                 lin = run.program.linearize(values)
                 after, slope = expected, primal.slope(lin, expected)
                 if not slope <= gradient_goal:
@@ -200,7 +202,11 @@ class AugmentedLagrangian(Solver):
                 run.accept(run.lin, after, 0.0, 0.0, outer=outer, penalty=rho)
             if stalled and (change == 0.0 or rho >= heaviest):
                 return settle(run, Status.STALLED)
-            falling, last = run.optimality.violation <= FALLING * last, run.optimality.violation
+            violation = run.optimality.violation
+            falling = violation <= FALLING * last
+            lost = run.has_been_feasible and len(recent) == PATIENCE
+            lost = lost and violation > max(self.tolerance, FALLING * max(recent))
+            last, recent = violation, [*recent, violation][-PATIENCE:]
             stuck, here = 0 if falling else stuck + 1, run.lin
             if stuck == PATIENCE and settle(run, Status.STALLED) is Status.LOCALLY_INFEASIBLE:
                 return Status.LOCALLY_INFEASIBLE
@@ -211,9 +217,12 @@ class AugmentedLagrangian(Solver):
                 violation_goal = max(min(violation_goal / rho**0.9, FALL * change), least)
                 gradient_goal = max(0.1 * gradient_goal, 0.0 if run.program.least_squares else 0.1 * self.tolerance)
             else:
-                if not falling and run.infeasible_stationary() and (ending := leave(run)) is not None:
-                    return ending
+                if not falling and (lost or run.infeasible_stationary()):
+                    ending = leave(run)
+                    if ending is not None and not lost:
+                        return ending
                 if run.lin is not here:  # led astray: from the new point more slowly, and without what was learned
+                    stuck, last, recent = 0, np.inf, []
                     first *= self.penalty_growth**2
                     rho, damping = min(first, heaviest), Damping(self.damping)
                     multipliers = expected = np.zeros(len(weights))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -18,6 +18,8 @@ SHRINK = 0.1
 ROUNDING = 1e-14
 SUFFICIENT = 1e-4
 LEAST_SHARE = 0.125  # of the second derivatives, before they are left out
+WELL = 0.75  # of the predicted decrease: a step that brings less is corrected
+CORRECTIONS = 3  # at most, of one trial
 
 
 @dataclass
@@ -28,11 +30,13 @@ class Damping:
         value: present damping, relative to the diagonal of the Hessian.
         growth: factor of the next rejection; doubles with each.
         share: of the second derivatives that left the last model convex.
+        base: (M,) constraints where the step is zero, in the model of the step taken last.
     """
 
     value: float
     growth: float = 2.0
     share: float = 1.0
+    base: Array = field(default_factory=lambda: STRAIGHT)
 
     def reject(self) -> None:
         """Grow, faster with every rejection in a row."""
@@ -55,6 +59,11 @@ def damped_step(
 ) -> tuple[Values, Array, int] | None:
     """One accepted step on the augmented objective.
 
+    A step of length d along curved constraints leaves them by some d^2, which costs rho d^4: the larger rho, the
+    shorter the steps that damping allows. So where second derivatives are in the model, a trial that brings much less
+    than predicted is followed by second-order corrections (Nocedal and Wright, section 18.3): the same model, with the
+    values of the constraints found there.
+
     Args:
         primal: the augmented objective and its factorisation.
         lin: where.
@@ -69,6 +78,7 @@ def damped_step(
     merit = primal.merit(lin, multipliers, penalty)
     # Least squares has no unit: what is rounding depends on the cost alone.
     slack = ROUNDING * (merit if primal.program.least_squares else max(1.0, abs(merit)))
+    rows = primal.program.constraints
     rejected, rounded = 0, False
     damping.share = share = min(4.0 * damping.share, 1.0)
     while damping.value <= LARGEST:
@@ -85,8 +95,23 @@ def damped_step(
             actual = merit - primal.merit(evaluation, multipliers, penalty)
             if not rounded and not actual >= SUFFICIENT * predicted - slack:
                 slack, rounded = max(slack, primal.rounding(lin, multipliers, penalty)), True
+            base = lin.constraints
+            for _ in range(CORRECTIONS if len(bend) > 0 else 0):
+                if not evaluation.finite or actual >= WELL * predicted - slack:
+                    break
+                # What the rows are at the trial, continued along their tangents back to no step.
+                curved_base = evaluation.constraints - rows.times(lin.constraint_jacobian, step)
+                again = model_step(primal, lin, multipliers, penalty, damping.value, chosen, curved_base)
+                if again is None:
+                    break
+                moved, there = primal.trial(lin, again[0])
+                better = merit - primal.merit(there, multipliers, penalty)
+                if not (there.finite and better > actual):
+                    break
+                base, step, values, evaluation, actual = curved_base, again[0], moved, there, better
             if evaluation.finite and actual >= SUFFICIENT * predicted - slack:
                 damping.accept(1.0 if predicted <= slack else min(actual / predicted, 1.0))
+                damping.base = base
                 return values, step, rejected
         rejected += 1
         damping.reject()

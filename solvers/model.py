@@ -39,6 +39,7 @@ def model_step(
     penalty: Array,
     damping: float,
     bend: Array = STRAIGHT,
+    constraints: Array | None = None,
 ) -> tuple[Array, float] | None:
     """Minimise the damped model.
 
@@ -49,6 +50,7 @@ def model_step(
         penalty: (M,) rho of every row.
         damping: relative to the diagonal of the Hessian at ``lin``.
         bend: (nnz,) what Gauss-Newton's Hessian leaves out, in the order of ``Program.normal``; empty for nothing.
+        constraints: (M,) their values in the model where the step is zero; None takes those at ``lin``.
 
     Returns:
         The tangent step and the decrease the model predicts; None when a system cannot be factorised, or the second
@@ -66,7 +68,7 @@ def model_step(
         program.equality,
         lin.residual,
         lin.jacobian,
-        lin.constraints,
+        lin.constraints if constraints is None else constraints,
         lin.constraint_jacobian,
         lin.hessian,
         bend,

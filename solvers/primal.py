@@ -79,10 +79,12 @@ class Primal:
         active = self.program.equality | (after != 0.0)
         return self.program.normal_entries(lin, np.where(active, penalty, 0.0))
 
-    def expected_multipliers(self, lin: Linearization, step: Array, multipliers: Array, penalty: Array) -> Array:
-        """(M,) lambda+ after a step, by the linear model of the constraints."""
+    def expected_multipliers(
+        self, lin: Linearization, step: Array, multipliers: Array, penalty: Array, base: Array
+    ) -> Array:
+        """(M,) lambda+ after a step, by the linear model of the constraints that are ``base`` without a step."""
         program = self.program
-        moved = lin.constraints + program.constraints.times(lin.constraint_jacobian, step)
+        moved = base + program.constraints.times(lin.constraint_jacobian, step)
         return self.next_multipliers(moved, multipliers, penalty)
 
     def bend(self, lin: Linearization, multipliers: Array) -> Array:

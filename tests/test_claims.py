@@ -54,6 +54,20 @@ def test_converged_is_true(name: str, kind: str) -> None:
     assert (result.status, result.claim) == ("CONVERGED", "true"), result
 
 
+@pytest.mark.parametrize("equalities_only", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "seed", "limit"), [("pendulum", 1, 130), ("cart-pole", 1, 150), ("two-link arm", 0, 100)]
+)
+def test_the_augmented_lagrangian_moves_along_curved_dynamics(
+    kind: str, seed: int, limit: int, equalities_only: bool
+) -> None:
+    """Newton steps leave the dynamics by their square: uncorrected, they crept to the limit of 300."""
+    twin, judge = stated(kind, seed, equalities_only)
+    result = answer(BACKENDS["alm"], twin, judge)
+    assert (result.status, result.claim) == ("CONVERGED", "true"), result
+    assert result.iterations <= limit
+
+
 @pytest.mark.parametrize("kind", ["orbit", "attitude slew"])
 def test_converged_is_true_without_inequalities(kind: str) -> None:
     twin, judge = stated(kind, equalities_only=True)
