@@ -13,7 +13,11 @@ from unifg.models import quadrotor
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 
 # A minimum that is not listed; IPOPT stays when it is started there (docs/reference-problems.md).
-CONFIRMED = {("ahead", True, 50): (580.25905,)}
+CONFIRMED = {
+    ("ahead", True, 20): (586.14768,),
+    ("ahead", True, 50): (580.25905,),
+    ("goto", True, 50): (3387.08409,),  # lower than what is listed
+}
 SOLVERS: dict[str, fg.Solver] = {
     "ipm": InteriorPoint(tolerance=1e-4),
     "sqp": SQP(tolerance=1e-4),
