@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from unifg.kkt import infeasible_stationary
+from unifg.kkt import infeasible_stationary, within_bounds
 from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.solver import Run
@@ -43,9 +43,9 @@ def settle(run: Run, status: Status) -> Status:
 
 def nearest(run: Run) -> tuple[Linearization, bool]:
     """Where descent on the violation from the present iterate ends, and whether nothing near that violates less."""
-    found = run.lin
-    if not run.infeasible_stationary():
-        found = least_violation(run.program, run.lin, run.tolerance, lambda: run.out_of_time)
+    found = within_bounds(run.program, run.lin)
+    if not infeasible_stationary(run.program, found, run.tolerance):
+        found = least_violation(run.program, found, run.tolerance, lambda: run.out_of_time)
     while infeasible_stationary(run.program, found, run.tolerance):
         lower = _downhill(run, found)
         if lower is None:
@@ -56,7 +56,8 @@ def nearest(run: Run) -> tuple[Linearization, bool]:
 
 def leave(run: Run) -> Status | None:
     """Where the violation is stationary: LOCALLY_INFEASIBLE, or None once the iterate was moved to violate less."""
-    found = _downhill(run, run.lin)
+    within = within_bounds(run.program, run.lin)
+    found = _downhill(run, within)
     if found is None:
         return Status.LOCALLY_INFEASIBLE
     run.begin_at(found)
@@ -103,7 +104,7 @@ def least_violation(
         out_of_time: asked before every step whether to end where it is.
     """
     solver = program.normal_solver()
-    lin = program.linearize(program.within_bounds(lin.values))
+    lin = within_bounds(program, lin)
     damping, size = FIRST_DAMPING, np.zeros(program.size)
     for _ in range(STEPS):
         outside = program.violation(lin.constraints)

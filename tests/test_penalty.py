@@ -73,7 +73,8 @@ def test_infeasible_problem_is_named() -> None:
     graph.constrain(lambda p: p, x, upper=1.0, name="below")
     solution = Penalty().solve(graph, {x: np.zeros((1, 1))})
     assert solution.status is fg.Status.LOCALLY_INFEASIBLE, solution.report()
-    assert solution.violation == pytest.approx(0.5, abs=1e-3)
+    assert solution.violation == pytest.approx(1.0, abs=1e-6)  # bounds are kept
+    assert solution.worst == ("below", 0)
 
 
 def test_limits_of_the_loop() -> None:

@@ -166,9 +166,17 @@ def _measure(
 def infeasible_stationary(program: Program, lin: Linearization, tolerance: float) -> bool:
     """Whether the point is stationary for 1/2 |violation|^2 without being feasible, in whatever units the unknowns are.
 
-    It is where the best step of :class:`unifg.violation.ViolationModel` promises nothing that counts. Descent
-    directions that satisfied bounds of the unknowns block do not count.
+    It is where the best step of :class:`unifg.violation.ViolationModel` promises nothing that counts. Bounds of the
+    unknowns are kept, since they can be: a point outside them is looked at where it is brought back, and descent
+    directions that they block do not count.
     """
+    lin = within_bounds(program, lin)
     if np.abs(program.violation(lin.constraints)).max(initial=0.0) <= tolerance:
         return False
     return ViolationModel(program, lin).stationary(tolerance)
+
+
+def within_bounds(program: Program, lin: Linearization) -> Linearization:
+    """The linearisation at the nearest point that respects every bound of an unknown; ``lin`` where it does."""
+    values = program.within_bounds(lin.values)
+    return lin if values is lin.values else program.linearize(values)

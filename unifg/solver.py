@@ -16,7 +16,7 @@ from unifg.errors import BackendError, GraphError, NotConverged
 from unifg.factor_norms import Deferred, factor_norms
 from unifg.graph import Graph
 from unifg.history import HEADER, Iteration, line
-from unifg.kkt import infeasible_stationary, optimality
+from unifg.kkt import infeasible_stationary, optimality, within_bounds
 from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.relative_offset import Factored
@@ -301,6 +301,8 @@ class Run:
             status = Status.LOCALLY_INFEASIBLE
         if status is Status.LOCALLY_INFEASIBLE and self.has_been_feasible:
             status = Status.STALLED
+        if status is Status.LOCALLY_INFEASIBLE and (within := within_bounds(self.program, self.lin)) is not self.lin:
+            self._move(within, self.multipliers)
         if not self.optimality.finite:
             self._move(self._best_lin, self._best_multipliers)
         measured = self.optimality

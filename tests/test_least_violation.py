@@ -1,0 +1,90 @@
+"""Where solves end that cannot keep everything: bounds hold, and the squares of all other violations are least."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
+from unifg.typing import Array
+
+Expected = tuple[fg.Graph, dict[fg.Family, Array], dict[str, float]]
+
+EQUALITIES: dict[str, fg.Solver] = {
+    "kkt": KKT(),
+    "kkt-full": KKT(full_steps=True),
+    "kkt-lm": KKT(globalization="levenberg-marquardt"),
+    "sqp-elimination": SQP(qp="elimination"),
+}
+BACKENDS: dict[str, fg.Solver] = {
+    "penalty": Penalty(),
+    "alm": AugmentedLagrangian(),
+    "alm-gauss-newton": AugmentedLagrangian(hessian="gauss-newton"),
+    "sqp": SQP(),
+    "sqp-exact": SQP(hessian="exact"),
+    "sqp-graph": SQP(qp="graph"),
+    "ipm": InteriorPoint(),
+    "ipm-gauss-newton": InteriorPoint(hessian="gauss-newton"),
+}
+
+
+def pushed(lower: float, upper: float) -> Expected:
+    """A point moved by u <= 1 that is to be 1.25 away: the motion and the goal share what is missing."""
+    graph = fg.Graph()
+    x, u = graph.variables("x", fg.Rn(1), 1), graph.variables("u", fg.Rn(1), 1)
+    graph.minimize(fg.prior, u, [0.0])
+    graph.constrain(lambda x, u: x - u, x, u, lower=0.0, upper=0.0, name="motion")
+    graph.constrain(lambda x: x - 1.25, x, lower=0.0, upper=0.0, name="goal")
+    graph.bound(u, lower=lower, upper=upper, name="push")
+    return graph, {x: np.zeros((1, 1)), u: np.zeros((1, 1))}, {"x": 1.125, "u": 1.0}
+
+
+def heavy_rows() -> Expected:
+    """2 x + y >= 6 and 3 y <= 3 beside x <= 1: y is where (4 - y)^2 + (3 y - 3)^2 is least."""
+    graph = fg.Graph()
+    x, y = graph.variables("x", fg.Rn(1), 1), graph.variables("y", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [5.0])
+    graph.minimize(fg.prior, y, [-3.0])
+    graph.constrain(lambda x, y: 2.0 * x + y, x, y, lower=6.0, name="far")
+    graph.constrain(lambda y: 3.0 * y, y, upper=3.0, name="near")
+    graph.bound(x, lower=-1.0, upper=1.0, name="box")
+    return graph, {x: np.full((1, 1), 3.0), y: np.zeros((1, 1))}, {"x": 1.0, "y": 1.3}
+
+
+def rim() -> Expected:
+    """A point of a square is to be on a circle of radius 4 around (0, -2): its upper corners are nearest."""
+    graph = fg.Graph()
+    p = graph.variables("p", fg.Rn(2), 1)
+    graph.minimize(fg.prior, p, [3.0, 3.0])
+    graph.constrain(
+        lambda p: np.sqrt(p[:, :1] ** 2 + (p[:, 1:] + 2.0) ** 2 + 1e-9), p, lower=4.0, upper=4.0, name="circle"
+    )
+    graph.bound(p, lower=[-1.0, -1.0], upper=[1.0, 1.0], name="square")
+    return graph, {p: np.array([[0.5, 0.25]])}, {"p": 1.0}
+
+
+CASES: dict[str, Callable[[], Expected]] = {
+    "pushed": lambda: pushed(-1.0, 1.0),
+    "pushed, one-sided": lambda: pushed(-np.inf, 1.0),
+    "pushed, given": lambda: pushed(1.0, 1.0),
+    "heavy rows": heavy_rows,
+    "rim": rim,
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("name", [*BACKENDS, *EQUALITIES])
+def test_bounds_are_kept_and_the_squares_of_the_rest_are_least(name: str, case: str) -> None:
+    if name in EQUALITIES and case != "pushed, given":
+        pytest.skip("has inequalities")
+    graph, guess, expected = CASES[case]()
+    solution = {**BACKENDS, **EQUALITIES}[name].solve(graph, guess)
+    assert solution.status is fg.Status.LOCALLY_INFEASIBLE, solution.report()
+    program = graph.compile()
+    rows = program.evaluate(solution.values).constraints
+    np.testing.assert_allclose(program.violation(rows)[program.bound_rows], 0.0, atol=1e-12)
+    for family, value in expected.items():
+        np.testing.assert_allclose(np.abs(solution[graph.families[family]]), value, atol=1e-5)
