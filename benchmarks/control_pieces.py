@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -39,7 +40,7 @@ def measure(problem: Problem) -> dict[str, float]:
     for name, function in (("assemble, factorise, solve", state.DIRECT), ("solve again", state.STEER),
                            ("trial: move and evaluate", state.ADVANCE), ("KKT numbers", state.MEASURE)):  # fmt: skip
         _many(links[function], workspace._address, 3)
-        pieces[name] = _least(lambda f=links[function]: _many(f, workspace._address, REPEATS)) / REPEATS
+        pieces[name] = _least(partial(_many, links[function], workspace._address, REPEATS)) / REPEATS
     lin = program.linearize(solution.values)
     entries, norms = lin.hessian.copy(), np.empty(len(program.arrays.fields))
     squares, gradient = np.empty(0), lin.gradient.copy()
@@ -56,12 +57,17 @@ def measure(problem: Problem) -> dict[str, float]:
     }  # fmt: skip
     for name, call in calls.items():
         call()
-        pieces[name] = _least(lambda c=call: [c() for _ in range(100)]) / 100
+        pieces[name] = _least(partial(_repeat, call, 100)) / 100
     cold = _least(lambda: [prepared.solve(stated.guess) for _ in range(10)]) / 10
     pieces["cold solve, all"], pieces["cold solve, iterations"] = cold, float(solution.iterations)
     still = _least(lambda: [prepared.solve(solution) for _ in range(20)]) / 20
     pieces["solve that needs no iteration"] = still
     return pieces
+
+
+def _repeat(call: Callable[[], object], times: int) -> None:
+    for _ in range(times):
+        call()
 
 
 def _least(call: Callable[[], object]) -> float:

@@ -14,6 +14,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -128,7 +129,7 @@ def steps(solver: fg.Solver, problem: tuple[fg.Graph, fg.Guess], multiplier: flo
 
 def iterations_by_length() -> str:
     """Fig. 3: the paper's stop rule, then our own KKT test."""
-    rule = {"step_tolerance": STEP, "tolerance": STRICT}
+    rule = partial(KKT, full_steps=True, step_tolerance=STEP, tolerance=STRICT)
     rows = []
     for length in LENGTHS:
         free = GaussNewton(line_search=False, step_tolerance=STEP, tolerance=STRICT)
@@ -137,8 +138,8 @@ def iterations_by_length() -> str:
             [
                 str(length),
                 steps(free, drive(length, constrained=False)),
-                steps(KKT(full_steps=True, **rule), linear),
-                steps(KKT(full_steps=True, **rule), quadratic),
+                steps(rule(), linear),
+                steps(rule(), quadratic),
                 steps(literal(LITERAL, STEP, STRICT), quadratic),
                 steps(KKT(), quadratic),
                 steps(literal(LITERAL), quadratic),
@@ -178,8 +179,8 @@ def sensitivity() -> str:
     first = table(["first multiplier", "KKT", "KKT, full steps", "AL", "AL, literal"], rows, 0)
     rows = []
     for rho in PENALTIES:
-        solvers = (literal(rho), AugmentedLagrangian(penalty=rho, inner_iterations=1), AugmentedLagrangian(penalty=rho))
-        rows.append([f"{rho:g}", *(steps(solver, drive(385)) for solver in solvers)])
+        loops = (literal(rho), AugmentedLagrangian(penalty=rho, inner_iterations=1), AugmentedLagrangian(penalty=rho))
+        rows.append([f"{rho:g}", *(steps(loop, drive(385)) for loop in loops)])
     return first + "\n\n" + table(["rho", "AL, literal", "AL, 1 inner step at most", "AL"], rows, 0)
 
 

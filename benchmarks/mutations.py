@@ -119,7 +119,7 @@ class _Finder:
             if node.name in WORDS:
                 return
             marks = [ast.unparse(mark) for mark in node.decorator_list]
-            inner = compiled or any(mark in ("compiled", "inlined") or "jit" in mark for mark in marks)
+            inner = compiled or any(mark in ("compiled", "inlined", "linked") or "jit" in mark for mark in marks)
             result = ast.unparse(node.returns) if isinstance(node, ast.FunctionDef) and node.returns else ""
             yield from self._body(node.body, (*path, node.name), inner)
             if isinstance(node, ast.FunctionDef):

@@ -156,3 +156,9 @@ def test_width_again(wide):
     }
     assert sorted(users) == ["tests/test_gate.py::test_width", "tests/test_gate.py::test_width_again"]
     assert restored
+
+
+@pytest.mark.parametrize("mark", ["compiled", "inlined", "linked", "njit(cache=True)"])
+def test_functions_under_numba_are_given_to_all_tests(mark: str) -> None:
+    source = f"@{mark}\ndef f(x):\n    return x + 1\n\n\ndef g(x):\n    return x + 1\n"
+    assert {change.function: change.compiled for change in mutations(source)} == {"f": True, "g": False}
