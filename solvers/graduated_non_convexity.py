@@ -7,10 +7,15 @@ backend does.
 
 Each surrogate is solved from the guess and from the solution of the one before, and the cheaper answer counts: a wrong
 measurement that was believed once bends the trajectory, and everything that started from there would stay bent; where
-odometry is weak, the guess alone misses what the surrogates found step by step. In the end two things are compared
-with the answer by the cost of the graph as stated. Dynamic covariance scaling, a loss with the same bound, takes a few
-iterations from the guess and sometimes finds what graduation did not. And measurements that were left out are taken
-back where they agree with the rest (:mod:`unifg.solvers.gating`), if the cost falls.
+odometry is weak, the guess alone misses what the surrogates found step by step. Dynamic covariance scaling, a loss with
+the same bound, takes a few iterations from the guess and sometimes finds what graduation did not.
+
+Answers are compared by the cost of the graph as stated, once its noise has the size that is found
+(:class:`unifg.solvers.gating.Scatter`): sum of rho(r^2 / s^2), s^2 being the variance of unit weight, at most one. By
+the stated numbers alone a wrong measurement often pays: to fit it what only odometry holds is bent within its standard
+deviations, which costs less than c^2. If all others agree ten times better than they had to, that is a contradiction.
+Measurements that were left out are taken back where they agree with the rest, and those that counted are taken out
+where the rest contradicts them (:mod:`unifg.solvers.gating`), as long as the answer is better for it.
 
 H. Yang, P. Antonante, V. Tzoumas, L. Carlone, "Graduated non-convexity for robust spatial perception: from non-minimal
 solvers to global outlier rejection", IEEE RA-L 5(2), 2020.
@@ -26,29 +31,31 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from unifg.compiled import CompiledTerm
 from unifg.errors import BackendError, NotConverged
 from unifg.graph import Graph
 from unifg.history import Iteration
-from unifg.linearization import Linearization
 from unifg.robust import DCS, Graduated, Loss
 from unifg.solution import Solution
 from unifg.solver import Callback, Prepared, Solver, Start
-from unifg.solvers.gating import Innovations
+from unifg.solvers.gating import Innovations, Scatter
 from unifg.solvers.gauss_newton import GaussNewton
 from unifg.solvers.levenberg_marquardt import LevenbergMarquardt
 from unifg.status import Status
 from unifg.terms import Cost
-from unifg.typing import Array, ArrayLike
+from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 from unifg.variables import Data
+from unifg.verdict import Verdict
 
 logger = logging.getLogger("unifg")
 
 FAR = 1e30  # a squared residual that no loss believes
-FEWER = 0.7  # share of the measurements to take back where all were too many
+FEWER = 0.7  # share of the measurements to take back or out where all were too many
 HALF = 0.5  # smaller weights mean that a measurement was left out
 LESS = 1e-9  # share of the cost by which a solution must be better
 ROUGH = 1e-2  # tolerance of the stages: a share of 1e-4 of the cost
-ROUNDS = 10  # of gating
+RIVALS = 3  # other answers that are named, at most
+ROUNDS = 20  # of taking back or out
 DECIDED = 1e-3  # a truncated loss is done when every weight is this close to zero or one
 
 
@@ -109,8 +116,9 @@ class _Stage:
 class GraduatedNonConvexity:
     """Solves graphs with `unifg.TruncatedLeastSquares` or `unifg.GemanMcClure` in one or more terms.
 
-    The answer has the lowest cost found, not the lowest there is: no local method knows that. CONVERGED says that it is
-    stationary.
+    The answer is the best found, not the best there is: no local method knows that. CONVERGED says that it is
+    stationary. ``solution.verdict`` says which measurements it believes and which other answers were found that cost
+    less, or as much (:class:`unifg.Verdict`).
 
     It is called like a backend. Terms with other losses, or none, take part as they are: measurements that can be
     trusted, such as odometry, are stated without a loss.
@@ -202,23 +210,26 @@ class _Search:
         self._run = replace(solver, max_iterations=options.stage_iterations, tolerance=rough).prepare(staged)
         self._last = solver.prepare(graph)
         self._damped: Prepared | None = None
+        self.found: list[_Answer] = []
+        robust = self._run.program.table.robust
+        self._terms = [t for t, _ in robust if isinstance(t.term, Cost) and isinstance(t.term.robust, _Stage)]
+        self._parts = {term.name: part for term, part in self._last.program.table.robust}
 
     def best(self, guess: Start) -> Solution:
         """The best answer found, judged with the losses themselves."""
         graduated = self._graduated(guess)
         if graduated.status is Status.INTERRUPTED:
             return self._interrupted(graduated)
-        solution = self._stated(graduated)
+        answer = self._answer(self._stated(graduated))
         for stage in self._stages:
             stage.now = _rival(stage.goal)
-        rival = self._stated(self._from(guess))
-        if rival.status is not Status.INTERRUPTED and rival.cost < (1.0 - LESS) * solution.cost:
+        rival = self._answer(self._stated(self._from(guess)))
+        if rival.solution.status is not Status.INTERRUPTED and rival.better(answer):
             losses = ", ".join(str(stage.now) for stage in self._stages)
-            found, missed = rival.cost, solution.cost
+            found, missed = rival.solution.cost, answer.solution.cost
             logger.info("%s: %s led to cost %g, the surrogates to %g", self._options.name, losses, found, missed)
-            solution = rival
-        solution = self._gated(solution)
-        return self._stated(solution)
+            answer = rival
+        return self._concluded(self._revised(answer))
 
     def _graduated(self, guess: Start) -> Solution:
         """Through the surrogates, each from the guess."""
@@ -271,52 +282,143 @@ class _Search:
         solution.status = Status.INTERRUPTED
         return solution
 
-    def _gated(self, solution: Solution) -> Solution:
-        """Take back what was left out but agrees with the rest, as long as the cost falls."""
+    def _revised(self, answer: _Answer) -> _Answer:
+        """Take back what was left out but agrees with the rest, take out what the rest contradicts."""
         program = self._last.program
         factorization = program.normal_solver()
         for _ in range(ROUNDS):
-            plain, lin = self._views(solution)
-            innovations = Innovations(program, factorization, lin.hessian)
-            if not innovations.determined:
-                return solution
-            better = self._taken_back(solution, innovations, plain)
+            for stage in self._stages:
+                stage.now = _Square()
+            values = answer.solution.values
+            plain = self._run.program.linearize(values)
+            innovations = Innovations(program, factorization, program.linearize(values).hessian)
+            if answer.solution.status is Status.INTERRUPTED or not innovations.determined:
+                return answer
+            back, out = [], []
+            everything = sum(len(kept) for kept in answer.kept)
+            for term, stage, kept, squared in zip(self._terms, self._stages, answer.kept, answer.squared, strict=True):
+                bound = _bound(stage.goal)
+                left = ~kept if term.active is None else ~kept & term.active
+                score = np.full(len(kept), np.inf)
+                score[left] = innovations.squared(term, plain, left)
+                score[score > min(bound, answer.scatter.limit(term.size, everything))] = np.inf
+                back.append(score / bound)
+                fall, far = innovations.without(term, plain, kept, stage.goal.weight(squared)[kept])
+                wrong = answer.scatter.contradicts(fall, term.size, everything)
+                answer.doubted[term.name] = np.flatnonzero(kept)[wrong]
+                # What would stay within its threshold counts, by the loss as stated, however the others scatter.
+                score = np.full(len(kept), np.inf)
+                score[kept] = np.where(wrong & (far > bound), -fall, np.inf)
+                out.append(score / bound)
+            better = self._with(answer, back, 1.0) or self._with(answer, out, 0.0)
             if better is None:
-                return solution
-            solution = better
-        return solution
+                return answer
+            answer = better
+        return answer
 
-    def _taken_back(self, solution: Solution, innovations: Innovations, plain: Linearization) -> Solution | None:
-        """A better solution with more measurements in it, or None."""
-        robust = [term for term, _ in self._run.program.table.robust]
-        scores = []
-        staged = [t for t in robust if isinstance(t.term, Cost) and any(t.term.robust is s for s in self._stages)]
-        for term, stage in zip(staged, self._stages, strict=True):
-            out = stage.goal.weight(stage.squared) < HALF
-            if term.active is not None:
-                out &= term.active
-            score = np.full(len(out), np.inf)
-            score[out] = innovations.squared(term, plain, out)
-            scores.append(score / _bound(stage.goal))
-        passing = np.sort(np.concatenate(scores))
-        passing = passing[passing <= 1.0]
-        weights = [stage.goal.weight(stage.squared) for stage in self._stages]
-        while len(passing):
-            limit = passing[-1]
-            for stage, weight, score in zip(self._stages, weights, scores, strict=True):
-                stage.now = _Held(np.where(score <= limit, 1.0, weight))
-            taken = self._stated(self.history.add(self._run, solution.values, self._data))
-            if taken.cost < (1.0 - LESS) * solution.cost:
-                return taken
-            passing = passing[: int(FEWER * len(passing))]
+    def _with(self, answer: _Answer, scores: list[Array], weight: float) -> _Answer | None:
+        """A better answer in which the measurements with the lowest finite scores have that weight, or None."""
+        every = np.sort(np.concatenate(scores))
+        every = every[np.isfinite(every)]
+        weights = [stage.goal.weight(s) for stage, s in zip(self._stages, answer.squared, strict=True)]
+        while len(every):
+            for stage, present, score in zip(self._stages, weights, scores, strict=True):
+                stage.now = _Held(np.where(score <= every[-1], weight, present))
+            found = self._answer(self._stated(self.history.add(self._run, answer.solution.values, self._data)))
+            if found.better(answer):
+                return found
+            every = every[: int(FEWER * len(every))]
         return None
 
-    def _views(self, solution: Solution) -> tuple[Linearization, Linearization]:
-        """The graph linearised at a solution without the losses, and with them."""
-        for stage in self._stages:
-            stage.now = _Square()
-        values = solution.values
-        return self._run.program.linearize(values), self._last.program.linearize(values)
+    def _answer(self, solution: Solution) -> _Answer:
+        """A solution with what it believes, remembered."""
+        program = self._last.program
+        lin = program.linearize(solution.values)
+        squared = [lin.squares[self._parts[term.name]] for term in self._terms]
+        rest, count = 2.0 * lin.cost, 0.0
+        for term, stage, s in zip(self._terms, self._stages, squared, strict=True):
+            weight = stage.goal.weight(s) if term.active is None else stage.goal.weight(s) * term.active
+            rest -= float(stage.goal.value(s).sum())
+            count += term.size * float(weight.sum())
+        staged = {term.name for term in self._terms}
+        for other in program.cost_terms:
+            if other.name not in staged:
+                count += other.size * (other.count if other.active is None else int(other.active.sum()))
+        found = _Answer(solution, self._stages, self._terms, squared, rest, count - program.size)
+        self.found.append(found)
+        return found
+
+    def _concluded(self, answer: _Answer) -> Solution:
+        """Solve once more, and say what was found besides."""
+        final = self._answer(self._stated(answer.solution))
+        doubted = answer.doubted if final.believes_as(answer) else {}
+        rivals: list[_Answer] = []
+        for other in sorted(self.found, key=lambda a: a.solution.cost):
+            known = any(other.believes_as(one) for one in [final, *rivals])
+            if other.solution.converged and not known and other.competes_with(final):
+                rivals.append(other)
+        kept = {term.name: kept for term, kept in zip(self._terms, final.kept, strict=True)}
+        others = tuple(other.solution for other in rivals[:RIVALS])
+        for other in rivals[:RIVALS]:
+            theirs = {term.name: kept for term, kept in zip(self._terms, other.kept, strict=True)}
+            other.solution.verdict = Verdict(theirs, other.doubted, other.scatter.unit)
+        final.solution.verdict = Verdict(kept, doubted, final.scatter.unit, others)
+        return final.solution
+
+
+class _Answer:
+    """A solution, which measurements it believes, and how much those scatter."""
+
+    def __init__(
+        self,
+        solution: Solution,
+        stages: list[_Stage],
+        terms: list[CompiledTerm],
+        squared: list[Array],
+        rest: float,
+        freedom: float,
+    ) -> None:
+        """Sum up.
+
+        Args:
+            solution: of the graph as stated.
+            stages: of every term with a loss.
+            terms: those terms.
+            squared: (n,) squared residuals of their factors.
+            rest: twice the cost of all other terms.
+            freedom: residuals that count less unknowns.
+        """
+        self.solution, self.squared, self._rest = solution, squared, rest
+        self._goals = [stage.goal for stage in stages]
+        self._active = [np.ones(len(s)) if t.active is None else t.active for t, s in zip(terms, squared, strict=True)]
+        weights = [goal.weight(s) * a for goal, s, a in zip(self._goals, squared, self._active, strict=True)]
+        self.kept: list[BoolArray] = [weight >= HALF for weight in weights]
+        self.doubted: dict[str, IntArray] = {}
+        self.scatter = Scatter(rest + sum(float(w @ s) for w, s in zip(weights, squared, strict=True)), freedom)
+
+    def judged(self, unit: float) -> float:
+        """Twice the cost with the noise of all measurements smaller, by the root of ``unit``, than they state."""
+        losses = sum(
+            float((goal.value(squared / unit) * active).sum())
+            for goal, squared, active in zip(self._goals, self.squared, self._active, strict=True)
+        )
+        return self._rest / unit + losses
+
+    def better(self, other: _Answer) -> bool:
+        """Whether this answer costs less once noise has the size found in either."""
+        unit = min(self.scatter.unit, other.scatter.unit)
+        return self.judged(unit) < (1.0 - LESS) * other.judged(unit)
+
+    def believes_as(self, other: _Answer) -> bool:
+        """Whether both keep the same measurements."""
+        return all(np.array_equal(a, b) for a, b in zip(self.kept, other.kept, strict=True))
+
+    def competes_with(self, other: _Answer) -> bool:
+        """Whether this answer costs less than the other as stated, or nearly as little once noise has its size."""
+        if self.solution.cost < (1.0 - LESS) * other.solution.cost:
+            return True
+        unit = min(self.scatter.unit, other.scatter.unit)
+        return self.judged(unit) < other.judged(unit) + max(_bound(goal) for goal in self._goals)
 
 
 class _History:

@@ -16,10 +16,10 @@ from benchmarks.wrong_closures import Claim, with_wrong_closures
 from unifg.errors import BackendError, GraphError, NotConverged
 from unifg.files.g2o import read_g2o
 from unifg.history import Iteration
-from unifg.pose_graphs import manhattan, sphere
+from unifg.pose_graphs import PoseGraph, manhattan, sphere
 from unifg.robust import Graduated, Loss
 from unifg.solvers import GaussNewton, GraduatedNonConvexity, LevenbergMarquardt, graduated_non_convexity
-from unifg.solvers.gating import Innovations
+from unifg.solvers.gating import Innovations, Scatter
 from unifg.typing import Array, BoolArray
 
 LOSSES: list[Loss] = [
@@ -234,10 +234,121 @@ def test_right_closures_left_out_by_drift_are_taken_back(seed: int) -> None:
     plain = GaussNewton().solve(graph, guess)
     staged, stages = graduated_non_convexity._staged(graph)
     search = graduated_non_convexity._Search(GraduatedNonConvexity(), graph, staged, stages, None, None)
-    gated = search._gated(search._stated(plain))
+    gated = search._revised(search._answer(search._stated(plain))).solution
     kept = [loss.weight(sim.pose_graph.with_poses(s[x]).squared_errors()).mean() for s in (plain, gated)]
     assert kept[0] < 0.95 < 0.98 < kept[1]
     assert gated.converged and gated.cost < 0.9 * plain.cost
+
+
+def test_what_a_measurement_would_be_without_itself() -> None:
+    """By how much the cost falls, and the residual left, when one closure after the other is taken out for real."""
+    sim = manhattan(60, seed=3)
+    pose_graph = sim.pose_graph.with_poses(sim.truth)
+    graph, _, guess = pose_graph.graph(robust=fg.TruncatedLeastSquares(50.0))
+    program = graph.compile()
+    program.bind({})
+    lin = program.linearize(guess)
+    term = next(term for term, _ in program.table.robust)
+    matrix = program.normal.matrix(lin.hessian).toarray()
+    hessian = matrix + matrix.T - np.diag(matrix.diagonal())
+    jacobian, residual = program.costs.matrix(lin.jacobian).toarray(), lin.residual
+    step = -np.linalg.solve(hessian, jacobian.T @ residual)
+    linear = lin.residual + jacobian @ step  # the optimum of the linear problem
+    lin.residual[:] = linear
+    innovations = Innovations(program, program.normal_solver(), lin.hessian)
+    every = np.ones(term.count, dtype=np.bool_)
+    fall, far = innovations.without(term, lin, every, np.ones(term.count))
+    first = len(linear) - 3 * term.count
+    assert term.count > 10
+    for k in range(term.count):
+        own = np.arange(first + 3 * k, first + 3 * k + 3)
+        rest = np.setdiff1d(np.arange(len(linear)), own)
+        moved = -np.linalg.lstsq(jacobian[rest], linear[rest], rcond=None)[0]
+        without = linear + jacobian @ moved
+        np.testing.assert_allclose(fall[k], linear @ linear - without[rest] @ without[rest], rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(far[k], without[own] @ without[own], rtol=1e-6, atol=1e-9)
+
+
+def test_right_measurements_are_seldom_contradicted() -> None:
+    """One set of measurements in a hundred has one that is, whatever the size of the noise; a gross one always is."""
+    rng, called = np.random.default_rng(0), 0
+    n, unknowns, trials = 40, 4, 2000
+    design = rng.standard_normal((n, unknowns))
+    hat = design @ np.linalg.solve(design.T @ design, design.T)
+    for noise in (0.01, 1.0, 30.0):
+        residual = noise * rng.standard_normal((trials, n)) @ (np.eye(n) - hat)
+        for r in residual:
+            scatter = Scatter(float(r @ r), n - unknowns)
+            called += bool(scatter.contradicts(r**2 / (1.0 - np.diag(hat)), 1, n).any())
+        gross = residual[0] + 12.0 * noise * (np.eye(n) - hat)[7]
+        scatter = Scatter(float(gross @ gross), n - unknowns)
+        assert scatter.contradicts(gross**2 / (1.0 - np.diag(hat)), 1, n)[7]
+    assert 0.005 * 3 * trials < called <= 0.014 * 3 * trials
+
+
+def test_how_much_measurements_scatter_is_not_guessed_from_few() -> None:
+    assert Scatter(1e-8, 0.0).unit == 1.0
+    assert Scatter(3e-2, 3.0).unit > 0.2  # three numbers may be small by chance
+    assert Scatter(100.0, 10000.0).unit == pytest.approx(0.01, rel=0.05)
+    assert Scatter(5e4, 1e4).unit == 1.0  # larger noise than stated does not move the threshold
+    assert not Scatter(1.0, 2.0).contradicts(np.array([0.99]), 3, 1).any()
+    assert Scatter(0.0, 0.0).limit(3, 10) == np.inf
+
+
+def cautious(seed: int) -> tuple[PoseGraph, BoolArray, Array]:
+    """A graph whose noise is a seventh of what it states, with wrong closures; which those are; the right answer."""
+    sim = manhattan(150, seed, outliers=0.3)
+    edges = replace(sim.pose_graph.edges, information=0.02 * sim.pose_graph.edges.information)
+    pose_graph = replace(sim.pose_graph, edges=edges)
+    graph, x, guess = replace(pose_graph, edges=edges[~sim.outliers]).graph()
+    return pose_graph, sim.outliers, GaussNewton().solve(graph, guess, check=True)[x]
+
+
+@pytest.mark.parametrize("seed", [6, 7, 13])
+def test_a_wrong_closure_that_costs_less_is_still_wrong(seed: int) -> None:
+    """To keep it, odometry bends by less than its stated deviation and by much more than everything else scatters."""
+    pose_graph, wrong, right = cautious(seed)
+    loss = fg.TruncatedLeastSquares(3.37)
+    graph, x, guess = pose_graph.graph(robust=loss)
+    solution = GraduatedNonConvexity().solve(graph, guess, check=True)
+    np.testing.assert_allclose(solution[x][:, :2], right[:, :2], atol=1e-4)
+    assert solution.verdict is not None
+    closures = ~pose_graph.edges.odometry
+    np.testing.assert_array_equal(solution.verdict.kept["closures"], ~wrong[closures])
+    assert solution.verdict.unit**0.5 == pytest.approx(0.02**0.5, rel=0.25)
+    rival = solution.verdict.rivals[0]
+    assert rival.converged and rival.cost < solution.cost and rival.verdict is not None
+    assert (rival.verdict.kept["closures"] & wrong[closures]).any()
+    text = solution.report()
+    assert f"Kept {(~wrong[closures]).sum()} of {closures.sum()} in 'closures'; residuals are 0.1" in text
+    assert f"Another answer costs {rival.cost:.6g} (this one {solution.cost:.6g}): it keeps 1 in 'closures' (" in text
+
+
+def test_a_cheap_answer_far_off_is_not_taken() -> None:
+    """The cheapest answer as stated keeps one wrong closure, loses a right one and is 14 m off."""
+    pose_graph, wrong, right = cautious(10)
+    graph, x, guess = pose_graph.graph(robust=fg.TruncatedLeastSquares(3.37))
+    solution = GraduatedNonConvexity().solve(graph, guess, check=True)
+    np.testing.assert_allclose(solution[x][:, :2], right[:, :2], atol=1e-4)
+    assert solution.verdict is not None
+    np.testing.assert_array_equal(solution.verdict.kept["closures"], ~wrong[~pose_graph.edges.odometry])
+
+
+def test_a_verdict_names_what_is_doubted_and_what_is_inactive() -> None:
+    """Within the threshold a measurement counts, though nothing else is as far off; an inactive one does not count."""
+    graph = fg.Graph()
+    point = graph.variables("point", fg.Rn(1), 1)
+    y = np.concatenate([1e-3 * np.random.default_rng(1).standard_normal(40), [0.5, 9.0, 0.0]])
+    active = np.arange(43) < 42
+    loss = fg.TruncatedLeastSquares(3.0)
+    graph.minimize(fg.prior, point, graph.data("y", y[:, None], each=True), robust=loss, active=active, name="seen")
+    solution = GraduatedNonConvexity().solve(graph, {point: [[0.0]]}, check=True)
+    verdict = solution.verdict
+    assert verdict is not None and not verdict.rivals
+    assert verdict.left_out["seen"].tolist() == [41, 42]
+    assert verdict.doubted["seen"].tolist() == [40]
+    assert "Within their threshold, but further off than the others allow: 1 in 'seen' (40)." in solution.report()
+    assert GaussNewton().solve(graph, {point: [[0.0]]}).verdict is None
 
 
 class Abrupt(fg.TruncatedLeastSquares):

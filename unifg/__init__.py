@@ -35,6 +35,7 @@ from unifg.solution import Guess, Solution
 from unifg.solver import Prepared, Solver
 from unifg.status import Status
 from unifg.variables import Data, Family, Selection
+from unifg.verdict import Verdict
 
 try:
     __version__ = version("unifg")
@@ -82,6 +83,7 @@ __all__ = [
     "TruncatedLeastSquares",
     "Tukey",
     "UnifgError",
+    "Verdict",
     "between",
     "difference",
     "joint_prior",

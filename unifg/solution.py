@@ -19,6 +19,7 @@ from unifg.program import Program
 from unifg.status import Status
 from unifg.typing import Array, BoolArray, IntArray
 from unifg.variables import Family, Selection, Variable, as_selection
+from unifg.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,10 @@ class Solution:
         iterations: number of iterations taken.
         seconds: wall-clock time of the solve.
         solver: name of the backend.
+        verdict: which measurements it believes, from solves that decide that.
     """
+
+    verdict: Verdict | None = None
 
     def __init__(
         self,
@@ -233,6 +237,8 @@ class Solution:
         if self.worst is not None and self.violation > 0.0 and not self.converged:
             name, index = self.worst
             text += f" Largest violation: '{name}', factor {index}."
+        if self.verdict is not None:
+            text += f" {self.verdict.sentence(self.cost)}"
         return text
 
     def table(self) -> str:

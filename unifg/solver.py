@@ -242,9 +242,7 @@ class Run:
 
     def _move(self, lin: Linearization, multipliers: Array) -> None:
         self.lin, self.values, self.multipliers = lin, lin.values, multipliers
-        self.optimality = optimality(
-            self.program, lin, multipliers, self.tolerance, self.lent, self._start.flat
-        )
+        self.optimality = optimality(self.program, lin, multipliers, self.tolerance, self.lent, self._start.flat)
         if self.optimality.violation < self._least:
             self._least, self._least_values = self.optimality.violation, lin.values
 
