@@ -14,14 +14,16 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from unifg.columns import Columns, Values
-from unifg.differentiation import gradient_and_hessian, jacobian
+from unifg.differentiation import scalar_slopes, slopes, weighted_hessian
 from unifg.errors import GraphError, name_term
 from unifg.gather import Gather
 from unifg.jit import is_compiled
 from unifg.kernels import Kernel, side_by_side
 from unifg.lie import Manifold
+from unifg.moves import Moves, Near, Steps, directions_of
 from unifg.per_factor import per_factor
 from unifg.residuals import Residual
+from unifg.stack import Stack
 from unifg.terms import Constraint, Cost, Parameter, ScalarCost, Term
 from unifg.typing import Array, BoolArray, IntArray
 from unifg.variables import Data, Selection
@@ -79,6 +81,9 @@ class CompiledTerm:
         self._places = [k for k, a in enumerate(term.arguments) if isinstance(a, Selection)]
         self._function = term.residual.function
         self._jacobian = term.residual.jacobian
+        self._stack = Stack(self.name, self._evaluated)
+        self._jacobian_stack = Stack(self.name, self._attached)
+        self._directions = directions_of(tuple(self.manifolds))
         self.is_bound = isinstance(term, Constraint) and term.is_bound
         self.kernel, self.search_kernel = (None, None) if isinstance(term, ScalarCost) else _kernels(term.residual)
         self.place: IntArray = np.zeros(0, dtype=np.int64)
@@ -114,6 +119,7 @@ class CompiledTerm:
         active = self.term.active
         mask = data.get(active, active.value) if isinstance(active, Data) else active
         self.active: BoolArray | None = None if mask is None or mask.all() else mask.astype(bool)
+        self._bind_stacks()
         if hasattr(self, "size"):
             self._bind_parameters(data)
 
@@ -130,6 +136,7 @@ class CompiledTerm:
             self._arguments[place] = value = data.get(handle, handle.value)
             first, size = self._blocks[place]
             self._packed[:, first : first + size] = value.reshape(-1, size)
+        self._bind_stacks()
         return False
 
     def settle(self, parameters: Array) -> None:
@@ -153,7 +160,7 @@ class CompiledTerm:
         attached = self.term.residual.search if search and self.term.residual.search else self._jacobian
         points = [gather(values) for gather in self.gathers]
         if attached is None or numerical:
-            blocks = jacobian(lambda *moved: self._call(list(moved)), points, self.manifolds)
+            blocks = slopes(self._stack, Near(self._directions, points))
         else:
             blocks = [as_jacobian(self.name, block) for block in attached(*self.fill(points))]
             if len(blocks) > len(self.dims) and len(blocks) > max(self._places):
@@ -180,29 +187,20 @@ class CompiledTerm:
 
     def second_derivatives(self, values: Values, weights: Array) -> Array:
         """(n, D, D) Hessians of weights' r, weights (n, m), by differences; zero where inactive."""
-        points = [gather(values) for gather in self.gathers]
+        near = Near(self._directions, [gather(values) for gather in self.gathers])
+        with np.errstate(all="ignore"):
+            if self._jacobian is None or self.differenced:
+                return self._masked(weighted_hessian(self._stack, near, weights))
 
-        attached = self._jacobian
-        if attached is None or self.differenced:
+            def slope(near: Near, steps: Steps, moves: Moves) -> Array:
+                return np.asarray(np.einsum("nm,knmd->knd", weights, self._jacobian_stack(near, steps, moves)))
 
-            def weighted(*moved: Array) -> Array:
-                return np.asarray(np.einsum("nm,nm->n", weights, self._call(list(moved))))
-
-            with np.errstate(all="ignore"):
-                return self._masked(gradient_and_hessian(weighted, points, self.manifolds, together=True)[1])
-
-        def slope(*moved: Array) -> Array:
-            given = [np.asarray(block) for block in attached(*self.fill(list(moved)))]
-            blocks = given if len(given) == len(self.dims) else [given[place] for place in self._places]
-            return np.concatenate([np.einsum("nm,nmd->nd", weights, block) for block in blocks], axis=1)
-
-        second = np.concatenate(jacobian(slope, points, self.manifolds), axis=2)
+            second = np.concatenate(slopes(slope, near), axis=2)
         return self._masked(0.5 * (second + np.swapaxes(second, 1, 2)))
 
     def scalar_derivatives(self, values: Values) -> tuple[Array, Array, Array]:
         """Gradient (n, D), Hessian (n, D, D), rounding of the gradient (n, D) of a scalar cost, zero where inactive."""
-        points = [gather(values) for gather in self.gathers]
-        found = gradient_and_hessian(lambda *p: self._call(list(p)), points, self.manifolds)
+        found = scalar_slopes(self._stack, Near(self._directions, [gather(values) for gather in self.gathers]))
         gradient, hessian, rounding = (self._masked(array) for array in found)
         return gradient, hessian, rounding
 
@@ -273,6 +271,11 @@ class CompiledTerm:
         if self.kernel is not None:
             self._pack(self.kernel)
 
+    def _bind_stacks(self) -> None:
+        each = [k for k, a in enumerate(self.term.arguments) if isinstance(a, Data) and a.each]
+        for stack in (self._stack, self._jacobian_stack):
+            stack.bind(self._arguments, self._places, each)
+
     def _pack(self, kernel: Kernel) -> None:
         """Put the kernel's parameters side by side, and after them the constants in the place of variables."""
         points: list[Any] = [np.empty((1, m.storage)) for m in self.manifolds]
@@ -339,8 +342,19 @@ class CompiledTerm:
         return full
 
     def _call(self, points: list[Array]) -> Array:
+        return self._evaluated(self.fill(points))
+
+    def _attached(self, arguments: list[Any]) -> Array:
+        """(n, m, D) attached Jacobian side by side."""
+        assert self._jacobian is not None
+        blocks = [np.asarray(block) for block in self._jacobian(*arguments)]
+        return np.concatenate(
+            blocks if len(blocks) == len(self.dims) else [blocks[place] for place in self._places], axis=2
+        )
+
+    def _evaluated(self, arguments: list[Any]) -> Array:
         try:
-            result = self._function(*self.fill(points))
+            result = self._function(*arguments)
         except Exception as error:
             name_term(error, self.name)
             raise

@@ -1,35 +1,25 @@
 """Batched numerical differentiation on manifolds.
 
-A factor is evaluated for the whole batch at once, so a Jacobian of d columns costs 2 d batched calls
-whatever the number of factors. Perturbations are on the right: ``x [+] d = x Exp(d)``. Steps are those of
-:mod:`unifg.steps`. What the function returns is copied at once: it may use the same memory at each call.
+A factor is evaluated for the whole batch at once, and where the function allows it (:mod:`unifg.stack`) for many
+perturbations at once: a Jacobian is one call then. Perturbations are on the right: ``x [+] d = x Exp(d)``. Steps are
+those of :mod:`unifg.steps`. What the function returns is copied at once: it may use the same memory at each call.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from copy import copy
-from itertools import product
+from typing import TypeAlias
 
 import numpy as np
 
 from unifg.lie import Manifold
-from unifg.steps import (
-    ANGLE,
-    EPSILON,
-    FAR,
-    FIRST,
-    OTHER,
-    SECOND,
-    TURN,
-    VECTOR,
-    Part,
-    parts_of,
-    rotations,
-    steps_for,
-    uncertainties,
-)
-from unifg.typing import Array
+from unifg.moves import Moves, Near, Steps, directions_of
+from unifg.steps import EPSILON, FAR, FIRST, SECOND, uncertainties
+from unifg.typing import Array, BoolArray
+
+Many: TypeAlias = Callable[[Near, Steps, Moves], Array]
+"""(K, n, ...) values of a function after K moves."""
+ROUNDING = 16.0  # of what a residual sums up: a mixed difference of four values below this is no curvature
 
 
 def jacobian(function: Callable[..., Array], points: Sequence[Array], manifolds: Sequence[Manifold]) -> list[Array]:
@@ -43,35 +33,32 @@ def jacobian(function: Callable[..., Array], points: Sequence[Array], manifolds:
     Returns:
         One (n, m, d_k) array per variable.
     """
-    axes, size = _axes(points, manifolds, FIRST)
-    far = bool((size >= FAR).any())
+    return slopes(one_by_one(function), Near(directions_of(tuple(manifolds)), points))
 
-    def along(axis: _Axis, times: float) -> Array:
-        k = axis.argument
-        ahead, behind = (
-            _copied(function, [*points[:k], axis.moved(points[k], side), *points[k + 1 :]]) for side in (times, -times)
-        )
-        difference: Array = (ahead - behind) / (2.0 * times * axis.half[:, None])
-        return difference
 
-    columns = []
-    for axis in axes:
-        found = along(axis, 1.0)
-        if far:
-            wider = axis.at_least(steps_for(size, FIRST))
-            fourth = (4.0 * along(wider, 1.0) - along(wider, 2.0)) / 3.0
-            doubt = np.where(wider.half > axis.half, uncertainties(size, axis.half), np.inf)
-            believed = (np.abs(fourth - found) <= doubt[:, None]) & (size >= FAR)[:, None]
-            found = np.where(believed, fourth, found)
-        columns.append(found)
-    blocks = np.stack(columns, axis=-1)
-    for turned, R in _turns(points, axes):
+def slopes(many: Many, near: Near) -> list[Array]:
+    """Central differences of a function (n, m) of many moves: one (n, m, d_k) array per variable."""
+    directions = near.directions
+    width, steps = directions.width, near.steps(FIRST)
+    values = many(near, steps, directions.two_sided)
+    found = (values[:width] - values[width:]) / (2.0 * steps.half.T[:, :, None])
+    far = near.size >= FAR
+    if far.any():
+        wider = near.wider(steps, FIRST)
+        values = many(near, wider, directions.four_points)
+        ahead, behind, two_ahead, two_behind = values.reshape(4, width, *values.shape[1:])
+        half = wider.half.T[:, :, None]
+        fourth = (4.0 * ((ahead - behind) / (2.0 * half)) - (two_ahead - two_behind) / (4.0 * half)) / 3.0
+        doubt = np.where(wider.half > steps.half, uncertainties(near.size[:, None], steps.half), np.inf).T[:, :, None]
+        found = np.where((np.abs(fourth - found) <= doubt) & far[:, None], fourth, found)
+    blocks = np.ascontiguousarray(np.moveaxis(found, 0, -1))
+    for turned, R in near.rotations():
         blocks[..., turned] = blocks[..., turned] @ R
-    return np.split(blocks, np.cumsum([manifold.dim for manifold in manifolds])[:-1], axis=-1)
+    return np.split(blocks, directions.ends, axis=-1)
 
 
 def gradient_and_hessian(
-    function: Callable[..., Array], points: Sequence[Array], manifolds: Sequence[Manifold], together: bool = False
+    function: Callable[..., Array], points: Sequence[Array], manifolds: Sequence[Manifold]
 ) -> tuple[Array, Array, Array]:
     """Gradient (n, D), symmetric Hessian (n, D, D), and rounding of the gradient (n, D), of a batched scalar function.
 
@@ -84,44 +71,93 @@ def gradient_and_hessian(
         function: maps arrays like ``points`` to (n,).
         points: one (n, storage_k) array per variable.
         manifolds: the manifold of each variable.
-        together: whether all steps are those of a factor's largest coordinate, for the Hessians of residuals that may
-            round it.
     """
-    near, size = _axes(points, manifolds, FIRST)
-    axes, _ = _axes(points, manifolds, SECOND)
-    if together:
-        axes = [axis.at_least(steps_for(size, SECOND)) for axis in axes]
+    return scalar_slopes(one_by_one(function), Near(directions_of(tuple(manifolds)), points))
 
-    def at(*moves: tuple[_Axis, float]) -> Array:
-        moved = list(points)
-        first, times = moves[0]
-        if len(moves) == 2 and moves[1][0].part is first.part:
-            moved[first.argument] = first.moved(points[first.argument], times, moves[1])
-        else:
-            for axis, times in moves:
-                moved[axis.argument] = axis.moved(moved[axis.argument], times)
-        return _copied(function, moved)
 
-    count, total = len(points[0]), len(axes)
-    gradient, rounding = np.empty((count, total)), np.empty((count, total))
-    hessian = np.empty((count, total, total))
-    centre = _copied(function, points)
-    noise = EPSILON * np.abs(centre)
-    for a, axis in enumerate(axes):
-        first, h = near[a], axis.half
-        two = (at((first, 1.0)) - at((first, -1.0))) / (2.0 * first.half)
-        inside, outside, ahead, behind = (at((axis, times)) for times in (0.5, -0.5, 1.0, -1.0))
-        four = (8.0 * (inside - outside) - (ahead - behind)) / (6.0 * h)
-        doubt = noise / first.half + np.where(size >= FAR, uncertainties(size, first.half), 0.0)
-        believed = np.abs(four - two) <= doubt
-        gradient[:, a] = np.where(believed, four, two)
-        rounding[:, a] = np.where(believed, 3.0 * noise / h, noise / first.half)
-        hessian[:, a, a] = ((ahead - centre) + (behind - centre)) / h**2
-        for b, other in enumerate(axes[:a]):
-            mixed = sum(s * t * at((axis, s), (other, t)) for s, t in product((1.0, -1.0), repeat=2))
-            hessian[:, a, b] = hessian[:, b, a] = mixed / (4.0 * axis.half * other.half)
-    _to_body(points, axes, gradient, hessian)
+def scalar_slopes(many: Many, near: Near) -> tuple[Array, Array, Array]:
+    """What :func:`gradient_and_hessian` returns, of a function (n,) of many moves."""
+    directions, width = near.directions, near.directions.width
+    first, steps = near.steps(FIRST), near.steps(SECOND)
+    values = many(near, first, directions.two_sided)
+    two = (values[:width] - values[width:]).T / (2.0 * first.half)
+    values = many(near, steps, directions.scalar)
+    centre, values = values[0], values[1:]
+    inside, outside, ahead, behind = values[: 4 * width].reshape(4, width, len(centre))
+    h, noise = steps.half, EPSILON * np.abs(centre)[:, None]
+    four = (8.0 * (inside - outside) - (ahead - behind)).T / (6.0 * h)
+    doubt = noise / first.half
+    doubt = doubt + np.where((near.size >= FAR)[:, None], uncertainties(near.size[:, None], first.half), 0.0)
+    believed = np.abs(four - two) <= doubt
+    gradient = np.where(believed, four, two)
+    rounding = np.where(believed, 3.0 * noise / h, noise / first.half)
+    hessian = np.empty((len(centre), width, width))
+    diagonal = np.arange(width)
+    hessian[:, diagonal, diagonal] = ((ahead - centre) + (behind - centre)).T / h**2
+    a, b = directions.lower
+    both, one, other, neither = values[4 * width :].reshape(4, len(a), len(centre))
+    hessian[:, a, b] = hessian[:, b, a] = (both - one - other + neither).T / (4.0 * h[:, a] * h[:, b])
+    _to_body(near, gradient, hessian)
     return gradient, hessian, rounding
+
+
+def weighted_hessian(many: Many, near: Near, weights: Array) -> Array:
+    """(n, D, D) second differences of weights' r for a residual r (n, m) of many moves.
+
+    All steps are those of a factor's largest coordinate, because that is what the residual may round. Most residuals
+    are straight along most of their directions. Which ones is asked anew at every point, because a residual may be
+    straight here and bent elsewhere: the mixed differences along each direction and one that lies across all of them
+    are, to rounding, zero for all rows that count. Only between directions that bend are pairs looked at.
+
+    Args:
+        many: the residual.
+        near: the points.
+        weights: (n, m).
+    """
+    directions, width = near.directions, near.directions.width
+    hessian = np.zeros((len(weights), width, width))
+    if not weights.any():
+        return hessian
+    steps = near.wider(near.steps(SECOND), SECOND)
+    values = many(near, steps, directions.across)
+    centre = values[0]
+    change = values[1:] - centre
+    across = change[0]
+    ahead, behind, mixed = change[1:].reshape(3, width, *centre.shape)
+    slope = ahead - behind
+    reach = 0.5 * (1.0 + np.abs(near.coordinates) / steps.half)
+    rounding = ROUNDING * EPSILON * (np.abs(centre) + np.einsum("nc,cnm->nm", reach, np.abs(slope)))
+    straight = (np.abs(mixed - ahead - across) <= rounding) | (weights == 0.0)
+    bent: BoolArray = ~straight.reshape(width, -1).all(axis=1)
+    chosen = np.flatnonzero(bent)
+    if len(chosen):
+        both = np.einsum("nm,cnm->nc", weights, ahead + behind)
+        hessian[:, chosen, chosen] = both[:, chosen] / steps.half[:, chosen] ** 2
+    if len(chosen) > 1:
+        first, second, moves = directions.pairs(chosen)
+        values = many(near, steps, moves) - centre
+        pairs = np.einsum("nm,cnm->nc", weights, values[: len(first)] + values[len(first) :])
+        pairs -= both[:, first] + both[:, second]
+        pairs /= 2.0 * steps.half[:, first] * steps.half[:, second]
+        hessian[:, first, second] = hessian[:, second, first] = pairs
+    if directions.poses:
+        gradient = np.einsum("nm,cnm->nc", weights, slope) / (2.0 * steps.half)
+        _to_body(near, gradient, hessian)
+    return hessian
+
+
+def one_by_one(function: Callable[..., Array]) -> Many:
+    """Call a function once for each move."""
+
+    def many(near: Near, steps: Steps, moves: Moves) -> Array:
+        return np.stack(
+            [
+                np.array(function(*(stack[0] for stack in near.moved(steps, moves, k, k + 1))), dtype=np.float64)
+                for k in range(moves.count)
+            ]
+        )
+
+    return many
 
 
 def convexified(blocks: Array) -> Array:
@@ -133,100 +169,25 @@ def convexified(blocks: Array) -> Array:
     return result
 
 
-class _Axis:
-    """One direction to step along: an axis of a part of one variable.
-
-    Attributes:
-        argument: which variable.
-        part: of it.
-        half: (n,) half of what a step there and one back come to in the numbers that are stored.
-    """
-
-    def __init__(self, argument: int, part: Part, leaf: Manifold, axis: int, x: Array | None, step: Array) -> None:
-        """Take steps (n,) at the coordinate x (n,), if it is one that is added to."""
-        self.argument, self.part, self._leaf, self._axis, self._x = argument, part, leaf, axis, x
-        self._take(step)
-
-    def _take(self, step: Array) -> None:
-        x = self._x
-        self._step, self.half = step, step if x is None else 0.5 * ((x + step) - (x - step))
-
-    def at_least(self, step: Array) -> _Axis:
-        """The same axis with steps as long as these, or longer."""
-        wider = copy(self)
-        wider._take(np.maximum(self._step, step))
-        return wider
-
-    def moved(self, point: Array, times: float, also: tuple[_Axis, float] | None = None) -> Array:
-        """(n, storage) points so many steps away; ``also`` along another axis of the same part, at the same time."""
-        result, part = np.array(point), self.part
-        if part.kind == VECTOR:
-            result[:, part.start + self._axis] += times * self._step
-            if also:
-                result[:, part.start + also[0]._axis] += also[1] * also[0]._step
-            return result
-        tangent = np.zeros((len(point), part.dim))
-        tangent[:, self._axis] = times * self._step
-        if also:
-            tangent[:, also[0]._axis] = also[1] * also[0]._step
-        stored = result[:, part.start : part.start + part.storage]
-        stored[:] = self._leaf.retract(stored, tangent)
-        return result
-
-
-def _axes(points: Sequence[Array], manifolds: Sequence[Manifold], root: int) -> tuple[list[_Axis], Array]:
-    """One for each tangent direction, in order; and (n,) sizes of the largest coordinates of every factor."""
-    axes: list[_Axis] = []
-    largest = np.zeros(len(points[0]))
-    for k, (point, manifold) in enumerate(zip(points, manifolds, strict=True)):
-        sizes = np.abs(point)
-        own = steps_for(sizes, root)
-        for part, leaf in parts_of([manifold]):
-            stored = slice(part.start, part.start + part.storage)
-            if part.kind in (VECTOR, OTHER):
-                size = sizes[:, stored].max(axis=1)
-                largest = np.maximum(largest, size)
-                if part.turn >= 0 or part.kind == OTHER:
-                    own[:, stored] = steps_for(size, root)[:, None]
-            if part.kind == TURN:
-                own[:, stored] = steps_for(np.ones(()), root)
-            for axis in range(part.dim):
-                place = part.start + (axis if part.kind != OTHER else 0)
-                x = point[:, place] if part.kind in (VECTOR, ANGLE) else None
-                axes.append(_Axis(k, part, leaf, axis, x, own[:, place]))
-    return axes, largest
-
-
-def _turns(points: Sequence[Array], axes: Sequence[_Axis]) -> list[tuple[slice, Array]]:
-    """Columns of the positions that belong to a rotation, and the (n, d, d) rotations."""
-    turns: list[tuple[slice, Array]] = []
-    for column, axis in enumerate(axes):
-        part = axis.part
-        if part.turn >= 0 and (column == 0 or axes[column - 1].part is not part):
-            turns.append((slice(column, column + part.dim), rotations(points[axis.argument], part.turn, part.dim)))
-    return turns
-
-
-def _to_body(points: Sequence[Array], axes: Sequence[_Axis], gradient: Array, hessian: Array) -> None:
+def _to_body(near: Near, gradient: Array, hessian: Array) -> None:
     """Turn derivatives along stored positions into those along the axes of the body, in place.
 
     With t the translation and r the rotation that follows it, the position moves by ``R (t + 1/2 r x t + ...)``: to
     second order a mixed entry of t and r also has half of the gradient along ``r x t``.
     """
-    for columns, R in _turns(points, axes):
-        dim = columns.stop - columns.start
+    for columns, R in near.rotations():
+        stop, turned = columns.stop, _TURNED[columns.stop - columns.start]
         gradient[:, columns] = np.einsum("nk,nki->ni", gradient[:, columns], R)
         hessian[:, columns, :] = np.swapaxes(R, 1, 2) @ hessian[:, columns, :]
         hessian[:, :, columns] = hessian[:, :, columns] @ R
-        slope = gradient[:, columns]
-        for i in range(dim):
-            for j in range(1 if dim == 2 else 3):
-                turned = np.cross(np.eye(3)[2 if dim == 2 else j], np.eye(3)[i])[:dim]
-                bent = 0.5 * slope @ turned
-                hessian[:, columns.start + i, columns.stop + j] += bent
-                hessian[:, columns.stop + j, columns.start + i] += bent
+        bent = 0.5 * np.einsum("nk,ijk->nij", gradient[:, columns], turned)
+        after = slice(stop, stop + turned.shape[1])
+        hessian[:, columns, after] += bent
+        hessian[:, after, columns] += np.swapaxes(bent, 1, 2)
 
 
-def _copied(function: Callable[..., Array], points: Sequence[Array]) -> Array:
-    """What the function returns, safe from its next call."""
-    return np.array(function(*points), dtype=np.float64)
+_TURNED = {
+    2: np.array([[[0.0, 1.0]], [[-1.0, 0.0]]]),
+    3: np.array([[np.cross(r, t) for r in np.eye(3)] for t in np.eye(3)]),
+}
+"""What a turn r makes of a translation t, r x t: axes of t, axes of r, coordinates."""

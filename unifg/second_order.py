@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from weakref import WeakKeyDictionary
+
 import numpy as np
 
 from unifg.compiled import CompiledTerm
@@ -10,7 +12,7 @@ from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.table import POSITION
 from unifg.terms import Cost
-from unifg.typing import Array
+from unifg.typing import Array, IntArray
 
 
 def lagrangian_hessian(program: Program, lin: Linearization, multipliers: Array) -> Array:
@@ -49,10 +51,24 @@ def _add(program: Program, term: CompiledTerm, lin: Linearization, multipliers: 
     else:
         weights = program.rows_of(term, lin.residual, multipliers)
     second = term.second_derivatives(lin.values, weights)
-    width = second.shape[1]
+    if not second.any():
+        return
+    if term not in _places:
+        _places[term] = _find(program, term)
+    factor, row, column, times, place = _places[term]
+    np.add.at(entries, place, times * second[factor, row, column])
+
+
+_places: WeakKeyDictionary[CompiledTerm, tuple[IntArray, IntArray, IntArray, Array, IntArray]] = WeakKeyDictionary()
+
+
+def _find(program: Program, term: CompiledTerm) -> tuple[IntArray, IntArray, IntArray, Array, IntArray]:
+    """Factor, row and column of second derivatives, how often they count, and where in the normal matrix."""
+    width = sum(term.dims)
     start, pairs = int(term.place[POSITION]), width * (width + 1) // 2
     where = program.arrays.positions[start : start + term.count * pairs].reshape(term.count, pairs)
     row, column = np.tril_indices(width)
-    numbers = second[:, row, column]
-    np.add.at(entries, where[where >= 0], numbers[where >= 0])
-    np.add.at(entries, -2 - where[where < -1], 2.0 * numbers[where < -1])
+    factor, pair = np.nonzero(where != -1)
+    place = where[factor, pair]
+    doubled = place < -1
+    return factor, row[pair], column[pair], np.where(doubled, 2.0, 1.0), np.where(doubled, -2 - place, place)

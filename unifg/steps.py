@@ -38,6 +38,7 @@ ONE_SIDED, FIRST, SECOND = 2, 3, 4
 with the cube root, of second ones, and first ones by four points, with the fourth root."""
 SHORTEST = {ONE_SIDED: -23, FIRST: -17, SECOND: -13}  # exponents of two: near eps^(1/2), eps^(1/3) and eps^(1/4)
 EPSILON = float(np.finfo(np.float64).eps)
+SMALLEST_EXPONENT = -1074  # of a double, as math.frexp gives it
 SPACINGS = 17  # h is at least so many powers of two above the spacing of x
 
 FAR = 4096.0  # size of coordinates from which on two points alone are wrong by more than 1e-8
@@ -95,12 +96,20 @@ def compiled_parts(manifolds: Sequence[Manifold]) -> list[Part]:
     return [] if any(part.kind == OTHER for part in parts) else parts
 
 
-def steps_for(sizes: Array, root: int) -> Array:
-    """Steps for coordinates of some size."""
-    exponent = np.frexp(sizes)[1]
+def _table(root: int) -> Array:
+    """Steps for the exponents that doubles have, from the smallest on."""
+    exponent = np.arange(SMALLEST_EXPONENT, 1025)
     grown = SHORTEST[root] + np.maximum(exponent - 1, 0) // root
     result: Array = np.ldexp(1.0, np.maximum(grown, exponent - 53 + SPACINGS))
     return result
+
+
+_TABLES = {root: _table(root) for root in SHORTEST}
+
+
+def steps_for(sizes: Array, root: int) -> Array:
+    """Steps for coordinates of some size."""
+    return _TABLES[root].take(np.frexp(sizes)[1] - SMALLEST_EXPONENT, mode="clip")
 
 
 def uncertainties(size: Array, steps: Array) -> Array:
