@@ -46,7 +46,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "unifg/kkt.py": ("kkt", "infeasible", "solvers", "refusals"),
     "unifg/marginal.py": ("answers", "marginal_prior"),
     "unifg/solution.py": ("answers", "residual_history", "covariance", "refusals", "graph", "kkt"),
-    "unifg/solver.py": ("solvers", "refusals", "infeasible", "own_backend"),
+    "unifg/solver.py": ("answers", "early_ends", "interior_point", "solvers", "refusals", "infeasible", "own_backend"),
     "solvers/augmented_lagrangian.py": ("augmented_lagrangian", "solvers", "infeasible"),
     "solvers/barrier.py": ("interior_point", "solvers", "infeasible"),
     "solvers/barrier_direction.py": ("interior_point", "solvers"),

@@ -290,3 +290,49 @@ def test_check_accepts_jacobians_that_are_as_good_as_differences() -> None:
     x = graph.variables("x", fg.Rn(1), 2)
     graph.minimize(fg.residual(lambda a: 1e4 * a**2, lambda a: [(2e4 * a + 1.0)[:, :, None]], "steep"), x, name="steep")
     assert not graph.check({x: np.ones((2, 1))})
+
+
+@pytest.mark.parametrize("sigma", [1e-9, 1.0, 1e9])
+def test_check_finds_what_is_undetermined_whatever_the_unit(sigma: float) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 3)
+    graph.minimize(lambda a, b: b - a, x[:-1], x[1:], sigma=sigma, name="steps")
+    assert [finding.family for finding in graph.check({x: np.zeros((3, 1))}).findings] == ["x"], (
+        "nothing says where they begin"
+    )
+    graph.minimize(fg.prior, x[0], [0.0], sigma=sigma, name="begin")
+    assert not graph.check({x: np.zeros((3, 1))}).findings
+
+
+@pytest.mark.parametrize("sigma", [1e-6, 1.0, 1e6])
+def test_a_prior_of_what_leaves_is_the_same_in_every_unit(sigma: float) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 2)
+    graph.minimize(fg.prior, x[0], [1.0, -2.0], sigma=sigma, name="prior")
+    graph.minimize(lambda a, b: b - a - [3.0, 0.5], x[0], x[1], sigma=2.0 * sigma, name="step")
+    solution = GaussNewton().solve(graph, {x: np.zeros((2, 2))})
+    reference, information = solution.marginal_prior(["prior", "step"], x[0], x[1])
+    np.testing.assert_allclose(reference, [[4.0, -1.5]], rtol=1e-9)
+    np.testing.assert_allclose(information, np.eye(2) / (5.0 * sigma**2), rtol=1e-9, atol=1e-12 / sigma**2)
+
+
+# ---------------------------------------------------------------- what a solve says of itself
+
+
+def test_a_report_gives_the_number_that_decided() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [2.0])
+    text = GaussNewton().solve(graph, {x: np.zeros((1, 1))}).report()
+    assert "relative offset" in text and "violation" not in text
+    graph.constrain(lambda a: a, x, upper=1.0, name="limit")
+    text = SQP().solve(graph, {x: np.zeros((1, 1))}).report()
+    assert "stationarity" in text and "violation" in text and "relative offset" not in text
+
+
+def test_no_iteration_is_a_limit_like_any_other() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [2.0])
+    solution = GaussNewton(max_iterations=0).solve(graph, {x: np.ones((1, 1))})
+    assert solution.status is fg.Status.ITERATION_LIMIT and solution[x] == 1.0
