@@ -67,13 +67,14 @@ def metrics(solved: SolvedGraph) -> dict[str, Any]:
         "stationarity": solution.stationarity,
         "outliers": int(solved.outliers.sum()),
         "outlier_edges": _pairs(solved),
+        "rivals": [] if solution.verdict is None else [rival.cost for rival in solution.verdict.rivals],
         "seconds": {name: round(value, 6) for name, value in solved.seconds.items()},
     }
 
 
 def summary(solved: SolvedGraph) -> str:
     """The outcome as a table of two columns."""
-    numbers = metrics(solved)
+    numbers, verdict = metrics(solved), solved.solution.verdict
     more = f", {numbers['landmarks']} landmarks" if numbers["landmarks"] else ""
     skipped = ", ".join(f"{tag} ({count})" for tag, count in numbers["skipped_lines"].items())
     milliseconds = {name: 1e3 * value for name, value in solved.seconds.items()}
@@ -92,6 +93,7 @@ def summary(solved: SolvedGraph) -> str:
         ("chi2 at the end", f"{numbers['chi2']:.9g}"),
         ("without outliers", f"{numbers['chi2_inliers']:.9g}" if numbers["outliers"] else ""),
         ("outliers", "" if solved.loss is None else f"{numbers['outliers']} of the loop closures"),
+        ("believed", "" if verdict is None else verdict.sentence(numbers["cost"])),
         ("iterations", f"{numbers['iterations']}"),
         ("status", solved.solution.status.value),
         ("time", ", ".join(f"{name} {value:.1f} ms" for name, value in milliseconds.items())),

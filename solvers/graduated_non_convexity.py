@@ -414,9 +414,11 @@ class _Answer:
         return all(np.array_equal(a, b) for a, b in zip(self.kept, other.kept, strict=True))
 
     def competes_with(self, other: _Answer) -> bool:
-        """Whether this answer costs less than the other as stated, or nearly as little once noise has its size."""
+        """Whether this answer costs less than the other as stated, or believes something else for nearly as little."""
         if self.solution.cost < (1.0 - LESS) * other.solution.cost:
             return True
+        if not any((ours & ~theirs).any() for ours, theirs in zip(self.kept, other.kept, strict=True)):
+            return False  # it only gave up more
         unit = min(self.scatter.unit, other.scatter.unit)
         return self.judged(unit) < other.judged(unit) + max(_bound(goal) for goal in self._goals)
 

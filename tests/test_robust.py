@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from benchmarks.wrong_closures import Claim, with_wrong_closures
+from benchmarks import gtsam_peer
+from benchmarks.wrong_closures import HEAD, METHODS, Claim, rows, with_wrong_closures
 from unifg.errors import BackendError, GraphError, NotConverged
 from unifg.files.g2o import read_g2o
 from unifg.history import Iteration
-from unifg.pose_graphs import PoseGraph, manhattan, sphere
+from unifg.pose_graphs import Edges, PoseGraph, manhattan, sphere
 from unifg.robust import Graduated, Loss
 from unifg.solvers import GaussNewton, GraduatedNonConvexity, LevenbergMarquardt, graduated_non_convexity
 from unifg.solvers.gating import Innovations, Scatter
@@ -334,6 +335,33 @@ def test_a_cheap_answer_far_off_is_not_taken() -> None:
     np.testing.assert_array_equal(solution.verdict.kept["closures"], ~wrong[~pose_graph.edges.odometry])
 
 
+@pytest.mark.parametrize("seed", [0, 2])
+def test_wrong_closures_that_agree_with_each_other(seed: int) -> None:
+    """Eight of them say that a street is another one: each alone would be borne out by the other seven."""
+    sim, rng, count = manhattan(200, seed), np.random.default_rng(seed), 8
+    edges, group, truth = sim.pose_graph.edges, sim.pose_graph.group, sim.truth
+    first = rng.integers(0, 60) + np.arange(count)
+    second = rng.integers(100, 190) + np.arange(count)
+    displaced = group.compose(truth[first[:1]], group.exp(np.array([[0.5, 0.3, 0.1]])))
+    move = group.compose(displaced, group.inverse(truth[second[:1]]))
+    seen = group.compose(group.inverse(truth[first]), group.compose(np.repeat(move, count, axis=0), truth[second]))
+    measured = group.compose(seen, group.exp(0.02 * rng.standard_normal((count, 3))))
+    every = Edges(
+        np.concatenate([edges.first, first]),
+        np.concatenate([edges.second, second]),
+        np.concatenate([edges.measured, measured]),
+        0.02 * np.concatenate([edges.information, np.repeat(sim.pose_graph.closures.information[:1], count, axis=0)]),
+    )
+    pose_graph, wrong = replace(sim.pose_graph, edges=every), np.arange(len(every)) >= len(edges)
+    graph, x, guess = pose_graph.graph(robust=fg.TruncatedLeastSquares(3.37))
+    solution = GraduatedNonConvexity().solve(graph, guess, check=True)
+    graph, y, guess = replace(pose_graph, edges=every[~wrong]).graph()
+    right = GaussNewton().solve(graph, guess, check=True)
+    np.testing.assert_allclose(solution[x][:, :2], right[y][:, :2], atol=1e-4)
+    assert solution.verdict is not None
+    np.testing.assert_array_equal(solution.verdict.kept["closures"], ~wrong[~pose_graph.edges.odometry])
+
+
 def test_a_verdict_names_what_is_doubted_and_what_is_inactive() -> None:
     """Within the threshold a measurement counts, though nothing else is as far off; an inactive one does not count."""
     graph = fg.Graph()
@@ -369,6 +397,30 @@ def test_a_rival_loss_is_named_where_it_finds_more(caplog: pytest.LogCaptureFixt
     assert "DCS(phi=3.85" in caplog.text
     weights = loss.weight(sim.pose_graph.with_poses(solution[x]).squared_errors())
     assert weights[sim.outliers].max() == 0.0 and weights[~sim.outliers].mean() > 0.98
+
+
+def test_the_study_of_wrong_closures_counts_what_each_method_keeps() -> None:
+    """A row per method; GTSAM's GNC agrees with ours where nothing is in doubt, in the plane and in space."""
+    methods = [method for method in METHODS if method != "GTSAM" or gtsam_peer.available()]
+    for clean in (manhattan(100, 1).pose_graph, sphere(5, 8).pose_graph):
+        found = {row[4].split()[0]: row for row in rows(clean, "toy", 0.3, 0, "anywhere", methods)}
+        assert list(found) == methods
+        for row in found.values():
+            assert len(row) == len(HEAD)
+            assert row[7].startswith("0 of ") and int(row[7].split()[-1]) == round(0.3 / 0.7 * len(clean.closures))
+            assert row[8] == "1.0000" and float(row[6]) > 0.95
+            assert float(row[5]) < 0.2
+        if "GTSAM" in found:
+            assert found["unifg"][5:9] == found["GTSAM"][5:9]
+
+
+@pytest.mark.data
+def test_wrong_closures_of_a_long_drive(shared_data: Path) -> None:
+    """One wrong closure that paid by the cost as stated left the answer 6 m off."""
+    clean = read_g2o(shared_data / "pose_graphs" / "M3500.g2o.gz")
+    (row,) = rows(clean, "M3500", 0.1, 0, "anywhere", ["unifg"])
+    assert row[4] == "unifg (CONVERGED)"
+    assert row[5:9] == ("0.000", "1.0000", "0 of 217", "1.0000")
 
 
 @pytest.mark.data

@@ -94,7 +94,11 @@ def test_outliers_are_found_and_named(dirty: Path, tmp_path: Path, capsys: pytes
     assert wrong <= found and len(found - wrong) <= 0.05 * len(sim.pose_graph.closures)
     assert metrics["outliers"] == len(metrics["outlier_edges"])  # type: ignore[arg-type]
     assert metrics["chi2_inliers"] < 1e-3 * metrics["chi2"]  # type: ignore[operator]
-    assert "TruncatedLeastSquares" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "TruncatedLeastSquares" in printed
+    kept = len(sim.pose_graph.closures) - len(found)
+    assert f"Kept {kept} of {len(sim.pose_graph.closures)} in 'closures'" in printed
+    assert printed.count("Another answer") == len(metrics["rivals"])  # type: ignore[arg-type]
     assert "loop closures taken for outliers" in (out / "scene.html").read_text()
 
 

@@ -27,7 +27,7 @@ class Verdict:
         unit: variance of unit weight: how large the squares of whitened residuals are against what was stated, at
             most one.
         rivals: other answers that were found and believe other measurements: those with a lower cost, as stated, and
-            those that can hardly be told from this one. Each has a verdict of its own.
+            those that keep something else and can hardly be told from this one. Each has a verdict of its own.
     """
 
     kept: dict[str, BoolArray]
