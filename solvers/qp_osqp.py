@@ -62,6 +62,7 @@ class OsqpRoute:
         self._limit = max_iterations
         self._workspace: osqp.OSQP | None = None
         self._adapted = False
+        self._asked = 0.0, 0  # digits and iterations, as the workspace has them
 
     @property
     def max_iterations(self) -> int:
@@ -81,8 +82,7 @@ class OsqpRoute:
         nothing = QPAnswer(np.zeros(self.program.size), multipliers, self.name, 0, np.inf)
         if (qp.lower >= INFINITY).any() or (qp.upper <= -INFINITY).any():
             return nothing  # OSQP would print that the limits cross
-        scaling = Scaling.of_subproblem(qp)
-        scaling = replace(scaling, rows=np.where(qp.lower == qp.upper, EQUALITIES, 1.0) * scaling.rows)
+        scaling = Scaling.of_subproblem(qp, EQUALITIES)
         try:
             self._update(scaling.scaled(qp))
             return self._refine(qp, scaling, multipliers, max(FINER * accuracy, TIGHTEST), nothing)
@@ -111,7 +111,7 @@ class OsqpRoute:
                 adaptive_rho_interval=25,
                 check_termination=EVERY,
             )
-            self._adapted = False
+            self._adapted, self._asked = False, (0.0, 0)
             return
         entries = self.program.constraints.compress(qp.jacobian)
         self._workspace.update(q=qp.gradient, l=lower, u=upper, Px=qp.hessian, Ax=entries)
@@ -122,7 +122,10 @@ class OsqpRoute:
         digits, spent = DIGITS, 0
         self._workspace.warm_start(x=np.zeros(self.program.size), y=multipliers / scaling.rows)
         while spent < self.max_iterations and digits >= FINEST:
-            self._workspace.update_settings(eps_abs=digits, max_iter=self.max_iterations - spent)
+            asked = digits, self.max_iterations - spent
+            if asked != self._asked:
+                self._workspace.update_settings(eps_abs=asked[0], max_iter=asked[1])
+                self._asked = asked
             result = self._workspace.solve(raise_error=False)
             spent += int(result.info.iter)
             self._adapted = self._adapted or result.info.rho_updates > 0

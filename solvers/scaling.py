@@ -19,7 +19,7 @@ from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.solvers.qp import QP, QPAnswer
 from unifg.sparse import Symmetric
-from unifg.typing import Array, IntArray
+from unifg.typing import Array, BoolArray, IntArray
 
 PASSES, NEAR = 12, 1.5  # each pass halves what is left in the exponents; factors are rounded anyway
 LARGEST = 2.0**40
@@ -46,17 +46,25 @@ class Scaling:
         return cls(program, np.ones(program.size), np.ones(program.constraints.count))
 
     @classmethod
-    def of(cls, program: Program, lin: Linearization) -> Scaling:
-        """For the problem as it is at ``lin``; factors of one where the units of the graph are good enough."""
-        found = cls(program, *equilibrate(program, program.normal, lin.hessian, lin.constraint_jacobian))
-        factors = np.concatenate([found.columns, found.rows[~program.bound_rows]])
-        modest = factors.max(initial=1.0) <= MODEST and factors.min(initial=1.0) >= 1.0 / MODEST
-        return cls.none(program) if modest else found
+    def of(cls, program: Program, lin: Linearization, neutral: Scaling | None = None) -> Scaling:
+        """For the problem as it is at ``lin``; factors of one where the units of the graph are good enough.
+
+        Args:
+            program: the compiled graph.
+            lin: where.
+            neutral: factors of one, to be returned again; new ones by default.
+        """
+        columns, rows = equilibrate(program, program.normal, lin.hessian, lin.constraint_jacobian)
+        if _modest(columns, rows, program.bound_rows):
+            return neutral or cls.none(program)
+        return cls(program, columns, rows)
 
     @classmethod
-    def of_subproblem(cls, qp: QP) -> Scaling:
-        """For one quadratic subproblem."""
-        return cls(qp.program, *equilibrate(qp.program, qp.pattern, qp.hessian, qp.jacobian))
+    def of_subproblem(cls, qp: QP, equalities: float = 1.0) -> Scaling:
+        """For one quadratic subproblem, with the rows of equalities ``equalities`` times as long."""
+        columns, rows = equilibrate(qp.program, qp.pattern, qp.hessian, qp.jacobian)
+        rows[qp.lower == qp.upper] *= equalities
+        return cls(qp.program, columns, rows)
 
     @cached_property
     def neutral(self) -> bool:
@@ -87,16 +95,18 @@ class Scaling:
 
     def scaled(self, qp: QP) -> QP:
         """The subproblem with scaled unknowns and rows."""
-        return replace(
-            qp,
-            hessian=self.hessian(qp.pattern, qp.hessian),
-            gradient=self.columns * qp.gradient,
-            jacobian=self.jacobian(qp.jacobian),
-            lower=self.rows * qp.lower,
-            upper=self.rows * qp.upper,
-            damping=qp.damping * self.columns**2.0,
-            curved_by=None if qp.curved_by is None else qp.curved_by / self.rows,
-            weights=None if qp.weights is None else qp.weights / self.rows**2.0,
+        return QP(
+            qp.program,
+            qp.lin,
+            qp.pattern,
+            self.hessian(qp.pattern, qp.hessian),
+            self.columns * qp.gradient,
+            self.jacobian(qp.jacobian),
+            self.rows * qp.lower,
+            self.rows * qp.upper,
+            qp.damping * np.square(self.columns),
+            None if qp.curved_by is None else qp.curved_by / self.rows,
+            None if qp.weights is None else qp.weights / np.square(self.rows),
         )
 
     def unscaled(self, answer: QPAnswer) -> QPAnswer:
@@ -122,20 +132,11 @@ def equilibrate(program: Program, pattern: Symmetric, hessian: Array, jacobian: 
     """
     constraints = program.constraints
     columns, rows = np.ones(program.size), np.ones(constraints.count)
-    of_bounds = program.bound_rows[constraints.free_rows]
-    slopes = np.where(of_bounds, 0.0, np.abs(jacobian[constraints.free]))
     _equilibrate(
-        pattern.indptr, pattern.indices, np.abs(hessian), constraints.free_rows, constraints.free_columns, slopes,
-        columns, rows,
+        pattern.indptr, pattern.indices, hessian, constraints.free, constraints.free_rows, constraints.free_columns,
+        program.bound_rows, jacobian, columns, rows,
     )  # fmt: skip
-    columns, rows = _rounded(columns), _rounded(rows)
-    rows[constraints.free_rows[of_bounds]] = 1.0 / columns[constraints.free_columns[of_bounds]]
     return columns, rows
-
-
-def _rounded(factors: Array) -> Array:
-    rounded: Array = np.exp2(np.round(np.log2(np.minimum(np.maximum(factors, 1.0 / LARGEST), LARGEST))))
-    return rounded
 
 
 @compiled
@@ -143,29 +144,44 @@ def _equilibrate(
     indptr: IntArray,
     indices: IntArray,
     hessian: Array,
+    free: IntArray,
     rows: IntArray,
     columns: IntArray,
-    slopes: Array,
+    of_bounds: BoolArray,
+    jacobian: Array,
     column_factors: Array,
     row_factors: Array,
 ) -> None:
-    """Ruiz' passes; entries must not be negative, and those that are not finite do not count."""
+    """Ruiz' passes, and rounding; entries that are not finite do not count."""
     of_columns, of_rows = np.empty(len(column_factors)), np.empty(len(row_factors))
+    entries = np.empty(len(indices) + len(free))  # but zeros, which a fixed pattern has many of: those of H, then of A
+    firsts, seconds = np.empty(len(entries), dtype=np.int64), np.empty(len(entries), dtype=np.int64)
+    count = 0
+    for column in range(len(column_factors)):
+        for at in range(indptr[column], indptr[column + 1]):
+            if hessian[at] != 0.0:
+                entries[count], firsts[count], seconds[count] = abs(hessian[at]), indices[at], column
+                count += 1
+    squares = count
+    for k in range(len(free)):
+        if jacobian[free[k]] != 0.0 and not of_bounds[rows[k]]:
+            entries[count], firsts[count], seconds[count] = abs(jacobian[free[k]]), rows[k], columns[k]
+            count += 1
     for _ in range(PASSES):
         furthest = 1.0
         of_columns[:], of_rows[:] = 0.0, 0.0
-        for column in range(len(column_factors)):
-            for at in range(indptr[column], indptr[column + 1]):
-                row = indices[at]
-                size = hessian[at] * column_factors[row] * column_factors[column]
-                if size < np.inf:
-                    of_columns[row] = max(of_columns[row], size)
-                    of_columns[column] = max(of_columns[column], size)
-        for at in range(len(slopes)):
-            size = slopes[at] * row_factors[rows[at]] * column_factors[columns[at]]
+        for k in range(squares):
+            row, column = firsts[k], seconds[k]
+            size = entries[k] * column_factors[row] * column_factors[column]
             if size < np.inf:
-                of_rows[rows[at]] = max(of_rows[rows[at]], size)
-                of_columns[columns[at]] = max(of_columns[columns[at]], size)
+                of_columns[row] = max(of_columns[row], size)
+                of_columns[column] = max(of_columns[column], size)
+        for k in range(squares, count):
+            row, column = firsts[k], seconds[k]
+            size = entries[k] * row_factors[row] * column_factors[column]
+            if size < np.inf:
+                of_rows[row] = max(of_rows[row], size)
+                of_columns[column] = max(of_columns[column], size)
         for k in range(len(column_factors)):
             if of_columns[k] > 0.0:
                 column_factors[k] /= np.sqrt(of_columns[k])
@@ -176,3 +192,27 @@ def _equilibrate(
                 furthest = max(furthest, of_rows[k], 1.0 / of_rows[k])
         if furthest < NEAR:
             break
+    _round(column_factors)
+    _round(row_factors)
+    for k in range(len(free)):
+        if of_bounds[rows[k]]:
+            row_factors[rows[k]] = 1.0 / column_factors[columns[k]]
+
+
+@compiled
+def _modest(columns: Array, rows: Array, of_bounds: BoolArray) -> bool:
+    """Whether no factor, but for those of bounds, is large or small."""
+    for factor in columns:
+        if not 1.0 / MODEST <= factor <= MODEST:
+            return False
+    for row in range(len(rows)):
+        if not of_bounds[row] and not 1.0 / MODEST <= rows[row] <= MODEST:
+            return False
+    return True
+
+
+@compiled
+def _round(factors: Array) -> None:
+    """Bring every factor to the nearest power of two within the largest ones."""
+    for k in range(len(factors)):
+        factors[k] = np.exp2(np.rint(np.log2(min(max(factors[k], 1.0 / LARGEST), LARGEST))))

@@ -360,7 +360,7 @@ class Subproblems:
         self.elastic = None if options.fallback is None else ElasticRoute(program, self.pattern)
         self._polish = Polish(program)
         self._scaled = options.scaling and not isinstance(self.first, EliminationRoute)
-        self.scaling = Scaling.none(program)
+        self.scaling = self._neutral = Scaling.none(program)
         self._misses = self._resting = 0
         self._first_answered = False
 
@@ -375,7 +375,7 @@ class Subproblems:
             if isinstance(route, (OsqpRoute, PiqpRoute, ElasticRoute)):
                 route.begin()
         if self._scaled:
-            self.scaling = Scaling.of(self.program, lin)
+            self.scaling = Scaling.of(self.program, lin, self._neutral)
         if isinstance(self.first, EliminationRoute):
             require_equalities(self.program, "SQP(qp='elimination')")
 
@@ -428,6 +428,8 @@ class Subproblems:
 
     def _contradicts(self, qp: QP, answer: QPAnswer) -> bool:
         """Whether an answer leaves most of the violation, as the least error of contradicting rows does."""
+        if answer.error <= 0.1 * self._tolerance:  # which is no less than what is left
+            return False
         linear = qp.linear(answer.step)
         left = largest(np.maximum(linear - qp.upper, 0.0) + np.maximum(qp.lower - linear, 0.0))
         return left > max(LEFT * largest(np.maximum(-qp.upper, 0.0) + np.maximum(qp.lower, 0.0)), 0.1 * self._tolerance)
@@ -455,12 +457,15 @@ class Subproblems:
 
 def _size(run: Run, workspace: Subproblems) -> float:
     """The largest KKT number of the present iterate, in scaled units."""
-    program, scaling = run.program, workspace.scaling
+    program, scaling, measured = run.program, workspace.scaling, run.optimality
+    if scaling.neutral:
+        scale = max(1.0, float(np.abs(run.multipliers).mean()) / 100.0) if len(run.multipliers) else 1.0
+        return max(scale * measured.stationarity, measured.violation, measured.complementarity)
     gradient = program.lagrangian_gradient(run.lin, run.multipliers)[program.columns.free]
     return max(
         largest(scaling.columns * gradient),
         largest(scaling.rows * program.violation(run.lin.constraints)),
-        run.optimality.complementarity,
+        measured.complementarity,
     )
 
 

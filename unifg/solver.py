@@ -332,12 +332,10 @@ class Run:
             return Status.NOT_FINITE
         if self.lin.cost < UNBOUNDED_COST:  # out there, derivatives may be lost to rounding and look like zero
             return Status.UNBOUNDED
-        if self.optimality.passes(self.tolerance):
-            return Status.CONVERGED
-        if self.optimality.holds(self.tolerance) and not self.optimality.determined:
-            return Status.UNDETERMINED
         if self.optimality.holds(self.tolerance):
-            return Status.IMPRECISE
+            if not self.optimality.determined:
+                return Status.UNDETERMINED
+            return Status.CONVERGED if self.optimality.passes(self.tolerance) else Status.IMPRECISE
         if self.iterations >= self._solver.max_iterations:
             return Status.ITERATION_LIMIT
         if self.out_of_time:
