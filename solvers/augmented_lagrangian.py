@@ -160,6 +160,7 @@ class AugmentedLagrangian(Solver):
         exact = self.hessian == "exact" and len(weights) > 0
         first, outer, stuck, last = rho, 0, 0, np.inf
         recent: list[float] = []  # violations after the last subproblems
+        hopeful = True  # rejected and corrected steps are the exception, and then come in rows
         while run.status is None:
             outer += 1
             run.penalties = penalty = rho * weights
@@ -169,13 +170,14 @@ class AugmentedLagrangian(Solver):
             slope = primal.slope(run.lin, after)
             while slope > gradient_goal and len(run.history) - before < self.inner_iterations:
                 bend = primal.bend(run.lin, expected) if exact else STRAIGHT
+                primal.hopeful, primal.reached = hopeful, None
                 taken = damped_step(primal, run.lin, multipliers, penalty, damping, bend)
                 if taken is None:
                     stalled = True
                     break
                 values, step, rejected = taken
                 expected = primal.expected_multipliers(run.lin, step, multipliers, penalty, damping.base)
-                lin = run.program.linearize(values)
+                lin, hopeful = primal.linearized(values), rejected == 0 and damping.base is run.lin.constraints
                 after, slope = expected, primal.slope(lin, expected)
                 if not slope <= gradient_goal:
                     plus = primal.next_multipliers(lin.constraints, multipliers, penalty)

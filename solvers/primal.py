@@ -112,6 +112,11 @@ class Primal:
             return values, self.reached
         return values, self.program.evaluate(values, lin.weights)
 
+    def linearized(self, values: Values) -> Linearization:
+        """Linearisation at the values of a step, which may be at hand since its trial."""
+        found = self.reached
+        return found if found is not None and found.values is values else self.program.linearize(values)
+
 
 @compiled
 def _slope(terms: Terms, free: IntArray, gradient: Array, entries: Array, multipliers: Array) -> float:
