@@ -23,6 +23,7 @@ from typing import Literal
 import numpy as np
 
 from unifg.errors import BackendError
+from unifg.jit import compiled
 from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.solver import Run, Solver
@@ -32,7 +33,7 @@ from unifg.solvers.least_violation import leave, settle
 from unifg.solvers.model import STRAIGHT, model_step
 from unifg.solvers.primal import Primal
 from unifg.status import Status
-from unifg.typing import Array
+from unifg.typing import Array, IntArray
 
 LARGEST_PENALTY = 1e10
 LARGEST_EASY = 1e6  # up to here rho grows after subproblems of one step
@@ -97,13 +98,13 @@ class AugmentedLagrangian(Solver):
 
     def search_step(self, run: Run, workspace: Primal, lin: Linearization) -> Array | None:
         """The primal step at the initial damping, with the penalty that suits the present iterate."""
-        rho, weights = self._first_penalties(run)
+        rho, weights = self._first_penalties(run, workspace)
         found = model_step(workspace, lin, run.multipliers, rho * weights, self.damping)
         return None if found is None else found[0]
 
     def iterate(self, run: Run, workspace: Primal) -> Status | None:
         """Alternate primal and dual steps."""
-        rho, weights = self._first_penalties(run)
+        rho, weights = self._first_penalties(run, workspace)
         if self.schedule == "bazzana":
             return self._literal(run, workspace, rho, weights)
         if self.schedule == "bazzana-damped":
@@ -241,9 +242,9 @@ class AugmentedLagrangian(Solver):
                 damping = Damping(self.damping)
         return None
 
-    def _first_penalties(self, run: Run) -> tuple[float, Array]:
+    def _first_penalties(self, run: Run, primal: Primal) -> tuple[float, Array]:
         """Initial rho, and (M,) weights of the rows: their penalties are rho times them."""
-        scale = self._scale(run)
+        scale = self._scale(run, primal)
         weights = scale**2
         if self.penalty is not None:
             return self.penalty, weights
@@ -258,7 +259,7 @@ class AugmentedLagrangian(Solver):
             rho = COLD_PENALTY * max(1.0, abs(run.lin.cost)) / max(1.0, 0.5 * outside)
         return float(np.clip(max(rho, least), 1e-3, 1e6)), weights
 
-    def _scale(self, run: Run) -> Array:
+    def _scale(self, run: Run, primal: Primal) -> Array:
         """(M,) factors that make constraints in different units alike, by the length of their gradients at the start.
 
         The largest entry of the gradient counts, over all factors of a term: one of them may be flat by chance.
@@ -266,13 +267,9 @@ class AugmentedLagrangian(Solver):
         program, rows = run.program, run.program.constraints
         if not self.scaling or self.schedule != "bcl":
             return np.ones(rows.count)
-        length = np.zeros(rows.count)
-        np.maximum.at(length, rows.free_rows, np.abs(run.lin.constraint_jacobian[rows.free]))
-        for term, part in zip(program.constraint_terms, program.slices, strict=True):
-            length[part] = np.tile(length[part].reshape(-1, term.size).max(axis=0), term.count)
-        length[length == 0.0] = 1.0
-        wanted = np.clip(length, SHORTEST, LONGEST) / length
-        return np.clip(wanted, 1.0 / LARGEST_SCALE, LARGEST_SCALE)
+        scale = np.empty(rows.count)
+        _balance(rows.free, rows.free_rows, run.lin.constraint_jacobian, primal.alike, scale)
+        return scale
 
     def _goals(self, run: Run, primal: Primal, rho: float, multipliers: Array, penalty: Array) -> tuple[float, float]:
         """First accuracy of the subproblem's gradient, and the scaled violation that earns a dual step."""
@@ -283,3 +280,16 @@ class AugmentedLagrangian(Solver):
 
     def _stop_rule(self, run: Run, step_norm: float) -> bool:
         return step_norm < self.step_tolerance and run.optimality.violation < self.violation_tolerance
+
+
+@compiled
+def _balance(free: IntArray, rows: IntArray, jacobian: Array, alike: IntArray, scale: Array) -> None:
+    """Write the factor of every row; rows of one number in ``alike`` get the same."""
+    length = np.zeros(len(scale))
+    for k in range(len(free)):
+        group = alike[rows[k]]
+        length[group] = max(length[group], abs(jacobian[free[k]]))
+    for row in range(len(scale)):
+        size = length[alike[row]] or 1.0
+        wanted = min(max(size, SHORTEST), LONGEST) / size
+        scale[row] = min(max(wanted, 1.0 / LARGEST_SCALE), LARGEST_SCALE)

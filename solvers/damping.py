@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from unifg.columns import Values
+from unifg.jit import compiled
 from unifg.linearization import Linearization
 from unifg.solvers.model import STRAIGHT, model_step
 from unifg.solvers.primal import Primal
@@ -121,12 +123,31 @@ def damped_step(
 
 def norm(step: Array) -> float:
     """Euclidean norm, without waking the threads of a BLAS, and of steps whose squares overflow too."""
+    squares = _squares(step)
+    if 1e-200 < squares < 1e200:
+        return math.sqrt(squares)
     size = largest(step)
-    if not 1e-100 < size < 1e100:
-        return size if not 0.0 < size < np.inf else size * norm(step / size)
-    return float(np.sqrt(np.square(step).sum()))
+    return size if not 0.0 < size < np.inf else size * math.sqrt(_squares(step / size))
 
 
 def largest(vector: Array) -> float:
     """Infinity norm."""
-    return float(np.abs(vector).max(initial=0.0))
+    return float(_largest(vector))
+
+
+@compiled
+def _squares(vector: Array) -> float:
+    total = 0.0
+    for number in vector:
+        total += number * number
+    return total
+
+
+@compiled
+def _largest(vector: Array) -> float:
+    result = 0.0
+    for number in vector:
+        if number != number:
+            return number
+        result = max(result, abs(number))
+    return result

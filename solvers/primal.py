@@ -6,6 +6,8 @@ is f itself.
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from unifg.columns import Values
@@ -39,6 +41,14 @@ class Primal:
         self.damping = 0.0
         self.hopeful = False
         self.reached: Linearization | None = None
+
+    @cached_property
+    def alike(self) -> IntArray:
+        """(M,) number of the first row of the same term that means the same in another factor."""
+        parts = [np.zeros(0, dtype=np.intp)]
+        for term, rows in zip(self.program.constraint_terms, self.program.slices, strict=True):
+            parts.append(rows.start + np.tile(np.arange(term.size), term.count))
+        return np.concatenate(parts)
 
     def next_multipliers(self, constraints: Array, multipliers: Array, penalty: Array) -> Array:
         """(M,) lambda+: the first-order dual update, zero for inactive rows."""
@@ -125,6 +135,7 @@ def _slope(terms: Terms, free: IntArray, gradient: Array, entries: Array, multip
     transposed_times(terms, False, entries, multipliers, full)
     for k in range(len(free)):
         size = abs(full[free[k]])
-        if not size <= largest:
-            largest = size
+        if size != size:
+            return size
+        largest = max(largest, size)
     return largest

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
 
 from unifg.columns import Values
+from unifg.jit import compiled
 from unifg.typing import Array
 
 HeldWeights: TypeAlias = dict[str, Array]
@@ -28,7 +30,7 @@ class Evaluation:
     @property
     def finite(self) -> bool:
         """Whether every number is finite."""
-        return bool(np.isfinite(self.cost) and np.isfinite(self.constraints).all())
+        return bool(math.isfinite(self.cost) and all_finite(self.constraints))
 
 
 @dataclass
@@ -73,8 +75,17 @@ class Linearization:
     def finite(self) -> bool:
         """Whether every number is finite."""
         return bool(
-            np.isfinite(self.cost)
-            and np.isfinite(self.gradient).all()
-            and np.isfinite(self.constraints).all()
-            and np.isfinite(self.constraint_jacobian).all()
+            math.isfinite(self.cost)
+            and all_finite(self.gradient)
+            and all_finite(self.constraints)
+            and all_finite(self.constraint_jacobian)
         )
+
+
+@compiled
+def all_finite(numbers: Array) -> bool:
+    """Whether every number is finite."""
+    for number in numbers:
+        if not math.isfinite(number):
+            return False
+    return True
