@@ -229,7 +229,7 @@ class Workspace:
 
     def prepare(self, run: Run, options: InteriorPoint) -> Work:
         """Set up one solve with the present data."""
-        if not np.array_equal(self.program.equality, self.system.equality):
+        if not (self.program.equality == self.system.equality).all():
             self._build(options.max_iterations)
         if len(self.work.log) < options.max_iterations + 2:
             self.work = self.work._replace(log=np.zeros((options.max_iterations + 2, 9)))

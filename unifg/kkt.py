@@ -30,6 +30,7 @@ from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.relative_offset import Factored, relative_offset
 from unifg.rounding import gradient_rounding
+from unifg.table import Terms
 from unifg.typing import Array, IntArray
 from unifg.violation import ViolationModel
 
@@ -92,19 +93,13 @@ def optimality(
             return Optimality(np.inf, np.inf, np.inf, -1, False)
         rounding = _relative_rounding(program, lin, multipliers) if program.differenced else 0.0
         return Optimality(offset.value, 0.0, 0.0, -1, True, offset.determined, rounding)
-    gradient = lin.gradient
-    if program.constraints.count:
-        gradient = gradient.copy()
-        passes.transposed_times(program.arrays, False, lin.constraint_jacobian, multipliers, gradient)
     measured = _measure(
+        program.arrays,
         program.columns.free,
-        gradient,
         lin.gradient,
         lin.constraints,
         lin.constraint_jacobian,
         multipliers,
-        program.lower,
-        program.upper,
     )
     stationarity, violation, complementarity, worst, finite = measured
     if not finite or not np.isfinite(lin.cost):
@@ -130,18 +125,18 @@ def _relative_rounding(program: Program, lin: Linearization, multipliers: Array)
 
 @compiled
 def _measure(
+    terms: Terms,
     free: IntArray,
-    gradient: Array,
     slope: Array,
     constraints: Array,
     entries: Array,
     multipliers: Array,
-    lower: Array,
-    upper: Array,
 ) -> tuple[float, float, float, int, bool]:
     """Stationarity, violation, complementarity, worst row, and whether everything is finite."""
     stationarity, violation, complementarity, size = 0.0, 0.0, 0.0, 0.0
     worst, count, finite = -1, len(constraints), True
+    gradient, lower, upper = slope.copy(), terms.lower, terms.upper
+    passes.transposed_times(terms, False, entries, multipliers, gradient)
     for k in range(len(free)):
         stationarity = max(stationarity, abs(gradient[free[k]]))
     for k in range(len(slope)):

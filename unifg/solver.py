@@ -17,7 +17,7 @@ from unifg.factor_norms import Deferred, factor_norms
 from unifg.graph import Graph
 from unifg.history import HEADER, Iteration, line
 from unifg.kkt import infeasible_stationary, optimality, within_bounds
-from unifg.linearization import Linearization
+from unifg.linearization import Linearization, all_finite
 from unifg.program import Program
 from unifg.relative_offset import Factored
 from unifg.solution import Guess, Solution
@@ -423,7 +423,7 @@ class Prepared:
                     f"{what} of '{name}' have shape {array.shape}, expected {(term.count, term.size)}", term=name
                 )
             result[rows] = array.ravel()
-        if given and not np.isfinite(result).all():
+        if given and not all_finite(result):
             name = self.program.row_name(int(np.flatnonzero(~np.isfinite(result))[0]))[0]
             raise GraphError(f"{what} of '{name}' are not finite", term=name)
         return result

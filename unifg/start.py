@@ -11,6 +11,7 @@ from unifg.columns import Columns, Values
 from unifg.errors import GraphError
 from unifg.lie import LieGroup, Manifold
 from unifg.lie.product import leaves
+from unifg.linearization import all_finite
 from unifg.retraction import Retraction
 from unifg.typing import ArrayLike
 from unifg.variables import Family
@@ -61,8 +62,7 @@ class Start:
                 )
             own[:] = array
         self._retraction.fix(values)
-        fine = bool(np.isfinite(values.flat).all())
-        if not (fine and all(leaf.is_valid(values[f][:, part]).all() for f, part, leaf in self._particular)):
+        if not (all_finite(values.flat) and all(leaf.is_valid(values[f][:, part]).all() for f, part, leaf in self._particular)):
             self._name_invalid(values)
         return values
 
