@@ -127,7 +127,8 @@ class Structure:
             self.first,
             self.last,
             self.least,
-            values if guess is None else np.maximum(np.abs(values), np.abs(guess)),
+            values,
+            values if guess is None else guess,
         )
         if math.isnan(cosine):
             return Offset(np.inf, True, False)
@@ -228,8 +229,8 @@ def _sound(solver: Factorization, diagonal: Array, size: int, weak: float = WEAK
     """Whether all pivots stand out from rounding errors."""
     if not solver.definite:
         return False
-    order = solver.plan.order[:size]
-    return bool((solver.pivots() > weak * diagonal[order]).all())
+    plan = solver.plan
+    return bool(_stands_out(plan.order, plan.signs, plan.pivots, diagonal, size, weak))
 
 
 def _counted(program: Program) -> BoolArray:
@@ -296,6 +297,15 @@ def _extent(manifold: Manifold) -> tuple[IntArray, IntArray, Array]:
 
 
 @compiled
+def _stands_out(order: IntArray, signs: Array, roots: Array, diagonal: Array, size: int, weak: float) -> bool:
+    """Whether all pivots, signs / roots^2, do."""
+    for k in range(size):
+        if not signs[k] > weak * diagonal[order[k]] * roots[k] * roots[k]:
+            return False
+    return True
+
+
+@compiled
 def _bounds(
     residual: Array,
     counted: BoolArray,
@@ -307,6 +317,7 @@ def _bounds(
     last: IntArray,
     least: Array,
     values: Array,
+    guess: Array,
 ) -> tuple[float, float, float]:
     """|r|; the largest |g_k| / sqrt(H_kk) and the norm of sqrt(H_kk) times the size of coordinate k, both over |r|.
 
@@ -327,7 +338,7 @@ def _bounds(
             return norm, math.nan, math.nan
         root = math.sqrt(information)
         for at in range(first[k], last[k]):
-            size = max(size, abs(values[at]))
+            size = max(size, abs(values[at]), abs(guess[at]))
         if norm > 0.0:
             rounding += (root * size / norm) ** 2
             if root > 0.0:
