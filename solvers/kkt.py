@@ -31,7 +31,7 @@ from unifg.linearization import Evaluation, Linearization
 from unifg.program import Program
 from unifg.solver import Run, Solver
 from unifg.solvers.damping import LARGEST, SUFFICIENT, Damping, largest, norm
-from unifg.solvers.kkt_system import KktSystem, fill
+from unifg.solvers.kkt_system import KktSystem, aim, fill
 from unifg.solvers.least_squares import require_squares
 from unifg.solvers.least_violation import leave, settle
 from unifg.solvers.primal import DIAGONAL_FLOOR
@@ -229,6 +229,7 @@ class Newton:
         if not np.array_equal(program.equality, self.system.equality):
             require_equalities(program, solver)
             self._structure(program)
+        self._begun = False  # equal solves take equal steps
 
     def step(
         self, lin: Linearization, multipliers: Array, damping: float, slackness: float, less: float = 0.0
@@ -248,14 +249,16 @@ class Newton:
         """
         n = self.program.size
         fill(self.system.arrays, lin.hessian, lin.constraint_jacobian, self._data)
-        diagonal = self.system.pattern.diagonal
-        curvatures = self._data[diagonal[:n]]
-        curvature = float(curvatures.max(initial=0.0)) or 1.0
-        pull = (largest(lin.constraint_jacobian) or 1.0) ** 2 / curvature
-        self._data[diagonal[:n]] += damping * np.maximum(curvatures, DIAGONAL_FLOOR * curvature)
-        self._data[diagonal[n:]] -= slackness * pull
-        if not self.system.saddle.factor(self._data):
+        if damping or slackness:
+            diagonal = self.system.pattern.diagonal
+            curvatures = self._data[diagonal[:n]]
+            curvature = float(curvatures.max(initial=0.0)) or 1.0
+            pull = (largest(lin.constraint_jacobian) or 1.0) ** 2 / curvature
+            self._data[diagonal[:n]] += damping * np.maximum(curvatures, DIAGONAL_FLOOR * curvature)
+            self._data[diagonal[n:]] -= slackness * pull
+        if not self.system.saddle.factor(self._data, self._begun):
             return None
+        self._begun = True
         kept = np.zeros(len(multipliers))
         if less:
             rows = self.system.arrays.rows
@@ -266,8 +269,17 @@ class Newton:
         """Solve with the last factorisation, the constraints moved by ``bend`` (M,)."""
         program, n, rows = self.program, self.program.size, self.system.arrays.rows
         right = np.empty(n + len(rows))
-        right[:n] = -program.lagrangian_gradient(lin, multipliers)[program.columns.free]
-        right[n:] = program.lower[rows] - (lin.constraints + bend)[rows]
+        aim(
+            program.arrays,
+            program.columns.free,
+            rows,
+            lin.gradient,
+            lin.constraints,
+            lin.constraint_jacobian,
+            multipliers,
+            bend,
+            right,
+        )
         found, error = self.system.saddle.solve(right)
         if not error <= RESIDUAL:
             return None
@@ -277,7 +289,7 @@ class Newton:
 
     def _structure(self, program: Program) -> None:
         self.system = KktSystem(program, program.equality)
-        self._data = np.zeros(self.system.pattern.nnz)
+        self._data, self._begun = np.zeros(self.system.pattern.nnz), False
 
 
 class Merit:

@@ -10,8 +10,10 @@ from unifg.elimination.factorization import Factorization
 from unifg.elimination.plan import Plan
 from unifg.elimination.saddle import SaddlePoint
 from unifg.jit import compiled
+from unifg.passes import transposed_times
 from unifg.program import Program
 from unifg.sparse import Symmetric
+from unifg.table import Terms
 from unifg.typing import Array, BoolArray, IntArray
 
 
@@ -110,3 +112,24 @@ def fill(kkt: KktArrays, hessian: Array, constraint_jacobian: Array, data: Array
         data[kkt.normal[k]] = hessian[k]
     for k in range(len(kkt.entries)):
         data[kkt.places[k]] += constraint_jacobian[kkt.entries[k]]
+
+
+@compiled
+def aim(
+    terms: Terms,
+    free: IntArray,
+    rows: IntArray,
+    gradient: Array,
+    constraints: Array,
+    constraint_jacobian: Array,
+    multipliers: Array,
+    bend: Array,
+    right: Array,
+) -> None:
+    """Write the right-hand side: what is left of stationarity, and of equalities moved by ``bend`` (M,)."""
+    full, n = gradient.copy(), len(free)
+    transposed_times(terms, False, constraint_jacobian, multipliers, full)
+    for k in range(n):
+        right[k] = -full[free[k]]
+    for k in range(len(rows)):
+        right[n + k] = terms.lower[rows[k]] - (constraints[rows[k]] + bend[rows[k]])

@@ -20,13 +20,16 @@ import numpy as np
 
 from unifg.elimination import substitution
 from unifg.elimination.factorization import Factorization
+from unifg.elimination.fronts import factor
+from unifg.elimination.plan import Plan
+from unifg.errors import UnifgError
 from unifg.jit import compiled
 from unifg.typing import Array, IntArray
 
 SHIFT = 1e-12  # on the diagonal of the equilibrated matrix
 SAFE_SHIFT = 2.0**-24  # not lost beside its own inverse; leaves more to refinement
 ACCURATE = 1e-8  # residual above which a factorisation with the small shift counts as spoilt by rounding
-SWEEPS = 4
+SWEEPS, NEAR = 4, 4.0
 CORRECTIONS = 12
 
 
@@ -48,30 +51,38 @@ class SaddlePoint:
         self._indptr = factorization.pattern.indptr.astype(np.int64)
         self._indices = factorization.pattern.indices.astype(np.int64)
         self._data: Array = np.zeros(factorization.pattern.nnz)
+        self._entries = np.zeros_like(self._indptr), np.zeros_like(self._indices), np.zeros_like(self._data)
         self._added: Array = np.zeros(size)
         self._shift = SHIFT
 
-    def factor(self, data: Array) -> bool:
+    def factor(self, data: Array, near: bool = False) -> bool:
         """Equilibrate, shift and factorise; False when an entry is not finite.
 
         Where a pivot vanishes all the same, because rounding took the shift, the larger shift is tried.
 
         Args:
             data: (nnz,) entries in the order of the pattern, kept until the next call.
+            near: whether the last matrix was like this one: then its diagonal D is where the new one starts.
 
         Raises:
             UnifgError: the array has the wrong shape, or the structure asked for makes no sense.
         """
-        self._data = data
-        equilibrate(self._indptr, self._indices, data, self.scale, self._added, SWEEPS)
+        self._data = data = np.ascontiguousarray(data, dtype=np.float64)
+        if data.shape != self._indices.shape:
+            raise UnifgError(f"data has shape {data.shape}; expected {self._indices.shape}")
+        starts, rows, entries = self._entries
+        if not near:
+            self.scale[:] = 1.0
+        enough = NEAR if near else 1.0
+        prepare(self._indptr, self._indices, data, starts, rows, entries, self.scale, self._added, enough)
         return self._factor(SHIFT) or self._factor(SAFE_SHIFT)
 
     def _factor(self, shift: float) -> bool:
         self._shift = shift
-        np.divide(shift, self.scale, out=self._added)
-        self._added /= self.scale
-        self._added[self.unknowns :] *= -1.0
-        return self.factorization.factor(self._data, self._added)
+        factorization = self.factorization
+        success = shifted(factorization.plan, self._data, self.scale, self.unknowns, shift, self._added)
+        factorization.adopt(bool(success))
+        return bool(success)
 
     def solve(self, right: Array) -> tuple[Array, float]:
         """Solve the system that was factorised, without its shift.
@@ -97,9 +108,7 @@ class SaddlePoint:
         out = np.empty(len(right))
         error = substitution.refine(
             self.factorization.plan,
-            self._indptr,
-            self._indices,
-            self._data,
+            *self._entries,
             right,
             self.scale,
             self.unknowns,
@@ -116,20 +125,58 @@ class SaddlePoint:
 
 
 @compiled
-def equilibrate(indptr: IntArray, indices: IntArray, data: Array, scale: Array, size: Array, sweeps: int) -> None:
-    """Find D that makes the largest entry of every row of D K D near one; one where a row is empty.
+def prepare(
+    indptr: IntArray,
+    indices: IntArray,
+    data: Array,
+    starts: IntArray,
+    rows: IntArray,
+    entries: Array,
+    scale: Array,
+    size: Array,
+    enough: float,
+) -> None:
+    """:func:`compress` and :func:`equilibrate`."""
+    compress(indptr, indices, data, starts, rows, entries)
+    equilibrate(starts, rows, entries, scale, size, enough)
+
+
+@compiled
+def shifted(plan: Plan, data: Array, scale: Array, unknowns: int, shift: float, added: Array) -> bool:
+    """Factorise with ``shift`` on the diagonal of the equilibrated matrix, negative for multipliers."""
+    for k in range(len(scale)):
+        added[k] = (shift if k < unknowns else -shift) / scale[k] / scale[k]
+    return factor(plan, data, added)
+
+
+@compiled
+def compress(
+    indptr: IntArray, indices: IntArray, data: Array, starts: IntArray, rows: IntArray, entries: Array
+) -> None:
+    """Leave out zeros, which a fixed pattern has many of: ``starts``, ``rows``, ``entries`` receive the same matrix."""
+    count = 0
+    for column in range(len(indptr) - 1):
+        starts[column] = count
+        for e in range(indptr[column], indptr[column + 1]):
+            rows[count], entries[count] = indices[e], data[e]
+            count += data[e] != 0.0
+    starts[len(indptr) - 1] = count
+
+
+@compiled
+def equilibrate(indptr: IntArray, indices: IntArray, data: Array, scale: Array, size: Array, enough: float) -> None:
+    """Improve D until the largest entry of every row of D K D is near one; a row that is empty keeps its own.
 
     Args:
         indptr: upper triangle of K by columns.
         indices: its rows.
         data: its entries.
-        scale: (n,) receives D.
+        scale: (n,) D: ones, or that of a matrix like this one.
         size: (n,) to work in.
-        sweeps: of Ruiz' iteration; the distance from one halves in the logarithm with each.
+        enough: factor from one that calls for another sweep of Ruiz' iteration, which halves it in the logarithm.
     """
-    scale[:] = 1.0
-    for _ in range(sweeps):
-        size[:] = 0.0
+    for _ in range(SWEEPS):
+        size[:], furthest = 0.0, 1.0
         for column in range(len(scale)):
             own, largest = scale[column], size[column]
             for e in range(indptr[column], indptr[column + 1]):
@@ -139,5 +186,8 @@ def equilibrate(indptr: IntArray, indices: IntArray, data: Array, scale: Array, 
                 size[row] = max(size[row], entry)
             size[column] = max(size[column], largest)
         for row in range(len(scale)):
-            if 0.0 < size[row] < np.inf:
-                scale[row] /= math.sqrt(size[row])
+            own = size[row] if 0.0 < size[row] < np.inf else 1.0
+            scale[row] /= math.sqrt(own)
+            furthest = max(furthest, own, 1.0 / own)
+        if furthest <= enough:
+            break

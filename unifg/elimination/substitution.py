@@ -14,6 +14,7 @@ from unifg.typing import Array, IntArray
 
 MEMORY = 4  # corrections that are combined
 PATIENCE = 2  # of them in a row that may fail to halve the residual
+FAST = 1e-3  # a correction that leaves less of the residual needs no combination, unless that would be the last
 ROUNDING = 1e-7  # of what the rows of unknowns have on the right
 
 
@@ -190,19 +191,18 @@ def residual(
                 bulk[row] += abs(entry * value)
         out[column] -= products
         bulk[column] += sizes
-    worst, least = 0.0, 0.0
-    for part in range(2):
-        error, size = 0.0, least
-        for i in range(first if part else 0, scalars if part else first):
-            if not scale[i] * abs(out[i]) <= error:  # so that NaN is not lost
-                error = scale[i] * abs(out[i])
-            size = max(size, scale[i] * bulk[i])
-        relative = error / size if size > 0.0 else error
-        if not relative <= worst:
-            worst = relative
-        for i in range(first):
-            least = max(least, abs(x[i]) / scale[i], ROUNDING * scale[i] * abs(right[i]))
-    return worst
+    error, size, least = 0.0, 0.0, 0.0
+    for i in range(first):
+        error, size = max(error, scale[i] * abs(out[i])), max(size, scale[i] * bulk[i])
+        least = max(least, abs(x[i]) / scale[i], ROUNDING * scale[i] * abs(right[i]))
+    worst, error, size = error / size if size > 0.0 else error, 0.0, least
+    for i in range(first, scalars):
+        error, size = max(error, scale[i] * abs(out[i])), max(size, scale[i] * bulk[i])
+    worst = max(worst, error / size if size > 0.0 else error)
+    total = 0.0  # what is compared loses NaN, a sum does not
+    for i in range(scalars):
+        total += out[i]
+    return worst if total == total else np.nan
 
 
 @compiled
@@ -242,7 +242,7 @@ def refine(
     scalars = len(right)
     x, rest, trial, after = np.zeros(scalars), right.copy(), np.empty(scalars), np.empty(scalars)
     step, other, bulk = np.empty(scalars), np.empty(scalars), np.empty(scalars)
-    moves, effects = np.zeros((MEMORY, scalars)), np.zeros((MEMORY, scalars))
+    moves, effects = np.empty((MEMORY, scalars)), np.empty((MEMORY, scalars))
     best, idle = np.inf, 0
     out[:] = 0.0
     for k in range(steps + 1):
@@ -255,9 +255,10 @@ def refine(
         if relative > tolerance:
             for i in range(scalars):
                 bulk[i] = scale[i] * (rest[i] - after[i])
-            _remember(k % MEMORY, step, bulk, moves, effects)
-            if k > 0:
-                _least(x, rest, scale, moves, effects, other)
+            kept = min(k + 1, MEMORY)
+            _remember(k % MEMORY, step, bulk, moves[:kept], effects[:kept])
+            if k > 0 and not 100.0 * tolerance < relative < FAST * best:
+                _least(x, rest, scale, moves[:kept], effects[:kept], other)
                 combined = residual(indptr, indices, data, other, right, scale, first, step, bulk)
                 if combined < relative:
                     relative = combined
