@@ -264,7 +264,7 @@ class AugmentedLagrangian(Solver):
 
         The largest entry of the gradient counts, over all factors of a term: one of them may be flat by chance.
         """
-        program, rows = run.program, run.program.constraints
+        rows = run.program.constraints
         if not self.scaling or self.schedule != "bcl":
             return np.ones(rows.count)
         scale = np.empty(rows.count)

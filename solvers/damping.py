@@ -148,6 +148,6 @@ def _largest(vector: Array) -> float:
     result = 0.0
     for number in vector:
         if number != number:
-            return number
+            return np.nan
         result = max(result, abs(number))
     return result

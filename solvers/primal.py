@@ -136,6 +136,6 @@ def _slope(terms: Terms, free: IntArray, gradient: Array, entries: Array, multip
     for k in range(len(free)):
         size = abs(full[free[k]])
         if size != size:
-            return size
+            return np.nan
         largest = max(largest, size)
     return largest

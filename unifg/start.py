@@ -62,7 +62,8 @@ class Start:
                 )
             own[:] = array
         self._retraction.fix(values)
-        if not (all_finite(values.flat) and all(leaf.is_valid(values[f][:, part]).all() for f, part, leaf in self._particular)):
+        fine = all_finite(values.flat)
+        if not (fine and all(leaf.is_valid(values[f][:, part]).all() for f, part, leaf in self._particular)):
             self._name_invalid(values)
         return values
 
