@@ -127,9 +127,9 @@ def aim(
     right: Array,
 ) -> None:
     """Write the right-hand side: what is left of stationarity, and of equalities moved by ``bend`` (M,)."""
-    full, n = gradient.copy(), len(free)
+    full, n = np.zeros(len(gradient)), len(free)
     transposed_times(terms, False, constraint_jacobian, multipliers, full)
     for k in range(n):
-        right[k] = -full[free[k]]
+        right[k] = -(gradient[free[k]] + full[free[k]])
     for k in range(len(rows)):
         right[n + k] = terms.lower[rows[k]] - (constraints[rows[k]] + bend[rows[k]])

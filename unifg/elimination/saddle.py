@@ -23,7 +23,7 @@ from unifg.elimination.factorization import Factorization
 from unifg.elimination.fronts import factor
 from unifg.elimination.plan import Plan
 from unifg.errors import UnifgError
-from unifg.jit import compiled
+from unifg.jit import compiled, in_order
 from unifg.typing import Array, IntArray
 
 SHIFT = 1e-12  # on the diagonal of the equilibrated matrix
@@ -144,9 +144,15 @@ def prepare(
 @compiled
 def shifted(plan: Plan, data: Array, scale: Array, unknowns: int, shift: float, added: Array) -> bool:
     """Factorise with ``shift`` on the diagonal of the equilibrated matrix, negative for multipliers."""
+    shifts(scale, unknowns, shift, added)
+    return factor(plan, data, added)
+
+
+@in_order
+def shifts(scale: Array, unknowns: int, shift: float, added: Array) -> None:
+    """The shift of every row in its own units."""
     for k in range(len(scale)):
         added[k] = (shift if k < unknowns else -shift) / scale[k] / scale[k]
-    return factor(plan, data, added)
 
 
 @compiled

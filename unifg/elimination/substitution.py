@@ -14,7 +14,6 @@ from unifg.typing import Array, IntArray
 
 MEMORY = 4  # corrections that are combined
 PATIENCE = 2  # of them in a row that may fail to halve the residual
-FAST = 1e-3  # a correction that leaves less of the residual needs no combination, unless that would be the last
 ROUNDING = 1e-7  # of what the rows of unknowns have on the right
 
 
@@ -257,7 +256,7 @@ def refine(
                 bulk[i] = scale[i] * (rest[i] - after[i])
             kept = min(k + 1, MEMORY)
             _remember(k % MEMORY, step, bulk, moves[:kept], effects[:kept])
-            if k > 0 and not 100.0 * tolerance < relative < FAST * best:
+            if k > 0:
                 _least(x, rest, scale, moves[:kept], effects[:kept], other)
                 combined = residual(indptr, indices, data, other, right, scale, first, step, bulk)
                 if combined < relative:
