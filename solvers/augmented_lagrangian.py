@@ -40,9 +40,10 @@ LARGEST_EASY = 1e6  # up to here rho grows after subproblems of one step
 COLD_PENALTY = 10.0  # Birgin and Martinez
 FALL = 0.25  # of the change of multipliers over rho, between outer iterations; else rho grows
 FALLING = 0.9  # of the violation, between outer iterations: progress where rho cannot grow
-PATIENCE = 3  # outer iterations in which it did not fall, before the least violation is looked for
+PATIENCE = 3  # outer iterations in which it did not fall, before another way is looked for
 WARM_PENALTY = 100.0
 LONGEST, SHORTEST = 2.0, 0.5  # rows of the constraint Jacobian whose length lies between are left as stated
+GROWN = 0.5  # of a row's scale, when its gradient has become longer
 LARGEST_SCALE = 1e4  # a row that hardly moves at the start says little about its scale
 
 
@@ -154,12 +155,14 @@ class AugmentedLagrangian(Solver):
         multipliers = expected = run.multipliers
         damping = Damping(self.damping)
         scale = np.sqrt(weights)
+        unit = self._scale(primal, run.lin)
         # Goals are for scaled violations, the KKT test and the last resort for those as stated.
         heaviest = LARGEST_PENALTY / min(1.0, float(weights.min(initial=1.0)))
         least = 0.1 * self.tolerance * min(1.0, float(scale.min(initial=1.0)))
         gradient_goal, violation_goal = self._goals(run, primal, rho, multipliers, rho * weights)
         exact = self.hessian == "exact" and len(weights) > 0
         first, outer, stuck, last = rho, 0, 0, np.inf
+        creeping, beginning, least_yet = 0, run.lin.values, np.inf
         recent: list[float] = []  # violations after the last subproblems
         hopeful = True  # rejected and corrected steps are the exception, and then come in rows
         while run.status is None:
@@ -184,6 +187,9 @@ class AugmentedLagrangian(Solver):
                     plus = primal.next_multipliers(lin.constraints, multipliers, penalty)
                     if not slope < (balance := primal.slope(lin, plus)):
                         after, slope = plus, balance
+                if largest(unit) > 1.0 and (less := self._lighter(primal, lin, unit)) is not None:
+                    unit, weights, scale = unit * less, weights * less**2, scale * less
+                    run.penalties = penalty = rho * weights
                 run.accept(
                     lin,
                     after,
@@ -224,8 +230,13 @@ class AugmentedLagrangian(Solver):
                     ending = leave(run)
                     if ending is not None and not lost:
                         return ending
+                unsolved = len(run.history) - before >= self.inner_iterations
+                creeping = creeping + 1 if unsolved and violation > FALL * least_yet else 0
+                least_yet = min(least_yet, violation)
+                if creeping == PATIENCE and not run.has_been_feasible and run.lin is here:  # rho began too small
+                    run.begin_at(run.program.linearize(beginning))
                 if run.lin is not here:  # led astray: from the new point more slowly, and without what was learned
-                    stuck, last, recent = 0, np.inf, []
+                    creeping, stuck, last, least_yet, recent = 0, 0, np.inf, np.inf, []
                     first *= self.penalty_growth**2
                     rho, damping = min(first, heaviest), Damping(self.damping)
                     multipliers = expected = np.zeros(len(weights))
@@ -244,7 +255,7 @@ class AugmentedLagrangian(Solver):
 
     def _first_penalties(self, run: Run, primal: Primal) -> tuple[float, Array]:
         """Initial rho, and (M,) weights of the rows: their penalties are rho times them."""
-        scale = self._scale(run, primal)
+        scale = self._scale(primal, run.lin)
         weights = scale**2
         if self.penalty is not None:
             return self.penalty, weights
@@ -259,17 +270,26 @@ class AugmentedLagrangian(Solver):
             rho = COLD_PENALTY * max(1.0, abs(run.lin.cost)) / max(1.0, 0.5 * outside)
         return float(np.clip(max(rho, least), 1e-3, 1e6)), weights
 
-    def _scale(self, run: Run, primal: Primal) -> Array:
-        """(M,) factors that make constraints in different units alike, by the length of their gradients at the start.
+    def _scale(self, primal: Primal, lin: Linearization) -> Array:
+        """(M,) factors that make constraints in different units alike, by the length of their gradients at a point.
 
         The largest entry of the gradient counts, over all factors of a term: one of them may be flat by chance.
         """
-        rows = run.program.constraints
+        rows = primal.program.constraints
         if not self.scaling or self.schedule != "bcl":
             return np.ones(rows.count)
         scale = np.empty(rows.count)
-        _balance(rows.free, rows.free_rows, run.lin.constraint_jacobian, primal.alike, scale)
+        _balance(rows.free, rows.free_rows, lin.constraint_jacobian, primal.alike, scale)
         return scale
+
+    def _lighter(self, primal: Primal, lin: Linearization, unit: Array) -> Array | None:
+        """(M,) factors that take back some of ``unit`` from rows that looked flat before; None where none does now.
+
+        The square of a speed near rest hardly moves, but where its limit is it does.
+        """
+        wanted = self._scale(primal, lin)
+        less = np.where((unit > 1.0) & (wanted < GROWN * unit), np.maximum(wanted, 1.0) / unit, 1.0)
+        return less if (less < 1.0).any() else None
 
     def _goals(self, run: Run, primal: Primal, rho: float, multipliers: Array, penalty: Array) -> tuple[float, float]:
         """First accuracy of the subproblem's gradient, and the scaled violation that earns a dual step."""

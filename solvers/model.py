@@ -102,8 +102,9 @@ def _minimize(
 ) -> float:
     """Newton's method on the piecewise quadratic; returns the predicted decrease, NaN when a system is singular."""
     curved = len(bend) > 0
-    lower, upper = terms.lower, terms.upper
-    residual, constraints = start_residual.copy(), start_constraints.copy()
+    # From where the model begins: a large penalty would multiply the rounding of a small step added to a value of one.
+    lower, upper = terms.lower - start_constraints, terms.upper - start_constraints
+    residual, constraints = start_residual.copy(), start_constraints - start_constraints
     residual_here, constraints_here = np.empty_like(residual), np.empty_like(constraints)
     residual_move, constraint_move = np.empty_like(residual), np.empty_like(constraints)
     after, weights = np.empty_like(constraints), np.empty_like(constraints)

@@ -92,10 +92,14 @@ class Primal:
     def expected_multipliers(
         self, lin: Linearization, step: Array, multipliers: Array, penalty: Array, base: Array
     ) -> Array:
-        """(M,) lambda+ after a step, by the linear model of the constraints that are ``base`` without a step."""
-        program = self.program
-        moved = base + program.constraints.times(lin.constraint_jacobian, step)
-        return self.next_multipliers(moved, multipliers, penalty)
+        """(M,) lambda+ after a step, by the linear model of the constraints that are ``base`` without a step.
+
+        Base and limit are subtracted before the step is added, so that a large penalty finds no rounding to multiply.
+        """
+        program, after = self.program, np.empty(len(multipliers))
+        moved = program.constraints.times(lin.constraint_jacobian, step)
+        update(moved, program.lower - base, program.upper - base, multipliers, penalty, after)
+        return after
 
     def bend(self, lin: Linearization, multipliers: Array) -> Array:
         """What :meth:`curvature` leaves out of the Hessian: second derivatives of residuals and constraints.

@@ -18,6 +18,8 @@ from problems import STARTS, ecg2o, ecg2o_inequality, pose_beside_disc, short_dr
 from unifg.models import obstacles, unicycle
 from unifg.scenarios.manoeuvres import CASES, ManoeuvreSettings, state_problem
 from unifg.solvers import SQP, AugmentedLagrangian
+from unifg.solvers.model import model_step
+from unifg.solvers.primal import Primal
 from unifg.typing import Array
 from units import drive
 
@@ -275,3 +277,39 @@ def test_units_of_variables_and_rows_are_free(what: str, unit: float) -> None:
     assert solution.converged, solution.report()
     assert solution.cost == pytest.approx(1.70, abs=0.01)
     assert solution.iterations <= 120
+
+
+def test_a_large_penalty_does_not_multiply_the_rounding_of_the_rows() -> None:
+    """Multipliers balance the gradient after one step from the answer, though 1e10 times the rounding of a row is 1e-6.
+
+    Limits of one are where that shows; at zero there is nothing to round.
+    """
+    graph = fg.Graph()
+    p = graph.variables("p", fg.Rn(2), 20)
+    graph.minimize(fg.between, p[:-1], p[1:], [0.3, 0.1])
+    graph.minimize(fg.prior, p, [0.0, 0.0], sigma=3.0)
+    graph.constrain(lambda v: (v**2).sum(axis=1, keepdims=True), p, lower=1.0, upper=1.0, name="rim")
+    angles = np.linspace(0.0, 1.0, 20)
+    guess = {p: np.stack([np.cos(angles), np.sin(angles)], axis=1)}
+    solution = SQP(tolerance=1e-10, hessian="exact").solve(graph, guess)
+    program = graph.compile()
+    lin, primal = program.linearize(program.values_from(solution.values)), Primal(program)
+    multipliers, penalty = solution.dual("rim").ravel() + 1e-7, np.full(20, 1e10)
+    found = model_step(primal, lin, multipliers, penalty, 0.0, primal.bend(lin, multipliers))
+    assert found is not None
+    expected = primal.expected_multipliers(lin, found[0], multipliers, penalty, lin.constraints)
+    assert primal.slope(lin, expected) < 1e-8
+    np.testing.assert_allclose(expected, solution.dual("rim").ravel(), atol=1e-8)
+
+
+def test_a_row_that_is_flat_at_the_start_gets_no_lasting_weight() -> None:
+    """The square of a thrust that is hardly on says nothing of its scale, which shows near the limit."""
+    graph = fg.Graph()
+    u = graph.variables("u", fg.Rn(2), 10)
+    graph.minimize(fg.prior, u, [3.0, 1.0])
+    graph.constrain(lambda v: (v**2).sum(axis=1, keepdims=True), u, upper=1.0, name="push")
+    guess = {u: np.full((10, 2), 1e-3)}
+    solution = AugmentedLagrangian().solve(graph, guess, check=True)
+    plain = AugmentedLagrangian(scaling=False).solve(graph, guess, check=True)
+    assert solution.iterations <= plain.iterations + 2
+    assert solution.penalties["push"].max() <= 10.0 * plain.penalties["push"].max()

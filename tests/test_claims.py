@@ -138,3 +138,14 @@ def test_the_judge_contradicts_what_is_false() -> None:
     seen = Lying().solve(twin.graph, solution.values)
     if seen.status is fg.Status.LOCALLY_INFEASIBLE:
         assert infeasible(seen, judge, 1e-6)[0] == "false"
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+@pytest.mark.parametrize(("kind", "equalities_only"), [("free final time", False), ("thrust cone", True)])
+def test_the_augmented_lagrangian_finds_its_way(kind: str, equalities_only: bool, seed: int) -> None:
+    """Limits of squares that are flat at the guess, and a valley of no mass, where a small penalty leads."""
+    twin, judge = stated(kind, seed, equalities_only)
+    result = answer(AugmentedLagrangian(), twin, judge)
+    assert (result.status, result.claim) == ("CONVERGED", "true"), result
+    assert result.iterations <= 200
+    assert result.cost == pytest.approx(judge.ipopt(twin.guess, 1e-6).cost, rel=1e-4)
