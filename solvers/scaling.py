@@ -3,8 +3,8 @@
 The largest entry of every row and column is brought near one by taking square roots of it out of both, again and again
 (Ruiz, A scaling algorithm to equilibrate both rows and columns norms in matrices, RAL-TR-2001-034). Factors are rounded
 to powers of two: stating a problem in them rounds nothing. Bounds of unknowns say nothing about their scale, and take
-over that of the unknown. A graph whose units are within a thousand of balance is solved in them. Answers, and the test
-they have to pass, stay in the units of the graph.
+over that of the unknown. A graph whose units are within a thousand of balance is solved in them, unless it is one of
+least squares alone, which has no unit of cost. Answers, and the test they have to pass, stay in the units of the graph.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from unifg.sparse import Symmetric
 from unifg.typing import Array, BoolArray, IntArray
 
 PASSES, NEAR = 12, 1.5  # each pass halves what is left in the exponents; factors are rounded anyway
-LARGEST = 2.0**40
+LARGEST = 2.0**60
 MODEST = 2.0**10  # factors up to this change little in double precision, and are left alone
 
 
@@ -55,7 +55,7 @@ class Scaling:
             neutral: factors of one, to be returned again; new ones by default.
         """
         columns, rows = equilibrate(program, program.normal, lin.hessian, lin.constraint_jacobian)
-        if _modest(columns, rows, program.bound_rows):
+        if not program.least_squares and _modest(columns, rows, program.bound_rows):
             return neutral or cls.none(program)
         return cls(program, columns, rows)
 

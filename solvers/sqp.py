@@ -215,6 +215,8 @@ class SQP(Solver):
         slope = merit.slope(qp, answer.step, lin)
         # The QP meets its conditions to its own accuracy only; what that costs in merit is noise.
         slack = ROUNDING * max(1.0, abs(here)) + max(NOISE * merit.price, min(answer.error, accuracy))
+        if program.least_squares:  # what is rounding depends on the cost alone, whose unit is free
+            slack = ROUNDING * abs(here)
         if slope > slack:
             return None
         trial = program.evaluate(values, lin.weights)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -132,3 +132,26 @@ def test_constraints_that_just_meet_are_not(build: Any) -> None:
     for gap in (-1e-5, -1e-3):
         solution = replace(SQP()).solve(*build(gap))
         assert solution.converged, solution.report()
+
+
+@pytest.mark.parametrize("information", [1e-24, 1e-12, 1e-6, 1e6, 1e12, 1e24])
+@pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
+def test_least_squares_has_no_unit_of_cost(hessian: Literal["gauss-newton", "exact"], information: float) -> None:
+    """Neither damping nor what counts as rounding may have one: a curved valley, and eight poses around a loop."""
+    graph = fg.Graph()
+    p = graph.variables("p", fg.Rn(2), 1)
+    graph.minimize(
+        lambda v: np.stack([10.0 * (v[:, 1] - v[:, 0] ** 2), 1.0 - v[:, 0] + 0.1 * v[:, 1] ** 3], axis=1),
+        p, information=information * np.eye(2),
+    )  # fmt: skip
+    solution = SQP(hessian=hessian).solve(graph, {p: [[-1.2, 1.0]]})
+    assert solution.converged, solution.report()
+    assert solution.iterations <= 50
+    rng = np.random.default_rng(3)
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE2, 8)
+    graph.minimize(fg.prior, x[0], [0.0, 0.0, 0.0], information=information * np.eye(3))
+    steps = np.array([1.0, 0.1, 0.5]) + 0.1 * rng.standard_normal((7, 3))
+    graph.minimize(fg.between, x[:-1], x[1:], steps, information=information * np.diag([1.0, 2.0, 10.0]))
+    graph.minimize(fg.between, x[7], x[0], [1.0, 0.0, 0.7], information=information * np.eye(3))
+    assert SQP(hessian=hessian).solve(graph, {x: 0.5 * rng.standard_normal((8, 3))}).converged
