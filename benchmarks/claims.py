@@ -23,10 +23,10 @@ from tqdm import tqdm
 
 import unifg as fg
 from benchmarks import twin_flights, twin_ground, twin_machines
+from benchmarks.backends import CONSTRAINED, EQUALITIES_ONLY
 from benchmarks.exact_judge import Judge, Peer
 from benchmarks.report import CHECKOUT, OUT, code_digest, machine, put_results, table
 from benchmarks.twins import Twin
-from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
 
 TOLERANCE = 1e-6
 SAME = 1e-4  # relative difference below which two costs are one optimum
@@ -54,15 +54,7 @@ KINDS: dict[str, Callable[..., Twin]] = {
     "payload": twin_machines.payload,
     "orbit": twin_flights.orbit,
 }
-BACKENDS: dict[str, fg.Solver] = {
-    "alm": AugmentedLagrangian(),
-    "sqp": SQP(),
-    "sqp exact": SQP(hessian="exact"),
-    "sqp graph": SQP(qp="graph"),
-    "ipm": InteriorPoint(),
-    "penalty": Penalty(),
-}
-EQUALITY_BACKENDS: dict[str, fg.Solver] = {"kkt": KKT(), **BACKENDS}
+EQUALITY_BACKENDS: dict[str, fg.Solver] = {"kkt": EQUALITIES_ONLY["kkt"], **CONSTRAINED}
 
 
 @dataclass
@@ -292,10 +284,10 @@ def main(arguments: list[str] | None = None) -> int:
     jobs: list[tuple[str, Callable[..., Twin], int, dict[str, fg.Solver], bool]] = []
     for name, build in KINDS.items():
         if not options.kinds or name in options.kinds:
-            jobs += [(name, build, seed, chosen(BACKENDS), False) for seed in range(options.seeds)]
+            jobs += [(name, build, seed, chosen(CONSTRAINED), False) for seed in range(options.seeds)]
             jobs += [(name, build, seed, chosen(EQUALITY_BACKENDS), True) for seed in range(options.seeds)]
     if not options.kinds or "parking" in options.kinds:
-        jobs += [("parking", PARKING, seed, chosen(BACKENDS), False) for seed in range(options.parkings)]
+        jobs += [("parking", PARKING, seed, chosen(CONSTRAINED), False) for seed in range(options.parkings)]
     done = {(case.kind, case.seed, case.equalities_only) for case in cases}
     jobs = [] if options.report else [job for job in jobs if (job[0], job[2], job[4]) not in done]
     with store.open("a", encoding="utf-8") as file:

@@ -9,24 +9,15 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from benchmarks.backends import CONSTRAINED, EQUALITIES_ONLY
 from unifg.kkt import infeasible_stationary
 from unifg.models import obstacles, unicycle
-from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
+from unifg.solvers import SQP, AugmentedLagrangian
 from unifg.solvers.least_violation import least_violation
 from unifg.typing import Array
 from units import drive
 
-BACKENDS: dict[str, fg.Solver] = {
-    "kkt": KKT(),
-    "kkt-full": KKT(full_steps=True),
-    "kkt-lm": KKT(globalization="levenberg-marquardt"),
-    "penalty": Penalty(),
-    "alm": AugmentedLagrangian(),
-    "sqp": SQP(),
-    "sqp-exact": SQP(hessian="exact"),
-    "sqp-graph": SQP(qp="graph"),
-    "ipm": InteriorPoint(),
-}
+BACKENDS = {**EQUALITIES_ONLY, **CONSTRAINED}
 LEAST = 0.00253189415  # squared, of a drive whose end is out of reach
 Problem = tuple[fg.Graph, dict[fg.Family, Array]]
 
@@ -65,7 +56,7 @@ def test_contradicting_equalities_end_at_the_least_violation(name: str, weight: 
     assert "Largest violation" in solution.report()
 
 
-@pytest.mark.parametrize("name", [name for name in BACKENDS if name != "kkt-full"])
+@pytest.mark.parametrize("name", [name for name in BACKENDS if name != "kkt full"])
 def test_one_impossible_row_among_others_is_named(name: str) -> None:
     graph, guess = chain()
     solution = BACKENDS[name].solve(graph, guess)
@@ -86,7 +77,7 @@ def saddle(away: float = 0.0) -> Problem:
     return graph, {x: np.array([[away, 0.0]])}
 
 
-@pytest.mark.parametrize("name", [name for name in BACKENDS if name != "kkt-full"])
+@pytest.mark.parametrize("name", [name for name in BACKENDS if name != "kkt full"])
 def test_a_saddle_of_the_violation_is_not_taken_for_its_minimum(name: str) -> None:
     graph, guess = saddle()
     solution = BACKENDS[name].solve(graph, guess)
@@ -122,7 +113,7 @@ def test_what_was_feasible_once_is_not_called_infeasible(name: str) -> None:
     """Whatever valley a backend goes astray in: it started where the constraint holds."""
     graph, guess = bay()
     assert BACKENDS[name].solve(graph, guess).status is not fg.Status.LOCALLY_INFEASIBLE
-    if name != "kkt-full":  # full steps come across the root
+    if name != "kkt full":  # full steps come across the root
         x = graph.families["x"]
         assert BACKENDS[name].solve(graph, {x: [[1.5]]}).status is fg.Status.LOCALLY_INFEASIBLE  # this start is not
 
@@ -133,7 +124,7 @@ def test_the_unit_of_an_unknown_does_not_decide_what_is_infeasible(unit: float) 
     graph, guess = drive(position=unit)
     program = graph.compile()
     assert not infeasible_stationary(program, program.linearize(program.values_from(guess)), 1e-6)
-    for name in ("sqp", "sqp-graph", "ipm"):
+    for name in ("sqp", "sqp graph", "ipm"):
         assert BACKENDS[name].solve(graph, guess).status is not fg.Status.LOCALLY_INFEASIBLE, name
     graph, guess = drive(position=unit, blocked=True)
     program = graph.compile()

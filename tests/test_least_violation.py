@@ -8,26 +8,17 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
+from benchmarks.backends import CONSTRAINED, EQUALITIES_ONLY
+from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
 
 Expected = tuple[fg.Graph, dict[fg.Family, Array], dict[str, float]]
 
-EQUALITIES: dict[str, fg.Solver] = {
-    "kkt": KKT(),
-    "kkt-full": KKT(full_steps=True),
-    "kkt-lm": KKT(globalization="levenberg-marquardt"),
-    "sqp-elimination": SQP(qp="elimination"),
-}
-BACKENDS: dict[str, fg.Solver] = {
-    "penalty": Penalty(),
-    "alm": AugmentedLagrangian(),
-    "alm-gauss-newton": AugmentedLagrangian(hessian="gauss-newton"),
-    "sqp": SQP(),
-    "sqp-exact": SQP(hessian="exact"),
-    "sqp-graph": SQP(qp="graph"),
-    "ipm": InteriorPoint(),
-    "ipm-gauss-newton": InteriorPoint(hessian="gauss-newton"),
+EQUALITIES = {**EQUALITIES_ONLY, "sqp elimination": SQP(qp="elimination")}
+BACKENDS = {
+    **CONSTRAINED,
+    "alm gauss-newton": AugmentedLagrangian(hessian="gauss-newton"),
+    "ipm gauss-newton": InteriorPoint(hessian="gauss-newton"),
 }
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from unifg import passes
 from unifg.binding import Binding
 from unifg.buffers import Buffers
+from unifg.clean_hands import require_clean
 from unifg.columns import Columns, Values
 from unifg.compiled import CompiledTerm
 from unifg.differentiation import convexified
@@ -30,7 +31,6 @@ from unifg.terms import Constraint, Cost, ScalarCost
 from unifg.touched import require_touched, term_columns
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 from unifg.variables import Data, Family
-from unifg.vetting import require_clean
 
 if TYPE_CHECKING:
     from unifg.graph import Graph

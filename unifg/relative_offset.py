@@ -30,11 +30,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from unifg.elimination.factorization import Factorization
+from unifg.extents import extents
 from unifg.jit import compiled
-from unifg.lie import SE2, SE3, SO2, SO3, Manifold, Product, Rn
 from unifg.linearization import Linearization
 from unifg.program import Program
 from unifg.second_order import lagrangian_hessian
+from unifg.steps import ANGLE, TURN
 from unifg.touched import term_columns
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -262,38 +263,10 @@ def _idle(program: Program, diagonal: Array) -> BoolArray:
 
 
 def _extents(program: Program) -> tuple[IntArray, IntArray, Array]:
-    """Where the numbers stand that say how large each unknown coordinate is."""
-    first = np.zeros(program.columns.width, dtype=np.intp)
-    last, least = first.copy(), np.zeros(program.columns.width)
-    for family in program.families:
-        dim = family.manifold.dim
-        begin, end, smallest = _extent(family.manifold)
-        member = np.arange(family.count)[:, None] * family.manifold.storage + program.columns.storage[family]
-        offset = program.columns.offsets[family]
-        part = slice(offset, offset + family.count * dim)
-        first[part], last[part] = (begin + member).ravel(), (end + member).ravel()
-        least[part] = np.tile(smallest, family.count)
-    free = program.columns.free
-    return first[free], last[free], least[free]
-
-
-def _extent(manifold: Manifold) -> tuple[IntArray, IntArray, Array]:
-    """(d,) first and last storage of each tangent coordinate of one manifold, and the least size."""
-    dim, own = manifold.dim, np.arange(manifold.dim)
-    if isinstance(manifold, Product):
-        parts = [(part, _extent(part.manifold)) for part in manifold.components.values()]
-        first = np.concatenate([part.storage.start + found[0] for part, found in parts])
-        last = np.concatenate([part.storage.start + found[1] for part, found in parts])
-        return first, last, np.concatenate([found[2] for _, found in parts])
-    if isinstance(manifold, Rn):
-        return own, own + 1, np.zeros(dim)
-    nothing = np.zeros(dim, dtype=np.intp)
-    if manifold in (SO2, SO3):
-        return nothing, nothing, np.ones(dim)
-    if manifold in (SE2, SE3):
-        position = 2 if manifold is SE2 else 3
-        return nothing, np.where(own < position, position, 0), np.where(own < position, 0.0, 1.0)
-    return nothing, nothing + manifold.storage, np.zeros(dim)
+    """Where the numbers stand that say how large each unknown coordinate is; angles have none, but a least size."""
+    first, last, kinds = (place[program.columns.free] for place in extents(program))
+    angles = (kinds == ANGLE) | (kinds == TURN)
+    return np.where(angles, 0, first), np.where(angles, 0, last), angles.astype(np.float64)
 
 
 @compiled

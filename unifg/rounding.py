@@ -13,14 +13,14 @@ small.
 from __future__ import annotations
 
 import math
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from unifg.extents import extents
 from unifg.jit import compiled
 from unifg.linearization import Linearization
 from unifg.program import Program
-from unifg.steps import EPSILON, FIRST, OTHER, TURN, parts_of, step_for
+from unifg.steps import EPSILON, FIRST, step_for
 from unifg.table import COLUMN, COST, COUNT, DIFFERENCED, KIND, ROW, ROWS, WIDTH, Terms
 from unifg.typing import Array, IntArray
 
@@ -37,7 +37,7 @@ def gradient_rounding(program: Program, lin: Linearization, multipliers: Array) 
         return np.zeros(0)
     total = np.zeros(program.columns.width)
     if program.table.differenced:
-        first, last = _extents(program)
+        first, last, _ = extents(program)
         _add(
             program.arrays,
             lin.residual,
@@ -51,27 +51,6 @@ def gradient_rounding(program: Program, lin: Linearization, multipliers: Array) 
     if program.scalar_terms:
         total += lin.rounding
     return total[program.columns.free]
-
-
-_known: WeakKeyDictionary[Program, tuple[IntArray, IntArray]] = WeakKeyDictionary()
-
-
-def _extents(program: Program) -> tuple[IntArray, IntArray]:
-    """Storage whose largest number rules the step along each tangent coordinate; none for quaternions."""
-    if program not in _known:
-        columns = program.columns
-        first, last = np.zeros(columns.width, dtype=np.int64), np.zeros(columns.width, dtype=np.int64)
-        for family in columns.families:
-            for part, _ in parts_of([family.manifold]):
-                shared = part.turn >= 0 or part.kind == OTHER
-                for axis in range(part.dim if part.kind != TURN else 0):
-                    members = np.arange(family.count)
-                    column = columns.offsets[family] + members * family.manifold.dim + part.column + axis
-                    start = columns.storage[family] + members * family.manifold.storage + part.start
-                    first[column] = start if shared else start + axis
-                    last[column] = start + part.storage if shared else start + axis + 1
-        _known[program] = first, last
-    return _known[program]
 
 
 @compiled
