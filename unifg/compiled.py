@@ -119,7 +119,9 @@ class CompiledTerm:
         active = self.term.active
         mask = data.get(active, active.value) if isinstance(active, Data) else active
         self.active: BoolArray | None = None if mask is None or mask.all() else mask.astype(bool)
-        self._bind_stacks()
+        each = [k for k, a in enumerate(self.term.arguments) if isinstance(a, Data) and a.each]
+        for stack in (self._stack, self._jacobian_stack):
+            stack.bind(self._arguments, self._places, each)
         if hasattr(self, "size"):
             self._bind_parameters(data)
 
@@ -136,7 +138,8 @@ class CompiledTerm:
             self._arguments[place] = value = data.get(handle, handle.value)
             first, size = self._blocks[place]
             self._packed[:, first : first + size] = value.reshape(-1, size)
-        self._bind_stacks()
+        self._stack.forget()
+        self._jacobian_stack.forget()
         return False
 
     def settle(self, parameters: Array) -> None:
@@ -270,11 +273,6 @@ class CompiledTerm:
         self.parameter_count = self.parameter_spread = 0
         if self.kernel is not None:
             self._pack(self.kernel)
-
-    def _bind_stacks(self) -> None:
-        each = [k for k, a in enumerate(self.term.arguments) if isinstance(a, Data) and a.each]
-        for stack in (self._stack, self._jacobian_stack):
-            stack.bind(self._arguments, self._places, each)
 
     def _pack(self, kernel: Kernel) -> None:
         """Put the kernel's parameters side by side, and after them the constants in the place of variables."""

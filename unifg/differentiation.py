@@ -18,7 +18,7 @@ from unifg.steps import EPSILON, FAR, FIRST, SECOND, uncertainties
 from unifg.typing import Array, BoolArray
 
 Many: TypeAlias = Callable[[Near, Steps, Moves], Array]
-"""(K, n, ...) values of a function after K moves."""
+"""(K, n, ...) values of a function after K moves, which the next call may overwrite."""
 ROUNDING = 16.0  # of what a residual sums up: a mixed difference of four values below this is no curvature
 
 
@@ -41,19 +41,21 @@ def slopes(many: Many, near: Near) -> list[Array]:
     directions = near.directions
     width, steps = directions.width, near.steps(FIRST)
     values = many(near, steps, directions.two_sided)
-    found = (values[:width] - values[width:]) / (2.0 * steps.half.T[:, :, None])
+    found = np.subtract(values[:width], values[width:], out=values[:width])
+    found /= 2.0 * steps.half.T[:, :, None]
     far = near.size >= FAR
     if far.any():
-        wider = near.wider(steps, FIRST)
+        found, wider = found.copy(), near.wider(steps, FIRST)
         values = many(near, wider, directions.four_points)
         ahead, behind, two_ahead, two_behind = values.reshape(4, width, *values.shape[1:])
         half = wider.half.T[:, :, None]
         fourth = (4.0 * ((ahead - behind) / (2.0 * half)) - (two_ahead - two_behind) / (4.0 * half)) / 3.0
         doubt = np.where(wider.half > steps.half, uncertainties(near.size[:, None], steps.half), np.inf).T[:, :, None]
         found = np.where((np.abs(fourth - found) <= doubt) & far[:, None], fourth, found)
-    blocks = np.ascontiguousarray(np.moveaxis(found, 0, -1))
+    blocks = np.array(np.moveaxis(found, 0, -1), order="C")
     for turned, R in near.rotations():
-        blocks[..., turned] = blocks[..., turned] @ R
+        along = blocks[..., turned]
+        blocks[..., turned] = sum(along[..., k : k + 1] * R[:, None, k] for k in range(R.shape[1]))
     return np.split(blocks, directions.ends, axis=-1)
 
 
@@ -120,7 +122,7 @@ def weighted_hessian(many: Many, near: Near, weights: Array) -> Array:
         return hessian
     steps = near.wider(near.steps(SECOND), SECOND)
     values = many(near, steps, directions.across)
-    centre = values[0]
+    centre = values[0].copy()
     change = values[1:] - centre
     across = change[0]
     ahead, behind, mixed = change[1:].reshape(3, width, *centre.shape)
@@ -150,12 +152,7 @@ def one_by_one(function: Callable[..., Array]) -> Many:
     """Call a function once for each move."""
 
     def many(near: Near, steps: Steps, moves: Moves) -> Array:
-        return np.stack(
-            [
-                np.array(function(*(stack[0] for stack in near.moved(steps, moves, k, k + 1))), dtype=np.float64)
-                for k in range(moves.count)
-            ]
-        )
+        return np.stack([np.array(function(*near.after(steps, moves, k))) for k in range(moves.count)])
 
     return many
 

@@ -116,7 +116,7 @@ class Directions:
         self.ends = np.cumsum([manifold.dim for manifold in manifolds])[:-1]
         self.places, self.summed = np.array(places, dtype=np.int64), np.array(summed, dtype=bool)
         self.all_summed, self.ruling = all(summed), np.array(numbers, dtype=np.int64)
-        self.storage, self.all_rule = at, len(numbers) == at
+        self.storage, self.all_rule, self.in_place = at, len(numbers) == at, places == list(range(at))
         self._pairs: dict[bytes, tuple[IntArray, IntArray, Moves]] = {}
         one = np.eye(column)
         self.two_sided = Moves(self, np.concatenate([one, -one]))
@@ -159,19 +159,19 @@ class Near:
         self.directions, self.points = directions, points
         self.joined = points[0] if len(points) == 1 else np.concatenate(points, axis=1)
         ruling = self.joined if directions.all_rule else self.joined[:, directions.ruling]
+        self._stepped = self.joined if directions.in_place else self.joined[:, directions.places]
         self.size: Array = np.abs(ruling).max(axis=1, initial=0.0)
 
     @property
     def coordinates(self) -> Array:
         """(n, D) numbers that steps are added to; zero for directions of another kind."""
-        directions = self.directions
-        x = self.joined[:, directions.places]
+        directions, x = self.directions, self._stepped
         return x if directions.all_summed else np.where(directions.summed, x, 0.0)
 
     def steps(self, root: int) -> Steps:
         """Steps by the rule of :mod:`unifg.steps`."""
         directions = self.directions
-        x = self.joined[:, directions.places]
+        x = self._stepped
         size: Array = np.abs(x)
         for columns, stored in directions.shared:
             size[:, columns] = np.abs(self.joined[:, stored]).max(axis=1)[:, None]
@@ -182,7 +182,7 @@ class Near:
     def wider(self, steps: Steps, root: int) -> Steps:
         """Steps as long as those of the largest coordinate, or longer."""
         least = steps_for(self.size, root)[:, None]
-        return self._realised(self.joined[:, self.directions.places], np.maximum(steps.length, least))
+        return self._realised(self._stepped, np.maximum(steps.length, least))
 
     def _realised(self, x: Array, length: Array) -> Steps:
         half = 0.5 * ((x + length) - (x - length))
@@ -210,6 +210,21 @@ class Near:
                     found = leaf.retract(stored.reshape(-1, part.storage), tangent.reshape(-1, part.dim))
                     stack[rows, :, part.start : part.start + part.storage] = found.reshape(stored.shape)
             result.append(stack)
+        return result
+
+    def after(self, steps: Steps, moves: Moves, k: int) -> list[Array]:
+        """(n, storage) points after one move, one array per variable; what it leaves where it is is not copied."""
+        result = []
+        for point, (move, axis, place, times), turned in zip(self.points, moves.added, moves.turned, strict=True):
+            entries = np.flatnonzero(move == k)
+            parts = [(part, leaf, columns, many[rows == k]) for part, leaf, columns, rows, many in turned if k in rows]
+            moved = np.array(point) if len(entries) or parts else point
+            for e in entries:
+                moved[:, place[e]] += times[e] * steps.length[:, axis[e]]
+            for part, leaf, columns, multiples in parts:
+                stored = moved[:, part.start : part.start + part.storage]
+                stored[:] = leaf.retract(stored, multiples[0] * steps.length[:, columns])
+            result.append(moved)
         return result
 
     def rotations(self) -> list[tuple[slice, Array]]:

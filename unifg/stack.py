@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,8 @@ from unifg.moves import Moves, Near, Steps
 from unifg.typing import Array
 
 logger = logging.getLogger("unifg")
-LONGEST = 1 << 16  # numbers in the points of one call, which should fit into a cache with all that becomes of them
+LONGEST = 1 << 15  # numbers in the points of one call, which should fit into a cache with all that becomes of them
+SHORTEST = 4  # batches in a call that are worth it
 ALIKE = 1e-12  # relative difference that another order of summation may make
 
 
@@ -36,6 +38,7 @@ class Stack:
         self._places: list[int] = []
         self._each: list[int] = []
         self._long: bool | None = None  # whether it takes long batches; None before it was tried
+        self._memory = np.empty(0)  # for results of many calls: fresh memory of that size costs more than they do
         self._tiled: dict[tuple[int, int], Array] = {}
 
     def bind(self, arguments: list[Any], places: list[int], each: list[int]) -> None:
@@ -45,35 +48,43 @@ class Stack:
         if self._long is None:
             self._each = each
 
+    def forget(self) -> None:
+        """Constants have changed in place."""
+        self._tiled.clear()
+
     def __call__(self, near: Near, steps: Steps, moves: Moves) -> Array:
-        """(K, n, ...) what the function returns after each of K moves."""
+        """(K, n, ...) what the function returns after each of K moves, until it is called again."""
         if self._long is None:
             self._long = self._takes_long_batches(near, steps)
         count = len(near.joined)
         length = max(1, LONGEST // (count * near.directions.storage)) if self._long else 1
+        if length < SHORTEST:
+            return self._one_by_one(near, steps, moves)
         results: list[Array] = []
-        at = 0
-        while at < moves.count:
-            last = min(at + length, moves.count)
-            points = near.moved(steps, moves, at, last)
-            if last - at == 1:
-                results.append(self._single(points, 0)[None])
-            else:
-                found = self._batch(points)
-                if found is None:  # one by one it works, or fails as it would have alone
-                    logger.info("the residual '%s' does not take long batches", self.name)
-                    self._long, length = False, 1
-                    continue
-                results.append(found)
-            at = last
+        for at in range(0, moves.count, length):
+            found = self._batch(near.moved(steps, moves, at, min(at + length, moves.count)))
+            if found is None:  # one by one it works, or fails as it would have alone
+                logger.info("the residual '%s' does not take long batches", self.name)
+                self._long = False
+                return self._one_by_one(near, steps, moves)
+            results.append(found)
         return results[0] if len(results) == 1 else np.concatenate(results)
 
-    def _single(self, points: list[Array], k: int) -> Array:
-        """(n, ...) after one move."""
-        arguments = list(self._arguments)
-        for place, stack in zip(self._places, points, strict=True):
-            arguments[place] = stack[k]
-        return np.array(self._function(arguments))
+    def _one_by_one(self, near: Near, steps: Steps, moves: Moves) -> Array:
+        """The same, a call for each move."""
+        results = np.empty(0)
+        for k in range(moves.count):
+            arguments = list(self._arguments)
+            for place, point in zip(self._places, near.after(steps, moves, k), strict=True):
+                arguments[place] = point
+            found = self._function(arguments)
+            if k == 0:
+                shape = moves.count, *np.shape(found)
+                if self._memory.size < prod(shape):
+                    self._memory = np.empty(prod(shape))
+                results = self._memory[: prod(shape)].reshape(shape)
+            results[k] = found
+        return results
 
     def _batch(self, points: list[Array]) -> Array | None:
         """(k, n, ...) results of one call; None where it fails, or returns another shape."""
@@ -93,13 +104,17 @@ class Stack:
         return found.reshape(k, count, *found.shape[1:]) if found.shape[:1] == (k * count,) else None
 
     def _takes_long_batches(self, near: Near, steps: Steps) -> bool | None:
-        """Call it both ways; None where it returns no numbers to compare.
+        """Call it both ways; None where there are no numbers to compare.
 
         Arrays as long as the batch may or may not have a row for each factor: both is tried.
         """
         with np.errstate(all="ignore"):
-            points = near.moved(steps, near.directions.anywhere, 0, near.directions.anywhere.count)
-            alone = np.stack([self._single(points, k) for k in range(len(points[0]))])
+            anywhere = near.directions.anywhere
+            points = near.moved(steps, anywhere, 0, anywhere.count)
+            try:
+                alone = self._one_by_one(near, steps, anywhere).copy()
+            except Exception:  # it refuses these points: nobody asked for them but this
+                return None
             if not np.isfinite(alone).any():
                 return None
             size = _largest(alone) + _largest(near.joined)
