@@ -81,12 +81,9 @@ def add_curvature(terms: Terms, values: Array, residual: Array, multipliers: Arr
             gather_variables(term, i, terms.gather, terms.sizes, terms.parameters, values, v)
             if term[SECOND] != 0:
                 call_residual(term[SECOND], vector(v, 0, term[STORAGE]), p, table, vector(weights, 0, m), S)
-            elif term[DIFFERENCED] != 0:
-                parts = terms.parts[term[PART] : term[PART] + term[PARTS]]
-                _twice(parts, term, p, table, v, moved, step, weights, r, gradient, R, S)
             else:
                 parts = terms.parts[term[PART] : term[PART] + term[PARTS]]
-                _once(parts, term, p, table, v, moved, step, weights, r, gradient, J, R, S)
+                _difference(parts, term, p, table, v, moved, step, weights, r, gradient, J, R, S)
             _write(terms.sizes, terms.positions, term, i, S, hessian)
 
 
@@ -109,7 +106,7 @@ def carry_back(term: IntArray, i: int, whiteners: Array, residual: Array, out: A
 
 
 @in_order
-def _once(
+def _difference(
     parts: IntArray,
     term: IntArray,
     p: Array,
@@ -124,102 +121,74 @@ def _once(
     R: Array,
     second: Array,
 ) -> None:
-    """Derivative of J' w along every tangent direction of one factor, row by row."""
-    m, width, storage = term[ROWS], term[KERNEL_WIDTH], term[STORAGE]
-    call_residual(term[ADDRESS], vector(v, 0, storage), p, table, vector(r, 0, m), matrix(J, 0, m, width))
-    for d in range(width):
-        gradient[d] = 0.0
-        for a in range(m):
-            gradient[d] += weights[a] * J[a * width + d]
-    for k in range(storage):
-        moved[k] = v[k]
-    for k in range(width):
-        step[k] = 0.0
-    for part in range(len(parts)):
-        kind, start, size, dim, column, turn = parts[part]
-        for c in range(dim):
-            h = step_of(v, kind, start, dim, turn, c, ONE_SIDED)
-            step[column + c] = h
-            move(v, kind, start, dim, step, column, moved)
-            step[column + c] = 0.0
-            stepped = h if kind == TURN else (v[start + c] + h) - v[start + c]
-            call_residual(term[ADDRESS], vector(moved, 0, storage), p, table, vector(r, 0, m), matrix(J, 0, m, width))
-            for d in range(width):
-                total = -gradient[d]
-                for a in range(m):
-                    total += weights[a] * J[a * width + d]
-                second[column + c, d] = total / stepped
-        if turn >= 0:
-            rotation(v, turn, dim, R)
-            _turn_rows(R, dim, second, width, column)
-        for k in range(start, start + size):
-            moved[k] = v[k]
+    """Second derivatives of one factor, direction by direction.
 
-
-@in_order
-def _twice(
-    parts: IntArray,
-    term: IntArray,
-    p: Array,
-    table: Array,
-    v: Array,
-    moved: Array,
-    step: Array,
-    weights: Array,
-    r: Array,
-    gradient: Array,
-    R: Array,
-    second: Array,
-) -> None:
-    """Second differences of w' r, from its values alone: two points for each pair of directions.
-
-    All steps are those of the largest coordinate, because that is what the residual may round.
+    A kernel's own Jacobian is differenced to one side. Where that is made of differences itself, w' r is differenced
+    twice from its values alone, at two points for each pair of directions; all steps are then those of the largest
+    coordinate, because that is what the residual may round.
     """
+    twice = term[DIFFERENCED] != 0
     width, storage = term[KERNEL_WIDTH], term[STORAGE]
+    size, h, centre = 0.0, 0.0, 0.0
     for k in range(storage):
         moved[k] = v[k]
     for k in range(width):
         step[k] = 0.0
-    size = 0.0
-    for part in range(len(parts)):
-        if parts[part, 0] == VECTOR:
-            size = largest(v, parts[part, 1], parts[part, 3], size)
-    h = step_for(size, TWICE)
-    centre = _weighted(term, p, table, moved, weights, r)
+    if twice:
+        for part in range(len(parts)):
+            if parts[part, 0] == VECTOR:
+                size = largest(v, parts[part, 1], parts[part, 3], size)
+        h = step_for(size, TWICE)
+        centre = _weighted(term, p, table, moved, weights, r)
+    else:
+        _sloped(term, p, table, moved, weights, r, J, gradient)
     for first in range(len(parts)):
-        kind, start, _, dim, column, _ = parts[first]
+        kind, start, stored, dim, column, turn = parts[first]
         for c in range(column, column + dim):
-            both = 0.0  # w' r ahead and behind, less twice that at the centre
-            for side in range(2):
-                step[c] = h if side == 0 else -h
-                _shift(v, kind, start, step, column, c, moved)
-                change = _weighted(term, p, table, moved, weights, r) - centre
-                both += change
-                gradient[c] = (change - gradient[c] if side == 1 else change) / (1.0 if side == 0 else -2.0 * h)
-            second[c, c] = both  # over h^2, when all have been found
-            for other in range(first + 1):
-                its_kind, its_start, _, its_dim, its_column, _ = parts[other]
-                for d in range(its_column, min(its_column + its_dim, c)):
-                    total = -both - second[d, d]
-                    for side in range(2):
-                        step[c] = step[d] = h if side == 0 else -h
-                        _shift(v, kind, start, step, column, c, moved)
+            if twice:
+                both = 0.0  # w' r ahead and behind, less twice that at the centre
+                for side in range(2):
+                    step[c] = h if side == 0 else -h
+                    _shift(v, kind, start, step, column, c, moved)
+                    change = _weighted(term, p, table, moved, weights, r) - centre
+                    both += change
+                    gradient[c] = (change - gradient[c] if side == 1 else change) / (1.0 if side == 0 else -2.0 * h)
+                second[c, c] = both  # over h^2, when all have been found
+                for other in range(first + 1):
+                    its_kind, its_start, _, its_dim, its_column, _ = parts[other]
+                    for d in range(its_column, min(its_column + its_dim, c)):
+                        total = -both - second[d, d]
+                        for side in range(2):
+                            step[c] = step[d] = h if side == 0 else -h
+                            _shift(v, kind, start, step, column, c, moved)
+                            _shift(v, its_kind, its_start, step, its_column, d, moved)
+                            total += _weighted(term, p, table, moved, weights, r) - centre
+                        step[d] = 0.0
                         _shift(v, its_kind, its_start, step, its_column, d, moved)
-                        total += _weighted(term, p, table, moved, weights, r) - centre
-                    step[d] = 0.0
-                    _shift(v, its_kind, its_start, step, its_column, d, moved)
-                    second[c, d] = second[d, c] = total / (2.0 * h * h)
+                        second[c, d] = second[d, c] = total / (2.0 * h * h)
+            else:
+                step[c] = h = step_of(v, kind, start, dim, turn, c - column, ONE_SIDED)
+                _shift(v, kind, start, step, column, c, moved)
+                _sloped(term, p, table, moved, weights, r, J, second[c])
+                at = start + c - column
+                stepped = h if kind == TURN else (v[at] + h) - v[at]
+                for d in range(width):
+                    second[c, d] = (second[c, d] - gradient[d]) / stepped
             step[c] = 0.0
-            _shift(v, kind, start, step, column, c, moved)
-    for c in range(width):
-        second[c, c] /= h * h
+            for k in range(start, start + stored):
+                moved[k] = v[k]
+    if twice:
+        for c in range(width):
+            second[c, c] /= h * h
     for part in range(len(parts)):
         _, _, _, dim, column, turn = parts[part]
         if turn >= 0:
             rotation(v, turn, dim, R)
-            to_body(R, dim, second, width, column)
+            if twice:
+                to_body(R, dim, second, width, column)
             _turn_rows(R, dim, second, width, column)
-            _bend(R, dim, gradient, second, column)
+            if twice:
+                _bend(R, dim, gradient, second, column)
 
 
 @inlined
@@ -243,6 +212,17 @@ def _weighted(term: IntArray, p: Array, table: Array, v: Array, weights: Array, 
     for a in range(m):
         total += weights[a] * r[a]
     return total
+
+
+@inlined
+def _sloped(term: IntArray, p: Array, table: Array, v: Array, weights: Array, r: Array, J: Array, out: Array) -> None:
+    """Write J' w of one factor."""
+    m, width = term[ROWS], term[KERNEL_WIDTH]
+    call_residual(term[ADDRESS], vector(v, 0, term[STORAGE]), p, table, vector(r, 0, m), matrix(J, 0, m, width))
+    for d in range(width):
+        out[d] = 0.0
+        for a in range(m):
+            out[d] += weights[a] * J[a * width + d]
 
 
 @compiled
