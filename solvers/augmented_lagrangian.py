@@ -42,6 +42,7 @@ FALL = 0.25  # of the change of multipliers over rho, between outer iterations; 
 FALLING = 0.9  # of the violation, between outer iterations: progress where rho cannot grow
 PATIENCE = 3  # outer iterations in which it did not fall, before another way is looked for
 WARM_PENALTY = 100.0
+UNSEEN = 1e-11  # of the largest coordinate: steps as short as this are rounding, unless the gradient falls
 LONGEST, SHORTEST = 2.0, 0.5  # rows of the constraint Jacobian whose length lies between are left as stated
 GROWN = 0.5  # of a row's scale, when its gradient has become longer
 LARGEST_SCALE = 1e4  # a row that hardly moves at the start says little about its scale
@@ -182,7 +183,7 @@ class AugmentedLagrangian(Solver):
                 values, step, rejected = taken
                 expected = primal.expected_multipliers(run.lin, step, multipliers, penalty, damping.base)
                 lin, hopeful = primal.linearized(values), rejected == 0 and damping.base is run.lin.constraints
-                after, slope = expected, primal.slope(lin, expected)
+                steep, after, slope = slope, expected, primal.slope(lin, expected)
                 if not slope <= gradient_goal:
                     plus = primal.next_multipliers(lin.constraints, multipliers, penalty)
                     if not slope < (balance := primal.slope(lin, plus)):
@@ -204,6 +205,8 @@ class AugmentedLagrangian(Solver):
                     return Status.STOP_RULE
                 if run.status is not None:
                     return None
+                if slope > FALLING * steep and norm(step) <= UNSEEN * largest(lin.values.flat):
+                    break  # rounding, times rho, is all that is left of the gradient
                 if norm(step) < self.step_tolerance:
                     break  # too short to be of use: what violation remains is for the multipliers to remove
             change = largest(scale * (after - multipliers) / penalty)

@@ -14,6 +14,7 @@ from benchmarks.control_loops import Ours
 from benchmarks.control_problems import Unicycle
 from benchmarks.cylinder_flights import study
 from judge import judge
+from out_of_reach import goal_too_far
 from problems import STARTS, ecg2o, ecg2o_inequality, pose_beside_disc, short_drive
 from unifg.models import obstacles, unicycle
 from unifg.scenarios.manoeuvres import CASES, ManoeuvreSettings, state_problem
@@ -313,3 +314,13 @@ def test_a_row_that_is_flat_at_the_start_gets_no_lasting_weight() -> None:
     plain = AugmentedLagrangian(scaling=False).solve(graph, guess, check=True)
     assert solution.iterations <= plain.iterations + 2
     assert solution.penalties["push"].max() <= 10.0 * plain.penalties["push"].max()
+
+
+def test_no_steps_are_taken_at_what_rounding_leaves_of_a_gradient() -> None:
+    """A goal 1 % too far: rho rises to 5e7 and the gradient it multiplies cannot reach the tolerance any more."""
+    graph, guess = goal_too_far(0.01)
+    solution = AugmentedLagrangian().solve(graph, guess)
+    assert solution.status is fg.Status.LOCALLY_INFEASIBLE, solution.report()
+    lengths = [row.step_norm for row in solution.history[1:]]
+    assert sum(length < 1e-10 for length in lengths) <= 2, lengths
+    assert solution.iterations <= 15
