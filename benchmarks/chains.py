@@ -13,11 +13,12 @@ import unifg as fg
 from benchmarks.reference_problems import Problem
 from benchmarks.report import table
 from benchmarks.timing import Stopwatch, interleave, milliseconds, number, shown
-from unifg import passes, solver
+from unifg.answers import solver
 from unifg.elimination import fronts, substitution
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
 from unifg.models import unicycle
-from unifg.program import Program
+from unifg.program import passes
+from unifg.program.program import Program
 from unifg.solvers import AugmentedLagrangian, GaussNewton, model
 from unifg.typing import Array
 

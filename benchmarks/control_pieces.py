@@ -10,14 +10,14 @@ import numpy as np
 
 from benchmarks.control_problems import Problem, Quadrotor, Unicycle
 from benchmarks.report import table
-from unifg import passes
-from unifg.curvature import add_curvature
 from unifg.elimination.fronts import factor
 from unifg.elimination.substitution import solve
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
+from unifg.machine.links import run
+from unifg.program import passes
+from unifg.program.curvature import add_curvature
 from unifg.solvers import InteriorPoint
 from unifg.solvers import barrier_state as state
-from unifg.solvers.barrier_links import run
 
 REPEATS, ROUNDS = 500, 7
 

@@ -1,6 +1,6 @@
 """Claims judged by casadi's exact derivatives of a problem's second statement.
 
-The KKT numbers are those of :mod:`unifg.kkt`, whose docstring defines them; nothing of its code is used. A claim of
+The KKT numbers are those of :mod:`unifg.answers.optimality`, whose docstring defines them; nothing of its code is used. A claim of
 local infeasibility is tested by looking for a feasible point: IPOPT minimises the sum of all violations from the point
 where the claim was made.
 """
@@ -24,7 +24,7 @@ FEASIBLE = 1e-6
 
 @dataclass(frozen=True)
 class Numbers:
-    """Exact KKT numbers, scaled as in :mod:`unifg.kkt`."""
+    """Exact KKT numbers, scaled as in :mod:`unifg.answers.optimality`."""
 
     cost: float
     stationarity: float

@@ -17,8 +17,8 @@ from benchmarks import pose_graphs
 from benchmarks.gtsam_peer import ANCHOR, Peer, available, joint
 from benchmarks.report import table
 from benchmarks.timing import interleave, milliseconds, shown, spread
-from unifg.linearization import Linearization
-from unifg.program import Program
+from unifg.program.linearization import Linearization
+from unifg.program.program import Program
 from unifg.solvers import GaussNewton
 from unifg.typing import Array, IntArray
 

@@ -41,12 +41,20 @@ EARLY = 60.0  # [s]
 
 # Decisions, and the tests that are to notice when they change.
 TARGETS: dict[str, tuple[str, ...]] = {
-    "unifg/check.py": ("answers", "refusals", "graph"),
-    "unifg/covariance.py": ("answers", "covariance", "graph"),
-    "unifg/kkt.py": ("kkt", "infeasible", "solvers", "refusals"),
-    "unifg/marginal.py": ("answers", "marginal_prior"),
-    "unifg/solution.py": ("answers", "residual_history", "covariance", "refusals", "graph", "kkt"),
-    "unifg/solver.py": ("answers", "early_ends", "interior_point", "solvers", "refusals", "infeasible", "own_backend"),
+    "unifg/answers/check.py": ("answers", "refusals", "graph"),
+    "unifg/answers/covariance.py": ("answers", "covariance", "graph"),
+    "unifg/answers/optimality.py": ("kkt", "infeasible", "solvers", "refusals"),
+    "unifg/answers/marginal.py": ("answers", "marginal_prior"),
+    "unifg/answers/solution.py": ("answers", "residual_history", "covariance", "refusals", "graph", "kkt"),
+    "unifg/answers/solver.py": (
+        "answers",
+        "early_ends",
+        "interior_point",
+        "solvers",
+        "refusals",
+        "infeasible",
+        "own_backend",
+    ),
     "solvers/augmented_lagrangian.py": ("augmented_lagrangian", "solvers", "infeasible"),
     "solvers/barrier.py": ("interior_point", "solvers", "infeasible"),
     "solvers/barrier_direction.py": ("interior_point", "solvers"),

@@ -25,8 +25,8 @@ import numba
 import numpy as np
 
 import unifg as fg
+from unifg.answers.solver import Solver
 from unifg.models import avoidance, obstacles, quadrotor, unicycle
-from unifg.solver import Solver
 from unifg.solvers import (
     KKT,
     SQP,

@@ -15,11 +15,12 @@ import unifg as fg
 from benchmarks.gtsam_peer import ORDERINGS, Peer, available
 from benchmarks.report import CHECKOUT, table
 from benchmarks.timing import Spread, Stopwatch, interleave, milliseconds, number, shown, spread
-from unifg import passes, solver
+from unifg.answers import solver
 from unifg.elimination import factorization, fronts, substitution
 from unifg.files.g2o import read_g2o
 from unifg.pose_graphs import PoseGraph, manhattan, sphere
-from unifg.program import Program
+from unifg.program import passes
+from unifg.program.program import Program
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
 

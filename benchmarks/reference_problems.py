@@ -321,7 +321,7 @@ def render(results: dict[Problem, dict[str, Outcome]], loops: str, rounds: int) 
     peer_package = ("casadi",) if any("ipopt" in outcomes for outcomes in results.values()) else ()
     notes = (
         f"Median processor time of {rounds} interleaved cold solves (one where it took more than {SLOW / 1e3:.0f} s), "
-        f"tolerance 1e-6 each. KKT: largest number of our own test, scaled as in unifg.kkt. Solved: KKT below "
+        f"tolerance 1e-6 each. KKT: largest number of our own test, scaled as in unifg.answers.optimality. Solved: KKT below "
         f"{GOOD:.0e} (peers: converged), and a cost within 1e-4 of a known optimum or one at which IPOPT stays, to "
         f"{STAYS:.0e}, when it "
         "is started there at tolerance 1e-9; IPOPT is asked wherever the cost is not a known one to 1e-5. Staying "

@@ -18,9 +18,9 @@ import casadi as ca
 import numpy as np
 
 import unifg as fg
-from unifg.graph import AnyResidual
+from unifg.language.graph import AnyResidual
+from unifg.language.variables import Variable, as_selection, is_variable
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
-from unifg.variables import Variable, as_selection, is_variable
 
 Exact = Callable[..., Any]
 """Columns of one factor (variables, then constants) to a column of casadi expressions."""

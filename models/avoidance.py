@@ -21,12 +21,12 @@ from functools import cache
 
 import numpy as np
 
-from unifg.calls import vector
 from unifg.errors import GraphError, ModelError
-from unifg.jit import compiled
-from unifg.kernels import Kernel
+from unifg.kernels.kernel import Kernel
+from unifg.kernels.residuals import Residual, residual
 from unifg.lie import Rn
-from unifg.residuals import Residual, residual
+from unifg.machine.calls import vector
+from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 __all__ = [

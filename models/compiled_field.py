@@ -9,11 +9,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from unifg.calls import local_matrix, local_vector
 from unifg.errors import ModelError
-from unifg.jit import compiled, in_order
+from unifg.kernels.steps import FIRST, TURN, compiled_parts, move, rotation, step_for, step_of, to_body
 from unifg.lie import Manifold
-from unifg.steps import FIRST, TURN, compiled_parts, move, rotation, step_for, step_of, to_body
+from unifg.machine.calls import local_matrix, local_vector
+from unifg.machine.jit import compiled, in_order
 from unifg.typing import Array
 
 

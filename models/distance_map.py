@@ -15,7 +15,7 @@ import numpy as np
 from scipy import ndimage
 
 from unifg.errors import ModelError
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike, BoolArray
 
 HEADER = 8  # numbers in front of the cells of a table

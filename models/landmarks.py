@@ -11,14 +11,14 @@ import math
 
 import numpy as np
 
-from unifg.calls import local_matrix
-from unifg.jit import compiled
-from unifg.kernels import Kernel
+from unifg.kernels.kernel import Kernel
+from unifg.kernels.residuals import residual
 from unifg.lie import SO3, Rn
 from unifg.lie.scalar import so3
 from unifg.lie.scalar.so2 import wrap
+from unifg.machine.calls import local_matrix
+from unifg.machine.jit import compiled
 from unifg.models.quadrotor import STATE
-from unifg.residuals import residual
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["bearing_range", "height", "observe", "tilt"]

@@ -12,12 +12,12 @@ import math
 
 import numpy as np
 
-from unifg.jit import compiled
-from unifg.kernels import Kernel
+from unifg.kernels.kernel import Kernel
+from unifg.kernels.residuals import Residual, residual
+from unifg.kernels.robust import Reweighted
 from unifg.lie import SE2
+from unifg.machine.jit import compiled
 from unifg.models.distance_map import DistanceMap, bilinear
-from unifg.residuals import Residual, residual
-from unifg.robust import Reweighted
 from unifg.typing import Array, BoolArray
 
 DISCARD_BEYOND = 0.3  # [m] to the nearest surface

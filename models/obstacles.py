@@ -9,13 +9,13 @@ from functools import cache
 
 import numpy as np
 
-from unifg.calls import vector
 from unifg.errors import GraphError
-from unifg.jit import compiled
-from unifg.kernels import Kernel
+from unifg.kernels.kernel import Kernel
+from unifg.kernels.residuals import Residual, residual
 from unifg.lie import SE2
+from unifg.machine.calls import vector
+from unifg.machine.jit import compiled
 from unifg.models.smooth_field import SmoothField, smooth
-from unifg.residuals import Residual, residual
 from unifg.typing import Array
 
 NEAR = 1e-9  # below this distance the direction to the centre is undefined; the gradient is taken as zero

@@ -29,11 +29,11 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from unifg.calls import vector
 from unifg.errors import ModelError
-from unifg.jit import compiled
-from unifg.kernels import Kernel
-from unifg.residuals import Residual, residual
+from unifg.kernels.kernel import Kernel
+from unifg.kernels.residuals import Residual, residual
+from unifg.machine.calls import vector
+from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 SCALE = 0.075  # [m], the paper's k

@@ -23,12 +23,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from unifg.errors import ModelError
-from unifg.kernels import Kernel
+from unifg.kernels.kernel import Kernel
+from unifg.kernels.residuals import residual
 from unifg.lie import SO3, Product, Rn
 from unifg.models import quadrotor_dynamics, quadrotor_flight, quadrotor_second
 from unifg.models.quadrotor_dynamics import GRAVITY
 from unifg.models.quadrotor_field import field
-from unifg.residuals import residual
 from unifg.typing import Array, ArrayLike
 
 __all__ = [

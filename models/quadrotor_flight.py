@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from unifg.calls import local_vector
-from unifg.jit import compiled
 from unifg.lie.scalar import so3
+from unifg.machine.calls import local_vector
+from unifg.machine.jit import compiled
 from unifg.models.quadrotor_dynamics import acceleration
 from unifg.typing import Array
 

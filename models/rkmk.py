@@ -33,16 +33,16 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from unifg.errors import ModelError, UnifgError
-from unifg.jit import compiled
-from unifg.kernels import Argument, Kernel
+from unifg.kernels.kernel import Argument, Kernel
+from unifg.kernels.residuals import Residual, residual
 from unifg.lie import LieGroup, Rn
 from unifg.lie.lookup import bend_of, functions_of
 from unifg.lie.scalar import rn as scalar_rn
+from unifg.machine.jit import compiled
 from unifg.models.compiled_field import CompiledField
 from unifg.models.rkmk_batch import Field, FieldJacobian, StepDefect
 from unifg.models.rkmk_kernel import rollout_kernel, step_kernel
 from unifg.models.tableau import METHODS, Tableau
-from unifg.residuals import Residual, residual
 from unifg.typing import Array, ArrayLike
 
 Form: TypeAlias = Literal["full", "simplified"]

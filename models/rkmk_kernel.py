@@ -16,10 +16,10 @@ from types import ModuleType
 
 import numpy as np
 
-from unifg.calls import local_matrix, local_vector, vector
-from unifg.jit import compiled
 from unifg.lie import LieGroup
 from unifg.lie.scalar import rn
+from unifg.machine.calls import local_matrix, local_vector, vector
+from unifg.machine.jit import compiled
 from unifg.models.compiled_field import CompiledField, differences
 from unifg.typing import Array
 

@@ -7,7 +7,7 @@ corners within one cell, and have a continuous gradient.
 
 from __future__ import annotations
 
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
 from unifg.models.distance_map import HEADER, RING, DistanceMap, cell_of, sampler
 from unifg.typing import Array
 

@@ -11,14 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from unifg.calls import vector
-from unifg.factors import difference
-from unifg.jit import compiled
-from unifg.kernels import Kernel
+from unifg.kernels.kernel import Kernel
+from unifg.kernels.residuals import residual
+from unifg.language.factors import difference
 from unifg.lie import SE2, Rn
 from unifg.lie.scalar.rn import minus
 from unifg.lie.scalar.so2 import wrap
-from unifg.residuals import residual
+from unifg.machine.calls import vector
+from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike
 
 state = SE2

@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from unifg.jit import compiled
-from unifg.kernels import Kernel
+from unifg.kernels.kernel import Kernel
+from unifg.kernels.residuals import Residual, residual
 from unifg.lie import Rn
-from unifg.residuals import Residual, residual
+from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike
 
 SPEED = Rn(1)

@@ -20,8 +20,8 @@ from pathlib import Path
 from types import FrameType
 
 from unifg import __version__
+from unifg.answers.history import Iteration
 from unifg.errors import UnifgError
-from unifg.history import Iteration
 from unifg.scenarios import solve_arguments, velocity_tracking_arguments
 from unifg.scenarios.outcome import Outcome, Progress
 from unifg.scenarios.quadrotor import mpc_arguments, obstacles_arguments
@@ -288,8 +288,8 @@ def _manoeuvres_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_manoeuvres(chosen: argparse.Namespace, progress: Progress) -> Outcome:
+    from unifg.answers.status import Status
     from unifg.scenarios import manoeuvre_plots, manoeuvres
-    from unifg.status import Status
 
     names = MANOEUVRES if chosen.case == "both" else (chosen.case,)
     solved: list[manoeuvres.Manoeuvre] = []
@@ -314,8 +314,8 @@ def _run_manoeuvres(chosen: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _run_velocity_tracking(chosen: argparse.Namespace, progress: Progress) -> Outcome:
+    from unifg.answers.status import Status
     from unifg.scenarios import velocity_tracking, velocity_tracking_plots
-    from unifg.status import Status
 
     settings = velocity_tracking.TrackingSettings(
         chosen.length, chosen.solver, chosen.profile, chosen.linear, chosen.force_bounds, tolerance=chosen.tolerance

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from unifg.answers.history import Iteration
 from unifg.errors import UnifgError
-from unifg.history import Iteration
 from unifg.typing import Array
 
 if TYPE_CHECKING:

@@ -13,16 +13,16 @@ from pathlib import Path
 import numpy as np
 from scipy.special import chdtri
 
+from unifg.answers.history import Iteration
+from unifg.answers.solution import Solution
+from unifg.answers.solver import Solver
+from unifg.answers.status import Status
 from unifg.errors import ScenarioError
 from unifg.files.pose_graph import read_pose_graph
-from unifg.history import Iteration
+from unifg.kernels.robust import DCS, Cauchy, Huber, Loss, TruncatedLeastSquares, Tukey
 from unifg.pose_graphs.initialise import chordal, lago, odometric
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
-from unifg.robust import DCS, Cauchy, Huber, Loss, TruncatedLeastSquares, Tukey
-from unifg.solution import Solution
-from unifg.solver import Solver
 from unifg.solvers import GaussNewton, GraduatedNonConvexity, LevenbergMarquardt
-from unifg.status import Status
 from unifg.typing import Array, BoolArray
 
 __all__ = ["SolveSettings", "SolvedGraph", "robust_loss", "solve_file"]

@@ -22,17 +22,17 @@ from typing import Literal
 
 import numpy as np
 
+from unifg.answers.solver import Run, Solver
+from unifg.answers.status import Status
 from unifg.errors import BackendError
-from unifg.jit import compiled
-from unifg.linearization import Linearization
-from unifg.program import Program
-from unifg.solver import Run, Solver
+from unifg.machine.jit import compiled
+from unifg.program.linearization import Linearization
+from unifg.program.program import Program
 from unifg.solvers.damping import Damping, damped_step, largest, norm
 from unifg.solvers.least_squares import require_squares
 from unifg.solvers.least_violation import leave, settle
 from unifg.solvers.model import STRAIGHT, model_step
 from unifg.solvers.primal import Primal
-from unifg.status import Status
 from unifg.typing import Array, IntArray
 
 LARGEST_PENALTY = 1e10

@@ -36,8 +36,9 @@ from __future__ import annotations
 
 import math
 
-from unifg.jit import compiled
-from unifg.solvers.barrier_links import linked, parts, run
+from unifg.machine.jit import compiled
+from unifg.machine.links import linked, parts, run
+from unifg.program.table import BOUND, COLUMN, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, Terms
 from unifg.solvers.barrier_state import (
     ACCEPT,
     ACCEPTED,
@@ -119,7 +120,6 @@ from unifg.solvers.barrier_state import (
     S,
     Y,
 )
-from unifg.table import BOUND, COLUMN, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, Terms
 from unifg.typing import Array, IntArray
 
 OBJECTIVE = 0  # table.COST

@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 
 from unifg.elimination.plan import NEGATIVE
-from unifg.jit import compiled
-from unifg.solvers.barrier_links import holds, linked, parts, run
+from unifg.machine.jit import compiled
+from unifg.machine.links import holds, linked, parts, run
+from unifg.program.table import BOUND, COLUMN, COUNT, ENTRY, KIND, POSITION, ROW, ROWS, WIDTH, Terms
 from unifg.solvers.barrier_state import (
     AGAIN,
     ALPHA,
@@ -51,7 +52,6 @@ from unifg.solvers.barrier_state import (
     S,
     Y,
 )
-from unifg.table import BOUND, COLUMN, COUNT, ENTRY, KIND, POSITION, ROW, ROWS, WIDTH, Terms
 from unifg.typing import Array, IntArray
 
 FIRST_SHIFT, LARGEST_SHIFT, FIRST_GROWTH, SHIFT_GROWTH, SHIFT_DECAY = 1e-4, 1e20, 100.0, 8.0, 3.0

@@ -6,14 +6,14 @@ from functools import cache
 
 import numpy as np
 
-from unifg import passes
-from unifg.curvature import add_curvature
 from unifg.elimination.fronts import factor
 from unifg.elimination.substitution import solve
-from unifg.jit import compiled
-from unifg.retraction import retract_parts
+from unifg.machine.jit import compiled
+from unifg.machine.links import ADDRESS, NOTHING, NUMBER, TRUTH, link, linked, memory, number, parts, run
+from unifg.program import passes
+from unifg.program.curvature import add_curvature
+from unifg.program.retraction import retract_parts
 from unifg.solvers import barrier, barrier_direction
-from unifg.solvers.barrier_links import ADDRESS, NOTHING, NUMBER, TRUTH, link, linked, memory, number, parts, run
 from unifg.solvers.barrier_state import (
     ACCEPT,
     ACCEPTED,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from unifg.elimination.plan import Plan
-from unifg.table import Terms
+from unifg.program.table import Terms
 from unifg.typing import Array, IntArray
 
 # Places in Work.numbers.

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from unifg.columns import Values
-from unifg.jit import compiled
-from unifg.linearization import Linearization
+from unifg.machine.jit import compiled
+from unifg.program.columns import Values
+from unifg.program.linearization import Linearization
 from unifg.solvers.model import STRAIGHT, model_step
 from unifg.solvers.primal import Primal
 from unifg.typing import Array

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unifg.answers.solver import Run
+from unifg.answers.status import Status
 from unifg.errors import BackendError
-from unifg.linearization import Linearization
-from unifg.program import Program
-from unifg.solver import Run
+from unifg.program.linearization import Linearization
+from unifg.program.program import Program
 from unifg.solvers.damping import norm
 from unifg.solvers.least_squares import LeastSquares
 from unifg.solvers.primal import Primal
-from unifg.status import Status
 from unifg.typing import Array
 
 ROUNDING = 1e-14

@@ -20,12 +20,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri, fdtri
 
-from unifg.compiled import CompiledTerm
 from unifg.elimination.factorization import Factorization
-from unifg.linearization import Linearization
-from unifg.program import Program
-from unifg.table import ENTRY, ROW, WIDTH
-from unifg.touched import term_columns
+from unifg.program.linearization import Linearization
+from unifg.program.program import Program
+from unifg.program.table import ENTRY, ROW, WIDTH
+from unifg.program.term import CompiledTerm
+from unifg.program.touched import term_columns
 from unifg.typing import Array, BoolArray, IntArray
 
 CHANCE = 0.01  # that a right measurement among all is called wrong

@@ -31,21 +31,21 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from unifg.compiled import CompiledTerm
+from unifg.answers.history import Iteration
+from unifg.answers.solution import Solution
+from unifg.answers.solver import Callback, Prepared, Solver, Start
+from unifg.answers.status import Status
+from unifg.answers.verdict import Verdict
 from unifg.errors import BackendError, NotConverged
-from unifg.graph import Graph
-from unifg.history import Iteration
-from unifg.robust import DCS, Graduated, Loss
-from unifg.solution import Solution
-from unifg.solver import Callback, Prepared, Solver, Start
+from unifg.kernels.robust import DCS, Graduated, Loss
+from unifg.language.graph import Graph
+from unifg.language.terms import Cost
+from unifg.language.variables import Data
+from unifg.program.term import CompiledTerm
 from unifg.solvers.gating import Innovations, Scatter
 from unifg.solvers.gauss_newton import GaussNewton
 from unifg.solvers.levenberg_marquardt import LevenbergMarquardt
-from unifg.status import Status
-from unifg.terms import Cost
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
-from unifg.variables import Data
-from unifg.verdict import Verdict
 
 logger = logging.getLogger("unifg")
 

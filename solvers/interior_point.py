@@ -12,20 +12,20 @@ from typing import Literal
 
 import numpy as np
 
+from unifg.answers.history import Iteration
+from unifg.answers.solver import Run, Solver
+from unifg.answers.status import Status
 from unifg.errors import BackendError
-from unifg.history import Iteration
-from unifg.linearization import Linearization
-from unifg.program import Program
-from unifg.second_order import lagrangian_hessian
-from unifg.solver import Run, Solver
+from unifg.machine.links import memory
+from unifg.program.linearization import Linearization
+from unifg.program.program import Program
+from unifg.program.second_order import lagrangian_hessian
+from unifg.program.table import CONSTRAINT, COUNT, KIND, ROW, ROWS
 from unifg.solvers import barrier_state as state
-from unifg.solvers.barrier_links import memory
 from unifg.solvers.barrier_loop import addresses, call
 from unifg.solvers.barrier_state import Problem, Work, empty_work
 from unifg.solvers.kkt_system import KktSystem, stacked
 from unifg.solvers.least_violation import nearest
-from unifg.status import Status
-from unifg.table import CONSTRAINT, COUNT, KIND, ROW, ROWS
 from unifg.typing import Array
 
 ENDINGS = {

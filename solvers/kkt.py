@@ -26,16 +26,16 @@ from typing import Literal
 
 import numpy as np
 
+from unifg.answers.solver import Run, Solver
+from unifg.answers.status import Status
 from unifg.errors import BackendError
-from unifg.linearization import Evaluation, Linearization
-from unifg.program import Program
-from unifg.solver import Run, Solver
+from unifg.program.linearization import Evaluation, Linearization
+from unifg.program.program import Program
 from unifg.solvers.damping import LARGEST, SUFFICIENT, Damping, largest, norm
 from unifg.solvers.kkt_system import KktSystem, aim, fill
 from unifg.solvers.least_squares import require_squares
 from unifg.solvers.least_violation import leave, settle
 from unifg.solvers.primal import DIAGONAL_FLOOR
-from unifg.status import Status
 from unifg.typing import Array
 
 RESIDUAL = 1e-8  # relative, in the equilibrated system, of one that counts as solved

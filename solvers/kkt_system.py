@@ -9,11 +9,11 @@ import numpy as np
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.plan import Plan
 from unifg.elimination.saddle import SaddlePoint
-from unifg.jit import compiled
-from unifg.passes import transposed_times
-from unifg.program import Program
-from unifg.sparse import Symmetric
-from unifg.table import Terms
+from unifg.elimination.symmetric import Symmetric
+from unifg.machine.jit import compiled
+from unifg.program.passes import transposed_times
+from unifg.program.program import Program
+from unifg.program.table import Terms
 from unifg.typing import Array, BoolArray, IntArray
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from unifg.answers.solver import Solver
 from unifg.errors import BackendError
-from unifg.program import Program
-from unifg.solver import Solver
+from unifg.program.program import Program
 from unifg.solvers.primal import Primal
 
 

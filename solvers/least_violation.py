@@ -2,7 +2,7 @@
 
 A merit function or an elastic problem stalls at a point that is stationary for its own measure of violation. From
 there a damped Newton method on 1/2 |violation|^2 finds a point that is stationary for the measure of
-:func:`unifg.kkt.infeasible_stationary`, within the bounds of the unknowns, or a feasible one; then nothing is proved.
+:func:`unifg.answers.optimality.infeasible_stationary`, within the bounds of the unknowns, or a feasible one; then nothing is proved.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from unifg.kkt import infeasible_stationary, within_bounds
-from unifg.linearization import Linearization
-from unifg.program import Program
-from unifg.solver import Run
+from unifg.answers.optimality import infeasible_stationary, within_bounds
+from unifg.answers.solver import Run
+from unifg.answers.status import Status
+from unifg.answers.violation import ViolationModel, descent
+from unifg.program.linearization import Linearization
+from unifg.program.program import Program
 from unifg.solvers.damping import norm
-from unifg.status import Status
-from unifg.violation import ViolationModel, descent
 
 STEPS = 200
 FIRST_DAMPING, LARGEST_DAMPING, GROWTH, SHRINK = 1e-3, 1e10, 4.0, 0.2

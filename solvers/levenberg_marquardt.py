@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.linearization import Linearization
-from unifg.solver import Run
+from unifg.answers.solver import Run
+from unifg.answers.status import Status
+from unifg.program.linearization import Linearization
 from unifg.solvers.damping import Damping, damped_step, norm
 from unifg.solvers.least_squares import LeastSquares
 from unifg.solvers.model import model_step
 from unifg.solvers.primal import Primal
-from unifg.status import Status
 from unifg.typing import Array
 
 

@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 from unifg.elimination.factorization import Factorization
+from unifg.elimination.symmetric import Symmetric
 from unifg.errors import GraphError
-from unifg.sparse import Symmetric
 from unifg.typing import Array
 
 if TYPE_CHECKING:

@@ -8,20 +8,20 @@ from typing import Literal
 
 import numpy as np
 
-from unifg.compiled import CompiledTerm
-from unifg.differentiation import convexified
+from unifg.answers.solution import Guess, Solution
 from unifg.errors import BackendError, GraphError
-from unifg.graph import Graph
-from unifg.program import Program
-from unifg.rows import Rows
-from unifg.solution import Guess, Solution
+from unifg.kernels.differentiation import convexified
+from unifg.language.graph import Graph
+from unifg.language.terms import Cost
+from unifg.language.variables import Data, Family
+from unifg.program.program import Program
+from unifg.program.rows import Rows
+from unifg.program.term import CompiledTerm
+from unifg.program.touched import term_columns
 from unifg.solvers.kkt import require_equalities
 from unifg.solvers.linear_graphs import Factor, LinearFactor, LinearGraph, QuadraticFactor, dual_graph
 from unifg.solvers.qp import QP, subproblem
-from unifg.terms import Cost
-from unifg.touched import term_columns
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
-from unifg.variables import Data, Family
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,13 +16,13 @@ import numpy as np
 from unifg.elimination.fronts import factor
 from unifg.elimination.plan import NEGATIVE, Plan
 from unifg.elimination.substitution import solve
-from unifg.jit import compiled
-from unifg.linearization import Linearization
-from unifg.passes import add_constraints, times, transposed_times
+from unifg.elimination.symmetric import add_times
+from unifg.machine.jit import compiled
+from unifg.program.linearization import Linearization
+from unifg.program.passes import add_constraints, times, transposed_times
+from unifg.program.table import Terms
 from unifg.solvers.phr import barrier, update
 from unifg.solvers.primal import DIAGONAL_FLOOR, Primal
-from unifg.sparse import add_times
-from unifg.table import Terms
 from unifg.typing import Array, BoolArray, IntArray
 
 NEWTON_STEPS = 12

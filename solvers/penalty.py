@@ -12,17 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unifg.answers.solver import Run, Solver
+from unifg.answers.status import Status
 from unifg.errors import BackendError
-from unifg.linearization import Linearization
-from unifg.program import Program
-from unifg.solver import Run, Solver
+from unifg.program.linearization import Linearization
+from unifg.program.program import Program
 from unifg.solvers.damping import Damping, damped_step, norm
 from unifg.solvers.least_squares import require_squares
 from unifg.solvers.least_violation import settle
 from unifg.solvers.model import model_step
 from unifg.solvers.phr import update
 from unifg.solvers.primal import Primal
-from unifg.status import Status
 from unifg.typing import Array
 
 ROUNDING = 1e-15  # relative decrease of the objective that is noise

@@ -7,7 +7,7 @@ would keep penalising it).
 
 from __future__ import annotations
 
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 

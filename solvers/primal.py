@@ -10,14 +10,14 @@ from functools import cached_property
 
 import numpy as np
 
-from unifg.columns import Values
-from unifg.jit import compiled
-from unifg.linearization import Evaluation, Linearization
-from unifg.passes import transposed_times
-from unifg.program import Program
-from unifg.second_order import lagrangian_hessian
+from unifg.machine.jit import compiled
+from unifg.program.columns import Values
+from unifg.program.linearization import Evaluation, Linearization
+from unifg.program.passes import transposed_times
+from unifg.program.program import Program
+from unifg.program.second_order import lagrangian_hessian
+from unifg.program.table import Terms
 from unifg.solvers.phr import barrier, update
-from unifg.table import Terms
 from unifg.typing import Array, IntArray
 
 DIAGONAL_FLOOR = 1e-9  # of the largest diagonal entry: damping must act on unknowns with little curvature too

@@ -12,11 +12,11 @@ from typing import Protocol
 
 import numpy as np
 
-from unifg.linearization import Linearization
-from unifg.passes import add_constraints
-from unifg.program import Program
-from unifg.second_order import lagrangian_hessian
-from unifg.sparse import Symmetric
+from unifg.elimination.symmetric import Symmetric
+from unifg.program.linearization import Linearization
+from unifg.program.passes import add_constraints
+from unifg.program.program import Program
+from unifg.program.second_order import lagrangian_hessian
 from unifg.typing import Array
 
 
@@ -136,7 +136,7 @@ class Route(Protocol):
 
 
 def qp_error(qp: QP, step: Array, multipliers: Array) -> float:
-    """Largest of stationarity, infeasibility and complementarity, scaled as in :mod:`unifg.kkt`."""
+    """Largest of stationarity, infeasibility and complementarity, scaled as in :mod:`unifg.answers.optimality`."""
     if not (np.isfinite(step).all() and np.isfinite(multipliers).all()):
         return np.inf
     scale = max(1.0, float(np.abs(multipliers).mean()) / 100.0) if len(multipliers) else 1.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.program import Program
+from unifg.program.program import Program
 from unifg.solvers.constrained_elimination import Contradiction, Undetermined
 from unifg.solvers.linear_graphs import dual_graph
 from unifg.solvers.linearized_graph import equality_rows, primal_graph, stacked_step

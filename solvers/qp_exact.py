@@ -14,9 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from unifg.linearization import Linearization
-from unifg.passes import add_constraints
-from unifg.program import Program
+from unifg.program.linearization import Linearization
+from unifg.program.passes import add_constraints
+from unifg.program.program import Program
 from unifg.solvers.kkt_system import KktSystem, fill
 from unifg.solvers.qp import QP, QPAnswer, subproblem
 from unifg.solvers.scaling import Scaling

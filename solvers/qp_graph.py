@@ -13,12 +13,12 @@ import numpy as np
 
 from unifg.elimination.fronts import factor
 from unifg.elimination.substitution import solve
-from unifg.jit import compiled
-from unifg.passes import add_constraints, times, transposed_times
-from unifg.program import Program
+from unifg.machine.jit import compiled
+from unifg.program.passes import add_constraints, times, transposed_times
+from unifg.program.program import Program
+from unifg.program.table import Terms
 from unifg.solvers.kkt_system import KktArrays, KktSystem, fill
 from unifg.solvers.qp import QP, QPAnswer, qp_error
-from unifg.table import Terms
 from unifg.typing import Array, BoolArray, IntArray
 
 ITERATIONS = 60

@@ -22,7 +22,7 @@ from dataclasses import replace
 import numpy as np
 import osqp
 
-from unifg.program import Program
+from unifg.program.program import Program
 from unifg.solvers.kkt_system import KktSystem
 from unifg.solvers.qp import QP, QPAnswer, qp_error
 from unifg.solvers.scaling import Scaling

@@ -11,9 +11,9 @@ import numpy as np
 import piqp
 import scipy.sparse as sp
 
-from unifg.program import Program
+from unifg.elimination.symmetric import Symmetric
+from unifg.program.program import Program
 from unifg.solvers.qp import QP, QPAnswer, qp_error
-from unifg.sparse import Symmetric
 from unifg.typing import Array, BoolArray, IntArray
 
 INFINITY = 1e30  # PIQP treats larger limits as absent

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from unifg.program import Program
+from unifg.program.program import Program
 from unifg.solvers.qp import QP, QPAnswer, qp_error
 from unifg.solvers.qp_graph import GraphRoute
 

@@ -10,7 +10,7 @@ import qpsolvers
 import scipy.sparse as sp
 
 from unifg.errors import BackendError
-from unifg.program import Program
+from unifg.program.program import Program
 from unifg.solvers.qp import QP, QPAnswer, qp_error
 from unifg.typing import Array
 

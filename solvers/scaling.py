@@ -14,11 +14,11 @@ from functools import cached_property
 
 import numpy as np
 
-from unifg.jit import compiled
-from unifg.linearization import Linearization
-from unifg.program import Program
+from unifg.elimination.symmetric import Symmetric
+from unifg.machine.jit import compiled
+from unifg.program.linearization import Linearization
+from unifg.program.program import Program
 from unifg.solvers.qp import QP, QPAnswer
-from unifg.sparse import Symmetric
 from unifg.typing import Array, BoolArray, IntArray
 
 PASSES, NEAR = 12, 1.5  # each pass halves what is left in the exponents; factors are rounded anyway

@@ -15,10 +15,11 @@ from typing import Literal
 
 import numpy as np
 
+from unifg.answers.solver import Run, Solver
+from unifg.answers.status import Status
 from unifg.errors import BackendError
-from unifg.linearization import Evaluation, Linearization
-from unifg.program import Program
-from unifg.solver import Run, Solver
+from unifg.program.linearization import Evaluation, Linearization
+from unifg.program.program import Program
 from unifg.solvers.damping import largest, norm
 from unifg.solvers.kkt import require_equalities
 from unifg.solvers.least_violation import leave, settle
@@ -31,7 +32,6 @@ from unifg.solvers.qp_piqp import ElasticRoute, PiqpRoute
 from unifg.solvers.qp_polish import Polish
 from unifg.solvers.qp_qpsolvers import QpsolversRoute
 from unifg.solvers.scaling import Scaling
-from unifg.status import Status
 from unifg.typing import Array
 
 ARMIJO = 1e-4

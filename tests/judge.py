@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 import unifg as fg
-from unifg.terms import Constraint, Cost, ScalarCost
+from unifg.language.terms import Constraint, Cost, ScalarCost
+from unifg.language.variables import Data, Selection
 from unifg.typing import Array
-from unifg.variables import Data, Selection
 
 STEP = 1e-5
 WIDE = 2e-4  # of second differences

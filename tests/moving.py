@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 
 import unifg as fg
-from unifg.calls import local_matrix, local_vector
-from unifg.jit import compiled
 from unifg.lie.lookup import functions_of
+from unifg.machine.calls import local_matrix, local_vector
+from unifg.machine.jit import compiled
 from unifg.models.compiled_field import CompiledField
 from unifg.typing import Array
 

@@ -9,8 +9,8 @@ import pytest
 
 import unifg as fg
 from unifg.errors import GraphError
+from unifg.kernels.residuals import Residual, residual
 from unifg.models import avoidance, obstacles
-from unifg.residuals import Residual, residual
 from unifg.solvers import SQP, GaussNewton, InteriorPoint
 from unifg.typing import Array
 

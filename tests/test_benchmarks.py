@@ -12,7 +12,7 @@ import unifg as fg
 from benchmarks import chains, elimination, gtsam_peer, marginals, own_residuals, pose_graphs
 from benchmarks.timing import Stopwatch, interleave, number, shown, spread
 from unifg.pose_graphs import manhattan
-from unifg.program import Program
+from unifg.program.program import Program
 from unifg.solvers import GaussNewton
 
 

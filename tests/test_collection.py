@@ -16,7 +16,7 @@ from hock_schittkowski import Case
 from judge import judge
 from lie_problems import LieCase
 from problems import short_drive
-from unifg.terms import Constraint
+from unifg.language.terms import Constraint
 from unifg.typing import Array
 
 # Equalities, inequalities, costs that are no squares.

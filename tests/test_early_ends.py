@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from unifg.answers.solver import Run
 from unifg.models import obstacles, unicycle
 from unifg.scenarios.manoeuvres import CASES, ManoeuvreSettings, state_problem
-from unifg.solver import Run
 from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
 from unifg.typing import Array
 

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unifg.elimination.factorization import Factorization, Ordering
+from unifg.elimination.symmetric import Symmetric
 from unifg.errors import UnifgError
-from unifg.sparse import Symmetric
 from unifg.typing import Array, BoolArray, IntArray
 
 System = tuple[Symmetric, Array, IntArray, BoolArray]

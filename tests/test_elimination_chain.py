@@ -14,8 +14,8 @@ from unifg.elimination.chain import stages
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.ordering import block_graph
 from unifg.elimination.plan import ADJACENT, DIRECT, Plan
-from unifg.jit import compiled
-from unifg.sparse import Symmetric
+from unifg.elimination.symmetric import Symmetric
+from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from test_elimination import backward_error, full
 from unifg.elimination.factorization import Factorization, Ordering
-from unifg.sparse import Symmetric, scatter
+from unifg.elimination.symmetric import Symmetric, scatter
 from unifg.typing import Array, IntArray
 
 Graph = tuple[int, IntArray, IntArray, Array, Array]  # poses, first, second, first Jacobian, information

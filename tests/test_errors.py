@@ -15,6 +15,7 @@ import unifg as fg
 from problems import short_drive
 from test_house import LIBRARY, name_of
 from unifg.elimination.factorization import Factorization
+from unifg.elimination.symmetric import Symmetric
 from unifg.files.ros_map import OccupancyMap
 from unifg.models import quadrotor
 from unifg.models.distance_map import DistanceMap
@@ -24,7 +25,6 @@ from unifg.pose_graphs.generate import manhattan
 from unifg.pose_graphs.residuals import chart_between, sighting
 from unifg.scenarios.quadrotor.standardised import standardised
 from unifg.solvers import SQP
-from unifg.sparse import Symmetric
 
 EXCEPTIONS = {
     name for name, kind in vars(builtins).items() if isinstance(kind, type) and issubclass(kind, BaseException)

@@ -128,7 +128,7 @@ def test_side_folders_use_absolute_imports() -> None:
         ("import importlib\nimportlib.import_module('unifg.solvers.sqp')", "unifg.models", 1),
         ("import models", "unifg.scenarios", 1),
         ("from unifg.models import unicycle\nfrom unifg.solvers import SQP", "unifg.scenarios", 0),
-        ("from unifg.solver import Solver\nimport unifg.modelset", "unifg.models", 0),
+        ("from unifg.answers.solver import Solver\nimport unifg.modelset", "unifg.models", 0),
     ],
 )
 def test_wrong_imports_are_found(source: str, package: str, lines: int) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 import unifg as fg
 from benchmarks.backends import CONSTRAINED, EQUALITIES_ONLY
-from unifg.kkt import infeasible_stationary
+from unifg.answers.optimality import infeasible_stationary
 from unifg.models import obstacles, unicycle
 from unifg.solvers import SQP, AugmentedLagrangian
 from unifg.solvers.least_violation import least_violation

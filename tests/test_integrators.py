@@ -10,7 +10,7 @@ import pytest
 
 import unifg as fg
 from moving import FLYER, Carried, compiled_carried, drag_and_thrust, with_held_rate
-from unifg.differentiation import jacobian
+from unifg.kernels.differentiation import jacobian
 from unifg.lie.lookup import bend_of
 from unifg.models import rkmk
 from unifg.models.rkmk import Method

@@ -13,15 +13,15 @@ import pytest
 
 import unifg as fg
 import unifg.models
-from unifg.differentiation import jacobian
-from unifg.jit import compiled
+from unifg.kernels.differentiation import jacobian
+from unifg.kernels.residuals import Residual
+from unifg.machine.jit import compiled
 from unifg.models import avoidance, landmarks, lidar, obstacles, quadrotor, rkmk, unicycle, vehicle
 from unifg.models.compiled_field import CompiledField
 from unifg.models.distance_map import DistanceMap
 from unifg.models.potential import potential
 from unifg.models.smooth_field import SmoothField
 from unifg.pose_graphs import bearing, bearing_range, chart_between, distance, sighting
-from unifg.residuals import Residual
 from unifg.typing import Array
 
 RNG = np.random.default_rng(7)

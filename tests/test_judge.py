@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.solver import Run, Solver
+from unifg.answers.solver import Run, Solver
 from unifg.solvers import (
     KKT,
     SQP,

@@ -11,7 +11,7 @@ import unifg as fg
 from problems import PROBLEMS, Guess, ecg2o, ecg2o_inequality, short_drive, three_variable_qp
 from test_sqp_exact import two_rotations
 from unifg.models import unicycle
-from unifg.program import Program
+from unifg.program.program import Program
 from unifg.solvers import SQP
 from unifg.solvers.constrained_elimination import Contradiction, Undetermined, eliminate
 from unifg.solvers.linear_graphs import LinearFactor, LinearGraph, QuadraticFactor, dual_graph

@@ -10,6 +10,7 @@ import pytest
 from scipy.linalg import null_space
 
 import unifg as fg
+from unifg.answers.solver import Prepared
 from unifg.lie import SO3
 from unifg.models import quadrotor
 from unifg.scenarios.quadrotor.arrival import arrival, seen_from_the_vehicle
@@ -19,7 +20,6 @@ from unifg.scenarios.quadrotor.estimator import DeadReckoningEstimator, Estimato
 from unifg.scenarios.quadrotor.layouts import Layout
 from unifg.scenarios.quadrotor.window import WindowSettings, without
 from unifg.scenarios.quadrotor.world import QuadrotorWorld, Reading
-from unifg.solver import Prepared
 from unifg.solvers import KKT
 from unifg.typing import Array
 

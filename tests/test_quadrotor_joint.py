@@ -15,7 +15,7 @@ import unifg as fg
 from benchmarks import quadrotor_pull
 from unifg.lie import SO3
 from unifg.models import quadrotor
-from unifg.program import Program
+from unifg.program.program import Program
 from unifg.scenarios.quadrotor.belief import Belief
 from unifg.scenarios.quadrotor.episode import Flight, FlightSettings
 from unifg.scenarios.quadrotor.estimator import Estimator

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from unifg.answers.relative_offset import relative_offset
 from unifg.elimination.factorization import Factorization
 from unifg.files.g2o import read_g2o
 from unifg.lie import LieGroup
-from unifg.linearization import Linearization
 from unifg.pose_graphs import manhattan, sphere
-from unifg.program import Program
-from unifg.relative_offset import relative_offset
+from unifg.program.linearization import Linearization
+from unifg.program.program import Program
 from unifg.solvers import (
     KKT,
     SQP,

@@ -12,7 +12,7 @@ import pytest
 
 import unifg as fg
 from problems import short_drive
-from unifg.factor_norms import factor_norms
+from unifg.answers.factor_norms import factor_norms
 from unifg.scenarios.residual_plot import ResidualMonitor, residual_picture
 from unifg.solvers import (
     KKT,
@@ -145,7 +145,7 @@ def test_nothing_is_worked_out_unless_asked(monkeypatch: pytest.MonkeyPatch) -> 
         made.append(1)
         return factor_norms(*given)
 
-    monkeypatch.setattr("unifg.solver.factor_norms", counted)
+    monkeypatch.setattr("unifg.answers.solver.factor_norms", counted)
     graph, guess = short_drive()
     SQP(verbose=False).solve(graph, guess, callback=lambda row: None)
     assert not made

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
 from unifg.models import rkmk, unicycle
 from unifg.models.compiled_field import CompiledField
 from unifg.models.rkmk import Form

@@ -14,11 +14,11 @@ import pytest
 import unifg as fg
 from benchmarks import gtsam_peer
 from benchmarks.wrong_closures import HEAD, METHODS, Claim, rows, with_wrong_closures
+from unifg.answers.history import Iteration
 from unifg.errors import BackendError, GraphError, NotConverged
 from unifg.files.g2o import read_g2o
-from unifg.history import Iteration
+from unifg.kernels.robust import Graduated, Loss
 from unifg.pose_graphs import Edges, PoseGraph, manhattan, sphere
-from unifg.robust import Graduated, Loss
 from unifg.solvers import GaussNewton, GraduatedNonConvexity, LevenbergMarquardt, graduated_non_convexity
 from unifg.solvers.gating import Innovations, Scatter
 from unifg.typing import Array, BoolArray

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from unifg.kernels.residuals import Residual, residual
 from unifg.lie import Manifold
 from unifg.models import avoidance, landmarks, obstacles, quadrotor, unicycle, vehicle
-from unifg.residuals import Residual, residual
-from unifg.second_order import lagrangian_hessian
+from unifg.program.second_order import lagrangian_hessian
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array
 

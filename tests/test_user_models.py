@@ -12,8 +12,8 @@ import pytest
 
 import unifg as fg
 from moving import Carried, compiled_carried
-from unifg.jit import compiled
 from unifg.lie.lookup import functions_of
+from unifg.machine.jit import compiled
 from unifg.models import rkmk
 from unifg.models.compiled_field import CompiledField
 from unifg.models.rkmk import Method

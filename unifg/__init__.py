@@ -12,7 +12,13 @@ solution = SQP().solve(graph, {x: np.zeros((2, 3))})
 
 from importlib.metadata import PackageNotFoundError, version
 
-from unifg.check import Finding, Report
+from unifg.answers.check import Finding, Report
+from unifg.answers.history import Iteration
+from unifg.answers.optimality import Optimality, optimality
+from unifg.answers.solution import Guess, Solution
+from unifg.answers.solver import Prepared, Solver
+from unifg.answers.status import Status
+from unifg.answers.verdict import Verdict
 from unifg.errors import (
     BackendError,
     FileFormatError,
@@ -22,20 +28,14 @@ from unifg.errors import (
     ScenarioError,
     UnifgError,
 )
-from unifg.factors import ManifoldResidual, between, difference, prior
-from unifg.graph import Graph
-from unifg.history import Iteration
-from unifg.joint_prior import joint_prior
-from unifg.kkt import Optimality, optimality
+from unifg.kernels.residuals import Residual, residual
+from unifg.kernels.robust import DCS, Cauchy, GemanMcClure, Huber, Loss, Reweighted, TruncatedLeastSquares, Tukey
+from unifg.language.factors import ManifoldResidual, between, difference, prior
+from unifg.language.graph import Graph
+from unifg.language.joint_prior import joint_prior
+from unifg.language.variables import Data, Family, Selection
 from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Manifold, Product, Rn, wrap_angle
-from unifg.residuals import Residual, residual
-from unifg.robust import DCS, Cauchy, GemanMcClure, Huber, Loss, Reweighted, TruncatedLeastSquares, Tukey
 from unifg.smoothing import FixedLag, Incremental
-from unifg.solution import Guess, Solution
-from unifg.solver import Prepared, Solver
-from unifg.status import Status
-from unifg.variables import Data, Family, Selection
-from unifg.verdict import Verdict
 
 try:
     __version__ = version("unifg")

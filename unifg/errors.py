@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from unifg.solution import Solution
+    from unifg.answers.solution import Solution
 
 
 class UnifgError(ValueError):

@@ -15,12 +15,12 @@ from functools import cache
 import numpy as np
 
 import unifg as fg
-from unifg.calls import local_matrix
-from unifg.jit import compiled
-from unifg.kernels import Kernel
+from unifg.kernels.kernel import Kernel
+from unifg.kernels.residuals import Residual
 from unifg.lie.scalar import so3
+from unifg.machine.calls import local_matrix
+from unifg.machine.jit import compiled
 from unifg.models import quadrotor
-from unifg.residuals import Residual
 from unifg.typing import Array
 
 STORED, TANGENT = 17, 16  # of state and parameters; landmarks follow

@@ -12,9 +12,9 @@ import time
 import numpy as np
 
 import unifg as fg
+from unifg.kernels.residuals import Residual
 from unifg.lie import SO3
 from unifg.models import avoidance, landmarks, quadrotor
-from unifg.residuals import Residual
 from unifg.scenarios.quadrotor.belief import Belief
 from unifg.scenarios.quadrotor.braking import brake, stopping_height
 from unifg.scenarios.quadrotor.flyable import moves, room

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from unifg.scenarios.outcome import Outcome, Progress
 
 if TYPE_CHECKING:
-    from unifg.history import Iteration
+    from unifg.answers.history import Iteration
 
 __all__ = ["AVOIDANCES", "DESCRIPTION", "GUESSES", "HESSIANS", "SOLVERS", "add_arguments", "run"]
 
@@ -46,8 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(chosen: argparse.Namespace, progress: Progress) -> Outcome:
     """Optimise the flight that was asked for."""
+    from unifg.answers.status import Status
     from unifg.scenarios.quadrotor import obstacles, obstacles_results  # solvers and physics: not for --help
-    from unifg.status import Status
 
     settings = obstacles.CourseSettings(
         solver=chosen.solver,

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 
 import unifg as fg
-from unifg.program import Program
+from unifg.language.variables import as_selection
+from unifg.program.program import Program
 from unifg.solvers.kkt_system import KktSystem, fill
 from unifg.typing import Array
-from unifg.variables import as_selection
 
 SHIFT = 1e-10  # constraints are softened by a standard deviation of 1e-5, in their own units
 

@@ -7,11 +7,11 @@ from functools import cache
 from typing import cast
 
 from unifg.errors import GraphError
-from unifg.jit import compiled
-from unifg.kernels import Kernel
+from unifg.kernels.kernel import Kernel
+from unifg.kernels.residuals import Residual, residual
 from unifg.lie import LieGroup, Manifold, Rn
 from unifg.lie.lookup import functions_of
-from unifg.residuals import Residual, residual
+from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 import unifg as fg
-from unifg.jit import compiled
-from unifg.kernels import Kernel
+from unifg.kernels.kernel import Kernel
+from unifg.machine.jit import compiled
 from unifg.models import landmarks, quadrotor
 from unifg.scenarios.quadrotor.arrival import arrival
 from unifg.scenarios.quadrotor.window import PLACES, Window, WindowSettings

@@ -8,21 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.elimination.vectors import (
-    Address,
-    blend,
-    get,
-    inverse_root,
-    lane,
-    load,
-    minus,
-    pack,
-    plus,
-    splat,
-    store,
-    times,
-)
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
+from unifg.machine.vectors import Address, blend, get, inverse_root, lane, load, minus, pack, plus, splat, store, times
 
 VANISHED = 8.9e-16  # pivots below this part of their original diagonal are rounding errors
 STRIP, DEPTH = 64, 192  # columns and products handled together: what stays in the second-level cache

@@ -9,7 +9,7 @@ of the Dulmage-Mendelsohn decomposition and network flow to graph bisection impr
 from __future__ import annotations
 
 from unifg.elimination.ordering import filled
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
 from unifg.typing import IntArray
 
 LEAF = 120  # nodes that are not split any further

@@ -22,9 +22,9 @@ from unifg.elimination.plan import (
     ZERO,
     Plan,
 )
+from unifg.elimination.symmetric import Symmetric
 from unifg.elimination.tree import EliminationTree
 from unifg.errors import UnifgError
-from unifg.sparse import Symmetric
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["Factorization", "Ordering"]

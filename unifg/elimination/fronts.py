@@ -31,8 +31,8 @@ from unifg.elimination.plan import (
     ZERO,
     Plan,
 )
-from unifg.elimination.vectors import address, blend, get, load, plus, put, splat, store
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
+from unifg.machine.vectors import address, blend, get, load, plus, put, splat, store
 from unifg.typing import Array
 
 BLOCK = 96  # pivots eliminated before the rest of a panel is brought up to date

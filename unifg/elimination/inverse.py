@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from unifg.elimination.dense import subtract_products, subtract_signed
 from unifg.elimination.plan import FIRST, FRONTS, INDEX, PANEL, PIVOTS, ROWS, STRIDE, Plan
-from unifg.elimination.vectors import address, get, load, minus, put, splat, store, times
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
+from unifg.machine.vectors import address, get, load, minus, put, splat, store, times
 from unifg.typing import Array, BoolArray, IntArray
 
 

@@ -21,7 +21,7 @@ from unifg.elimination.plan import (
     UPDATE,
     UPDATE_STRIDE,
 )
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
 from unifg.typing import IntArray
 
 Narrow = NDArray[np.int32]

@@ -23,7 +23,7 @@ from unifg.elimination.factorization import Factorization
 from unifg.elimination.fronts import factor
 from unifg.elimination.plan import Plan
 from unifg.errors import UnifgError
-from unifg.jit import compiled, in_order
+from unifg.machine.jit import compiled, in_order
 from unifg.typing import Array, IntArray
 
 SHIFT = 1e-12  # on the diagonal of the equilibrated matrix

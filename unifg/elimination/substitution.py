@@ -8,8 +8,8 @@ import numpy as np
 
 from unifg.elimination.fronts import factor
 from unifg.elimination.plan import ADJACENT, FIRST, FRONTS, INDEX, PANEL, PIVOTS, ROWS, SCALARS, STRIDE, Plan
-from unifg.elimination.vectors import Address, address, blend, get, load, minus, plus_products, put, splat, store, total
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
+from unifg.machine.vectors import Address, address, blend, get, load, minus, plus_products, put, splat, store, total
 from unifg.typing import Array, IntArray
 
 MEMORY = 4  # corrections that are combined

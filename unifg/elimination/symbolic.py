@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.elimination.ordering import filled
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
 from unifg.typing import Array, IntArray
 
 # Nanoseconds of a front, of an entry added into the parent, and of a multiplication with an addition.

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from unifg.calls import matrix, vector
 from unifg.errors import UnifgError
-from unifg.jit import compiled
+from unifg.machine.calls import matrix, vector
+from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike
 
 Scalar = Callable[..., None]

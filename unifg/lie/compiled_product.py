@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from types import ModuleType
 
-from unifg.calls import local_matrix, vector
-from unifg.jit import compiled
 from unifg.lie.manifold import Manifold
 from unifg.lie.product import Product
+from unifg.machine.calls import local_matrix, vector
+from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 Scalar = Callable[..., None]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.elimination.factorization import Factorization
+from unifg.elimination.symmetric import Symmetric, scatter
 from unifg.errors import GraphError
-from unifg.sparse import Symmetric, scatter
 from unifg.typing import Array, IntArray
 
 __all__ = ["block_least_squares"]

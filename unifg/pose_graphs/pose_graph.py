@@ -12,14 +12,14 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from unifg.errors import GraphError
-from unifg.factors import ManifoldResidual, between
-from unifg.graph import Graph
+from unifg.kernels.residuals import Residual
+from unifg.kernels.robust import Loss
+from unifg.language.factors import ManifoldResidual, between
+from unifg.language.graph import Graph
+from unifg.language.variables import Family
 from unifg.lie import SE2, SE3, LieGroup, Rn
 from unifg.pose_graphs.residuals import bearing, bearing_range, chart_between, distance, sighting
-from unifg.residuals import Residual
-from unifg.robust import Loss
 from unifg.typing import Array, BoolArray, IntArray
-from unifg.variables import Family
 
 __all__ = ["Edges", "Ids", "PoseGraph", "ResidualName", "RobustOn", "Sightings"]
 

@@ -10,15 +10,15 @@ from collections.abc import Callable
 from functools import cache
 from types import ModuleType
 
-from unifg.calls import local_matrix, local_vector, vector
 from unifg.errors import GraphError
-from unifg.factors import ManifoldResidual
-from unifg.jit import compiled
-from unifg.kernels import Kernel
+from unifg.kernels.kernel import Kernel
+from unifg.kernels.residuals import Residual, residual
+from unifg.language.factors import ManifoldResidual
 from unifg.lie import SE2, SE3, LieGroup, Manifold, Rn
 from unifg.lie.lookup import functions_of
 from unifg.lie.scalar.so2 import wrap
-from unifg.residuals import Residual, residual
+from unifg.machine.calls import local_matrix, local_vector, vector
+from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 __all__ = ["bearing", "bearing_range", "chart_between", "distance", "sighting"]

@@ -8,8 +8,8 @@ that the parent adds to its own front (J. Liu, "The multifrontal method", SIAM R
 from __future__ import annotations
 
 from unifg.elimination.dense import eliminate, subtract_signed
-from unifg.elimination.vectors import address, blend, get, load, plus, put, splat, store
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
+from unifg.machine.vectors import address, blend, get, load, plus, put, splat, store
 from unifg.smoothing.fields import (
     CANDIDATE,
     CANDIDATES,

@@ -8,24 +8,24 @@ from typing import Any
 
 import numpy as np
 
-from unifg.calls import RETRACTION, address
 from unifg.errors import GraphError
-from unifg.factors import prior
-from unifg.graph import AnyResidual, complete
-from unifg.jit import compiled, is_compiled
-from unifg.kernels import Kernel, side_by_side
+from unifg.kernels.kernel import Kernel, side_by_side
+from unifg.kernels.per_factor import per_factor
+from unifg.kernels.residuals import Residual
+from unifg.kernels.robust import DCS, Cauchy, GemanMcClure, Huber, Loss, Tukey
+from unifg.kernels.whitening import DIAGONAL, FULL, reciprocals, square_roots
+from unifg.language.factors import prior
+from unifg.language.graph import AnyResidual, complete
+from unifg.language.variables import as_selection, is_variable
 from unifg.lie import Manifold, Rn
 from unifg.lie.lookup import functions_of
 from unifg.lie.product import leaves
-from unifg.per_factor import per_factor
-from unifg.residuals import Residual
-from unifg.robust import DCS, Cauchy, GemanMcClure, Huber, Loss, Tukey
+from unifg.machine.calls import RETRACTION, address
+from unifg.machine.jit import compiled, is_compiled
 from unifg.smoothing.families import GrowingFamily
 from unifg.smoothing.fields import SLOTS_MAX
 from unifg.smoothing.linear import CAUCHY, DCS_LOSS, GEMAN_MCCLURE, HUBER, PART, QUADRATIC, TUKEY
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
-from unifg.variables import as_selection, is_variable
-from unifg.whitening import DIAGONAL, FULL, reciprocals, square_roots
 
 
 @dataclass(eq=False)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.errors import GraphError
+from unifg.language.variables import Family, Index, Selection
 from unifg.lie import Manifold, Rn
 from unifg.typing import IntArray
-from unifg.variables import Family, Index, Selection
 
 
 class GrowingFamily(Family):

@@ -8,13 +8,13 @@ from typing import Literal
 import numpy as np
 
 from unifg.errors import GraphError
+from unifg.language.variables import Selection, Variable, as_selection
 from unifg.smoothing.factors import Staged
 from unifg.smoothing.families import GrowingFamily
 from unifg.smoothing.fields import FAMILY, MEMBER
 from unifg.smoothing.marginalize import marginalize
 from unifg.smoothing.smoother import Effort, Smoother
 from unifg.typing import Array, ArrayLike, BoolArray
-from unifg.variables import Selection, Variable, as_selection
 
 
 class FixedLag(Smoother):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from math import log1p, sqrt
 
-from unifg.calls import call_residual, call_retraction, matrix, vector, vector_at
-from unifg.elimination.vectors import get, load, plus, put, splat, store
-from unifg.jit import compiled
+from unifg.kernels.whitening import DIAGONAL, FULL
+from unifg.machine.calls import call_residual, call_retraction, matrix, vector, vector_at
+from unifg.machine.jit import compiled
+from unifg.machine.vectors import get, load, plus, put, splat, store
 from unifg.smoothing.fields import (
     ADDRESS,
     DATA,
@@ -31,7 +32,6 @@ from unifg.smoothing.fields import (
     State,
 )
 from unifg.typing import Array, IntArray
-from unifg.whitening import DIAGONAL, FULL
 
 PART = 6  # numbers that describe a part of a manifold
 QUADRATIC, HUBER, CAUCHY, TUKEY, GEMAN_MCCLURE, DCS_LOSS = range(6)
@@ -45,7 +45,7 @@ def length_of(kind: IntArray) -> int:
 
 @compiled
 def robust_weight(loss: int, parameter: float, squared: float) -> float:
-    """rho'(s), see :mod:`unifg.robust`; ``parameter`` is the squared scale, or Phi."""
+    """rho'(s), see :mod:`unifg.kernels.robust`; ``parameter`` is the squared scale, or Phi."""
     if loss == HUBER:
         return 1.0 if squared <= parameter else sqrt(parameter / squared)
     if loss == CAUCHY:

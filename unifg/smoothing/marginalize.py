@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.elimination.ordering import filled
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
 from unifg.smoothing.cliques import add_child
 from unifg.smoothing.fields import (
     ALIVE,

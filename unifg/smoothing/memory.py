@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
 from unifg.smoothing.fields import CLASSES, HEADS, LISTS_END, NUMBERS_END, State
 from unifg.typing import Array, IntArray
 

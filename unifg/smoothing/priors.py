@@ -7,8 +7,8 @@ micro Lie theory", eq. 69), and the quadratic is written anew in d'.
 
 from __future__ import annotations
 
-from unifg.calls import call_residual, matrix, vector
-from unifg.jit import compiled
+from unifg.machine.calls import call_residual, matrix, vector
+from unifg.machine.jit import compiled
 from unifg.smoothing.fields import (
     CANDIDATE,
     COUNT,

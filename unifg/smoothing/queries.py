@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
 from unifg.smoothing.fields import (
     ALIVE,
     CANDIDATE,

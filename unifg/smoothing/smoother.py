@@ -9,9 +9,10 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.graph import AnyResidual
+from unifg.kernels.robust import Loss
+from unifg.language.graph import AnyResidual
+from unifg.language.variables import Selection, Variable, as_selection
 from unifg.lie import Manifold
-from unifg.robust import Loss
 from unifg.smoothing.factors import Kinds, Staged, Types
 from unifg.smoothing.families import GrowingFamily
 from unifg.smoothing.fields import (
@@ -31,7 +32,6 @@ from unifg.smoothing.fields import (
 from unifg.smoothing.queries import add_factors, add_variables, estimates, joint_covariance, total_cost
 from unifg.smoothing.update import update_tree
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
-from unifg.variables import Selection, Variable, as_selection
 
 T = TypeVar("T", Array, IntArray)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.elimination.ordering import filled
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
 from unifg.smoothing.fields import (
     ALIVE,
     CANDIDATE,

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.elimination.ordering import filled
-from unifg.elimination.vectors import splat, store
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
+from unifg.machine.vectors import splat, store
 from unifg.smoothing.cliques import add_child, add_factor, eliminate_clique, substitute
 from unifg.smoothing.fields import (
     CHANGED,

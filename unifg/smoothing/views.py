@@ -12,7 +12,7 @@ from typing import Any, cast
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
 from unifg.smoothing.fields import State
 
 

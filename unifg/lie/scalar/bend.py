@@ -15,9 +15,9 @@ from __future__ import annotations
 
 import math
 
-from unifg.calls import vector
-from unifg.jit import compiled
 from unifg.lie.scalar.series import SERIES_BELOW, k_slope, k_value, x_cot_x
+from unifg.machine.calls import vector
+from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from unifg.jit import compiled, in_order
+from unifg.machine.jit import compiled, in_order
 from unifg.typing import Array
 
 

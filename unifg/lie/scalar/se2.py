@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import math
 
-from unifg.jit import compiled
 from unifg.lie.scalar.series import c_value, k_value, sinc, sinc_and_cos, x_cot_x
 from unifg.lie.scalar.so2 import wrap
+from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 

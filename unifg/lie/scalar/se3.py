@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 
-from unifg.jit import compiled
 from unifg.lie.scalar.series import b_slope, c_slope, c_value, k_slope, k_value, x_cot_x
 from unifg.lie.scalar.so3 import (
     coefficients,
@@ -29,6 +28,7 @@ from unifg.lie.scalar.so3 import (
     write_polynomial,
     write_product,
 )
+from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 

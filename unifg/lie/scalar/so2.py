@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from unifg.jit import compiled
+from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 PI = math.pi

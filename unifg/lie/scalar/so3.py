@@ -15,9 +15,9 @@ from __future__ import annotations
 
 import math
 
-from unifg.jit import compiled
 from unifg.lie.scalar.series import TINY, c_value, k_value, x_cot_x
 from unifg.lie.scalar.so2 import wrap
+from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 DRIFT = 4e-15  # of |q|^2; below it a product keeps its digits, so that a zero step changes none

@@ -1,0 +1,177 @@
+"""The optimality test every backend is judged by.
+
+For min f(x) s.t. l <= g(x) <= u with L = f + lambda' g, at a point and multipliers:
+
+- stationarity: max |grad f + A' lambda| over the unknowns (tangent coordinates, right perturbation);
+- violation: max distance of g outside [l, u];
+- complementarity: max |lambda_i| times the distance of g_i to the limit its sign points at; a multiplier
+  pointing at a limit that does not exist has the wrong sign and counts as |lambda_i|.
+
+Stationarity and complementarity are divided by max(1, mean|lambda| / 100); the violation is not scaled.
+
+Pure least squares, a graph without constraints and scalar costs, has a zero point of cost, and with it a measure that
+does not depend on the unit of the information: there the stationarity is the relative offset of
+:mod:`unifg.answers.relative_offset`, and the Hessian must be regular too: where it is not, some unknowns may be moved freely.
+
+A stationarity that is made of differences is known up to their rounding, :mod:`unifg.answers.rounding`. Where that exceeds the
+tolerance nothing passes: a derivative that rounding has left nothing of looks like zero.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from unifg.answers.relative_offset import Factored, relative_offset
+from unifg.answers.rounding import gradient_rounding
+from unifg.answers.violation import ViolationModel
+from unifg.machine.jit import compiled
+from unifg.program import passes
+from unifg.program.linearization import Linearization
+from unifg.program.program import Program
+from unifg.program.table import Terms
+from unifg.typing import Array, IntArray
+
+
+@dataclass(frozen=True)
+class Optimality:
+    """KKT numbers at a point.
+
+    Attributes:
+        stationarity, violation, complementarity: as defined in the module's docstring.
+        worst_row: constraint row with the largest violation, or -1 without constraints.
+        finite: whether everything could be evaluated.
+        determined: whether no unknown may be moved freely; looked at for least squares only.
+        rounding: by how much differences may be wrong about the stationarity.
+    """
+
+    stationarity: float
+    violation: float
+    complementarity: float
+    worst_row: int
+    finite: bool
+    determined: bool = True
+    rounding: float = 0.0
+
+    def holds(self, tolerance: float) -> bool:
+        """Whether all three numbers are within ``tolerance``."""
+        return self.finite and max(self.stationarity, self.violation, self.complementarity) <= tolerance
+
+    def passes(self, tolerance: float) -> bool:
+        """Whether all three numbers are known to be within ``tolerance``, at a point that is determined."""
+        return self.determined and self.holds(tolerance) and self.rounding <= tolerance
+
+    def blurred(self, tolerance: float) -> bool:
+        """Whether rounding above ``tolerance`` is all that differences still see of the stationarity."""
+        sound = self.finite and max(self.violation, self.complementarity) <= tolerance
+        return sound and self.stationarity <= self.rounding and self.rounding > tolerance
+
+
+def optimality(
+    program: Program,
+    lin: Linearization,
+    multipliers: Array,
+    enough: float = 0.0,
+    lent: Factored | None = None,
+    guess: Array | None = None,
+) -> Optimality:
+    """Measure the KKT conditions at a linearised point.
+
+    Args:
+        program: the compiled graph with its data bound.
+        lin: linearisation at the point, whose gradient is the true one, robust losses included.
+        multipliers: (M,) one per constraint row.
+        enough: of least squares, a relative offset above this may be a lower bound, which takes no factorisation.
+        lent: of least squares, a backend's factorisation near this point.
+        guess: of least squares, the stored values that the solve began with.
+    """
+    if program.least_squares:
+        offset = relative_offset(program, lin, enough, lent, guess)
+        if not (offset.finite and np.isfinite(lin.cost)):
+            return Optimality(np.inf, np.inf, np.inf, -1, False)
+        rounding = _relative_rounding(program, lin, multipliers) if program.differenced else 0.0
+        return Optimality(offset.value, 0.0, 0.0, -1, True, offset.determined, rounding)
+    measured = _measure(
+        program.arrays,
+        program.columns.free,
+        lin.gradient,
+        lin.constraints,
+        lin.constraint_jacobian,
+        multipliers,
+    )
+    stationarity, violation, complementarity, worst, finite = measured
+    if not finite or not np.isfinite(lin.cost):
+        return Optimality(np.inf, np.inf, np.inf, -1, False)
+    rounding = 0.0
+    if program.differenced:
+        rounding = float(gradient_rounding(program, lin, multipliers).max(initial=0.0))
+        rounding /= max(1.0, float(np.abs(multipliers).mean()) / 100.0) if len(multipliers) else 1.0
+    return Optimality(stationarity, violation, complementarity, worst, True, True, rounding)
+
+
+def _relative_rounding(program: Program, lin: Linearization, multipliers: Array) -> float:
+    """By how much differences may be wrong about a relative offset."""
+    rounding = gradient_rounding(program, lin, multipliers)
+    size = float(np.linalg.norm(lin.residual))
+    if not len(rounding) or size == 0.0:
+        return 0.0
+    curvature = np.sqrt(lin.hessian[program.normal.diagonal])
+    seen = curvature > 0.0
+    with np.errstate(over="ignore"):
+        return float((rounding[seen] / curvature[seen]).max(initial=0.0)) / size
+
+
+@compiled
+def _measure(
+    terms: Terms,
+    free: IntArray,
+    slope: Array,
+    constraints: Array,
+    entries: Array,
+    multipliers: Array,
+) -> tuple[float, float, float, int, bool]:
+    """Stationarity, violation, complementarity, worst row, and whether everything is finite."""
+    stationarity, violation, complementarity, size = 0.0, 0.0, 0.0, 0.0
+    worst, count, finite = -1, len(constraints), True
+    gradient, lower, upper = slope.copy(), terms.lower, terms.upper
+    passes.transposed_times(terms, False, entries, multipliers, gradient)
+    for k in range(len(free)):
+        stationarity = max(stationarity, abs(gradient[free[k]]))
+    for k in range(len(slope)):
+        finite = finite and math.isfinite(slope[k])
+    for k in range(len(entries)):
+        finite = finite and math.isfinite(entries[k])
+    for row in range(count):
+        value, multiplier = constraints[row], multipliers[row]
+        finite = finite and math.isfinite(value) and math.isfinite(multiplier)
+        size += abs(multiplier)
+        outside = max(max(value - upper[row], lower[row] - value), 0.0)
+        if worst < 0 or outside > violation:
+            worst, violation = row, outside
+        if lower[row] != upper[row]:
+            limit = upper[row] if multiplier > 0.0 else lower[row]
+            slack = abs(value - limit) if math.isfinite(limit) else 1.0
+            complementarity = max(complementarity, abs(multiplier) * slack)
+    scale = max(1.0, size / max(count, 1) / 100.0)
+    return stationarity / scale, violation, complementarity / scale, worst, finite
+
+
+def infeasible_stationary(program: Program, lin: Linearization, tolerance: float) -> bool:
+    """Whether the point is stationary for 1/2 |violation|^2 without being feasible, in whatever units the unknowns are.
+
+    It is where the best step of :class:`unifg.answers.violation.ViolationModel` promises nothing that counts. Bounds of the
+    unknowns are kept, since they can be: a point outside them is looked at where it is brought back, and descent
+    directions that they block do not count.
+    """
+    lin = within_bounds(program, lin)
+    if np.abs(program.violation(lin.constraints)).max(initial=0.0) <= tolerance:
+        return False
+    return ViolationModel(program, lin).stationary(tolerance)
+
+
+def within_bounds(program: Program, lin: Linearization) -> Linearization:
+    """The linearisation at the nearest point that respects every bound of an unknown; ``lin`` where it does."""
+    values = program.within_bounds(lin.values)
+    return lin if values is lin.values else program.linearize(values)

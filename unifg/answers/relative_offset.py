@@ -1,0 +1,329 @@
+"""The convergence test of least squares: how far the residual is from being orthogonal to what steps can change.
+
+With r the weighted, whitened residual, J its Jacobian and P the projection onto the columns of J, the relative offset
+is |P r| / |r|: the cosine of the angle between the residual and its tangent space, between zero and one, whatever the
+unit of the cost. Its square, g' H^-1 g / |r|^2 with g = J'r and H = J'J, is the share of the cost that a Gauss-Newton
+step promises to remove (Bates and Watts, "A relative offset orthogonality convergence criterion for nonlinear least
+squares", Technometrics 23(2), 1981). With robust losses r and J carry the square roots of the weights, so that g is
+the true gradient and H is never indefinite.
+
+Where residuals vanish at the solution, |P r| is compared with the rounding errors of r instead: those of numbers as
+large as the variables, or as they were at the guess, seen through J.
+
+Where H is singular, the curvature of the residuals may still determine every unknown: the solution of n equations that
+cannot be met has a singular J. There the Hessian with that curvature takes the place of H, and what its Newton step
+promises to remove is measured. Only where it is singular too is a point undetermined.
+
+No matrix is factorised for a point that is far from stationary: the largest cosine between r and one column of J is a
+lower bound. Near the end the factor of the last linearisation serves as preconditioner of a few conjugate-gradient
+steps on H itself, whose energy bounds g' H^-1 g from below and is exact when the remainder vanishes. Only where that
+factor is too old does H get a new one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from unifg.elimination.factorization import Factorization
+from unifg.kernels.steps import ANGLE, TURN
+from unifg.machine.jit import compiled
+from unifg.program.extents import extents
+from unifg.program.linearization import Linearization
+from unifg.program.program import Program
+from unifg.program.second_order import lagrangian_hessian
+from unifg.program.touched import term_columns
+from unifg.typing import Array, BoolArray, IntArray
+
+EPS = 2.0**-52
+LARGEST = 1e308
+ROUNDING = 4.0  # roundings in a residual, each of a number as large as the variables
+WEAK = 1e-13  # pivots below this, relative to the diagonal, are rounding errors
+FLAT = 1e-6  # the same of a Hessian whose second derivatives are differences
+STEPS = 4  # conjugate-gradient steps before a new factor is cheaper
+SAME = 1e-4  # remainder, relative to the energy, at which an old factor is as good as a new one
+SINGULAR_SHIFT = 1e-9  # of the diagonal: makes a singular Hessian a preconditioner
+DAMPED = 1e2  # a direction this many times stiffer than the damping is seen through it
+
+
+class Factored(Protocol):
+    """What a backend can lend: its factorisation of a matrix near the Hessian.
+
+    Attributes:
+        solver: the factorisation.
+        damping: what was added to the diagonal, relative to it.
+    """
+
+    @property
+    def solver(self) -> Factorization: ...  # noqa: D102
+
+    damping: float
+
+
+@dataclass(frozen=True)
+class Offset:
+    """Result of the test at one point.
+
+    Attributes:
+        value: |P r| / |r|, zero where |P r| is rounding; above ``enough`` it may be a lower bound.
+        determined: whether the costs determine every unknown.
+        finite: whether everything could be evaluated.
+    """
+
+    value: float
+    determined: bool
+    finite: bool
+
+
+def relative_offset(
+    program: Program,
+    lin: Linearization,
+    enough: float = 0.0,
+    lent: Factored | None = None,
+    guess: Array | None = None,
+) -> Offset:
+    """Measure |P r| / |r| at a linearised point.
+
+    Args:
+        program: a compiled graph without constraints and scalar costs.
+        lin: linearisation at the point.
+        enough: a value above this need not be exact: nobody asks how far a point is from passing.
+        lent: factorisation of a backend that may be reused, and overwritten.
+        guess: stored values that the solve began with; unknowns that have shrunk since count as large as they were.
+    """
+    return _structure(program).measure(program, lin, enough, lent, guess)
+
+
+class Structure:
+    """What does not change between points of one graph.
+
+    Attributes:
+        counted: (C,) rows that touch an unknown; empty when all do. Costs between fixed variables are constants.
+        first, last: (n,) storage whose largest number is the size of each unknown coordinate.
+        least: (n,) its size at least: one radian for angles.
+    """
+
+    def __init__(self, program: Program) -> None:
+        """Look at the terms and at the manifolds."""
+        self.counted = _counted(program)
+        self.first, self.last, self.least = _extents(program)
+        self._own: Factorization | None = None
+
+    def measure(
+        self, program: Program, lin: Linearization, enough: float, lent: Factored | None, guess: Array | None
+    ) -> Offset:
+        """See :func:`relative_offset`."""
+        values = program.columns.values(lin.values).flat
+        size, cosine, rounding = _bounds(
+            lin.residual,
+            self.counted,
+            lin.gradient,
+            program.columns.free,
+            lin.hessian,
+            program.normal.diagonal,
+            self.first,
+            self.last,
+            self.least,
+            values,
+            values if guess is None else guess,
+        )
+        if math.isnan(cosine):
+            return Offset(np.inf, True, False)
+        floor = ROUNDING * EPS * rounding + (EPS * EPS * math.sqrt(program.size) / size if size else 0.0)
+        limit = max(enough, floor)
+        if enough > 0.0 and cosine > limit:
+            return Offset(cosine, True, True)
+        energy, determined = self._energy(program, lin, (limit * size) ** 2 if enough > 0.0 else np.inf, lent)
+        value = math.sqrt(energy) / size if size else 0.0
+        return Offset(0.0 if value <= floor else value, determined, True)
+
+    def _energy(self, program: Program, lin: Linearization, limit: float, lent: Factored | None) -> tuple[float, bool]:
+        """Return g' H^-1 g, or a lower bound above ``limit``; and whether H is regular."""
+        gradient = lin.gradient[program.columns.free]
+        diagonal = lin.hessian[program.normal.diagonal]
+        if lent is not None and lent.solver.definite:
+            energy, exact = _climb(program, lin.hessian, gradient, lent.solver, limit)
+            if energy > limit:
+                return energy, True
+            # A loss may have taken away since then what held a variable.
+            if exact and not program.table.robust and self._regular(program, lin.hessian, diagonal, lent):
+                return energy, True
+        solver = self._solver(program) if lent is None else lent.solver
+        if lent is not None:
+            lent.damping = 0.0
+        if solver.factor(lin.hessian) and _sound(solver, diagonal, program.size):
+            return float(gradient @ solver.solve(gradient)), True
+        idle = _idle(program, diagonal)
+        if idle.any():  # what no active factor touches is not asked for
+            added = np.where(idle, 1.0, 0.0)
+            if solver.factor(lin.hessian, added) and _sound(solver, diagonal + added, program.size):
+                return float(gradient @ solver.solve(gradient)), True
+        largest = diagonal.max(initial=0.0)
+        if largest == 0.0:
+            return 0.0, False
+        if not solver.factor(lin.hessian, SINGULAR_SHIFT * np.maximum(diagonal, 1e-9 * largest)):
+            return np.inf, False
+        energy, _ = _climb(program, lin.hessian, gradient, solver, limit)
+        bent = self._bent(program, lin)
+        return (energy, False) if bent is None else (float(gradient @ bent.solve(gradient)), True)
+
+    def _bent(self, program: Program, lin: Linearization) -> Factorization | None:
+        """The Hessian with the curvature of the residuals, factorised; None where that is singular or indefinite."""
+        hessian = lagrangian_hessian(program, lin, np.zeros(0))
+        diagonal = hessian[program.normal.diagonal]
+        solver = self._solver(program)
+        regular = bool((diagonal > 0.0).all()) and solver.factor(hessian)
+        return solver if regular and _sound(solver, diagonal, program.size, FLAT) else None
+
+    def _regular(self, program: Program, hessian: Array, diagonal: Array, lent: Factored) -> bool:
+        """Whether a factor near the Hessian shows that every direction is determined."""
+        if not (_sound(lent.solver, diagonal, program.size) and diagonal.all()):
+            return False
+        if lent.damping == 0.0:
+            return True
+        # Inverse iteration: a direction without information would dominate after two solves through the damping.
+        vector = np.random.default_rng(1).choice([-1.0, 1.0], program.size) / np.sqrt(diagonal)
+        for _ in range(2):
+            vector = lent.solver.solve(diagonal * vector)
+            vector /= math.sqrt(float(diagonal @ np.square(vector)))
+        return float(vector @ program.normal.times(hessian, vector)) > DAMPED * lent.damping
+
+    def _solver(self, program: Program) -> Factorization:
+        if self._own is None:
+            self._own = program.normal_solver()
+        return self._own
+
+
+def _climb(
+    program: Program, hessian: Array, gradient: Array, solver: Factorization, limit: float
+) -> tuple[float, bool]:
+    """Energy of conjugate gradients on H x = g, preconditioned by a factor; and whether nothing is missing from it."""
+    energy, rest = 0.0, gradient.copy()
+    z = solver.solve(rest)
+    product = float(rest @ z)
+    direction = z
+    for _ in range(STEPS):
+        if not product > 0.0:
+            return energy, product == 0.0
+        curved = program.normal.times(hessian, direction)
+        curvature = float(direction @ curved)
+        if not curvature > 0.0:
+            return energy, False
+        length = product / curvature
+        energy += length * product
+        if energy > limit:
+            return energy, False
+        rest -= length * curved
+        z = solver.solve(rest)
+        before, product = product, float(rest @ z)
+        if product <= SAME * energy:
+            return energy + max(product, 0.0), True
+        direction = z + product / before * direction
+    return energy, False
+
+
+def _sound(solver: Factorization, diagonal: Array, size: int, weak: float = WEAK) -> bool:
+    """Whether all pivots stand out from rounding errors."""
+    if not solver.definite:
+        return False
+    plan = solver.plan
+    return bool(_stands_out(plan.order, plan.signs, plan.pivots, diagonal, size, weak))
+
+
+def _counted(program: Program) -> BoolArray:
+    """(C,) rows that touch an unknown, or nothing when all do."""
+    if program.size == program.columns.width:
+        return np.zeros(0, dtype=bool)
+    rows = [np.zeros(0, dtype=bool)]
+    for term in program.cost_terms:
+        touching = np.zeros(term.count, dtype=bool)
+        for columns in term_columns(program.columns, term):
+            touching |= (program.columns.unknown[columns] >= 0).any(axis=1)
+        rows.append(np.repeat(touching, term.size))
+    counted: BoolArray = np.concatenate(rows)
+    return counted[:0] if counted.all() else counted
+
+
+def _idle(program: Program, diagonal: Array) -> BoolArray:
+    """(n,) unknowns without information because every factor that could give some is switched off."""
+    bare: BoolArray = diagonal == 0.0
+    if not bare.any():
+        return bare
+    touched = np.zeros(program.columns.width, dtype=bool)
+    for term in program.cost_terms:
+        on = np.ones(term.count, dtype=bool) if term.active is None else term.active
+        for columns in term_columns(program.columns, term):
+            touched[columns[on]] = True
+    idle: BoolArray = bare & ~touched[program.columns.free]
+    return idle
+
+
+def _extents(program: Program) -> tuple[IntArray, IntArray, Array]:
+    """Where the numbers stand that say how large each unknown coordinate is; angles have none, but a least size."""
+    first, last, kinds = (place[program.columns.free] for place in extents(program))
+    angles = (kinds == ANGLE) | (kinds == TURN)
+    return np.where(angles, 0, first), np.where(angles, 0, last), angles.astype(np.float64)
+
+
+@compiled
+def _stands_out(order: IntArray, signs: Array, roots: Array, diagonal: Array, size: int, weak: float) -> bool:
+    """Whether all pivots, signs / roots^2, do."""
+    for k in range(size):
+        if not signs[k] > weak * diagonal[order[k]] * roots[k] * roots[k]:
+            return False
+    return True
+
+
+@compiled
+def _bounds(
+    residual: Array,
+    counted: BoolArray,
+    gradient: Array,
+    free: IntArray,
+    hessian: Array,
+    diagonal: IntArray,
+    first: IntArray,
+    last: IntArray,
+    least: Array,
+    values: Array,
+    guess: Array,
+) -> tuple[float, float, float]:
+    """|r|; the largest |g_k| / sqrt(H_kk) and the norm of sqrt(H_kk) times the size of coordinate k, both over |r|.
+
+    The second is not a number when some derivative is not finite.
+    """
+    squares = cosine = rounding = 0.0
+    if len(counted):
+        for row in range(len(residual)):
+            if counted[row]:
+                squares += residual[row] * residual[row]
+    else:
+        for row in range(len(residual)):
+            squares += residual[row] * residual[row]
+    norm = math.sqrt(min(squares, LARGEST))
+    for k in range(len(free)):
+        slope, information, size = gradient[free[k]], hessian[diagonal[k]], least[k]
+        if not math.isfinite(slope) or not math.isfinite(information):
+            return norm, math.nan, math.nan
+        root = math.sqrt(information)
+        for at in range(first[k], last[k]):
+            size = max(size, abs(values[at]), abs(guess[at]))
+        if norm > 0.0:
+            rounding += (root * size / norm) ** 2
+            if root > 0.0:
+                cosine = max(cosine, abs(slope) / root / norm)
+    return norm, cosine, math.sqrt(rounding)
+
+
+_STRUCTURES: WeakKeyDictionary[Program, Structure] = WeakKeyDictionary()
+
+
+def _structure(program: Program) -> Structure:
+    found = _STRUCTURES.get(program)
+    if found is None:
+        found = _STRUCTURES[program] = Structure(program)
+    return found

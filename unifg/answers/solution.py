@@ -1,0 +1,295 @@
+"""What every backend returns, and what the next solve may start from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from unifg.answers.covariance import Covariances
+from unifg.answers.factor_norms import FactorNorms, factor_norms
+from unifg.answers.history import HEADER, Iteration, line
+from unifg.answers.marginal import Variables, information, marginal_prior
+from unifg.answers.optimality import Optimality
+from unifg.answers.status import Status
+from unifg.answers.verdict import Verdict
+from unifg.errors import GraphError
+from unifg.language.variables import Family, Selection, Variable, as_selection
+from unifg.program.linearization import Linearization
+from unifg.program.program import Program
+from unifg.typing import Array, BoolArray, IntArray
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Values of the families, multipliers and penalties of the constraints by term name.
+
+    Attributes:
+        values: (count, storage) per family.
+        multipliers: (n, m) per constraint term; absent terms start at zero.
+        penalties: (n, m) per constraint term, of backends that have them; absent terms leave them to the backend.
+    """
+
+    values: Mapping[Family, Array]
+    multipliers: Mapping[str, Array] = field(default_factory=dict)
+    penalties: Mapping[str, Array] = field(default_factory=dict)
+
+
+class Solution:
+    """The final iterate with its KKT numbers.
+
+    Attributes:
+        status: why the solve ended.
+        cost: objective, with its 1/2.
+        stationarity, violation, complementarity: KKT numbers, see :mod:`unifg.answers.optimality`. The stationarity of pure least
+            squares is its relative offset, free of the unit of cost; above the tolerance, at least this.
+        rounding: by how much numerical differentiation may be wrong about the stationarity.
+        iterations: number of iterations taken.
+        seconds: wall-clock time of the solve.
+        solver: name of the backend.
+        verdict: which measurements it believes, from solves that decide that.
+    """
+
+    verdict: Verdict | None = None
+
+    def __init__(
+        self,
+        program: Program,
+        linearization: Linearization,
+        multipliers: Array,
+        penalties: Array,
+        status: Status,
+        measured: Optimality,
+        history: list[Iteration] | Callable[[], list[Iteration]],
+        iterations: int,
+        seconds: float,
+        solver: str,
+    ) -> None:
+        """Assembled by :class:`unifg.Solver`."""
+        self._program = program
+        self._lin = linearization
+        self._multipliers, self._penalties = multipliers, penalties
+        self._data = dict(program.data)
+        self._equality = program.equality
+        self._lower, self._upper = program.lower, program.upper
+        self.status = status
+        self.cost = linearization.cost
+        self.stationarity = measured.stationarity
+        self.rounding = measured.rounding
+        self.violation = measured.violation
+        self.complementarity = measured.complementarity
+        self._worst_row = measured.worst_row
+        self._history = history
+        self.iterations = iterations
+        self.seconds = seconds
+        self.solver = solver
+
+    @property
+    def history(self) -> list[Iteration]:
+        """One row per iteration, row 0 being the start."""
+        if callable(self._history):
+            self._history = self._history()
+        return self._history
+
+    @history.setter
+    def history(self, rows: list[Iteration]) -> None:
+        self._history = rows
+
+    @property
+    def converged(self) -> bool:
+        """Whether the KKT conditions hold to the tolerance."""
+        return self.status.converged
+
+    @property
+    def values(self) -> dict[Family, Array]:
+        """Copies of the values of every family."""
+        return {family: array.copy() for family, array in self._lin.values.items()}
+
+    @property
+    def multipliers(self) -> dict[str, Array]:
+        """Multipliers of every constraint term, (n, m) each."""
+        return self._by_term(self._multipliers)
+
+    @property
+    def penalties(self) -> dict[str, Array]:
+        """Penalties the solve ended with, (n, m) for every constraint term; empty when the backend has none."""
+        return self._by_term(self._penalties) if self._penalties.any() else {}
+
+    @property
+    def residuals(self) -> FactorNorms:
+        """(n,) residual norms of the factors of every term at the solution; see :mod:`unifg.answers.factor_norms`."""
+        g = self._lin.constraints
+        outside = np.maximum(g - self._upper, 0.0) - np.maximum(self._lower - g, 0.0)
+        return factor_norms(self._program, self._lin, outside)
+
+    @property
+    def worst(self) -> tuple[str, int] | None:
+        """Term and factor with the largest violation, None without constraints."""
+        return None if self._worst_row < 0 else self._program.row_name(self._worst_row)
+
+    def __getitem__(self, variable: Variable) -> Array:
+        """(n, storage) values of a family or selection."""
+        selection = as_selection(variable)
+        self._require(selection)
+        return self._lin.values[selection.family][selection.indices][:, selection.storage].copy()
+
+    def dual(self, name: str) -> Array:
+        """Multipliers of a constraint or bound (n, m), or reaction of fixed variables (n, d).
+
+        Positive at an active upper limit, negative at an active lower one. A reaction nu makes
+        grad f + A' lambda + nu vanish on the fixed coordinates.
+
+        Raises:
+            GraphError: when no constraint, bound or fix has that name.
+        """
+        multipliers = self.multipliers
+        if name in multipliers:
+            return multipliers[name]
+        if name in self._program.columns.fixed:
+            reaction = -self._program.lagrangian_gradient(self._lin, self._multipliers)
+            return reaction[self._program.columns.fixed[name]]
+        known = ", ".join([*multipliers, *self._program.columns.fixed]) or "none"
+        raise GraphError(f"no constraint, bound or fix is called '{name}' (there are: {known})", term=name)
+
+    def shifted(self, *families: Family, by: int = 1) -> Guess:
+        """A guess moved ``by`` stages towards the end of the horizon, for the next control tick.
+
+        Member k of each family takes the value of member k + by, the last ones repeat the end. The
+        multipliers and penalties of a factor move with the stage of its first variable.
+
+        Args:
+            *families: the families that run along the horizon.
+            by: number of stages, non-negative.
+        """
+        if by < 0:
+            raise GraphError(f"shifted: by must not be negative, found {by}")
+        values = self.values
+        for family in families:
+            self._require(as_selection(family))
+            stages = np.minimum(np.arange(family.count) + by, family.count - 1)
+            values[family] = values[family][stages]
+        multipliers, penalties = self.multipliers, self.penalties
+        for term in self._program.constraint_terms:
+            first = term.gathers[0].selection
+            if first.family in families and len(first) == term.count:
+                rows = _shifted_rows(first.indices.astype(np.int64).tobytes(), by)
+                multipliers[term.name] = multipliers[term.name][rows]
+                if penalties:
+                    penalties[term.name] = penalties[term.name][rows]
+        return Guess(values, multipliers, penalties)
+
+    def covariance(self, *variables: Variable) -> Array:
+        """(k, k) joint covariance of the selected variables, in their tangent spaces, in the order given.
+
+        What is fixed is known: its rows and columns are zero, as are directions that an active constraint forbids.
+
+        Raises:
+            GraphError: when the system is singular.
+        """
+        for variable in variables:
+            self._require(as_selection(variable))
+        columns = [self._program.columns.of(as_selection(variable)).ravel() for variable in variables]
+        return self._covariances.joint(np.concatenate(columns))
+
+    def marginals(self, variable: Variable) -> Array:
+        """(n, d, d) covariance of each selected variable by itself, all of them at about the cost of one solve.
+
+        Members that are fixed are known: their blocks are zero.
+
+        Raises:
+            GraphError: when the system is singular.
+        """
+        self._require(as_selection(variable))
+        return self._covariances.blocks(self._program.columns.of(as_selection(variable)))
+
+    @cached_property
+    def _covariances(self) -> Covariances:
+        return Covariances(self._program, self._lin, self._equality | self._held())
+
+    def information(self, terms: Sequence[str], *variables: Variable) -> Array:
+        """Information matrix (d, d) of the named costs over the selected variables; see :mod:`unifg.answers.marginal`."""
+        columns = np.concatenate([self._program.columns.of(as_selection(v)).ravel() for v in variables])
+        return information(self._program, self._lin, terms, columns)[0]
+
+    def marginal_prior(self, terms: Sequence[str], remove: Variables, keep: Variables) -> tuple[Array, Array]:
+        """Reference (1, S) and information (D, D) of a prior that replaces variables leaving a window.
+
+        Only the named costs and equality constraints that touch ``remove`` are marginalised, at this solution's
+        linearisation point. ``keep`` is one selection, for ``fg.prior``, or several, for ``fg.joint_prior``; details
+        and errors in :func:`unifg.answers.marginal.marginal_prior`.
+        """
+        return marginal_prior(self._program, self._lin, terms, remove, keep, self._equality)
+
+    def report(self) -> str:
+        """The status sentence with the numbers behind it."""
+        kkt = (
+            f"relative offset {self.stationarity:.1e}"
+            if self._program.least_squares
+            else f"stationarity {self.stationarity:.1e}, violation {self.violation:.1e}, "
+            f"complementarity {self.complementarity:.1e}"
+        )
+        text = (
+            f"{self.solver}: {self.status.value} Cost {self.cost:.6g} after {self.iterations} iterations in "
+            f"{1e3 * self.seconds:.1f} ms; {kkt}."
+        )
+        if self.worst is not None and self.violation > 0.0 and not self.converged:
+            name, index = self.worst
+            text += f" Largest violation: '{name}', factor {index}."
+        if self.verdict is not None:
+            text += f" {self.verdict.sentence(self.cost)}"
+        return text
+
+    def table(self) -> str:
+        """The history as a table."""
+        return "\n".join([HEADER, *map(line, self.history)])
+
+    def __repr__(self) -> str:
+        """The report."""
+        return f"<Solution {self.report()}>"
+
+    def _held(self) -> BoolArray:
+        """Inequalities that are active: the multiplier outweighs the distance to its limit."""
+        limit = np.where(self._multipliers > 0.0, self._upper, self._lower)
+        distance = np.where(np.isfinite(limit), np.abs(self._lin.constraints - limit), np.inf)
+        held: BoolArray = np.abs(self._multipliers) > distance
+        return held
+
+    def _by_term(self, stacked: Array) -> dict[str, Array]:
+        """Rows of the constraints, (n, m) for every term."""
+        program = self._program
+        return {
+            term.name: stacked[rows].reshape(term.count, term.size).copy()
+            for term, rows in zip(program.constraint_terms, program.slices, strict=True)
+        }
+
+    def _require(self, selection: Selection) -> None:
+        if selection.family not in self._lin.values:
+            raise GraphError(
+                f"family '{selection.family.name}' is not part of this solution", family=selection.family.name
+            )
+
+
+@lru_cache(maxsize=256)
+def _shifted_rows(stages: bytes, by: int) -> IntArray:
+    """For each factor the factor ``by`` stages later with the same rank within its stage.
+
+    Where no such stage exists, the last stage that has that rank serves. Control loops ask for the same every tick.
+
+    Args:
+        stages: of the factors, int64.
+        by: number of stages.
+    """
+    place: dict[tuple[int, int], int] = {}
+    seen: dict[int, int] = {}
+    keys = []
+    last: dict[int, int] = {}
+    for factor, stage in enumerate(np.frombuffer(stages, dtype=np.int64).tolist()):
+        rank = seen.get(stage, 0)
+        seen[stage] = rank + 1
+        place[stage, rank] = factor
+        keys.append((stage, rank))
+        if rank not in last or stage >= keys[last[rank]][0]:
+            last[rank] = factor
+    return np.array([place.get((stage + by, rank), last[rank]) for stage, rank in keys], dtype=np.intp)

@@ -1,0 +1,449 @@
+"""The frame every backend runs in: checks before, one loop state during, one judge after."""
+
+from __future__ import annotations
+
+import logging
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from unifg.answers.factor_norms import Deferred, factor_norms
+from unifg.answers.history import HEADER, Iteration, line
+from unifg.answers.optimality import infeasible_stationary, optimality, within_bounds
+from unifg.answers.relative_offset import Factored
+from unifg.answers.solution import Guess, Solution
+from unifg.answers.status import Status
+from unifg.errors import BackendError, GraphError, NotConverged
+from unifg.language.graph import Graph
+from unifg.language.variables import Data, Family
+from unifg.program.columns import Values
+from unifg.program.linearization import Linearization, all_finite
+from unifg.program.program import Program
+from unifg.typing import Array, ArrayLike
+
+logger = logging.getLogger("unifg")
+
+Start: TypeAlias = Mapping[Family, ArrayLike] | Guess | Solution
+Callback: TypeAlias = Callable[[Iteration], bool | None]
+
+UNBOUNDED_COST = -1e20
+
+
+@dataclass(kw_only=True)
+class Solver(ABC):
+    """Options common to all backends.
+
+    Attributes:
+        tolerance: for the KKT test of :mod:`unifg.answers.optimality`.
+        max_iterations: iterations (linear systems or subproblems solved) before giving up.
+        time_limit: seconds before giving up, checked once an iteration.
+        verbose: log one line per iteration at level INFO to the logger ``unifg``.
+        keep_values: keep the values of every iterate in the history, for pictures of a solve.
+        keep_residuals: keep the residual norm of every factor in the history, one number per factor and row.
+        search_iterations: the first so many steps use the search Jacobians of residuals that have one, and are taken
+            in full without a merit test. Costs and KKT numbers are the true ones throughout.
+    """
+
+    tolerance: float = 1e-6
+    max_iterations: int = 100
+    time_limit: float = np.inf
+    verbose: bool = False
+    keep_values: bool = False
+    keep_residuals: bool = False
+    search_iterations: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse options no solve could honour."""
+        if not self.tolerance > 0.0:
+            raise BackendError(f"{self.name}: tolerance must be positive, found {self.tolerance}")
+        if self.max_iterations < 0:
+            raise BackendError(f"{self.name}: max_iterations must not be negative, found {self.max_iterations}")
+        if self.search_iterations < 0:
+            raise BackendError(f"{self.name}: search_iterations must not be negative, found {self.search_iterations}")
+
+    @property
+    def name(self) -> str:
+        """The backend's class name."""
+        return type(self).__name__
+
+    def solve(
+        self,
+        graph: Graph,
+        guess: Start,
+        *,
+        data: Mapping[Data, ArrayLike] | None = None,
+        duals: Mapping[str, ArrayLike] | None = None,
+        check: bool = False,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """Solve once; a control loop uses :meth:`prepare` and keeps structure and workspaces.
+
+        Args:
+            graph: the problem.
+            guess: values per family, or a guess or solution that carries multipliers too.
+            data: values of data for this solve; others keep their defaults.
+            duals: multipliers by term name, overriding those of the guess.
+            check: raise instead of returning a solution that did not converge.
+            callback: called with every row of the history; returning True ends the solve.
+
+        Raises:
+            GraphError: when the graph, guess or data is malformed.
+            BackendError: when this backend cannot take this class of problem.
+            NotConverged: with ``check=True``.
+        """
+        return self.prepare(graph).solve(guess, data=data, duals=duals, check=check, callback=callback)
+
+    def prepare(self, graph: Graph) -> Prepared:
+        """Compile the graph and allocate the backend's workspaces for repeated solves."""
+        program = graph.compile()
+        self.require(program)
+        return Prepared(self, program)
+
+    def require(self, program: Program) -> None:  # noqa: B027 - most backends take everything
+        """Raise BackendError when the backend cannot take this class of problem."""
+
+    def runs_alone(self, program: Program) -> bool:
+        """Whether :meth:`iterate` evaluates the start itself and ends with :meth:`Run.conclude` when nobody watches."""
+        return False
+
+    @abstractmethod
+    def workspace(self, program: Program) -> Any:
+        """What the backend keeps between solves of one structure."""
+
+    @abstractmethod
+    def iterate(self, run: Run, workspace: Any) -> Status | None:
+        """Improve ``run`` until it has a status, or return the reason to stop."""
+
+    def search_step(self, run: Run, workspace: Any, lin: Linearization) -> Array | None:
+        """The backend's own tangent step for the model ``lin``, which is made of search Jacobians; None for no step."""
+        raise BackendError(f"{self.name} has no search_step: set search_iterations=0")
+
+
+class Run:
+    """State of one solve: the present iterate, its KKT numbers, and what has been recorded.
+
+    A backend moves with :meth:`accept`; the solve is over when ``status`` is set.
+
+    Attributes:
+        program: the compiled graph with its data bound.
+        values: at the present iterate.
+        lin: linearisation there.
+        multipliers: (M,) present multipliers.
+        penalties: (M,) those of the guess, for backends that have any, who leave their last ones here; zero for none.
+        optimality: KKT numbers of both.
+        status: None while the solve goes on.
+        history: rows so far.
+        iterations: so far.
+        alone: whether nobody looks before the end; there is no linearisation then until :meth:`conclude`.
+        tolerance: of the KKT test.
+        lent: the backend's factorisation of a matrix near the Hessian of the objective, which the KKT test of least
+            squares may use and overwrite; None where the backend has no such thing.
+    """
+
+    def __init__(self, solver: Solver, program: Program, values: Values, multipliers: Array, callback: Callback | None):
+        """Linearise at the start and test it, unless the backend does."""
+        self._solver = solver
+        self._callback = callback
+        self._started = time.perf_counter()
+        self.program = program
+        self.tolerance = solver.tolerance
+        self.history: list[Iteration] = []
+        self.status: Status | None = None
+        self._best: tuple[float, float] | None = None
+        self._recall: Callable[[], list[Iteration]] | None = None
+        self._least, self._least_values, self._start = np.inf, values, values
+        self.lent: Factored | None = None
+        self.iterations = 0
+        if solver.verbose:
+            logger.info(HEADER)
+        self.values, self.multipliers, self.penalties = values, multipliers, np.zeros(len(multipliers))
+        self.alone = not (self.watched or solver.search_iterations) and solver.runs_alone(program)
+        if not self.alone:
+            self.accept(program.linearize(values), multipliers, 0.0, 0.0)
+
+    @property
+    def seconds(self) -> float:
+        """Time since the solve began."""
+        return time.perf_counter() - self._started
+
+    @property
+    def out_of_time(self) -> bool:
+        """Whether the time limit has passed."""
+        return self.seconds > self._solver.time_limit
+
+    def accept(
+        self,
+        lin: Linearization,
+        multipliers: Array,
+        step_norm: float,
+        step_length: float,
+        **details: float | int | str,
+    ) -> None:
+        """Make ``lin`` the present iterate: measure it, record a row, decide whether to go on."""
+        self._move(lin, multipliers)
+        self.iterations = len(self.history)
+        deferred = Deferred(lambda: factor_norms(self.program, lin, self.program.violation(lin.constraints)))
+        row = Iteration(
+            self.iterations,
+            lin.cost,
+            self.optimality.stationarity,
+            self.optimality.violation,
+            self.optimality.complementarity,
+            step_norm,
+            step_length,
+            self.seconds,
+            lin.norms,
+            dict(details),
+            {family: array.copy() for family, array in lin.values.items()} if self._solver.keep_values else None,
+            deferred,
+        )
+        if self._solver.keep_residuals:
+            deferred()
+        self.history.append(row)
+        if self._solver.verbose:
+            logger.info(line(row))
+        self._keep_best()
+        self.status = self._decide()
+        if self._callback is not None and self._callback(row) and self.status is None:
+            self.status = Status.INTERRUPTED
+        deferred.close()
+
+    @property
+    def watched(self) -> bool:
+        """Whether somebody looks at every iteration: a callback, a log, kept values or residuals, a time limit."""
+        solver = self._solver
+        kept = solver.verbose or solver.keep_values or solver.keep_residuals
+        return bool(self._callback or kept or np.isfinite(solver.time_limit))
+
+    def conclude(
+        self, lin: Linearization, multipliers: Array, iterations: int, history: Callable[[], list[Iteration]]
+    ) -> None:
+        """Make ``lin`` the last iterate of a solve that ran alone.
+
+        Args:
+            lin: linearisation at the last iterate.
+            multipliers: (M,) there.
+            iterations: how many there were.
+            history: makes their rows when somebody asks for them.
+        """
+        start, carried = self.values, self.multipliers
+        self._move(lin, multipliers)
+        if not self.optimality.finite:
+            self._move(self.program.linearize(start), carried)
+            self._keep_best()
+            self._move(lin, multipliers)
+        self._keep_best()
+        self.iterations, self._recall = iterations, history
+        self.status = self._decide()
+
+    def _move(self, lin: Linearization, multipliers: Array) -> None:
+        self.lin, self.values, self.multipliers = lin, lin.values, multipliers
+        self.optimality = optimality(self.program, lin, multipliers, self.tolerance, self.lent, self._start.flat)
+        if self.optimality.violation < self._least:
+            self._least, self._least_values = self.optimality.violation, lin.values
+
+    def begin_at(self, lin: Linearization) -> None:
+        """Move the start, as onto the bounds, without spending an iteration."""
+        self._move(lin, self.multipliers)
+        self._keep_best()
+        self.status = self._decide()
+
+    def search(self, workspace: Any) -> None:
+        """Take the first steps along the search Jacobians; the multipliers wait, and the true numbers are recorded.
+
+        Without a merit test a step may lead out of the residuals' domain: the search ends before such a step.
+        """
+        program = self.program
+        if not any(term.term.residual.search for term in program.terms):
+            return
+        while self.status is None and len(self.history) <= self._solver.search_iterations:
+            step = self._solver.search_step(self, workspace, program.linearize(self.values, search=True))
+            reached = None if step is None else program.linearize(program.retract(self.values, step))
+            if step is None or reached is None or not reached.finite:
+                return
+            self.accept(reached, self.multipliers, float(np.linalg.norm(step)), 1.0, search=1)
+
+    @property
+    def least_violated(self) -> Values:
+        """Values of least violation among the start and all iterates."""
+        if self.alone:  # then nobody has looked at the start
+            outside = self.program.violation(self.program.evaluate(self._start).constraints)
+            size = float(np.abs(outside).max(initial=0.0))
+            if size < self._least:
+                self._least, self._least_values = size, self._start
+        return self._least_values
+
+    @property
+    def has_been_feasible(self) -> bool:
+        """Whether the start or an iterate met the constraints, which proves that they can be met."""
+        _ = self.least_violated
+        return self._least <= self.tolerance
+
+    def infeasible_stationary(self) -> bool:
+        """Whether no nearby point violates the constraints less, though they are violated."""
+        return infeasible_stationary(self.program, self.lin, self.tolerance)
+
+    def finish(self, reason: Status | None) -> Solution:
+        """Return the last iterate, judged by the KKT test of the original problem.
+
+        No ranking of iterates comes before the backend's own choice: a step of a real-time iteration may raise every
+        merit, and would never be taken from a feasible start. Only where the last iterate is not finite does the best
+        of the others stand in for it.
+        """
+        status = self.status or reason or Status.STALLED
+        if status is Status.STALLED and self.infeasible_stationary():
+            status = Status.LOCALLY_INFEASIBLE
+        if status is Status.LOCALLY_INFEASIBLE and self.has_been_feasible:
+            status = Status.STALLED
+        if status is Status.LOCALLY_INFEASIBLE and (within := within_bounds(self.program, self.lin)) is not self.lin:
+            self._move(within, self.multipliers)
+        if not self.optimality.finite:
+            self._move(self._best_lin, self._best_multipliers)
+        measured = self.optimality
+        if measured.passes(self.tolerance) and status is not Status.UNBOUNDED:
+            status = Status.CONVERGED
+        elif measured.holds(self.tolerance) and not measured.determined:
+            status = Status.UNDETERMINED
+        elif measured.holds(self.tolerance) and status is not Status.UNBOUNDED:
+            status = Status.IMPRECISE
+        elif measured.blurred(self.tolerance) and status in (Status.STALLED, Status.ITERATION_LIMIT):
+            status = Status.IMPRECISE
+        elif status.converged:
+            status = Status.STALLED
+        return Solution(
+            self.program,
+            self.lin,
+            self.multipliers,
+            self.penalties,
+            status,
+            measured,
+            self._recall or self.history,
+            self.iterations,
+            self.seconds,
+            self._solver.name,
+        )
+
+    def _decide(self) -> Status | None:
+        if not self.optimality.finite:
+            return Status.NOT_FINITE
+        if self.lin.cost < UNBOUNDED_COST:  # out there, derivatives may be lost to rounding and look like zero
+            return Status.UNBOUNDED
+        if self.optimality.holds(self.tolerance):
+            if not self.optimality.determined:
+                return Status.UNDETERMINED
+            return Status.CONVERGED if self.optimality.passes(self.tolerance) else Status.IMPRECISE
+        if self.iterations >= self._solver.max_iterations:
+            return Status.ITERATION_LIMIT
+        if self.out_of_time:
+            return Status.TIME_LIMIT
+        return None
+
+    def _keep_best(self) -> None:
+        """What to return if the last iterate is not finite: feasible ones rank by stationarity, others by violation."""
+        measured = self.optimality
+        feasible = measured.violation <= self.tolerance
+        error = max(measured.stationarity, measured.complementarity)
+        rank = (0.0, error) if feasible else (measured.violation, error)
+        if self._best is None or (measured.finite and rank <= self._best):
+            self._best, self._best_lin, self._best_multipliers = rank, self.lin, self.multipliers
+
+
+class Prepared:
+    """A backend bound to one compiled graph; solves repeatedly without rebuilding structure.
+
+    Attributes:
+        solver: the backend and its options.
+        program: the compiled graph.
+    """
+
+    def __init__(self, solver: Solver, program: Program) -> None:
+        """Made by :meth:`Solver.prepare`."""
+        self.solver = solver
+        self.program = program
+        self._workspace: Any = None
+        self._constraints = {
+            t.name: (t, rows) for t, rows in zip(program.constraint_terms, program.slices, strict=True)
+        }
+
+    def solve(
+        self,
+        guess: Start,
+        *,
+        data: Mapping[Data, ArrayLike] | None = None,
+        duals: Mapping[str, ArrayLike] | None = None,
+        check: bool = False,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """Solve from ``guess``; arguments and errors as for :meth:`Solver.solve`."""
+        program = self.program
+        program.bind(data or {})
+        values = program.values_from(guess if isinstance(guess, Mapping) else guess.values)
+        carried = {} if isinstance(guess, Mapping) else guess.multipliers
+        run = Run(self.solver, program, values, self._stacked("multipliers", {**carried, **(duals or {})}), callback)
+        if not isinstance(guess, Mapping):
+            run.penalties = self._stacked("penalties", guess.penalties)
+        self._refuse_not_finite(run)
+        reason = None
+        if run.status is None:
+            if self._workspace is None:
+                self._workspace = self.solver.workspace(program)
+            try:
+                run.search(self._workspace)
+                reason = self.solver.iterate(run, self._workspace)
+            except KeyboardInterrupt:
+                if run._best is None:
+                    raise  # there is nothing to return
+                run.status = Status.INTERRUPTED
+            if run.alone and not run.iterations:
+                self._refuse_not_finite(run)
+        solution = run.finish(reason)
+        if check and not solution.converged:
+            raise NotConverged(solution)
+        return solution
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Workspaces hold compiled objects that do not pickle; they are rebuilt on first use."""
+        return {**self.__dict__, "_workspace": None}
+
+    def _stacked(self, what: str, given: Mapping[str, ArrayLike]) -> Array:
+        """(M,) multipliers or penalties, zero where none are given."""
+        result = np.zeros(self.program.constraints.count)
+        for name, value in given.items():
+            if name not in self._constraints:
+                known = ", ".join(self._constraints) or "none"
+                raise GraphError(f"{what} given for '{name}', which is no constraint (there are: {known})", term=name)
+            term, rows = self._constraints[name]
+            array = np.asarray(value, dtype=np.float64)
+            if array.shape != (term.count, term.size):
+                raise GraphError(
+                    f"{what} of '{name}' have shape {array.shape}, expected {(term.count, term.size)}", term=name
+                )
+            result[rows] = array.ravel()
+        if given and not all_finite(result):
+            name = self.program.row_name(int(np.flatnonzero(~np.isfinite(result))[0]))[0]
+            raise GraphError(f"{what} of '{name}' are not finite", term=name)
+        return result
+
+    def _refuse_not_finite(self, run: Run) -> None:
+        if run.status is not Status.NOT_FINITE:
+            return
+        for term in self.program.terms:
+            with np.errstate(all="ignore"):
+                value = term.residual(run.values)
+                bad = ~np.isfinite(value.reshape(len(value), -1)).all(axis=1)
+            if bad.any():
+                index = int(np.flatnonzero(bad)[0])
+                selection = term.gathers[0].selection
+                raise GraphError(
+                    f"term '{term.name}': the residual of factor {index} is not finite at the guess "
+                    f"(its first variable is {selection.family.name}[{selection.indices[index % len(selection)]}]); "
+                    "move the guess away from the singularity",
+                    term=term.name,
+                    family=selection.family.name,
+                    index=index,
+                )
+        raise GraphError("a Jacobian is not finite at the guess: run graph.check(guess) to find the term")

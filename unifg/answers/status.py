@@ -1,0 +1,39 @@
+"""Why a solve ended, as a sentence."""
+
+from enum import Enum
+
+
+class Status(Enum):
+    """Outcome of a solve; the value is the sentence shown to the user.
+
+    Only CONVERGED claims a solution, and only the KKT test of :mod:`unifg.answers.optimality` grants it.
+    """
+
+    CONVERGED = "The KKT conditions of the problem hold to the tolerance."
+    STOP_RULE = "The chosen stop rule ended the loop, but the KKT conditions do not hold to the tolerance."
+    ITERATION_LIMIT = "The iteration limit was reached before the KKT conditions held; raise max_iterations."
+    TIME_LIMIT = "The time limit was reached before the KKT conditions held; raise time_limit."
+    STALLED = "No step improved the merit any more, though the KKT conditions do not hold to the tolerance."
+    LOCALLY_INFEASIBLE = (
+        "The point is stationary for the violation of the constraints: no nearby point violates them less."
+    )
+    UNBOUNDED = "The objective fell below every reasonable value: it is probably unbounded below."
+    UNDETERMINED = (
+        "The costs are stationary but do not determine every unknown: others would fit as well; run "
+        "graph.check(guess), fix a variable or add priors."
+    )
+    IMPRECISE = (
+        "The KKT conditions seem to hold, but differences of values as large as these cannot tell: attach Jacobians, "
+        "or state the costs in smaller numbers."
+    )
+    SINGULAR = (
+        "The linear system is singular: the costs do not determine every unknown; run graph.check(guess), add priors, "
+        "or use a damped backend."
+    )
+    NOT_FINITE = "A residual, Jacobian or linear system was not finite where the backend needed it."
+    INTERRUPTED = "The callback or the user ended the solve."
+
+    @property
+    def converged(self) -> bool:
+        """Whether a solution is claimed."""
+        return self is Status.CONVERGED

@@ -1,0 +1,76 @@
+"""Which measurements an answer believes, and which answers compete with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from unifg.typing import BoolArray, IntArray
+
+if TYPE_CHECKING:
+    from unifg.answers.solution import Solution
+
+NONE = np.zeros(0, dtype=np.intp)
+SHOWN = 5  # factors that a sentence names
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What a solve that tells right measurements from wrong ones found.
+
+    Attributes:
+        kept: (n,) per term with a loss that leaves out: whether a factor counts.
+        doubted: factors that count, since they lie within their thresholds, though what they disagree with the others
+            by is more than those scatter.
+        unit: variance of unit weight: how large the squares of whitened residuals are against what was stated, at
+            most one.
+        rivals: other answers that were found and believe other measurements: those with a lower cost, as stated, and
+            those that keep something else and can hardly be told from this one. Each has a verdict of its own.
+    """
+
+    kept: dict[str, BoolArray]
+    doubted: dict[str, IntArray] = field(default_factory=dict)
+    unit: float = 1.0
+    rivals: tuple[Solution, ...] = field(default=(), repr=False)
+
+    @property
+    def left_out(self) -> dict[str, IntArray]:
+        """Factors that do not count, by term."""
+        return {name: np.flatnonzero(~kept) for name, kept in self.kept.items()}
+
+    def __post_init__(self) -> None:
+        """Name every term."""
+        object.__setattr__(self, "doubted", {name: self.doubted.get(name, NONE) for name in self.kept})
+
+    def sentence(self, cost: float) -> str:
+        """What is kept, and a warning where there are rivals.
+
+        Args:
+            cost: of the answer this belongs to.
+        """
+        parts = [f"{int(kept.sum())} of {len(kept)} in '{name}'" for name, kept in self.kept.items()]
+        text = f"Kept {', '.join(parts)}; residuals are {self.unit**0.5:.2g} of what was stated."
+        if any(len(which) for which in self.doubted.values()):
+            text += f" Within their threshold, but further off than the others allow: {_named(self.doubted)}."
+        for rival in self.rivals:
+            assert rival.verdict is not None
+            theirs = rival.verdict.kept
+            more = _named({name: np.flatnonzero(theirs[name] & ~kept) for name, kept in self.kept.items()})
+            fewer = _named({name: np.flatnonzero(kept & ~theirs[name]) for name, kept in self.kept.items()})
+            differs = " and ".join(
+                text for text in (f"keeps {more}" if more else "", f"leaves out {fewer}" if fewer else "") if text
+            )
+            text += f" Another answer costs {rival.cost:.6g} (this one {cost:.6g}): it {differs}."
+        return text
+
+
+def _named(factors: dict[str, IntArray]) -> str:
+    """How many factors of which term, the first of them by number."""
+    parts = []
+    for name, which in factors.items():
+        listed = ", ".join(map(str, which[:SHOWN].tolist())) + (", ..." if len(which) > SHOWN else "")
+        if len(which):
+            parts.append(f"{len(which)} in '{name}' ({listed})")
+    return ", ".join(parts)

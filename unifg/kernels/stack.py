@@ -1,0 +1,141 @@
+"""A user's batched function at the points of many moves, in few calls where it allows that.
+
+A residual treats its factors one by one, so the factors of many perturbed batches may stand in one long batch: what
+small arrays cost is the call. But a function may know the length of its batch: by arrays of its own with a row per
+factor, by the index of a factor. So it is first called both ways at points that differ from batch to batch. Where the
+long call fails, or returns other numbers, there is one call for each batch for good.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from math import prod
+from typing import Any
+
+import numpy as np
+
+from unifg.kernels.moves import Moves, Near, Steps
+from unifg.typing import Array
+
+logger = logging.getLogger("unifg")
+LONGEST = 1 << 15  # numbers in the points of one call, which should fit into a cache with all that becomes of them
+SHORTEST = 4  # batches in a call that are worth it
+ALIKE = 1e-12  # relative difference that another order of summation may make
+
+
+class Stack:
+    """A batched function of all arguments, and those that are constants.
+
+    Attributes:
+        name: of the term, for messages.
+    """
+
+    def __init__(self, name: str, function: Callable[[list[Any]], Array]) -> None:
+        """Take a function of the list of its arguments."""
+        self.name, self._function = name, function
+        self._arguments: list[Any] = []
+        self._places: list[int] = []
+        self._each: list[int] = []
+        self._long: bool | None = None  # whether it takes long batches; None before it was tried
+        self._memory = np.empty(0)  # for results of many calls: fresh memory of that size costs more than they do
+        self._tiled: dict[tuple[int, int], Array] = {}
+
+    def bind(self, arguments: list[Any], places: list[int], each: list[int]) -> None:
+        """Take constants, where variables stand among them, and which of them have a row for each factor."""
+        self._arguments, self._places = arguments, places
+        self._tiled.clear()
+        if self._long is None:
+            self._each = each
+
+    def forget(self) -> None:
+        """Constants have changed in place."""
+        self._tiled.clear()
+
+    def __call__(self, near: Near, steps: Steps, moves: Moves) -> Array:
+        """(K, n, ...) what the function returns after each of K moves, until it is called again."""
+        if self._long is None:
+            self._long = self._takes_long_batches(near, steps)
+        count = len(near.joined)
+        length = max(1, LONGEST // (count * near.directions.storage)) if self._long else 1
+        if length < SHORTEST:
+            return self._one_by_one(near, steps, moves)
+        results: list[Array] = []
+        for at in range(0, moves.count, length):
+            found = self._batch(near.moved(steps, moves, at, min(at + length, moves.count)))
+            if found is None:  # one by one it works, or fails as it would have alone
+                logger.info("the residual '%s' does not take long batches", self.name)
+                self._long = False
+                return self._one_by_one(near, steps, moves)
+            results.append(found)
+        return results[0] if len(results) == 1 else np.concatenate(results)
+
+    def _one_by_one(self, near: Near, steps: Steps, moves: Moves) -> Array:
+        """The same, a call for each move."""
+        results = np.empty(0)
+        for k in range(moves.count):
+            arguments = list(self._arguments)
+            for place, point in zip(self._places, near.after(steps, moves, k), strict=True):
+                arguments[place] = point
+            found = self._function(arguments)
+            if k == 0:
+                shape = moves.count, *np.shape(found)
+                if self._memory.size < prod(shape):
+                    self._memory = np.empty(prod(shape))
+                results = self._memory[: prod(shape)].reshape(shape)
+            results[k] = found
+        return results
+
+    def _batch(self, points: list[Array]) -> Array | None:
+        """(k, n, ...) results of one call; None where it fails, or returns another shape."""
+        k, count = points[0].shape[:2]
+        arguments = list(self._arguments)
+        for place in self._each:
+            if (place, k) not in self._tiled:
+                given = arguments[place]
+                self._tiled[place, k] = np.tile(given, (k,) + (1,) * (given.ndim - 1))
+            arguments[place] = self._tiled[place, k]
+        for place, stack in zip(self._places, points, strict=True):
+            arguments[place] = stack.reshape(k * count, stack.shape[2])
+        try:
+            found = np.array(self._function(arguments))
+        except Exception:
+            return None
+        return found.reshape(k, count, *found.shape[1:]) if found.shape[:1] == (k * count,) else None
+
+    def _takes_long_batches(self, near: Near, steps: Steps) -> bool | None:
+        """Call it both ways; None where there are no numbers to compare.
+
+        Arrays as long as the batch may or may not have a row for each factor: both is tried.
+        """
+        with np.errstate(all="ignore"):
+            anywhere = near.directions.anywhere
+            points = near.moved(steps, anywhere, 0, anywhere.count)
+            try:
+                alone = self._one_by_one(near, steps, anywhere).copy()
+            except Exception:  # it refuses these points: nobody asked for them but this
+                return None
+            if not np.isfinite(alone).any():
+                return None
+            size = _largest(alone) + _largest(near.joined)
+            each = self._each
+            for rows in (each + self._perhaps(len(near.joined)), each):
+                self._each = rows
+                self._tiled.clear()
+                found = self._batch(points)
+                if found is not None and found.shape == alone.shape:
+                    if np.allclose(found, alone, rtol=0.0, atol=ALIKE * size, equal_nan=True):
+                        return True
+        return False
+
+    def _perhaps(self, count: int) -> list[int]:
+        known = {*self._places, *self._each}
+        return [
+            k
+            for k, given in enumerate(self._arguments)
+            if k not in known and isinstance(given, np.ndarray) and given.ndim and len(given) == count > 1
+        ]
+
+
+def _largest(numbers: Array) -> float:
+    return float(np.abs(numbers[np.isfinite(numbers)]).max(initial=0.0))

@@ -1,0 +1,211 @@
+"""Residuals every robot shares: priors, relative measurements, differences.
+
+They exist on any manifold: ``prior``, ``between`` and ``difference`` are completed with the manifold of the
+variables they are given. Jacobians are in right perturbation, X Exp(d); equation numbers are those of Sola et al.,
+"A micro Lie theory", arXiv:1812.01537.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from functools import cache
+from types import ModuleType
+from typing import Any, cast
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.kernels.kernel import Kernel
+from unifg.kernels.residuals import Residual, residual
+from unifg.lie import LieGroup, Manifold, Rn
+from unifg.lie.lookup import functions_of
+from unifg.lie.scalar import rn
+from unifg.machine.calls import local_matrix, local_vector, vector
+from unifg.machine.jit import compiled
+from unifg.typing import Array
+
+
+@dataclass(frozen=True)
+class ManifoldResidual:
+    """A residual defined on every manifold; :meth:`on` completes it.
+
+    Attributes:
+        name: shown in tables and messages.
+        build: makes the residual for one manifold.
+    """
+
+    name: str
+    build: Callable[[Manifold], Residual]
+
+    def on(self, manifold: Manifold) -> Residual:
+        """The residual for variables on ``manifold``.
+
+        Raises:
+            GraphError: when it has no meaning there.
+        """
+        return self.build(manifold)
+
+
+# ---------------------------------------------------------------- groups with compiled functions
+
+
+def _relative(group: LieGroup, functions: ModuleType) -> Callable[..., None]:
+    """Write Log(p^-1 x^-1 y) and its derivatives, with p a measured element or nothing."""
+    storage, dim = group.storage, group.dim
+    between, log, adjoint = functions.between, functions.log, functions.adjoint
+    inverse_jacobian = functions.right_jacobian_inverse
+
+    @compiled
+    def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+        x, y = vector(v, 0, storage), vector(v, storage, storage)
+        seen, error = local_vector(storage), local_vector(storage)
+        between(x, y, seen)
+        if len(p):
+            between(p, seen, error)
+            log(error, r)
+        else:
+            log(seen, r)
+        if len(J):
+            after, transport = local_matrix(dim, dim), local_matrix(dim, dim)
+            inverse_jacobian(r, after)  # eq. 79
+            between(y, x, seen)
+            adjoint(seen, transport)
+            for i in range(dim):
+                for k in range(dim):
+                    total = 0.0
+                    for j in range(dim):
+                        total += after[i, j] * transport[j, k]
+                    J[i, k] = -total
+                    J[i, dim + k] = after[i, k]
+
+    return kernel
+
+
+def _deviation(group: LieGroup, functions: ModuleType) -> Callable[..., None]:
+    """Write Log(p^-1 x) and its derivative."""
+    local, inverse_jacobian = functions.local, functions.right_jacobian_inverse
+
+    @compiled
+    def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+        local(p, v, r)
+        if len(J):
+            inverse_jacobian(r, J)
+
+    return kernel
+
+
+# ---------------------------------------------------------------- vectors
+
+
+@compiled
+def _vector_deviation(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """X - p."""
+    for i in range(len(r)):
+        r[i] = v[i] - p[i]
+        if len(J):
+            for k in range(len(r)):
+                J[i, k] = 1.0 if i == k else 0.0
+
+
+@compiled
+def _vector_relative(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """Y - x - p, or y - x."""
+    dim = len(r)
+    for i in range(dim):
+        r[i] = rn.minus(rn.minus(v[dim + i], v[i]), p[i] if len(p) else 0.0)
+        if len(J):
+            for k in range(dim):
+                J[i, k] = -1.0 if i == k else 0.0
+                J[i, dim + k] = 1.0 if i == k else 0.0
+
+
+# ---------------------------------------------------------------- any other manifold, evaluated by NumPy
+
+
+class _Batched:
+    """A picklable function of values on one manifold, with derivatives where it is a group."""
+
+    def __init__(self, manifold: Manifold) -> None:
+        self.manifold = manifold
+        self.derivative = self.jacobian if isinstance(manifold, LieGroup) else None
+
+    def after(self, tangent: Array, count: int) -> Array:
+        """(n, d, d) inverse right Jacobians (eq. 79)."""
+        assert isinstance(self.manifold, LieGroup)
+        dim = self.manifold.dim
+        return np.broadcast_to(self.manifold.right_jacobian_inverse(tangent), (count, dim, dim))
+
+    def jacobian(self, *arguments: Array) -> list[Array]:
+        raise NotImplementedError
+
+
+class _Prior(_Batched):
+    def __call__(self, x: Array, reference: Array) -> Array:
+        return np.atleast_2d(self.manifold.local(reference, x))
+
+    def jacobian(self, *arguments: Array) -> list[Array]:
+        return [self.after(self(*arguments), len(arguments[0]))]
+
+
+class _Relative(_Batched):
+    def __call__(self, x: Array, y: Array, measured: Array | None = None) -> Array:
+        if measured is None:
+            return self.manifold.local(x, y)
+        assert isinstance(self.manifold, LieGroup)
+        return self.manifold.log(self.manifold.between(measured, self.manifold.between(x, y)))
+
+    def jacobian(self, *arguments: Array) -> list[Array]:
+        assert isinstance(self.manifold, LieGroup)
+        after = self.after(self(*arguments), len(arguments[0]))
+        return [-after @ self.manifold.adjoint(self.manifold.between(arguments[1], arguments[0])), after]
+
+
+@cache
+def _complete(
+    manifold: Hashable, name: str, arguments: tuple[Any, ...], vectors: Callable[..., None], groups: Any, batched: Any
+) -> Residual:
+    """The kernel for vectors, for groups with compiled functions, or the batched function for all others."""
+    assert isinstance(manifold, Manifold)
+    functions = functions_of(manifold)
+    if isinstance(manifold, Rn):
+        return residual(Kernel(vectors, arguments, manifold.dim, name=name, linear=True))
+    if isinstance(manifold, LieGroup) and functions is not None:
+        return residual(Kernel(groups(manifold, functions), arguments, manifold.dim, name=name))
+    function = batched(manifold)
+    return residual(function, function.derivative, name)
+
+
+def _build_prior(manifold: Manifold) -> Residual:
+    return _complete(
+        cast(Hashable, manifold), "prior", (manifold, (manifold.storage,)), _vector_deviation, _deviation, _Prior
+    )
+
+
+def _build_between(manifold: Manifold) -> Residual:
+    if not isinstance(manifold, LieGroup):
+        raise GraphError(f"between needs a Lie group, found {manifold.name}; use difference")
+    return _complete(
+        cast(Hashable, manifold),
+        "between",
+        (manifold, manifold, (manifold.storage,)),
+        _vector_relative,
+        _relative,
+        _Relative,
+    )
+
+
+def _build_difference(manifold: Manifold) -> Residual:
+    return _complete(
+        cast(Hashable, manifold), "difference", (manifold, manifold), _vector_relative, _relative, _Relative
+    )
+
+
+prior = ManifoldResidual("prior", _build_prior)
+"""``prior(x, reference)``: Log(reference^-1 x), with reference (storage,) or (n, storage)."""
+
+between = ManifoldResidual("between", _build_between)
+"""``between(x, y, measured)``: Log(measured^-1 x^-1 y), with x_T_y measured, (storage,) or (n, storage)."""
+
+difference = ManifoldResidual("difference", _build_difference)
+"""``difference(x, y)``: Log(x^-1 y), zero when both agree; for rates and smoothness."""

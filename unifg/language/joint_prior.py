@@ -1,0 +1,145 @@
+"""A prior about several variables at once: what marginalisation leaves behind, or any correlated belief.
+
+The residual stacks the local differences of all its variables from a joint reference; the ``information=`` of the
+term, over the stacked tangent spaces, holds how they are correlated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import cast
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.kernels.kernel import Kernel
+from unifg.kernels.residuals import Residual, residual
+from unifg.lie import LieGroup, Manifold, Rn
+from unifg.lie.product import leaves
+from unifg.lie.scalar import se2, se3, so2, so3
+from unifg.machine.calls import local_matrix, vector
+from unifg.machine.jit import compiled
+from unifg.typing import Array
+
+VECTOR = 0  # how a leaf is compared; groups by their numbers in GROUPS
+GROUPS = {"SO2": 1, "SE2": 2, "SO3": 3, "SE3": 4}
+
+
+def joint_prior(*manifolds: Manifold) -> Residual:
+    """Stacked Log(m_k^-1 x_k) of variables x_k from the parts m_k of one reference.
+
+    ``graph.minimize(fg.joint_prior(fg.SE2, fg.Rn(1)), x[0], bias, reference, information=omega)``: the last argument
+    is the reference, (S,) or (n, S), the storage of all variables side by side; ``information`` is (D, D) over their
+    tangent spaces in the same order. :meth:`unifg.Solution.marginal_prior` gives both.
+
+    Args:
+        *manifolds: of the variables, in order.
+
+    Returns:
+        A residual with D rows; compiled when every component is a vector or one of the library's groups.
+
+    Raises:
+        GraphError: without a manifold.
+    """
+    if not manifolds:
+        raise GraphError("joint_prior: name the manifold of at least one variable")
+    return _complete(manifolds)
+
+
+@cache
+def _complete(manifolds: tuple[Manifold, ...]) -> Residual:
+    parts = [leaf for manifold in manifolds for leaf, _, _ in leaves(manifold)]
+    storage, dim = (sum(getattr(part, size) for part in parts) for size in ("storage", "dim"))
+    if all(_kind(leaf) is not None for leaf in parts):
+        table = [[cast(int, _kind(leaf)), leaf.storage, leaf.dim] for leaf in parts]
+        return residual(
+            Kernel(
+                _stacked,
+                (*manifolds, (storage,)),
+                dim,
+                np.array(table, dtype=np.float64).ravel(),
+                name="joint prior",
+                linear=all(isinstance(leaf, Rn) for leaf in parts),
+            )
+        )
+    batched = _Stacked(manifolds)
+    known = all(isinstance(manifold, LieGroup) for manifold in manifolds)
+    return residual(batched, batched.jacobian if known else None, "joint prior")
+
+
+def _kind(leaf: Manifold) -> int | None:
+    """How the kernel compares elements of ``leaf``; None when it cannot."""
+    if isinstance(leaf, Rn):
+        return VECTOR
+    return GROUPS.get(leaf.name) if type(leaf).__module__.startswith("unifg.lie.") else None
+
+
+@compiled
+def _stacked(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """Leaf after leaf; the table holds kind, storage and dimension of each."""
+    derive = len(J) > 0
+    if derive:
+        J[:] = 0.0
+    at = row = 0
+    block = local_matrix(6, 6)
+    for leaf in range(len(table) // 3):
+        kind, storage, dim = int(table[3 * leaf]), int(table[3 * leaf + 1]), int(table[3 * leaf + 2])
+        if kind == 0:
+            for i in range(dim):
+                r[row + i] = v[at + i] - p[at + i]
+                if derive:
+                    J[row + i, row + i] = 1.0
+        else:
+            here, reference, out = vector(v, at, storage), vector(p, at, storage), vector(r, row, dim)
+            square = block.reshape(-1)[: dim * dim].reshape(dim, dim)
+            if kind == 1:
+                so2.local(reference, here, out)
+                so2.right_jacobian_inverse(out, square)
+            elif kind == 2:
+                se2.local(reference, here, out)
+                se2.right_jacobian_inverse(out, square)
+            elif kind == 3:
+                so3.local(reference, here, out)
+                so3.right_jacobian_inverse(out, square)
+            else:
+                se3.local(reference, here, out)
+                se3.right_jacobian_inverse(out, square)
+            if derive:
+                for i in range(dim):
+                    for k in range(dim):
+                        J[row + i, row + k] = square[i, k]
+        at += storage
+        row += dim
+
+
+class _Stacked:
+    """The same for manifolds that only have batched methods; picklable."""
+
+    def __init__(self, manifolds: Sequence[Manifold]) -> None:
+        self.manifolds = manifolds
+        self.bounds = np.cumsum([0, *(manifold.storage for manifold in manifolds)]).tolist()
+
+    def __call__(self, *arguments: Array) -> Array:
+        """(n, D) stacked differences of variables (n, storage_k) from references (n, S) or (S,)."""
+        return np.concatenate(self._differences(arguments), axis=1)
+
+    def jacobian(self, *arguments: Array) -> list[Array]:
+        """One (n, D, d_k) array per variable."""
+        differences = self._differences(arguments)
+        count, total = len(differences[0]), sum(part.shape[1] for part in differences)
+        blocks, row = [], 0
+        for manifold, difference in zip(self.manifolds, differences, strict=True):
+            assert isinstance(manifold, LieGroup)
+            block = np.zeros((count, total, manifold.dim))
+            block[:, row : row + manifold.dim] = manifold.right_jacobian_inverse(difference)
+            blocks.append(block)
+            row += manifold.dim
+        return blocks
+
+    def _differences(self, arguments: Sequence[Array]) -> list[Array]:
+        *points, reference = arguments
+        parts = zip(self.manifolds, points, self.bounds, self.bounds[1:], strict=False)
+        found = [manifold.local(reference[..., a:b], point) for manifold, point, a, b in parts]
+        count = max(len(np.atleast_2d(part)) for part in found)
+        return [np.broadcast_to(np.atleast_2d(part), (count, part.shape[-1])) for part in found]

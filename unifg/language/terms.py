@@ -1,0 +1,132 @@
+"""Terms of a graph as the user stated them: costs, constraints, and fixed variables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.kernels.residuals import Residual
+from unifg.kernels.robust import Loss
+from unifg.language.variables import Data, Selection, as_selection, is_variable
+from unifg.typing import Array, ArrayLike, BoolArray
+
+Parameter: TypeAlias = ArrayLike | Data
+
+
+@dataclass(eq=False)
+class Term:
+    """A batch of factors that share one residual function.
+
+    Attributes:
+        name: unique name, used in tables, messages and ``dual``.
+        residual: the batched function.
+        arguments: selections, data and constants in the order the function takes them.
+        active: (n,) boolean, constant or data; None means all.
+        count: number of factors n.
+    """
+
+    name: str
+    residual: Residual
+    arguments: tuple[Any, ...]
+    active: BoolArray | Data | None
+    count: int
+
+    @property
+    def selections(self) -> list[Selection]:
+        """The variable arguments, in order."""
+        return [argument for argument in self.arguments if isinstance(argument, Selection)]
+
+
+@dataclass(eq=False)
+class Cost(Term):
+    """1/2 rho(|W r|^2) with W'W the information matrix.
+
+    Attributes:
+        sigma: standard deviations: scalar, (m,) or (n, m).
+        information: (m, m) or (n, m, m); excludes ``sigma``.
+        robust: loss applied to the squared whitened norm.
+    """
+
+    sigma: Parameter | None = None
+    information: Parameter | None = None
+    robust: Loss | None = None
+
+
+@dataclass(eq=False)
+class ScalarCost(Term):
+    """A cost that is not a square: (n,) values added to the objective as they are."""
+
+
+@dataclass(eq=False)
+class Constraint(Term):
+    """lower <= g(x) <= upper.
+
+    Attributes:
+        lower: scalar, (m,) or (n, m); may be -inf.
+        upper: same; equal to ``lower`` for an equality.
+        is_bound: whether g is the variable itself, whose Jacobian is the identity.
+    """
+
+    lower: Parameter = -np.inf
+    upper: Parameter = np.inf
+    is_bound: bool = False
+
+
+@dataclass(eq=False)
+class Fix:
+    """Variables that take a given value and leave the unknowns.
+
+    Attributes:
+        name: its reaction is ``solution.dual(name)``.
+        selection: what is fixed.
+        value: (storage,) or (n, storage).
+    """
+
+    name: str
+    selection: Selection
+    value: Array | Data
+
+
+def prepare_arguments(name: str, arguments: tuple[Any, ...], active: Any) -> tuple[tuple[Any, ...], Any, int]:
+    """Normalise a term's arguments and find its number of factors.
+
+    Selections of length 1 are shared; all longer ones, every ``each=True`` data and ``active`` must agree.
+
+    Raises:
+        GraphError: when there is no variable among the arguments, or the lengths disagree.
+    """
+    normal = tuple(as_selection(a) if is_variable(a) else a for a in arguments)
+    lengths: list[tuple[str, int]] = []
+    for argument in normal:
+        if isinstance(argument, Selection):
+            if len(argument) == 0:
+                raise GraphError(
+                    f"term '{name}': the selection from family '{argument.family.name}' is empty",
+                    term=name,
+                    family=argument.family.name,
+                )
+            if len(argument) > 1:
+                lengths.append((f"family '{argument.family.name}'", len(argument)))
+        elif isinstance(argument, Data) and argument.each:
+            lengths.append((f"data '{argument.name}'", len(argument.value)))
+    if not any(isinstance(argument, Selection) for argument in normal):
+        raise GraphError(f"term '{name}' has no variable among its arguments: pass a family or a selection", term=name)
+    if active is not None and not isinstance(active, Data):
+        active = np.asarray(active, dtype=bool)
+        if active.ndim != 1:
+            raise GraphError(f"term '{name}': active= must be (n,) booleans, found shape {active.shape}", term=name)
+    if active is not None:
+        value = active.value if isinstance(active, Data) else active
+        if value.dtype != bool:
+            raise GraphError(f"term '{name}': active= data must be boolean, found {value.dtype}", term=name)
+        lengths.append(("active=", len(value)))
+    if len({length for _, length in lengths}) > 1:
+        found = ", ".join(f"{what} has {length}" for what, length in lengths)
+        raise GraphError(
+            f"term '{name}': the number of factors is unclear: {found}. Only selections of length 1 are shared",
+            term=name,
+        )
+    return normal, active, lengths[0][1] if lengths else 1

@@ -1,0 +1,116 @@
+"""Where each variable is stored, where its tangent coordinates stand, and which of them are unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.language.terms import Fix
+from unifg.language.variables import Family, Selection
+from unifg.typing import Array, IntArray
+
+
+class Values(dict[Family, Array]):
+    """(count, storage) arrays by family, all of them views of one flat array.
+
+    Attributes:
+        flat: the storage of all families in their order.
+    """
+
+    def __init__(self, columns: Columns, flat: Array) -> None:
+        """View ``flat`` by families."""
+        self.flat = flat
+        for family, start in columns.storage.items():
+            size = family.count * family.manifold.storage
+            self[family] = flat[start : start + size].reshape(family.count, family.manifold.storage)
+
+
+class Columns:
+    """Numbering of the full tangent space and of the unknowns within it.
+
+    Attributes:
+        storage: where each family's storage starts.
+        stored: length of the storage of all families.
+        offsets: first column of each family.
+        width: number of columns, fixed variables included.
+        free: (size,) columns that are unknown.
+        unknown: (width,) number of each column among the unknowns, -1 where fixed.
+        fixed: (n, d) columns of each fix, by its name.
+    """
+
+    def __init__(self, families: Sequence[Family], fixes: Sequence[Fix]) -> None:
+        """Number the families in the order given, members in theirs."""
+        self.families = list(families)
+        self.offsets: dict[Family, int] = {}
+        self.storage: dict[Family, int] = {}
+        self.width = self.stored = 0
+        for family in families:
+            self.offsets[family], self.storage[family] = self.width, self.stored
+            self.width += family.count * family.manifold.dim
+            self.stored += family.count * family.manifold.storage
+        is_free = np.ones(self.width, dtype=bool)
+        self.fixed: dict[str, IntArray] = {}
+        for fix in fixes:
+            self.fixed[fix.name] = self.of(fix.selection)
+            is_free[self.fixed[fix.name]] = False
+        self.free = np.flatnonzero(is_free)
+        self.unknown = np.full(self.width, -1, dtype=np.intp)
+        self.unknown[self.free] = np.arange(len(self.free))
+
+    @property
+    def size(self) -> int:
+        """Number of unknown coordinates."""
+        return len(self.free)
+
+    def of(self, selection: Selection) -> IntArray:
+        """(n, d) columns of a selection."""
+        family = selection.family
+        base = self.offsets[family] + selection.indices * family.manifold.dim
+        columns: IntArray = base[:, None] + np.arange(selection.tangent.start, selection.tangent.stop)
+        return columns
+
+    def starts(self, selection: Selection) -> IntArray:
+        """(n,) where the storage of each selected member, or of its selected component, starts."""
+        family = selection.family
+        first = self.storage[family] + selection.storage.start
+        starts: IntArray = first + selection.indices * family.manifold.storage
+        return starts
+
+    def values(self, parts: Mapping[Family, Array]) -> Values:
+        """One array per family as views of one flat array; values that are such already stay as they are."""
+        if isinstance(parts, Values):
+            return parts
+        flat = np.empty(self.stored)
+        values = Values(self, flat)
+        for family in self.families:
+            values[family][:] = parts[family]
+        return values
+
+    def view(self, flat: Array) -> Values:
+        """The families' storage as one array, by families."""
+        return Values(self, flat)
+
+    def nodes(self) -> tuple[IntArray, IntArray]:
+        """For every full column its variable, numbered over all families; and the first unknown of each variable.
+
+        Returns:
+            (width,) variables, and (V + 1,) where each variable's unknowns start.
+        """
+        sizes = np.concatenate([np.full(f.count, f.manifold.dim) for f in self.families])
+        variable = np.repeat(np.arange(len(sizes)), sizes)
+        free = np.bincount(variable[self.free], minlength=len(sizes))
+        return variable, np.concatenate([[0], np.cumsum(free)])
+
+    def all_fixed(self, family: Family) -> bool:
+        """Whether nothing of the family is unknown."""
+        offset = self.offsets[family]
+        return bool((self.unknown[offset : offset + family.count * family.manifold.dim] < 0).all())
+
+    def name(self, column: int) -> tuple[str, int]:
+        """Family and member of a column."""
+        for family in reversed(self.families):
+            if column >= self.offsets[family]:
+                return family.name, (column - self.offsets[family]) // family.manifold.dim
+        raise GraphError(f"column {column} belongs to no family", index=column)

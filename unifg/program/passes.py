@@ -1,0 +1,353 @@
+"""The compiled loops over all terms of a graph: evaluate, linearise, accumulate, multiply.
+
+Terms are rows of an integer table (:mod:`unifg.program.table`), residuals are addresses; a pass over a whole graph is one
+call from Python. Terms without a kernel have been evaluated by NumPy beforehand: their raw residuals and Jacobians
+already stand where a kernel would have written them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from unifg.kernels.whitening import DIAGONAL, FULL
+from unifg.machine.calls import call_residual, matrix, vector, vector_at
+from unifg.machine.jit import compiled, inlined
+from unifg.program.table import (
+    ACTIVE,
+    ADDRESS,
+    BOUND,
+    COLUMN,
+    CONSTRAINT,
+    COST,
+    COUNT,
+    ENTRY,
+    GATHER,
+    KEEP,
+    KERNEL_WIDTH,
+    KIND,
+    PARAMETER,
+    PARAMETERS,
+    POSITION,
+    ROW,
+    ROWS,
+    SEARCH,
+    SIZE,
+    SLOTS,
+    SPREAD,
+    STORAGE,
+    TABLE,
+    TABLE_SIZE,
+    WEIGHT,
+    WHITEN,
+    WHITENER,
+    WIDTH,
+    Terms,
+)
+from unifg.typing import Array, IntArray
+
+
+@inlined
+def gather_variables(
+    term: IntArray, i: int, gather: IntArray, sizes: IntArray, parameters: Array, values: Array, out: Array
+) -> None:
+    """Copy the variables of factor i side by side; negative starts are constants among the parameters."""
+    at, slots = 0, term[SLOTS]
+    for slot in range(slots):
+        start, size = gather[term[GATHER] + i * slots + slot], sizes[term[SIZE] + slot]
+        if start >= 0:
+            for k in range(size):
+                out[at + k] = values[start + k]
+        else:
+            for k in range(size):
+                out[at + k] = parameters[k - start - 1]
+        at += size
+
+
+@inlined
+def _run(
+    term: IntArray,
+    where: int,
+    i: int,
+    gather: IntArray,
+    sizes: IntArray,
+    parameters: Array,
+    values: Array,
+    scratch: Array,
+    r: Array,
+    J: Array,
+) -> None:
+    """Call a kernel of factor i."""
+    gather_variables(term, i, gather, sizes, parameters, values, scratch)
+    call_residual(
+        where,
+        vector(scratch, 0, term[STORAGE]),
+        vector(parameters, term[PARAMETER] + i * term[SPREAD], term[PARAMETERS]),
+        vector_at(term[TABLE], term[TABLE_SIZE]),
+        r,
+        J,
+    )
+
+
+@inlined
+def _whiten(term: IntArray, i: int, whiteners: Array, r: Array, J: Array) -> None:
+    """W r and W J in place; a full W is upper triangular."""
+    rows, width = len(r), J.shape[1]
+    kind, spread = term[WHITEN], term[WHITEN] & 1
+    if kind & DIAGONAL:
+        start = term[WHITENER] + i * spread * rows
+        for a in range(rows):
+            w = whiteners[start + a]
+            r[a] *= w
+            if len(J):
+                for d in range(width):
+                    J[a, d] *= w
+    elif kind & FULL:
+        start = term[WHITENER] + i * spread * rows * rows
+        for a in range(rows):
+            total = 0.0
+            for b in range(a, rows):
+                total += whiteners[start + a * rows + b] * r[b]
+            r[a] = total
+            if len(J):
+                w = whiteners[start + a * rows + a]
+                for d in range(width):
+                    J[a, d] *= w
+                for b in range(a + 1, rows):
+                    w = whiteners[start + a * rows + b]
+                    for d in range(width):
+                        J[a, d] += w * J[b, d]
+
+
+@inlined
+def _violation(value: float, lower: float, upper: float) -> float:
+    """Distance outside the limits."""
+    return max(value - upper, lower - value, 0.0)
+
+
+@compiled
+def evaluate(terms: Terms, values: Array, residual: Array, constraints: Array, squares: Array, scratch: Array) -> float:
+    """Whitened residuals, constraints, and squared norms of robust factors; returns the cost of the others."""
+    fields, gather, sizes, parameters = terms.fields, terms.gather, terms.sizes, terms.parameters
+    whiteners, active = terms.whiteners, terms.active
+    cost = 0.0
+    for t in range(len(fields)):
+        term = fields[t]
+        m, kind = term[ROWS], term[KIND]
+        target = residual if kind == COST else constraints
+        for i in range(term[COUNT]):
+            at = term[ROW] + i * m
+            r = vector(target, at, m)
+            if kind == BOUND:
+                r[0] = values[gather[term[GATHER] + i]]
+                continue
+            if term[ACTIVE] >= 0 and active[term[ACTIVE] + i] == 0:
+                r[:] = 0.0
+            elif term[ADDRESS] != 0:
+                _run(term, term[ADDRESS], i, gather, sizes, parameters, values, scratch, r, matrix(scratch, 0, 0, 0))
+            if kind == COST:
+                _whiten(term, i, whiteners, r, matrix(scratch, 0, 0, 0))
+                squared = 0.0
+                for a in range(m):
+                    squared += r[a] * r[a]
+                if term[WEIGHT] >= 0:
+                    squares[term[WEIGHT] + i] = squared
+                else:
+                    cost += 0.5 * squared
+    return cost
+
+
+@compiled
+def linearize(
+    terms: Terms,
+    values: Array,
+    search: bool,
+    residual: Array,
+    jacobian: Array,
+    constraints: Array,
+    constraint_jacobian: Array,
+    squares: Array,
+    norms: Array,
+    gradient: Array,
+    hessian: Array,
+    scratch: Array,
+) -> float:
+    """Residuals, Jacobians, gradient and J'J in one pass; robust factors stop after whitening, see :func:`weigh`.
+
+    Returns the cost of the factors that are not robust. ``scratch`` holds a factor's variables, then J with all its
+    columns for terms that keep only some.
+    """
+    fields, gather, sizes, parameters = terms.fields, terms.gather, terms.sizes, terms.parameters
+    whiteners, active, columns, positions = terms.whiteners, terms.active, terms.columns, terms.positions
+    lower, upper = terms.lower, terms.upper
+    cost = 0.0
+    for t in range(len(fields)):
+        term = fields[t]
+        m, width, kind = term[ROWS], term[WIDTH], term[KIND]
+        target = residual if kind == COST else constraints
+        blocks = jacobian if kind == COST else constraint_jacobian
+        where = term[SEARCH] if search and term[SEARCH] != 0 else term[ADDRESS]
+        total = 0.0
+        for i in range(term[COUNT]):
+            at = term[ROW] + i * m
+            r, J = vector(target, at, m), matrix(blocks, term[ENTRY] + i * m * width, m, width)
+            if kind == BOUND:
+                r[0] = values[gather[term[GATHER] + i]]
+                J[0, 0] = 1.0
+                total += _violation(r[0], lower[at], upper[at]) ** 2
+                continue
+            if term[ACTIVE] >= 0 and active[term[ACTIVE] + i] == 0:
+                r[:] = 0.0
+                J[:] = 0.0
+            elif where != 0:
+                if term[KEEP] < 0:
+                    _run(term, where, i, gather, sizes, parameters, values, scratch, r, J)
+                else:
+                    full = matrix(scratch, term[STORAGE], m, term[KERNEL_WIDTH])
+                    _run(term, where, i, gather, sizes, parameters, values, scratch, r, full)
+                    for a in range(m):
+                        for d in range(width):
+                            J[a, d] = full[a, sizes[term[KEEP] + d]]
+            if kind == CONSTRAINT:
+                for a in range(m):
+                    total += _violation(r[a], lower[at + a], upper[at + a]) ** 2
+                continue
+            _whiten(term, i, whiteners, r, J)
+            squared = 0.0
+            for a in range(m):
+                squared += r[a] * r[a]
+            total += squared
+            if term[WEIGHT] >= 0:
+                squares[term[WEIGHT] + i] = squared
+            else:
+                cost += 0.5 * squared
+                _accumulate(term, i, columns, positions, r, J, gradient, hessian)
+        norms[t] = np.sqrt(total)
+    return cost
+
+
+@compiled
+def weigh(
+    terms: Terms,
+    weights: Array,
+    residual: Array,
+    jacobian: Array,
+    gradient: Array,
+    hessian: Array,
+) -> None:
+    """Scale robust factors by the square root of their weights and add them to gradient and Hessian."""
+    fields, columns, positions = terms.fields, terms.columns, terms.positions
+    for t in range(len(fields)):
+        term = fields[t]
+        if term[KIND] != COST or term[WEIGHT] < 0:
+            continue
+        m, width = term[ROWS], term[WIDTH]
+        for i in range(term[COUNT]):
+            r = vector(residual, term[ROW] + i * m, m)
+            J = matrix(jacobian, term[ENTRY] + i * m * width, m, width)
+            root = np.sqrt(weights[term[WEIGHT] + i])
+            for a in range(m):
+                r[a] *= root
+                for d in range(width):
+                    J[a, d] *= root
+            _accumulate(term, i, columns, positions, r, J, gradient, hessian)
+
+
+@inlined
+def _accumulate(
+    term: IntArray,
+    i: int,
+    columns: IntArray,
+    positions: IntArray,
+    r: Array,
+    J: Array,
+    gradient: Array,
+    hessian: Array,
+) -> None:
+    """Add J'r and the upper triangle of J'J of one factor."""
+    rows, width = J.shape
+    column = term[COLUMN] + i * width
+    at = term[POSITION] + i * (width * (width + 1) // 2)
+    for d in range(width):
+        total = 0.0
+        for a in range(rows):
+            total += J[a, d] * r[a]
+        gradient[columns[column + d]] += total
+        for e in range(d + 1):
+            where = positions[at + e]
+            if where != -1:
+                total = 0.0
+                for a in range(rows):
+                    total += J[a, d] * J[a, e]
+                if where >= 0:
+                    hessian[where] += total
+                else:
+                    hessian[-2 - where] += 2.0 * total
+        at += d + 1
+
+
+@compiled
+def add_constraints(terms: Terms, constraint_jacobian: Array, weights: Array, hessian: Array) -> None:
+    """Add the upper triangle of A' diag(weights) A."""
+    fields, positions = terms.fields, terms.positions
+    for t in range(len(fields)):
+        term = fields[t]
+        if term[KIND] == COST:
+            continue
+        m, width = term[ROWS], term[WIDTH]
+        for i in range(term[COUNT]):
+            row = term[ROW] + i * m
+            for a in range(m):
+                w = weights[row + a]
+                if w == 0.0:
+                    continue
+                entry = term[ENTRY] + (i * m + a) * width
+                at = term[POSITION] + i * (width * (width + 1) // 2)
+                for d in range(width):
+                    scaled = w * constraint_jacobian[entry + d]
+                    for e in range(d + 1):
+                        where = positions[at + e]
+                        if where >= 0:
+                            hessian[where] += scaled * constraint_jacobian[entry + e]
+                        elif where != -1:
+                            hessian[-2 - where] += 2.0 * scaled * constraint_jacobian[entry + e]
+                    at += d + 1
+
+
+@compiled
+def times(terms: Terms, costs: bool, entries: Array, other: Array, out: Array) -> None:
+    """J v over the unknowns, for the rows of the costs or of the constraints."""
+    fields, columns, unknowns = terms.fields, terms.columns, terms.unknown
+    for t in range(len(fields)):
+        term = fields[t]
+        if (term[KIND] == COST) != costs:
+            continue
+        m, width = term[ROWS], term[WIDTH]
+        for i in range(term[COUNT]):
+            column = term[COLUMN] + i * width
+            for a in range(m):
+                entry = term[ENTRY] + (i * m + a) * width
+                total = 0.0
+                for d in range(width):
+                    unknown = unknowns[columns[column + d]]
+                    if unknown >= 0:
+                        total += entries[entry + d] * other[unknown]
+                out[term[ROW] + i * m + a] = total
+
+
+@compiled
+def transposed_times(terms: Terms, costs: bool, entries: Array, other: Array, out: Array) -> None:
+    """Add J' v to ``out`` over the full tangent space, fixed variables included."""
+    fields, columns = terms.fields, terms.columns
+    for t in range(len(fields)):
+        term = fields[t]
+        if (term[KIND] == COST) != costs:
+            continue
+        m, width = term[ROWS], term[WIDTH]
+        for i in range(term[COUNT]):
+            column = term[COLUMN] + i * width
+            for a in range(m):
+                scale = other[term[ROW] + i * m + a]
+                if scale != 0.0:
+                    entry = term[ENTRY] + (i * m + a) * width
+                    for d in range(width):
+                        out[columns[column + d]] += scale * entries[entry + d]

@@ -1,0 +1,390 @@
+"""A compiled graph: offsets, ordering and sparsity once; values, Jacobians and gradients as often as needed.
+
+Backends see only this. Rows of costs are whitened and weighted, so the objective is 1/2 |r|^2 plus scalar
+costs; rows of constraints read ``lower <= g <= upper``. Columns are tangent coordinates of the unknowns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from unifg.elimination.factorization import Factorization
+from unifg.elimination.symmetric import Symmetric
+from unifg.errors import GraphError
+from unifg.kernels.differentiation import convexified
+from unifg.language.binding import Binding
+from unifg.language.terms import Constraint, Cost, ScalarCost
+from unifg.language.variables import Data, Family
+from unifg.machine.buffers import Buffers
+from unifg.program import passes
+from unifg.program.clean_hands import require_clean
+from unifg.program.columns import Columns, Values
+from unifg.program.guess import Start
+from unifg.program.linearization import Evaluation, HeldWeights, Linearization
+from unifg.program.retraction import Retraction
+from unifg.program.rows import Rows
+from unifg.program.table import ENTRY, ROW, WIDTH, Table, Terms
+from unifg.program.term import CompiledTerm
+from unifg.program.touched import require_touched, term_columns
+from unifg.typing import Array, ArrayLike, BoolArray, IntArray
+
+if TYPE_CHECKING:
+    from unifg.language.graph import Graph
+
+
+class Program:
+    """The compiled form of a graph.
+
+    Attributes:
+        graph: what was compiled.
+        columns: numbering of the tangent coordinates.
+        size: number of unknown ones.
+        costs, constraints: patterns of the stacked Jacobians.
+        normal: pattern of the Gauss-Newton Hessian of the objective plus A'A.
+        blocks: (size,) the variable that every unknown belongs to.
+        lower, upper: (M,) limits with the present data.
+        cost_terms, scalar_terms, constraint_terms: compiled terms in row order.
+        slices: rows of each constraint term.
+        bound_rows: (M,) whether a row bounds an unknown itself.
+        table: all terms as compiled loops take them.
+        batched: terms without a kernel, evaluated by NumPy.
+        retraction: moves all variables.
+        scratch: memory for compiled loops.
+    """
+
+    def __init__(self, graph: Graph) -> None:
+        """Compile; see :meth:`unifg.Graph.compile`."""
+        if not graph.families:
+            raise GraphError("the graph has no variables: add a family with graph.variables(...)")
+        self.graph = graph
+        self.families = list(graph.families.values())
+        self.columns = Columns(self.families, graph.fixes)
+        self.size = self.columns.size
+        self.terms = [CompiledTerm(term) for term in graph.terms]
+        self.cost_terms = [c for c in self.terms if isinstance(c.term, Cost)]
+        self.scalar_terms = [c for c in self.terms if isinstance(c.term, ScalarCost)]
+        self.constraint_terms = [c for c in self.terms if isinstance(c.term, Constraint)]
+        require_touched(self.columns, self.terms)
+        variable, starts = self.columns.nodes()
+        self.blocks = variable[self.columns.free]
+        self.normal = self._pattern(self.cost_terms + self.scalar_terms + self.constraint_terms, variable, starts)
+        stacked = self.cost_terms + self.constraint_terms
+        self.table = Table(stacked, self.columns, self.normal)
+        self.batched = [term for term in stacked if term.kernel is None and not term.is_bound]
+        self.costs = Rows(self.table, self.cost_terms, True, self.size)
+        self.constraints = Rows(self.table, self.constraint_terms, False, self.size)
+        self._cost_slices = _slices(self.cost_terms)
+        self.slices = _slices(self.constraint_terms)
+        self.bound_rows = np.zeros(self.constraints.count, dtype=bool)
+        for term, rows in zip(self.constraint_terms, self.slices, strict=True):
+            self.bound_rows[rows] = term.is_bound
+        self._scalar_blocks()
+        self._hessian: tuple[Symmetric, IntArray] | None = None
+        self.retraction = Retraction(self.columns, graph.fixes)
+        self._start = Start(graph, self.columns, self.retraction)
+        self._names = [term.name for term in stacked]
+        self.scratch = np.empty(self.table.scratch)
+        self._buffers = Buffers([*self.table.sizes, self.columns.width, self.normal.nnz])
+        self._binding, self._fresh, self._vetted = Binding(graph._data), True, False
+        self.bind({})
+
+    @property
+    def least_squares(self) -> bool:
+        """Whether the objective is a sum of squares, robust or not, and nothing constrains it."""
+        return bool(self.cost_terms) and not (self.scalar_terms or self.constraint_terms)
+
+    @property
+    def differenced(self) -> bool:
+        """Whether some derivative comes from differences, which round."""
+        return bool(self.scalar_terms or self.table.differenced)
+
+    @property
+    def fully_compiled(self) -> bool:
+        """Whether a compiled loop can do without Python: every term a kernel, no robust loss, compiled retractions."""
+        return not (self.batched or self.scalar_terms or self.table.robust) and self.retraction.compiled
+
+    @property
+    def arrays(self) -> Terms:
+        """What compiled loops need to know about the terms, with the present data."""
+        return self.table.arrays
+
+    @property
+    def hessian(self) -> Symmetric:
+        """Pattern of the Gauss-Newton Hessian of the objective alone."""
+        return self._objective()[0]
+
+    @property
+    def objective_places(self) -> IntArray:
+        """Where the entries of ``hessian`` stand in ``normal``."""
+        return self._objective()[1]
+
+    # ---------------------------------------------------------------- data and values
+
+    def bind(self, data: Mapping[Data, ArrayLike]) -> None:
+        """Take new data; everything not named returns to its default.
+
+        Raises:
+            GraphError: on unknown data, a changed shape, NaN, or crossed limits.
+        """
+        changed = self._binding.take(data)
+        self.data = self._binding.given
+        if not (changed or self._fresh):
+            return
+        try:
+            rebound = [term for term in self.terms if term.rebind(self.data, changed)]
+            limits = self._fresh or any(isinstance(term.term, Constraint) for term in rebound)
+            if limits:
+                self._bind_limits()
+        except GraphError:
+            self._binding.forget()
+            raise
+        if limits or rebound:
+            self.table.bind(self.terms if self._fresh else rebound, self.lower, self.upper)
+        for k, fix in enumerate(self.graph.fixes):
+            if not isinstance(fix.value, Data):
+                if self._fresh:
+                    self.retraction.bind(k, np.asarray(fix.value))
+            elif self._fresh or fix.value in changed:
+                self.retraction.bind(k, self.data.get(fix.value, fix.value.value))
+        self._fresh = False
+
+    def _bind_limits(self) -> None:
+        self.lower = _stacked([c.lower for c in self.constraint_terms])
+        self.upper = _stacked([c.upper for c in self.constraint_terms])
+        crossed = np.flatnonzero(self.lower > self.upper)
+        if len(crossed):
+            name, index = self.row_name(int(crossed[0]))
+            raise GraphError(f"term '{name}': lower exceeds upper in factor {index}", term=name, index=index)
+        self.equality = self.lower == self.upper
+
+    def values_from(self, guess: Mapping[Family, ArrayLike]) -> Values:
+        """Copy and check a guess, and give fixed variables their values.
+
+        Raises:
+            GraphError: naming the family and index of what is missing, misshapen, NaN or off its manifold.
+        """
+        values = self._start(guess)
+        if not self._vetted:
+            for term in self.terms:
+                require_clean(term, values)
+            self._vetted = True
+        return values
+
+    def retract(self, values: Values, step: Array) -> Values:
+        """Move the unknowns by a tangent step; fixed variables stay."""
+        return self.retraction(values, step)
+
+    def within_bounds(self, values: Values) -> Values:
+        """The nearest values that respect every bound of an unknown; ``values`` itself when all do."""
+        moved = Values(self.columns, values.flat.copy())
+        for term in self.constraint_terms:
+            if not term.is_bound:
+                continue
+            selection = term.gathers[0].selection
+            part = moved[selection.family][selection.indices, selection.storage]
+            moved[selection.family][selection.indices, selection.storage] = np.clip(part, term.lower, term.upper)
+        self.retraction.fix(moved)
+        return values if np.array_equal(moved.flat, values.flat) else moved
+
+    # ---------------------------------------------------------------- evaluation
+
+    def evaluate(self, values: Mapping[Family, Array], weights: HeldWeights | None = None) -> Evaluation:
+        """Objective and constraints; ``weights`` are those of the linearisation whose line search this is."""
+        table, values = self.table, self.columns.values(values)
+        residual, constraints = np.empty(table.residuals), np.empty(table.constraints)
+        squares = np.empty(table.weights)
+        with np.errstate(all="ignore"):
+            for term in self.batched:
+                self.rows_of(term, residual, constraints)[:] = term.residual(values)
+            cost = passes.evaluate(table.arrays, values.flat, residual, constraints, squares, self.scratch)
+            for term, part in table.robust:
+                assert isinstance(term.term, Cost) and term.term.robust is not None
+                held = weights.get(term.name) if weights else None
+                robust = term.term.robust.value(squares[part]) if held is None else held * squares[part]
+                cost += 0.5 * float(robust.sum())
+            for term in self.scalar_terms:
+                cost += float(term.residual(values).sum())
+        return Evaluation(cost, constraints)
+
+    def linearize(self, values: Mapping[Family, Array], search: bool = False) -> Linearization:
+        """Everything a backend needs at ``values``; with ``search``, by search Jacobians where a residual has one."""
+        table, values = self.table, self.columns.values(values)
+        residual, jacobian, constraints, constraint_jacobian, gradient, hessian = self._buffers.take()
+        gradient[:], hessian[:] = 0.0, 0.0
+        squares, size = np.empty(table.weights), np.empty(len(table.arrays.fields))
+        norms: dict[str, float] = {}
+        scalars: dict[str, Array] = {}
+        weights: HeldWeights = {}
+        concavity = np.zeros(self.normal.nnz if self.scalar_terms else 0)
+        rounding = np.zeros(self.columns.width if self.scalar_terms else 0)
+        with np.errstate(all="ignore"):
+            for term in self.batched:
+                self.rows_of(term, residual, constraints)[:] = term.residual(values)
+                self._entries_of(term, jacobian, constraint_jacobian, term.jacobians(values, search=search))
+            cost = passes.linearize(
+                table.arrays,
+                values.flat,
+                search,
+                residual,
+                jacobian,
+                constraints,
+                constraint_jacobian,
+                squares,
+                size,
+                gradient,
+                hessian,
+                self.scratch,
+            )
+            if table.robust:
+                cost += self._weigh(squares, residual, jacobian, gradient, hessian, weights)
+            for term in self.scalar_terms:
+                value = term.residual(values)
+                cost += float(value.sum())
+                scalars[term.name], norms[term.name] = value, float(np.abs(value).sum())
+                slope, curvature, doubt = term.scalar_derivatives(values)
+                columns, factor, a, b, place = self._scalars[term.name]
+                np.add.at(gradient, columns.ravel(), slope.ravel())
+                np.add.at(rounding, columns.ravel(), doubt.ravel())
+                np.add.at(hessian, place, (convex := convexified(curvature))[factor, a, b])
+                np.add.at(concavity, place, (curvature - convex)[factor, a, b])
+        norms |= self.norms(size)
+        found = residual, jacobian, constraints, constraint_jacobian, gradient, hessian
+        return Linearization(values, cost, *found, norms, weights, concavity, squares, scalars, rounding)
+
+    def _weigh(
+        self,
+        squares: Array,
+        residual: Array,
+        jacobian: Array,
+        gradient: Array,
+        hessian: Array,
+        held: HeldWeights,
+    ) -> float:
+        """Finish what robust terms began: find weights, scale, accumulate; return their cost."""
+        table = self.table
+        weights, cost = np.empty(table.weights), 0.0
+        for term, part in table.robust:
+            assert isinstance(term.term, Cost) and term.term.robust is not None
+            loss = term.term.robust
+            weights[part] = loss.weight(squares[part])
+            cost += 0.5 * float(loss.value(squares[part]).sum())
+            if loss.held:
+                held[term.name] = weights[part]
+        passes.weigh(table.arrays, weights, residual, jacobian, gradient, hessian)
+        return cost
+
+    def norms(self, sizes: Array) -> dict[str, float]:
+        """Residual norms of the terms by name, as compiled loops leave them."""
+        return dict(zip(self._names, sizes.tolist(), strict=True))
+
+    def rows_of(self, term: CompiledTerm, residual: Array, constraints: Array) -> Array:
+        """(n, m) rows of a term in the stacked residuals."""
+        start = int(term.place[ROW])
+        target = residual if isinstance(term.term, Cost) else constraints
+        return target[start : start + term.count * term.size].reshape(term.count, term.size)
+
+    def _entries_of(self, term: CompiledTerm, costs: Array, constraints: Array, blocks: list[Array]) -> None:
+        """Copy (n, m, d_k) blocks side by side into the stacked Jacobian."""
+        start, width = int(term.place[ENTRY]), int(term.place[WIDTH])
+        target = costs if isinstance(term.term, Cost) else constraints
+        own = target[start : start + term.count * term.size * width].reshape(term.count, term.size, width)
+        at = 0
+        for block in blocks:
+            own[:, :, at : at + block.shape[2]] = block
+            at += block.shape[2]
+
+    # ---------------------------------------------------------------- products backends need
+
+    def hessian_entries(self, lin: Linearization) -> Array:
+        """Gauss-Newton Hessian of the objective in the order of ``hessian``."""
+        return lin.hessian[self.objective_places]
+
+    def normal_entries(self, lin: Linearization, row_weights: Array) -> Array:
+        """Gauss-Newton Hessian plus A' diag(row_weights) A, in the order of ``normal``."""
+        entries = lin.hessian.copy()
+        passes.add_constraints(self.table.arrays, lin.constraint_jacobian, row_weights, entries)
+        return entries
+
+    def lagrangian_gradient(self, lin: Linearization, multipliers: Array) -> Array:
+        """Gradient of the objective plus A' multipliers, over the full tangent space."""
+        if not self.constraints.count:
+            return lin.gradient
+        return lin.gradient + self.constraints.transposed_times(lin.constraint_jacobian, multipliers)
+
+    def violation(self, constraints: Array) -> Array:
+        """(M,) signed distance outside the limits: positive above, negative below, zero inside."""
+        return np.maximum(constraints - self.upper, 0.0) - np.maximum(self.lower - constraints, 0.0)
+
+    def normal_solver(self) -> Factorization:
+        """A factorisation for matrices in the pattern ``normal``."""
+        return Factorization(self.normal, self.blocks)
+
+    def row_name(self, row: int) -> tuple[str, int]:
+        """Term and factor of a constraint row."""
+        for term, rows in zip(self.constraint_terms, self.slices, strict=True):
+            if rows.start <= row < rows.stop:
+                return term.name, (row - rows.start) // term.size
+        raise GraphError(f"row {row} belongs to no constraint", index=row)
+
+    def cost_rows(self, names: Sequence[str]) -> BoolArray:
+        """(C,) whether each cost row belongs to one of the named terms.
+
+        Raises:
+            GraphError: when no least-squares cost has such a name.
+        """
+        chosen = np.zeros(self.costs.count, dtype=bool)
+        slices = {term.name: rows for term, rows in zip(self.cost_terms, self._cost_slices, strict=True)}
+        for name in names:
+            if name not in slices:
+                raise GraphError(f"no cost is called '{name}' (there are: {', '.join(slices) or 'none'})", term=name)
+            chosen[slices[name]] = True
+        return chosen
+
+    def _pattern(self, terms: Sequence[CompiledTerm], variable: IntArray, starts: IntArray) -> Symmetric:
+        """Every two variables of a factor share a block."""
+        first, second = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
+        for term in terms:
+            members = [variable[columns[:, 0]] for columns in term_columns(self.columns, term)]
+            for k, a in enumerate(members):
+                for b in members[:k]:
+                    first.append(np.minimum(a, b))
+                    second.append(np.maximum(a, b))
+        return Symmetric.of_blocks(starts, np.concatenate(first), np.concatenate(second))
+
+    def _objective(self) -> tuple[Symmetric, IntArray]:
+        """Pattern of the objective's Hessian and where its entries stand in ``normal``."""
+        if self._hessian is None:
+            if not self.constraint_terms:
+                self._hessian = self.normal, np.arange(self.normal.nnz)
+            else:
+                variable, starts = self.columns.nodes()
+                pattern = self._pattern(self.cost_terms + self.scalar_terms, variable, starts)
+                columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
+                self._hessian = pattern, self.normal.positions(pattern.indices, columns)
+        return self._hessian
+
+    def _scalar_blocks(self) -> None:
+        """Where gradient and Hessian blocks of scalar costs go."""
+        self._scalars: dict[str, tuple[IntArray, IntArray, IntArray, IntArray, IntArray]] = {}
+        for term in self.scalar_terms:
+            full = np.concatenate(term_columns(self.columns, term), axis=1)
+            mapped = self.columns.unknown[full]
+            keep = (mapped[:, :, None] <= mapped[:, None, :]) & (mapped[:, :, None] >= 0)
+            factor, a, b = np.nonzero(keep)
+            place = self.normal.positions(mapped[factor, a], mapped[factor, b])
+            self._scalars[term.name] = full, factor, a, b, place
+
+
+def _slices(terms: Sequence[CompiledTerm]) -> list[slice]:
+    """Rows of each term in the stack."""
+    ends = np.cumsum([0] + [term.count * term.size for term in terms]).tolist()
+    return [slice(start, end) for start, end in pairwise(ends)]
+
+
+def _stacked(parts: list[Array]) -> Array:
+    """One flat array, also of nothing."""
+    return np.concatenate([part.ravel() for part in parts]) if parts else np.zeros(0)

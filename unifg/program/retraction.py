@@ -1,0 +1,111 @@
+"""Moving all variables of a graph by one tangent step, in one compiled call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from unifg.language.terms import Fix
+from unifg.lie import Manifold, Rn
+from unifg.lie.lookup import functions_of
+from unifg.lie.product import leaves
+from unifg.machine.calls import RETRACTION, address, call_retraction, vector
+from unifg.machine.jit import compiled
+from unifg.program.columns import Columns, Values
+from unifg.typing import Array, IntArray
+
+ADDITION = 0  # in the place of an address: the retraction is a sum
+
+
+class Retraction:
+    """x [+] d for every variable; fixed ones take their values.
+
+    Attributes:
+        parts: one row per component of a family, for :func:`retract_parts`.
+    """
+
+    def __init__(self, columns: Columns, fixes: Sequence[Fix]) -> None:
+        """Lay out the parts of every family."""
+        self._columns = columns
+        self._python = []
+        self._kept = []  # addresses are good for as long as the functions live
+        parts = []
+        for family in columns.families:
+            parts_of = list(leaves(family.manifold))
+            if any(_compiled_retraction(leaf) is None for leaf, _, _ in parts_of):
+                self._python.append(family)
+                continue
+            for leaf, storage, tangent in parts_of:
+                function = _compiled_retraction(leaf)
+                self._kept.append(function)
+                where = ADDITION if function == ADDITION else address(function, RETRACTION)  # type: ignore[arg-type]
+                parts.append(
+                    [
+                        where,
+                        family.count,
+                        columns.storage[family] + storage,
+                        family.manifold.storage,
+                        leaf.storage,
+                        columns.offsets[family] + tangent,
+                        family.manifold.dim,
+                        leaf.dim,
+                    ]
+                )
+        self.parts = np.array(parts, dtype=np.int64).reshape(-1, 8)
+        places = [columns.starts(fix.selection)[:, None] + np.arange(fix.selection.manifold.storage) for fix in fixes]
+        self._fixed = np.concatenate([np.zeros(0, dtype=np.intp), *(place.ravel() for place in places)])
+        self._sizes = [place.shape for place in places]
+        self._values = np.zeros(len(self._fixed))
+
+    @property
+    def compiled(self) -> bool:
+        """Whether every family has a compiled retraction."""
+        return not self._python
+
+    def bind(self, which: int, value: Array) -> None:
+        """Take the present value of one fix."""
+        count, storage = self._sizes[which]
+        start = sum(a * b for a, b in self._sizes[:which])
+        self._values[start : start + count * storage].reshape(count, storage)[:] = value
+
+    def fix(self, values: Values) -> None:
+        """Write the values of fixed variables."""
+        values.flat[self._fixed] = self._values
+
+    def __call__(self, values: Values, step: Array) -> Values:
+        """Move the unknowns by a tangent step."""
+        columns = self._columns
+        full = np.zeros(columns.width)
+        moved = Values(columns, values.flat.copy())
+        retract_parts(self.parts, columns.free, np.ascontiguousarray(step), full, values.flat, moved.flat)
+        for family in self._python:
+            offset, dim = columns.offsets[family], family.manifold.dim
+            part = full[offset : offset + family.count * dim].reshape(family.count, dim)
+            moved[family][:] = family.manifold.retract(values[family], part)
+        self.fix(moved)  # retractions wrap and renormalise; a fixed value stays as given
+        return moved
+
+
+def _compiled_retraction(manifold: Manifold) -> object:
+    """The compiled retraction of a manifold, ADDITION, or None when it has only a batched one."""
+    if isinstance(manifold, Rn):
+        return ADDITION
+    functions = functions_of(manifold)
+    return None if functions is None else functions.retract
+
+
+@compiled
+def retract_parts(parts: IntArray, free: IntArray, step: Array, full: Array, values: Array, moved: Array) -> None:
+    """Spread the step over the tangent space and move every part."""
+    for k in range(len(free)):
+        full[free[k]] = step[k]
+    for p in range(len(parts)):
+        where, count, storage, stride, size, tangent, hop, dim = parts[p]
+        for i in range(count):
+            x, d = storage + i * stride, tangent + i * hop
+            if where == ADDITION:
+                for k in range(size):
+                    moved[x + k] = values[x + k] + full[d + k]
+            else:
+                call_retraction(where, vector(values, x, size), vector(full, d, dim), vector(moved, x, size))

@@ -1,0 +1,233 @@
+"""All terms of a graph as arrays that compiled loops can walk: one row of integers per term.
+
+The rows say where everything stands: machine code, variables, parameters, whitening, rows of the stacked residual,
+entries of the Jacobian, columns, and the places of J'J in the matrix of the normal equations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from unifg.elimination.symmetric import Symmetric
+from unifg.kernels.steps import Part, as_table, compiled_parts
+from unifg.language.terms import Constraint, Cost
+from unifg.machine.jit import compiled
+from unifg.program.columns import Columns
+from unifg.program.term import CompiledTerm
+from unifg.typing import Array, IntArray
+
+(
+    KIND,  # COST, CONSTRAINT or BOUND
+    ADDRESS,  # of the kernel; 0: NumPy has evaluated the term already
+    SEARCH,  # address of the kernel with the search Jacobian
+    COUNT,  # factors
+    ROWS,  # of one factor
+    SLOTS,  # variables of one factor
+    STORAGE,  # numbers that store them
+    WIDTH,  # tangent columns of those that are not constants here
+    KERNEL_WIDTH,  # tangent columns that the kernel writes
+    GATHER,  # first start of a variable in Terms.gather
+    SIZE,  # first storage size in Terms.sizes
+    KEEP,  # first column to keep in Terms.sizes; -1: all
+    PARAMETER,  # first parameter of factor 0
+    PARAMETERS,  # of one factor
+    SPREAD,  # from the parameters of one factor to the next; 0: shared
+    TABLE,  # address of the shared table
+    TABLE_SIZE,
+    WHITEN,  # bit 0: one whitener for each factor; DIAGONAL, FULL
+    WHITENER,  # first whitener
+    ACTIVE,  # first flag; -1: all active
+    WEIGHT,  # first robust weight; -1: not robust
+    ROW,  # first row of the stacked residual
+    ENTRY,  # first entry of the stacked Jacobian
+    COLUMN,  # first column in Terms.columns
+    POSITION,  # first place in Terms.positions
+    PART,  # first row of Terms.parts
+    PARTS,  # of the variables; 0: linear, or without a compiled retraction
+    SECOND,  # address of the kernel's second derivatives; 0: to be differenced
+    DIFFERENCED,  # whether the Jacobian is made of differences
+    FIELDS,
+) = range(30)
+
+COST, CONSTRAINT, BOUND = 0, 1, 2
+
+
+class Terms(NamedTuple):
+    """What compiled loops read.
+
+    Attributes:
+        fields: (T, FIELDS) one row per term, in the order of the program.
+        gather: where each variable of each factor starts in the stored values; negative: constants.
+        sizes: storage sizes of variables, and columns kept.
+        columns: (n, D) full tangent columns of each factor, term after term.
+        unknown: full column to unknown, or -1.
+        positions: place of every pair (d, e <= d) of columns in the normal matrix; -1: fixed; -2 - p: the pair stands
+            for both triangles, because both columns are the same unknown.
+        parts: (L, 6) of the variables of every term, as :class:`unifg.kernels.steps.Part` has them.
+        active: flags.
+        parameters: of kernels, and constants in the place of variables.
+        whiteners: reciprocal standard deviations and upper triangular square roots.
+        lower, upper: (M,) limits of constraints.
+    """
+
+    fields: IntArray
+    gather: IntArray
+    sizes: IntArray
+    columns: IntArray
+    unknown: IntArray
+    positions: IntArray
+    parts: IntArray
+    active: IntArray
+    parameters: Array
+    whiteners: Array
+    lower: Array
+    upper: Array
+
+
+class Table:
+    """Builds :class:`Terms` once and renews what data can change.
+
+    Attributes:
+        arrays: for the compiled loops.
+        residuals, weights: number of rows of all costs, number of robust factors.
+        constraints: number of constraint rows.
+        entries, constraint_entries: lengths of the stacked Jacobians.
+        scratch: how many numbers the loops need for one factor.
+        differenced: whether the Jacobian of any term is made of differences.
+        robust: robust terms and their slices of weights.
+    """
+
+    def __init__(self, terms: Sequence[CompiledTerm], columns: Columns, normal: Symmetric) -> None:
+        """Lay everything out; numbers come with :meth:`bind`."""
+        self._terms = terms
+        self._columns = columns
+        fields = np.zeros((len(terms), FIELDS), dtype=np.int64)
+        gather, sizes, tangent = [], [], []
+        parts: list[Part] = []
+        starts = {"gather": 0, "sizes": 0, "tangent": 0, "positions": 0, "parameters": 0, "whiteners": 0, "active": 0}
+        self.residuals = self.weights = self.constraints = self.entries = self.constraint_entries = 0
+        self.scratch = 1
+        self.differenced = any(term.differenced for term in terms)
+        self.robust: list[tuple[CompiledTerm, slice]] = []
+        for row, term in zip(fields, terms, strict=True):
+            layout = term.layout(columns, starts["parameters"])
+            count, m, width = layout.count, layout.rows, layout.columns.shape[1]
+            row[COUNT], row[ROWS], row[WIDTH] = count, m, width
+            row[SLOTS], row[STORAGE], row[KERNEL_WIDTH] = len(layout.sizes), sum(layout.sizes), layout.kernel_width
+            row[GATHER], row[SIZE], row[COLUMN] = starts["gather"], starts["sizes"], starts["tangent"]
+            row[KEEP] = -1 if layout.keep is None else starts["sizes"] + len(layout.sizes)
+            row[POSITION], row[PARAMETER], row[WHITENER] = (
+                starts["positions"],
+                starts["parameters"],
+                starts["whiteners"],
+            )
+            row[ACTIVE], row[WEIGHT] = -1, -1
+            row[PART] = len(parts)
+            if term.kernel is not None and not term.kernel.linear:
+                parts += compiled_parts(term.kernel.manifolds)
+            row[PARTS] = len(parts) - row[PART]
+            row[DIFFERENCED] = term.differenced
+            gather.append(layout.gather.ravel())
+            sizes += [*layout.sizes, *(layout.keep or [])]
+            tangent.append(layout.columns.ravel())
+            starts["gather"] += layout.gather.size
+            starts["sizes"] = len(sizes)
+            starts["tangent"] += layout.columns.size
+            starts["positions"] += count * (width * (width + 1) // 2)
+            starts["parameters"] += term.parameters.size
+            starts["whiteners"] += term.whitener.size
+            self.scratch = max(self.scratch, sum(layout.sizes) + m * layout.kernel_width)
+            row[PARAMETERS], row[SPREAD], row[WHITEN] = term.parameter_count, term.parameter_spread, term.whitening
+            if term.kernel is not None:
+                row[ADDRESS], row[SECOND] = term.kernel.address, term.kernel.second_address
+                row[TABLE], row[TABLE_SIZE] = term.kernel.table.ctypes.data, term.kernel.table.size
+            if term.search_kernel is not None:
+                row[SEARCH] = term.search_kernel.address
+            entries = count * m * width
+            if isinstance(term.term, Cost):
+                row[KIND], row[ROW], row[ENTRY] = COST, self.residuals, self.entries
+                self.residuals += count * m
+                self.entries += entries
+                if term.term.robust is not None:
+                    row[WEIGHT] = self.weights
+                    self.robust.append((term, slice(self.weights, self.weights + count)))
+                    self.weights += count
+            else:
+                assert isinstance(term.term, Constraint)
+                row[KIND] = BOUND if term.is_bound else CONSTRAINT
+                row[ROW], row[ENTRY] = self.constraints, self.constraint_entries
+                self.constraints += count * m
+                self.constraint_entries += entries
+            term.place = row
+        counts = fields[:, COUNT]
+        self._active_starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        self.arrays = Terms(
+            fields,
+            _joined(gather),
+            np.array(sizes or [0], dtype=np.int64),
+            _joined(tangent),
+            columns.unknown.astype(np.int64),
+            np.empty(starts["positions"], dtype=np.int32),
+            as_table(parts),
+            np.ones(int(counts.sum()), dtype=np.uint8),
+            np.empty(max(starts["parameters"], 1)),
+            np.empty(max(starts["whiteners"], 1)),
+            np.empty(self.constraints),
+            np.empty(self.constraints),
+        )
+        locate(fields, self.arrays.columns, self.arrays.unknown, normal.indptr, normal.indices, self.arrays.positions)
+
+    @property
+    def sizes(self) -> tuple[int, int, int, int]:
+        """Lengths of the stacked residual, its Jacobian, the stacked constraints and theirs."""
+        return self.residuals, self.entries, self.constraints, self.constraint_entries
+
+    def bind(self, rebound: Sequence[CompiledTerm], lower: Array, upper: Array) -> None:
+        """Copy limits and everything that some terms have bound; their parameters live here from then on."""
+        arrays = self.arrays
+        arrays.lower[:], arrays.upper[:] = lower, upper
+        for row, term, start in zip(arrays.fields, self._terms, self._active_starts, strict=False):
+            if term not in rebound:
+                continue
+            parameters = arrays.parameters[row[PARAMETER] : row[PARAMETER] + term.parameters.size]
+            parameters[:] = term.parameters
+            term.settle(parameters)
+            arrays.whiteners[row[WHITENER] : row[WHITENER] + term.whitener.size] = term.whitener.ravel()
+            row[ACTIVE] = -1
+            if term.active is not None and not term.is_bound:
+                row[ACTIVE] = start
+                arrays.active[start : start + term.count] = term.active
+
+
+def _joined(parts: list[IntArray]) -> IntArray:
+    """One int64 array, also of nothing."""
+    return np.concatenate([np.zeros(0, dtype=np.int64), *parts]).astype(np.int64, copy=False)
+
+
+@compiled
+def locate(
+    fields: IntArray, columns: IntArray, unknown: IntArray, indptr: IntArray, indices: IntArray, positions: IntArray
+) -> None:
+    """Find every pair of columns of every factor in a matrix compressed by columns."""
+    at = 0
+    for t in range(len(fields)):
+        width = fields[t, WIDTH]
+        for i in range(fields[t, COUNT]):
+            column = fields[t, COLUMN] + i * width
+            for d in range(width):
+                for e in range(d + 1):
+                    a, b = unknown[columns[column + d]], unknown[columns[column + e]]
+                    positions[at] = -1
+                    if a >= 0 and b >= 0:
+                        low, high = indptr[max(a, b)], indptr[max(a, b) + 1] - 1
+                        while low < high:
+                            middle = (low + high) // 2
+                            if indices[middle] < min(a, b):
+                                low = middle + 1
+                            else:
+                                high = middle
+                        positions[at] = -2 - low if a == b and d != e else low
+                    at += 1

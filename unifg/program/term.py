@@ -1,0 +1,408 @@
+"""One term with its shapes known: where its numbers stand, and how to evaluate it by itself.
+
+Solvers run all terms at once through :mod:`unifg.program.table`; the batched functions here serve terms without a kernel,
+checks, and messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Set
+from dataclasses import dataclass
+from math import prod
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from unifg.errors import GraphError, name_term
+from unifg.kernels.differentiation import scalar_slopes, slopes, weighted_hessian
+from unifg.kernels.kernel import Kernel, side_by_side
+from unifg.kernels.moves import Moves, Near, Steps, directions_of
+from unifg.kernels.per_factor import per_factor
+from unifg.kernels.residuals import Residual
+from unifg.kernels.stack import Stack
+from unifg.kernels.whitening import DIAGONAL, FULL, reciprocals, square_roots
+from unifg.language.terms import Constraint, Cost, Parameter, ScalarCost, Term
+from unifg.language.variables import Data, Selection
+from unifg.lie import Manifold
+from unifg.machine.jit import is_compiled
+from unifg.program.columns import Columns, Values
+from unifg.program.gather import Gather
+from unifg.program.vetting import as_float64, as_jacobian, notice_no_information
+from unifg.typing import Array, BoolArray, IntArray
+
+Bound: TypeAlias = Mapping[Data, Array]
+
+
+@dataclass
+class Layout:
+    """Where the numbers of a term stand.
+
+    Attributes:
+        count, rows: factors and the rows of each; a bound is a factor of one row for each scalar.
+        gather: (n, slots) starts of the variables in the stored values, negative for constants.
+        sizes: storage of each slot.
+        columns: (n, D) full tangent columns.
+        kernel_width: tangent columns the kernel writes.
+        keep: those of them that are no constants here; None for all.
+    """
+
+    count: int
+    rows: int
+    gather: IntArray
+    sizes: list[int]
+    columns: IntArray
+    kernel_width: int
+    keep: list[int] | None
+
+
+class CompiledTerm:
+    """A term with its shapes known.
+
+    Attributes:
+        term: what the user stated.
+        name: the term's name.
+        count: factors n.
+        size: residual dimension m.
+        dims: tangent dimension of each variable argument.
+        data: all data the term reads.
+    """
+
+    parameters: Array
+    _packed: Array
+
+    def __init__(self, term: Term) -> None:
+        """Find the residual's dimension by one evaluation at identity elements."""
+        self.term = term
+        self.name = term.name
+        self.count = term.count
+        self.gathers = [Gather(s, term.count) for s in term.selections]
+        self.manifolds = [s.manifold for s in term.selections]
+        self.dims = [manifold.dim for manifold in self.manifolds]
+        self._places = [k for k, a in enumerate(term.arguments) if isinstance(a, Selection)]
+        self._function = term.residual.function
+        self._jacobian = term.residual.jacobian
+        self._stack = Stack(self.name, self._evaluated)
+        self._jacobian_stack = Stack(self.name, self._attached)
+        self._directions = directions_of(tuple(self.manifolds))
+        self.is_bound = isinstance(term, Constraint) and term.is_bound
+        self.kernel, self.search_kernel = (None, None) if isinstance(term, ScalarCost) else _kernels(term.residual)
+        self.place: IntArray = np.zeros(0, dtype=np.int64)
+        shaping = [getattr(term, name, None) for name in ("active", "sigma", "information", "lower", "upper")]
+        self._shaping = frozenset(value for value in shaping if isinstance(value, Data))
+        self.data = self._shaping | {argument for argument in term.arguments if isinstance(argument, Data)}
+        self._blocks: dict[int, tuple[int, int]] = {}
+        self.bind({})
+        if is_compiled(self._function) and not isinstance(term, ScalarCost):
+            self.kernel = self._own_kernel()
+            self._function, self._jacobian = self.kernel, self.kernel.jacobian
+        if self.kernel is not None:
+            self._require_manifolds(self.kernel)
+        with np.errstate(all="ignore"):
+            trial = self._call([np.tile(m.identity(), (self.count, 1)) for m in self.manifolds])
+        scalar = isinstance(term, ScalarCost)
+        expected = "(n,)" if scalar else "(n, m)"
+        if trial.ndim != (1 if scalar else 2) or len(trial) != self.count:
+            raise GraphError(
+                f"term '{self.name}': its function returned shape {trial.shape}, expected {expected} with "
+                f"n = {self.count}; arguments were {self._shapes()}",
+                term=self.name,
+            )
+        self.size = 1 if scalar else trial.shape[1]
+        self.shape = trial.shape
+        self._bind_parameters({})
+        if isinstance(self.term, Cost) and isinstance(self.term.information, np.ndarray):
+            notice_no_information(self.name, self.whitener)
+
+    def bind(self, data: Bound) -> None:
+        """Take the present value of every data argument."""
+        self._arguments: list[Any] = [data.get(a, a.value) if isinstance(a, Data) else a for a in self.term.arguments]
+        active = self.term.active
+        mask = data.get(active, active.value) if isinstance(active, Data) else active
+        self.active: BoolArray | None = None if mask is None or mask.all() else mask.astype(bool)
+        each = [k for k, a in enumerate(self.term.arguments) if isinstance(a, Data) and a.each]
+        for stack in (self._stack, self._jacobian_stack):
+            stack.bind(self._arguments, self._places, each)
+        if hasattr(self, "size"):
+            self._bind_parameters(data)
+
+    def rebind(self, data: Bound, changed: Set[Data]) -> bool:
+        """Take changed data; True when more than parameters of the kernel had to be renewed."""
+        if not (mine := self.data & changed):
+            return False
+        places = [k for k, a in enumerate(self.term.arguments) if isinstance(a, Data) and a in mine]
+        if self.kernel is None or mine & self._shaping or not all(place in self._blocks for place in places):
+            self.bind(data)
+            return True
+        for place in places:
+            handle = self.term.arguments[place]
+            self._arguments[place] = value = data.get(handle, handle.value)
+            first, size = self._blocks[place]
+            self._packed[:, first : first + size] = value.reshape(-1, size)
+        self._stack.forget()
+        self._jacobian_stack.forget()
+        return False
+
+    def settle(self, parameters: Array) -> None:
+        """Keep the parameters where the compiled loops read them."""
+        self.parameters = parameters
+        if self.kernel is not None:
+            self._packed = parameters[: self._packed.size].reshape(self._packed.shape)
+
+    def residual(self, values: Values) -> Array:
+        """(n, m) residuals, zero where inactive, not whitened; (n,) for a scalar cost."""
+        return self._masked(self._checked(self._call([gather(values) for gather in self.gathers])))
+
+    def jacobians(self, values: Values, numerical: bool = False, search: bool = False) -> list[Array]:
+        """One (n, m, d_k) array per variable argument, zero where inactive.
+
+        Args:
+            values: where to differentiate.
+            numerical: differentiate numerically even when a Jacobian is attached.
+            search: prefer the residual's search Jacobian, which is not a derivative.
+        """
+        attached = self.term.residual.search if search and self.term.residual.search else self._jacobian
+        points = [gather(values) for gather in self.gathers]
+        if attached is None or numerical:
+            blocks = slopes(self._stack, Near(self._directions, points))
+        else:
+            blocks = [as_jacobian(self.name, block) for block in attached(*self.fill(points))]
+            if len(blocks) > len(self.dims) and len(blocks) > max(self._places):
+                blocks = [blocks[place] for place in self._places]  # some of its arguments are constants here
+            wanted = [(self.count, self.size, dim) for dim in self.dims]
+            if [block.shape for block in blocks] != wanted:
+                raise GraphError(
+                    f"term '{self.name}': the attached Jacobian returned shapes {[b.shape for b in blocks]}, "
+                    f"expected {wanted}",
+                    term=self.name,
+                )
+        return [self._masked(block) for block in blocks]
+
+    def carry_back(self, residual: Array) -> Array:
+        """(n, m) W' r for whitened residuals."""
+        if self.whitening & DIAGONAL:
+            return residual * self.whitener
+        if self.whitening & FULL:
+            carried: Array = np.einsum(
+                "nab,na->nb", np.broadcast_to(self.whitener, (self.count, self.size, self.size)), residual
+            )
+            return carried
+        return residual
+
+    def second_derivatives(self, values: Values, weights: Array) -> Array:
+        """(n, D, D) Hessians of weights' r, weights (n, m), by differences; zero where inactive."""
+        near = Near(self._directions, [gather(values) for gather in self.gathers])
+        with np.errstate(all="ignore"):
+            if self._jacobian is None or self.differenced:
+                return self._masked(weighted_hessian(self._stack, near, weights))
+
+            def slope(near: Near, steps: Steps, moves: Moves) -> Array:
+                return np.asarray(np.einsum("nm,knmd->knd", weights, self._jacobian_stack(near, steps, moves)))
+
+            second = np.concatenate(slopes(slope, near), axis=2)
+        return self._masked(0.5 * (second + np.swapaxes(second, 1, 2)))
+
+    def scalar_derivatives(self, values: Values) -> tuple[Array, Array, Array]:
+        """Gradient (n, D), Hessian (n, D, D), rounding of the gradient (n, D) of a scalar cost, zero where inactive."""
+        found = scalar_slopes(self._stack, Near(self._directions, [gather(values) for gather in self.gathers]))
+        gradient, hessian, rounding = (self._masked(array) for array in found)
+        return gradient, hessian, rounding
+
+    @property
+    def differenced(self) -> bool:
+        """Whether the Jacobian of a term that is no scalar cost is made of differences."""
+        if self.kernel is not None:
+            return self.kernel.differenced
+        return self._jacobian is None and not self.is_bound
+
+    def layout(self, columns: Columns, parameters: int) -> Layout:
+        """Where this term's numbers stand, when its parameters begin at ``parameters``."""
+        tangent = [columns.of(selection) for selection in self.term.selections]
+        wide = [np.broadcast_to(part, (self.count, part.shape[1])) for part in tangent]
+        joined = np.concatenate(wide, axis=1)
+        starts = [np.broadcast_to(columns.starts(s), (self.count,)) for s in self.term.selections]
+        sizes = [selection.manifold.storage for selection in self.term.selections]
+        if self.is_bound:
+            scalars = (starts[0][:, None] + np.arange(self.size)).reshape(-1, 1)
+            return Layout(self.count * self.size, 1, scalars, [1], joined.reshape(-1, 1), 1, None)
+        if self.kernel is None:
+            return Layout(self.count, self.size, np.stack(starts, axis=1), sizes, joined, joined.shape[1], None)
+        constants = parameters + self.parameter_count * (self.count if self.parameter_spread else 1)
+        gather: list[IntArray] = []
+        keep: list[int] = []
+        sizes, width = [], 0
+        for argument, expected in zip(self.term.arguments, self.kernel.arguments, strict=True):
+            if isinstance(expected, int | tuple):
+                continue
+            sizes.append(expected.storage)
+            if isinstance(argument, Selection):
+                gather.append(starts.pop(0))
+                keep += range(width, width + expected.dim)
+            else:
+                own = self._constants[len(gather)]
+                spread = expected.storage if len(own) > 1 else 0
+                gather.append(-1 - constants - spread * np.arange(self.count))
+                constants += own.size
+            width += expected.dim
+        return Layout(
+            self.count,
+            self.size,
+            np.stack(gather, axis=1),
+            sizes,
+            joined,
+            width,
+            None if len(keep) == width else keep,
+        )
+
+    def _bind_parameters(self, data: Bound) -> None:
+        term = self.term
+        self.whitening = 0
+        self.whitener: Array = np.zeros(0)
+        if isinstance(term, Cost):
+            if term.sigma is not None:
+                self.whitener = reciprocals(self.name, resolve(term.sigma, data), self.count, self.size)
+                self.whitening = DIAGONAL
+            if term.information is not None:
+                self.whitener = square_roots(self.name, resolve(term.information, data), self.count, self.size)
+                self.whitening = FULL
+            if self.whitening and len(self.whitener) > 1:
+                self.whitening |= 1
+        if isinstance(term, Constraint):
+            self.lower = self._limit(resolve(term.lower, data), "lower", -np.inf)
+            self.upper = self._limit(resolve(term.upper, data), "upper", np.inf)
+        self.parameters = self._packed = np.zeros(0)
+        self.parameter_count = self.parameter_spread = 0
+        if self.kernel is not None:
+            self._pack(self.kernel)
+
+    def _pack(self, kernel: Kernel) -> None:
+        """Put the kernel's parameters side by side, and after them the constants in the place of variables."""
+        points: list[Any] = [np.empty((1, m.storage)) for m in self.manifolds]
+        try:
+            variables, parameters, _ = kernel.split(self.fill(points), self.count)
+        except GraphError as error:
+            raise GraphError(f"term '{self.name}': {error}", term=self.name) from None
+        packed = side_by_side(parameters)
+        self.parameter_count = packed.shape[1]
+        self.parameter_spread = packed.shape[1] if len(packed) > 1 else 0
+        places = [k for k, expected in enumerate(kernel.arguments) if not isinstance(expected, int | tuple)]
+        given = {slot: v for slot, (k, v) in enumerate(zip(places, variables, strict=True)) if k not in self._places}
+        self._constants = given
+        self.parameters = np.concatenate([packed.ravel(), *(array.ravel() for array in given.values())])
+        self._packed = self.parameters[: packed.size].reshape(packed.shape)
+        slots = [k for k, expected in enumerate(kernel.arguments) if isinstance(expected, int | tuple)]
+        sizes = [prod(part.shape[1:]) for part in parameters]
+        starts = np.cumsum([0, *sizes]).tolist()
+        self._blocks = {k: (start, size) for k, start, size in zip(slots, starts, sizes, strict=False) if size}
+
+    def _own_kernel(self) -> Kernel:
+        """Compile the user's function of one factor for the manifolds and shapes it is used with."""
+        arguments: list[Manifold | int] = []
+        shapes = []
+        for given, argument in zip(self._arguments, self.term.arguments, strict=True):
+            if isinstance(argument, Selection):
+                arguments.append(argument.manifold)
+                continue
+            shape = np.shape(given)
+            each = argument.each if isinstance(argument, Data) else len(shape) > 1
+            shapes.append(shape[1:] if each else shape)
+            arguments.append(len(shapes[-1]))
+        own = self.term.residual
+        return per_factor(own.function, own.jacobian, own.rows, arguments, shapes, self.name)
+
+    def _require_manifolds(self, kernel: Kernel) -> None:
+        if len(kernel.arguments) != len(self.term.arguments):
+            raise GraphError(
+                f"term '{self.name}': {kernel.name} takes {len(kernel.arguments)} arguments, found "
+                f"{len(self.term.arguments)}: {self._shapes()}",
+                term=self.name,
+            )
+        for place, selection in zip(self._places, self.term.selections, strict=True):
+            expected = kernel.arguments[place]
+            if expected != selection.manifold:
+                wanted = "a parameter, not a variable" if isinstance(expected, int | tuple) else expected.name
+                raise GraphError(
+                    f"term '{self.name}': argument {place} of {kernel.name} is {wanted}; found {selection!r} on "
+                    f"{selection.manifold.name}",
+                    term=self.name,
+                    family=selection.family.name,
+                )
+
+    def _limit(self, limit: Array, which: str, none: float) -> Array:
+        try:
+            full = np.array(np.broadcast_to(limit, (self.count, self.size)))
+        except ValueError as error:
+            raise GraphError(
+                f"term '{self.name}': {which} has shape {limit.shape}, which does not fit {self.shape}",
+                term=self.name,
+            ) from error
+        if self.active is not None:
+            full[~self.active] = none
+        return full
+
+    def _call(self, points: list[Array]) -> Array:
+        return self._evaluated(self.fill(points))
+
+    def _attached(self, arguments: list[Any]) -> Array:
+        """(n, m, D) attached Jacobian side by side."""
+        assert self._jacobian is not None
+        blocks = [np.asarray(block) for block in self._jacobian(*arguments)]
+        return np.concatenate(
+            blocks if len(blocks) == len(self.dims) else [blocks[place] for place in self._places], axis=2
+        )
+
+    def _evaluated(self, arguments: list[Any]) -> Array:
+        try:
+            result = self._function(*arguments)
+        except Exception as error:
+            name_term(error, self.name)
+            raise
+        return as_float64(self.name, result)
+
+    def fill(self, points: list[Array]) -> list[Any]:
+        """All arguments in order, variables at these points."""
+        arguments = list(self._arguments)
+        for place, point in zip(self._places, points, strict=True):
+            arguments[place] = point
+        return arguments
+
+    def _checked(self, residual: Array) -> Array:
+        if residual.shape != self.shape:
+            raise GraphError(
+                f"term '{self.name}': its function returned shape {residual.shape}, and {self.shape} before",
+                term=self.name,
+            )
+        return residual
+
+    def _masked(self, array: Array) -> Array:
+        if self.active is None:
+            return array
+        shape = (-1,) + (1,) * (array.ndim - 1)
+        return np.where(self.active.reshape(shape), array, 0.0)
+
+    def _shapes(self) -> str:
+        """Shapes of all arguments, for messages."""
+        shapes = []
+        for argument in self.term.arguments:
+            if isinstance(argument, Selection):
+                shapes.append(f"{argument!r} as ({self.count}, {argument.manifold.storage})")
+            elif isinstance(argument, Data):
+                shapes.append(repr(argument))
+            else:
+                shapes.append(f"constant {np.shape(argument)}" if np.shape(argument) else f"{argument!r}")
+        return ", ".join(shapes)
+
+
+def _kernels(residual: Residual) -> tuple[Kernel | None, Kernel | None]:
+    """The kernel and the one to search with; none when they do not belong together, and NumPy evaluates the term."""
+    kernel, search = residual.kernel, residual.search_kernel
+    if kernel is None or residual.search is None:
+        return kernel, None
+    same = search is not None and search.arguments == kernel.arguments and search.table is kernel.table
+    return (kernel, search) if same else (None, None)
+
+
+def resolve(parameter: Parameter, data: Bound) -> Array:
+    """The present value of a parameter."""
+    if isinstance(parameter, Data):
+        return data.get(parameter, parameter.value)
+    return np.asarray(parameter, dtype=np.float64)
