@@ -10,9 +10,9 @@ from unittest import mock
 import numpy as np
 
 import unifg as fg
-from benchmarks.reference_problems import Problem
 from benchmarks.report import table
 from benchmarks.timing import Stopwatch, interleave, milliseconds, number, shown
+from benchmarks.unicycle_problems import Problem
 from unifg.answers import solver
 from unifg.elimination import fronts, substitution
 from unifg.machine.jit import compiled

@@ -10,19 +10,17 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 import unifg as fg
 from benchmarks.report import table
+from benchmarks.unicycle_problems import Problem
 from unifg.lie import wrap_angle
 from unifg.models import obstacles, unicycle
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
-
-if TYPE_CHECKING:  # it imports this module
-    from benchmarks.reference_problems import Problem
 
 STEPS = 100
 TOLERANCE = 1e-4  # of every solver in the loop

@@ -15,7 +15,7 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 
 import unifg as fg
-from benchmarks import closed_loop, reference_problems
+from benchmarks import closed_loop, unicycle_problems
 from unifg.models import avoidance, quadrotor
 from unifg.typing import Array
 
@@ -34,7 +34,7 @@ SPHERES = {  # x, y, z, radius [m]
 }  # fmt: skip
 # (instance, blocked, N): known local optima, the one reached by IPOPT from the cold guess first.
 OPTIMA: dict[tuple[str, bool, int], tuple[float, ...]] = {
-    **reference_problems.OPTIMA,
+    **unicycle_problems.OPTIMA,
     ("straight", False, 100): (6.40879,),
     ("straight", True, 100): (19.66481,),
     ("behind", False, 100): (59.47490,),
@@ -50,7 +50,7 @@ OPTIMA: dict[tuple[str, bool, int], tuple[float, ...]] = {
 }
 
 
-class Unicycle(reference_problems.Problem):
+class Unicycle(unicycle_problems.Problem):
     """A problem of the table of sixteen, at any horizon."""
 
     robot: ClassVar[str] = "unicycle"

@@ -1,8 +1,8 @@
 """Claims judged by casadi's exact derivatives of a problem's second statement.
 
-The KKT numbers are those of :mod:`unifg.answers.optimality`, whose docstring defines them; nothing of its code is used. A claim of
-local infeasibility is tested by looking for a feasible point: IPOPT minimises the sum of all violations from the point
-where the claim was made.
+The KKT numbers are those of :mod:`unifg.answers.optimality`, whose docstring defines them; nothing of its code is used.
+A claim of local infeasibility is tested by looking for a feasible point: IPOPT minimises the sum of all violations from
+the point where the claim was made.
 """
 
 from __future__ import annotations

@@ -22,8 +22,8 @@ import numpy as np
 from tqdm import tqdm
 
 import unifg as fg
-from benchmarks.reference_problems import DT, EFFORT, LIMIT, STAGE, TERMINAL
 from benchmarks.report import CHECKOUT, OUT, machine, put_results, table
+from benchmarks.unicycle_problems import DT, EFFORT, LIMIT, STAGE, TERMINAL
 from unifg.models import obstacles, unicycle
 from unifg.models.potential import Sense, potential
 from unifg.solvers import SQP, AugmentedLagrangian

@@ -18,7 +18,7 @@ from unittest.mock import patch
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks import closed_loop, control_problems, control_starts, reference_problems
+from benchmarks import closed_loop, control_problems, control_starts, unicycle_problems
 from benchmarks.report import CHECKOUT, machine, put_results, table
 from unifg.scenarios.manoeuvres import CASES, run_manoeuvre
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
@@ -82,7 +82,7 @@ def counting() -> Iterator[Count]:
 def cases(quick: bool) -> dict[str, Callable[[], object]]:
     """Everything that is counted, by name."""
     found: dict[str, Callable[[], object]] = {}
-    for problem in reference_problems.problems()[:: 8 if quick else 1]:
+    for problem in unicycle_problems.problems()[:: 8 if quick else 1]:
         found[f"reference problem: {problem.name}"] = _cold(closed_loop.Formulation(problem), 1e-6)
     for case in control_problems.problems()[:: 12 if quick else 1]:
         found[f"control case: {case.robot} {case.name}"] = _cold(case.formulation(), 1e-4)

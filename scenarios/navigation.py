@@ -147,7 +147,20 @@ class Episode:
         except KeyboardInterrupt:
             interrupted = True
         progress(1.0, "done")
-        return recording.log(self, interrupted)
+        controller = self.settings.controller
+        return recording.log(
+            interrupted,
+            occupancy=self.occupancy,
+            path=self.path,
+            goals=self.goals,
+            start=self.start,
+            dt=controller.dt,
+            robot_radius=controller.robot_radius,
+            solver=self.settings.solver,
+            coupling=self.settings.coupling,
+            seed=self.settings.seed,
+            control_limits=controller.limits,
+        )
 
     def _tick(self, goal: int, odometry: Array | None, dead_reckoning: Array, recording: Recording) -> Array:
         """Estimate and plan; the measured time is what a robot would spend."""

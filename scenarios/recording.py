@@ -11,7 +11,6 @@ from unifg.typing import Array
 
 if TYPE_CHECKING:
     from unifg.scenarios.controller import Plan
-    from unifg.scenarios.navigation import Episode
     from unifg.scenarios.perception import Tracks
     from unifg.scenarios.pilot import Pilot
     from unifg.scenarios.world import Scan, World
@@ -67,28 +66,24 @@ class Recording:
         for name, value in row.items():
             self._columns.setdefault(name, []).append(value)
 
-    def log(self, episode: Episode, interrupted: bool) -> EpisodeLog:
-        """The finished record."""
-        settings, columns = episode.settings, dict(self._columns)
+    def log(self, interrupted: bool, **conditions: Any) -> EpisodeLog:
+        """The finished record.
+
+        Args:
+            interrupted: whether the episode ended before its time.
+            conditions: the fields of an :class:`EpisodeLog` that were known before the first tick.
+        """
+        columns = dict(self._columns)
         detected, status = columns.pop("detected"), columns.pop("status")
         arrays: dict[str, Any] = {name: np.array(values) for name, values in columns.items()}
         return EpisodeLog(
-            occupancy=episode.occupancy,
-            path=episode.path,
-            goals=episode.goals,
-            start=episode.start,
-            dt=settings.controller.dt,
-            robot_radius=settings.controller.robot_radius,
-            solver=settings.solver,
-            coupling=settings.coupling,
-            seed=settings.seed,
             scan_angles=self._angles,
             collisions=self._world.collisions,
             reached=self.reached,
             detected=detected,  # type: ignore[arg-type]
             status=status,  # type: ignore[arg-type]
             obstacle_moving=self._world.obstacle_states()[:, 3].astype(bool),
-            control_limits=settings.controller.limits,
             interrupted=interrupted,
+            **conditions,
             **arrays,
         )

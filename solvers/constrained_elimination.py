@@ -19,8 +19,8 @@ from typing import Literal
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
 
-from unifg.errors import GraphError, UnifgError
-from unifg.solvers.linear_graphs import Factor, LinearFactor, LinearGraph, QuadraticFactor
+from unifg.errors import UnifgError
+from unifg.solvers.linear_factors import Factor, LinearFactor, QuadraticFactor
 from unifg.typing import Array
 
 RANK = 1e-10  # relative to a factor's own size: smaller is what rounding left of dependent rows
@@ -87,35 +87,37 @@ class Elimination:
 
 
 def eliminate(
-    graph: LinearGraph, order: Iterable[str] | None = None, *, undetermined: Literal["refuse", "zero"] = "refuse"
+    sizes: Mapping[str, int],
+    factors: Iterable[Factor],
+    order: Sequence[str],
+    *,
+    undetermined: Literal["refuse", "zero"] = "refuse",
 ) -> Elimination:
     """Eliminate all variables.
 
     Args:
-        graph: what to solve.
-        order: every variable once; by default the engine's order.
+        sizes: dimension of each variable, by name.
+        factors: what to solve.
+        order: every variable once.
         undetermined: "refuse" coordinates that no factor determines, or set them to "zero".
 
     Raises:
-        GraphError: when ``order`` is no permutation of the variables.
         Contradiction: when constraints cannot all hold.
         Undetermined: when there is no unique minimum.
     """
-    names = tuple(order) if order is not None else graph.engine_order()
-    if sorted(names) != sorted(graph.variables):
-        raise GraphError(f"{graph.title}: the order must name each of its {len(graph.sizes)} variables once")
-    place = {name: k for k, name in enumerate(names)}
-    waiting: list[list[Factor]] = [[] for _ in names]
-    for factor in graph.factors:
+    place = {name: k for k, name in enumerate(order)}
+    waiting: list[list[Factor]] = [[] for _ in order]
+    for factor in factors:
         if factor.variables:
             waiting[min(place[name] for name in factor.variables)].append(factor)
         elif isinstance(factor, LinearFactor) and factor.kind == "constraint":
             _require_zero(factor, factor.right, float(np.abs(factor.right).max(initial=0.0)))
     conditionals = []
-    for k, name in enumerate(names):
+    for k, name in enumerate(order):
         separator = sorted({v for factor in waiting[k] for v in factor.variables if v != name}, key=place.__getitem__)
-        sizes = {v: graph.sizes[v] for v in (name, *separator)}
-        conditional, left = _eliminate(name, sizes, waiting[k], undetermined == "zero")
+        conditional, left = _eliminate(
+            name, {v: sizes[v] for v in (name, *separator)}, waiting[k], undetermined == "zero"
+        )
         conditionals.append(conditional)
         for factor in left:
             waiting[min(place[v] for v in factor.variables)].append(factor)

@@ -32,13 +32,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from unifg.answers.history import Iteration
-from unifg.answers.solution import Solution
+from unifg.answers.solution import NotConverged, Solution
 from unifg.answers.solver import Callback, Prepared, Solver, Start
 from unifg.answers.status import Status
 from unifg.answers.verdict import Verdict
-from unifg.errors import BackendError, NotConverged
+from unifg.errors import BackendError
 from unifg.kernels.robust import DCS, Graduated, Loss
-from unifg.language.graph import Graph
+from unifg.language.graph import Statement
 from unifg.language.terms import Cost
 from unifg.language.variables import Data
 from unifg.program.term import CompiledTerm
@@ -148,7 +148,7 @@ class GraduatedNonConvexity:
 
     def solve(
         self,
-        graph: Graph,
+        graph: Statement,
         guess: Start,
         *,
         data: Mapping[Data, ArrayLike] | None = None,
@@ -196,8 +196,8 @@ class _Search:
     def __init__(
         self,
         options: GraduatedNonConvexity,
-        graph: Graph,
-        staged: Graph,
+        graph: Statement,
+        staged: Statement,
         stages: list[_Stage],
         data: Mapping[Data, ArrayLike] | None,
         callback: Callback | None,
@@ -465,11 +465,11 @@ def _rival(loss: Loss) -> Loss:
     return DCS(_bound(loss) / 3.0)
 
 
-def _staged(graph: Graph) -> tuple[Graph, list[_Stage]]:
+def _staged(graph: Statement) -> tuple[Statement, list[_Stage]]:
     """The same graph with a `_Stage` in place of every loss that has surrogates."""
     staged, stages = copy(graph), []
     staged.terms = list(graph.terms)
-    staged._program = None
+    staged.compiled = None
     for k, term in enumerate(staged.terms):
         if isinstance(term, Cost) and isinstance(term.robust, Graduated):
             stages.append(_Stage(term.robust))

@@ -1,8 +1,9 @@
 """Where a solve ends that cannot meet its constraints: the nearest point that violates them least.
 
-A merit function or an elastic problem stalls at a point that is stationary for its own measure of violation. From
-there a damped Newton method on 1/2 |violation|^2 finds a point that is stationary for the measure of
-:func:`unifg.answers.optimality.infeasible_stationary`, within the bounds of the unknowns, or a feasible one; then nothing is proved.
+A merit function or an elastic problem stalls at a point that is stationary for its own measure of violation. From there
+a damped Newton method on 1/2 |violation|^2 finds a point that is stationary for the measure of
+:func:`unifg.answers.optimality.infeasible_stationary`, within the bounds of the unknowns, or a feasible one; then
+nothing is proved.
 """
 
 from __future__ import annotations

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from unifg.solvers.linear_graphs import Factor, LinearGraph
+from unifg.solvers.linear_factors import Factor
 from unifg.typing import Array
 
 if TYPE_CHECKING:
@@ -17,19 +18,20 @@ SHORT, ABOVE = 7, 0.24  # names from this length on stand above their circles
 TURN = 2.4  # [rad] between factors that would cover each other: the golden angle spreads any number
 
 
-def draw(graph: LinearGraph, ax: Axes) -> None:
+def draw(variables: Iterable[str], factors: Iterable[Factor], ax: Axes) -> None:
     """Draw circles for variables, crosses for constraints, squares for other factors.
 
     Families run from left to right, one below the other. Curvature factors hang on dashed lines, as in the paper;
     damping is left out.
 
     Args:
-        graph: what to draw.
+        variables: names, as "family[member]".
+        factors: what joins them.
         ax: a matplotlib axes; its limits and frame are changed.
     """
-    at = _places(graph)
+    at = _places(variables)
     taken: dict[tuple[float, float], int] = {}
-    for factor in graph.factors:
+    for factor in factors:
         if factor.kind == "damping" or not factor.variables:
             continue
         x, y = _place(factor, at, taken)
@@ -52,17 +54,16 @@ def draw(graph: LinearGraph, ax: Axes) -> None:
         ax.scatter([x], [y], s=420, c="white", edgecolors="tab:blue", zorder=3)
         above = 0.0 if len(name) < SHORT else ABOVE
         ax.text(x, y + above, name, ha="center", va="center", fontsize=6, zorder=4)
-    ax.set_title(graph.title)
     ax.set_aspect("equal", adjustable="datalim")
     ax.margins(0.1)
     ax.set_axis_off()
 
 
-def _places(graph: LinearGraph) -> dict[str, Array]:
+def _places(variables: Iterable[str]) -> dict[str, Array]:
     """(2,) where each variable stands: its member number to the right, its family downwards."""
     families: dict[str, int] = {}
     places: dict[str, Array] = {}
-    for name in graph.variables:
+    for name in variables:
         family, _, member = name[:-1].rpartition("[")
         lane = families.setdefault(family, len(families))
         places[name] = np.array([float(member) + 0.5 * (lane % 2), -1.2 * lane])

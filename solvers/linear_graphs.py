@@ -16,109 +16,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.symmetric import Symmetric
 from unifg.errors import GraphError
+from unifg.solvers.constrained_elimination import Elimination, eliminate
+from unifg.solvers.linear_factors import Factor, Kind, LinearFactor
+from unifg.solvers.linear_graph_drawing import draw
 from unifg.typing import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from unifg.solvers.constrained_elimination import Elimination
-
-Kind: TypeAlias = Literal["cost", "constraint", "curvature", "damping", "balance"]
-
-
-@dataclass(frozen=True, eq=False)
-class LinearFactor:
-    """Rows sum_v A_v d_v = b: to be met in the sense of least squares, or exactly by a constraint.
-
-    Attributes:
-        name: of the factor it was made of.
-        kind: "constraint" when the rows must hold.
-        blocks: (m, d_v) per variable.
-        right: (m,) b.
-        size: largest entry of the rows when they were made; what is far below it is rounding.
-    """
-
-    name: str
-    kind: Kind
-    blocks: Mapping[str, Array]
-    right: Array
-    size: float
-
-    @property
-    def variables(self) -> tuple[str, ...]:
-        """Names of its variables."""
-        return tuple(self.blocks)
-
-    @property
-    def rows(self) -> int:
-        """Number of rows."""
-        return len(self.right)
-
-    def residual(self, values: Mapping[str, Array]) -> Array:
-        """(m,) A d - b."""
-        return sum((block @ values[name] for name, block in self.blocks.items()), -self.right)
-
-    def gradient_at(self, values: Mapping[str, Array]) -> dict[str, Array]:
-        """(d_v,) per variable: gradient of 1/2 |A d - b|^2."""
-        residual = self.residual(values)
-        return {name: block.T @ residual for name, block in self.blocks.items()}
-
-    def __str__(self) -> str:
-        """Name, kind and variables."""
-        relation = "=" if self.kind == "constraint" else "~"
-        return f"{self.name}: {self.kind}, {self.rows} rows: A ({', '.join(self.variables)}) {relation} b"
-
-
-@dataclass(frozen=True, eq=False)
-class QuadraticFactor:
-    """1/2 d'Gd + g'd, where G need not be positive: curvature, and costs that are no squares.
-
-    Attributes:
-        name: of the factor it was made of.
-        kind: what it stands for.
-        sizes: d_v per variable, in the order of the rows of G.
-        hessian: (D, D) G.
-        gradient: (D,) g.
-    """
-
-    name: str
-    kind: Kind
-    sizes: Mapping[str, int]
-    hessian: Array
-    gradient: Array
-
-    @property
-    def variables(self) -> tuple[str, ...]:
-        """Names of its variables."""
-        return tuple(self.sizes)
-
-    @cached_property
-    def slices(self) -> dict[str, slice]:
-        """Rows of each variable in G."""
-        ends = np.cumsum([0, *self.sizes.values()]).tolist()
-        return {name: slice(ends[k], ends[k + 1]) for k, name in enumerate(self.sizes)}
-
-    def gradient_at(self, values: Mapping[str, Array]) -> dict[str, Array]:
-        """(d_v,) per variable: G d + g."""
-        step = np.concatenate([values[name] for name in self.sizes])
-        total = self.hessian @ step + self.gradient
-        return {name: total[part] for name, part in self.slices.items()}
-
-    def __str__(self) -> str:
-        """Name, kind and variables."""
-        return f"{self.name}: {self.kind}, 1/2 d'Gd + g'd over ({', '.join(self.variables)})"
-
-
-Factor: TypeAlias = LinearFactor | QuadraticFactor
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,16 +108,19 @@ class LinearGraph:
     def eliminate(
         self, order: Iterable[str] | None = None, *, undetermined: Literal["refuse", "zero"] = "refuse"
     ) -> Elimination:
-        """Eliminate the variables; arguments and errors as for :func:`constrained_elimination.eliminate`."""
-        from unifg.solvers.constrained_elimination import eliminate
+        """Eliminate the variables, by default in the engine's order.
 
-        return eliminate(self, order, undetermined=undetermined)
+        Arguments and errors as for :func:`unifg.solvers.constrained_elimination.eliminate`.
+        """
+        names = tuple(order) if order is not None else self.engine_order()
+        if sorted(names) != sorted(self.variables):
+            raise GraphError(f"{self.title}: the order must name each of its {len(self.sizes)} variables once")
+        return eliminate(self.sizes, self.factors, names, undetermined=undetermined)
 
     def draw(self, ax: Axes) -> None:
         """Draw on a matplotlib axes: circles are variables, crosses constraints, squares all other factors."""
-        from unifg.solvers.linear_graph_drawing import draw
-
-        draw(self, ax)
+        draw(self.variables, self.factors, ax)
+        ax.set_title(self.title)
 
     def __str__(self) -> str:
         """Variables with their dimensions, then the factors, a line each."""

@@ -8,10 +8,10 @@ from typing import Literal
 
 import numpy as np
 
+from unifg.answers.graph import Graph
 from unifg.answers.solution import Guess, Solution
 from unifg.errors import BackendError, GraphError
 from unifg.kernels.differentiation import convexified
-from unifg.language.graph import Graph
 from unifg.language.terms import Cost
 from unifg.language.variables import Data, Family
 from unifg.program.program import Program
@@ -19,7 +19,8 @@ from unifg.program.rows import Rows
 from unifg.program.term import CompiledTerm
 from unifg.program.touched import term_columns
 from unifg.solvers.kkt import require_equalities
-from unifg.solvers.linear_graphs import Factor, LinearFactor, LinearGraph, QuadraticFactor, dual_graph
+from unifg.solvers.linear_factors import Factor, LinearFactor, QuadraticFactor
+from unifg.solvers.linear_graphs import LinearGraph, dual_graph
 from unifg.solvers.qp import QP, subproblem
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 

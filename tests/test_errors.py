@@ -79,7 +79,8 @@ def test_plain_exceptions_are_found(source: str, count: int) -> None:
 
 
 def test_every_error_is_one_of_unifg_and_says_where() -> None:
-    errors = [kind for kind in vars(fg.errors).values() if isinstance(kind, type) and issubclass(kind, Exception)]
+    public = [getattr(fg, name) for name in fg.__all__]
+    errors = [kind for kind in public if isinstance(kind, type) and issubclass(kind, Exception)]
     assert len(errors) >= 7
     for kind in errors:
         assert issubclass(kind, fg.UnifgError)

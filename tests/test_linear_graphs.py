@@ -13,8 +13,9 @@ from test_sqp_exact import two_rotations
 from unifg.models import unicycle
 from unifg.program.program import Program
 from unifg.solvers import SQP
-from unifg.solvers.constrained_elimination import Contradiction, Undetermined, eliminate
-from unifg.solvers.linear_graphs import LinearFactor, LinearGraph, QuadraticFactor, dual_graph
+from unifg.solvers.constrained_elimination import Contradiction, Undetermined
+from unifg.solvers.linear_factors import LinearFactor, QuadraticFactor
+from unifg.solvers.linear_graphs import LinearGraph, dual_graph
 from unifg.solvers.linearized_graph import LinearGraphs, primal_graph
 from unifg.solvers.qp import subproblem
 from unifg.solvers.qp_elimination import EliminationRoute
@@ -286,7 +287,7 @@ def test_orders_and_names_are_checked() -> None:
     graph, guess = three_variable_qp()
     both = LinearGraphs.at(graph, guess)
     with pytest.raises(fg.GraphError, match="3 variables once"):
-        eliminate(both.primal, ["x[0]", "y[0]"])
+        both.primal.eliminate(["x[0]", "y[0]"])
     with pytest.raises(fg.GraphError, match="no variable 'w'"):
         LinearGraph("odd", {"v": 1}, (LinearFactor("f", "cost", {"w": np.eye(1)}, np.zeros(1), 1.0),))
 

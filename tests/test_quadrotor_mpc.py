@@ -16,10 +16,10 @@ from unifg.lie import SO3
 from unifg.scenarios import cli
 from unifg.scenarios.quadrotor import episode, mpc_arguments, results
 from unifg.scenarios.quadrotor.conditions import DRAG, MASS, WIND, draw_conditions
+from unifg.scenarios.quadrotor.coupling import COUPLINGS
 from unifg.scenarios.quadrotor.episode import Flight, FlightSettings, run_flight
 from unifg.scenarios.quadrotor.flight_log import FlightLog
 from unifg.scenarios.quadrotor.metrics import flight_metrics, state_errors
-from unifg.scenarios.quadrotor.pilot import COUPLINGS
 from unifg.scenarios.quadrotor.sensor import Reading
 from unifg.scenarios.quadrotor.tracker import Tracker
 from unifg.typing import Array

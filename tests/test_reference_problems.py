@@ -7,7 +7,7 @@ import pytest
 
 import unifg as fg
 from benchmarks.closed_loop import Formulation
-from benchmarks.reference_problems import Problem, problems
+from benchmarks.unicycle_problems import Problem, problems
 from judge import judge
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 

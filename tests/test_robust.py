@@ -15,7 +15,8 @@ import unifg as fg
 from benchmarks import gtsam_peer
 from benchmarks.wrong_closures import HEAD, METHODS, Claim, rows, with_wrong_closures
 from unifg.answers.history import Iteration
-from unifg.errors import BackendError, GraphError, NotConverged
+from unifg.answers.solution import NotConverged
+from unifg.errors import BackendError, GraphError
 from unifg.files.g2o import read_g2o
 from unifg.kernels.robust import Graduated, Loss
 from unifg.pose_graphs import Edges, PoseGraph, manhattan, sphere

@@ -13,9 +13,10 @@ solution = SQP().solve(graph, {x: np.zeros((2, 3))})
 from importlib.metadata import PackageNotFoundError, version
 
 from unifg.answers.check import Finding, Report
+from unifg.answers.graph import Graph
 from unifg.answers.history import Iteration
 from unifg.answers.optimality import Optimality, optimality
-from unifg.answers.solution import Guess, Solution
+from unifg.answers.solution import Guess, NotConverged, Solution
 from unifg.answers.solver import Prepared, Solver
 from unifg.answers.status import Status
 from unifg.answers.verdict import Verdict
@@ -24,14 +25,12 @@ from unifg.errors import (
     FileFormatError,
     GraphError,
     ModelError,
-    NotConverged,
     ScenarioError,
     UnifgError,
 )
 from unifg.kernels.residuals import Residual, residual
 from unifg.kernels.robust import DCS, Cauchy, GemanMcClure, Huber, Loss, Reweighted, TruncatedLeastSquares, Tukey
 from unifg.language.factors import ManifoldResidual, between, difference, prior
-from unifg.language.graph import Graph
 from unifg.language.joint_prior import joint_prior
 from unifg.language.variables import Data, Family, Selection
 from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Manifold, Product, Rn, wrap_angle

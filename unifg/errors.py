@@ -7,11 +7,6 @@ what Python itself asks for: ``AttributeError`` from ``__getattr__`` (``hasattr`
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from unifg.answers.solution import Solution
-
 
 class UnifgError(ValueError):
     """Base of every error raised by unifg.
@@ -63,26 +58,3 @@ class ScenarioError(UnifgError):
 
 class FileFormatError(UnifgError):
     """A file does not say what its format promises."""
-
-
-class NotConverged(UnifgError, RuntimeError):
-    """Raised by ``solve(..., check=True)``; carries the solution that fell short.
-
-    Also a ``RuntimeError``: the input was sound, the solve was not.
-
-    Attributes:
-        solution: the iterate the solve ended with, with its status and KKT numbers.
-        term: of the constraint violated most, None where none is.
-        index: its factor.
-    """
-
-    def __init__(self, solution: Solution) -> None:
-        """Keep the solution and repeat its report as the message."""
-        worst = solution.worst if solution.violation > 0.0 else None
-        term, index = worst or (None, None)
-        super().__init__(solution.report(), term=term, index=index)
-        self.solution = solution
-
-    def __reduce__(self) -> tuple[type[NotConverged], tuple[Solution]]:
-        """Made from the solution, not from its report."""
-        return type(self), (self.solution,)

@@ -17,9 +17,9 @@ from unifg.errors import ScenarioError, UnifgError
 from unifg.models import quadrotor
 from unifg.scenarios.quadrotor.braking import braking_control
 from unifg.scenarios.quadrotor.conditions import draw_conditions
+from unifg.scenarios.quadrotor.coupling import make_pilot
 from unifg.scenarios.quadrotor.estimator import EstimatorSettings
 from unifg.scenarios.quadrotor.flight_log import FlightLog, FlightRecorder
-from unifg.scenarios.quadrotor.pilot import make_pilot
 from unifg.scenarios.quadrotor.plan import ControllerSettings, Plan
 from unifg.scenarios.quadrotor.sensor import Reading
 from unifg.scenarios.quadrotor.world import QuadrotorWorld

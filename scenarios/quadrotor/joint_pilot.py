@@ -33,6 +33,6 @@ def joint_pilot(
     controller: ControllerSettings,
     joint: JointSettings | None = None,
 ) -> JointPilot:
-    """A pilot with one graph; arguments as of :func:`unifg.scenarios.quadrotor.pilot.make_pilot`."""
+    """A pilot with one graph; arguments as of :func:`unifg.scenarios.quadrotor.coupling.make_pilot`."""
     past = Estimator(state, nominal, estimator, layout.corners)
     return JointPilot(past, JointController(past, layout, solver, controller, joint or JointSettings()))

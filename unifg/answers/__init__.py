@@ -1,1 +1,1 @@
-"""TODO."""
+"""What is asked of a graph: solve, check, how good, how sure, and why not."""

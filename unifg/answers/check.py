@@ -8,20 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from unifg.elimination.factorization import Factorization
+from unifg.language.graph import Statement
 from unifg.language.terms import ScalarCost
 from unifg.language.variables import Data, Family
 from unifg.program.columns import Values
-from unifg.program.program import Program
+from unifg.program.program import Program, compile_graph
 from unifg.program.term import CompiledTerm
 from unifg.typing import Array, ArrayLike
-
-if TYPE_CHECKING:
-    from unifg.language.graph import Graph
 
 JACOBIAN_TOLERANCE = 1e-5  # relative; a central difference is good to about 1e-9 where the residual is smooth
 PIVOT_TOLERANCE = 1e-11  # relative to the largest pivot of the damped normal equations
@@ -61,14 +58,14 @@ class Report:
 
 
 def check_graph(
-    graph: Graph, guess: Mapping[Family, ArrayLike], data: Mapping[Data, ArrayLike] | None = None
+    graph: Statement, guess: Mapping[Family, ArrayLike], data: Mapping[Data, ArrayLike] | None = None
 ) -> Report:
     """Examine ``graph`` at ``guess``.
 
     Raises:
         GraphError: for input no solve would accept either (unknown variables, shapes, NaN, crossed limits).
     """
-    program = graph.compile()
+    program = compile_graph(graph)
     program.bind(data or {})
     values = program.values_from(guess)
     findings: list[Finding] = []

@@ -11,10 +11,11 @@ Stationarity and complementarity are divided by max(1, mean|lambda| / 100); the 
 
 Pure least squares, a graph without constraints and scalar costs, has a zero point of cost, and with it a measure that
 does not depend on the unit of the information: there the stationarity is the relative offset of
-:mod:`unifg.answers.relative_offset`, and the Hessian must be regular too: where it is not, some unknowns may be moved freely.
+:mod:`unifg.answers.relative_offset`, and the Hessian must be regular too: where it is not, some unknowns may be moved
+freely.
 
-A stationarity that is made of differences is known up to their rounding, :mod:`unifg.answers.rounding`. Where that exceeds the
-tolerance nothing passes: a derivative that rounding has left nothing of looks like zero.
+A stationarity that is made of differences is known up to their rounding, :mod:`unifg.answers.rounding`. Where that
+exceeds the tolerance nothing passes: a derivative that rounding has left nothing of looks like zero.
 """
 
 from __future__ import annotations
@@ -161,8 +162,8 @@ def _measure(
 def infeasible_stationary(program: Program, lin: Linearization, tolerance: float) -> bool:
     """Whether the point is stationary for 1/2 |violation|^2 without being feasible, in whatever units the unknowns are.
 
-    It is where the best step of :class:`unifg.answers.violation.ViolationModel` promises nothing that counts. Bounds of the
-    unknowns are kept, since they can be: a point outside them is looked at where it is brought back, and descent
+    It is where the best step of :class:`unifg.answers.violation.ViolationModel` promises nothing that counts. Bounds of
+    the unknowns are kept, since they can be: a point outside them is looked at where it is brought back, and descent
     directions that they block do not count.
     """
     lin = within_bounds(program, lin)

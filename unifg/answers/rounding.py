@@ -6,8 +6,8 @@ over the factors that touch an unknown, with the weight w of each row in the gra
     sum eps |w_a r_a| / h:
 
 w r of a whitened cost is |W r|^2, of a constraint lambda g. Terms with attached Jacobians and kernels with their own
-add nothing. Roundings inside a function are not seen from outside; :mod:`unifg.kernels.steps` chooses steps that keep them
-small.
+add nothing. Roundings inside a function are not seen from outside; :mod:`unifg.kernels.steps` chooses steps that keep
+them small.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from unifg.answers.marginal import Variables, information, marginal_prior
 from unifg.answers.optimality import Optimality
 from unifg.answers.status import Status
 from unifg.answers.verdict import Verdict
-from unifg.errors import GraphError
+from unifg.errors import GraphError, UnifgError
 from unifg.language.variables import Family, Selection, Variable, as_selection
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
@@ -43,8 +43,8 @@ class Solution:
     Attributes:
         status: why the solve ended.
         cost: objective, with its 1/2.
-        stationarity, violation, complementarity: KKT numbers, see :mod:`unifg.answers.optimality`. The stationarity of pure least
-            squares is its relative offset, free of the unit of cost; above the tolerance, at least this.
+        stationarity, violation, complementarity: KKT numbers, see :mod:`unifg.answers.optimality`. The stationarity of
+            pure least squares is its relative offset, free of the unit of cost; above the tolerance, at least this.
         rounding: by how much numerical differentiation may be wrong about the stationarity.
         iterations: number of iterations taken.
         seconds: wall-clock time of the solve.
@@ -52,7 +52,7 @@ class Solution:
         verdict: which measurements it believes, from solves that decide that.
     """
 
-    verdict: Verdict | None = None
+    verdict: Verdict[Solution] | None = None
 
     def __init__(
         self,
@@ -209,7 +209,7 @@ class Solution:
         return Covariances(self._program, self._lin, self._equality | self._held())
 
     def information(self, terms: Sequence[str], *variables: Variable) -> Array:
-        """Information matrix (d, d) of the named costs over the selected variables; see :mod:`unifg.answers.marginal`."""
+        """(d, d) information of the named costs over the selected variables; see :mod:`unifg.answers.marginal`."""
         columns = np.concatenate([self._program.columns.of(as_selection(v)).ravel() for v in variables])
         return information(self._program, self._lin, terms, columns)[0]
 
@@ -293,3 +293,26 @@ def _shifted_rows(stages: bytes, by: int) -> IntArray:
         if rank not in last or stage >= keys[last[rank]][0]:
             last[rank] = factor
     return np.array([place.get((stage + by, rank), last[rank]) for stage, rank in keys], dtype=np.intp)
+
+
+class NotConverged(UnifgError, RuntimeError):
+    """Raised by ``solve(..., check=True)``; carries the solution that fell short.
+
+    Also a ``RuntimeError``: the input was sound, the solve was not.
+
+    Attributes:
+        solution: the iterate the solve ended with, with its status and KKT numbers.
+        term: of the constraint violated most, None where none is.
+        index: its factor.
+    """
+
+    def __init__(self, solution: Solution) -> None:
+        """Keep the solution and repeat its report as the message."""
+        worst = solution.worst if solution.violation > 0.0 else None
+        term, index = worst or (None, None)
+        super().__init__(solution.report(), term=term, index=index)
+        self.solution = solution
+
+    def __reduce__(self) -> tuple[type[NotConverged], tuple[Solution]]:
+        """Made from the solution, not from its report."""
+        return type(self), (self.solution,)

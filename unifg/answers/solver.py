@@ -15,14 +15,14 @@ from unifg.answers.factor_norms import Deferred, factor_norms
 from unifg.answers.history import HEADER, Iteration, line
 from unifg.answers.optimality import infeasible_stationary, optimality, within_bounds
 from unifg.answers.relative_offset import Factored
-from unifg.answers.solution import Guess, Solution
+from unifg.answers.solution import Guess, NotConverged, Solution
 from unifg.answers.status import Status
-from unifg.errors import BackendError, GraphError, NotConverged
-from unifg.language.graph import Graph
+from unifg.errors import BackendError, GraphError
+from unifg.language.graph import Statement
 from unifg.language.variables import Data, Family
 from unifg.program.columns import Values
 from unifg.program.linearization import Linearization, all_finite
-from unifg.program.program import Program
+from unifg.program.program import Program, compile_graph
 from unifg.typing import Array, ArrayLike
 
 logger = logging.getLogger("unifg")
@@ -72,7 +72,7 @@ class Solver(ABC):
 
     def solve(
         self,
-        graph: Graph,
+        graph: Statement,
         guess: Start,
         *,
         data: Mapping[Data, ArrayLike] | None = None,
@@ -97,9 +97,9 @@ class Solver(ABC):
         """
         return self.prepare(graph).solve(guess, data=data, duals=duals, check=check, callback=callback)
 
-    def prepare(self, graph: Graph) -> Prepared:
+    def prepare(self, graph: Statement) -> Prepared:
         """Compile the graph and allocate the backend's workspaces for repeated solves."""
-        program = graph.compile()
+        program = compile_graph(graph)
         self.require(program)
         return Prepared(self, program)
 

@@ -3,21 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from unifg.typing import BoolArray, IntArray
 
-if TYPE_CHECKING:
-    from unifg.answers.solution import Solution
-
 NONE = np.zeros(0, dtype=np.intp)
 SHOWN = 5  # factors that a sentence names
 
 
+class Answer(Protocol):
+    """What a rival is asked: a solution."""
+
+    @property
+    def cost(self) -> float:
+        """Objective, with its 1/2."""
+
+    @property
+    def verdict(self) -> Verdict[Any] | None:
+        """Which measurements it believes."""
+
+
+AnswerT = TypeVar("AnswerT", bound=Answer)
+
+
 @dataclass(frozen=True, eq=False)
-class Verdict:
+class Verdict(Generic[AnswerT]):
     """What a solve that tells right measurements from wrong ones found.
 
     Attributes:
@@ -33,7 +45,7 @@ class Verdict:
     kept: dict[str, BoolArray]
     doubted: dict[str, IntArray] = field(default_factory=dict)
     unit: float = 1.0
-    rivals: tuple[Solution, ...] = field(default=(), repr=False)
+    rivals: tuple[AnswerT, ...] = field(default=(), repr=False)
 
     @property
     def left_out(self) -> dict[str, IntArray]:

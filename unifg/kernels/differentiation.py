@@ -1,8 +1,9 @@
 """Batched numerical differentiation on manifolds.
 
-A factor is evaluated for the whole batch at once, and where the function allows it (:mod:`unifg.kernels.stack`) for many
-perturbations at once: a Jacobian is one call then. Perturbations are on the right: ``x [+] d = x Exp(d)``. Steps are
-those of :mod:`unifg.kernels.steps`. What the function returns is copied at once: it may use the same memory at each call.
+A factor is evaluated for the whole batch at once, and where the function allows it (:mod:`unifg.kernels.stack`) for
+many perturbations at once: a Jacobian is one call then. Perturbations are on the right: ``x [+] d = x Exp(d)``. Steps
+are those of :mod:`unifg.kernels.steps`. What the function returns is copied at once: it may use the same memory at each
+call.
 """
 
 from __future__ import annotations

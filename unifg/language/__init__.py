@@ -1,1 +1,1 @@
-"""TODO."""
+"""What a user states: variables, terms, residuals, the graph."""

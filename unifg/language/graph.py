@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -17,15 +15,10 @@ from unifg.language.variables import Data, Family, Selection, Variable, as_selec
 from unifg.lie import Manifold, Rn
 from unifg.typing import Array, ArrayLike
 
-if TYPE_CHECKING:
-    from unifg.answers.check import Report
-    from unifg.elimination.tree import EliminationTree
-    from unifg.program.program import Program
-
 AnyResidual: TypeAlias = Function | Residual | ManifoldResidual
 
 
-class Graph:
+class Statement:
     """Variables on Lie groups, costs and constraints over them.
 
     The objective is ``sum 1/2 |r|^2`` over the costs plus the scalar costs; constraints read
@@ -36,6 +29,7 @@ class Graph:
         families: variable families by name.
         terms: costs and constraints in the order they were stated.
         fixes: fixed variables.
+        compiled: what rooms above have made of this statement, dropped with every change; None before.
     """
 
     def __init__(self) -> None:
@@ -45,7 +39,7 @@ class Graph:
         self.fixes: list[Fix] = []
         self._data: dict[str, Data] = {}
         self._names: set[str] = set()
-        self._program: Program | None = None
+        self.compiled: object | None = None
 
     def variables(self, name: str, manifold: Manifold, count: int) -> Family:
         """Add a family of ``count`` unknowns.
@@ -59,7 +53,7 @@ class Graph:
             raise GraphError(f"family '{name}' needs at least one member, found count={count}", family=name)
         family = Family(name, manifold, int(count))
         self.families[name] = family
-        self._program = None
+        self.compiled = None
         return family
 
     def data(self, name: str, value: ArrayLike, *, each: bool = False) -> Data:
@@ -197,38 +191,12 @@ class Graph:
         self._own(selection, unique)
         self._names.add(unique)
         self.fixes.append(Fix(unique, selection, held))
-        self._program = None
+        self.compiled = None
         return unique
-
-    def check(self, guess: Mapping[Family, ArrayLike], data: Mapping[Data, ArrayLike] | None = None) -> Report:
-        """Look for mistakes at ``guess``: see :mod:`unifg.answers.check`."""
-        from unifg.answers.check import check_graph
-
-        return check_graph(self, guess, data)
-
-    def elimination_tree(self) -> EliminationTree:
-        """How the engine eliminates the variables of this graph: its Bayes tree, to print and to look at."""
-        program = self.compile()
-        columns, blocks = program.columns, program.blocks
-        first = [int(columns.free[k]) for k in np.unique(blocks, return_index=True)[1]]
-        names = tuple("{}[{}]".format(*columns.name(column)) for column in first)
-        return replace(program.normal_solver().tree, names=names)
-
-    def compile(self) -> Program:
-        """Offsets, ordering and sparsity; computed once and kept until the graph changes.
-
-        Raises:
-            GraphError: when the graph has no variable, or a variable no term touches.
-        """
-        if self._program is None:
-            from unifg.program.program import Program
-
-            self._program = Program(self)
-        return self._program
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle the statement of the problem, not its compiled form."""
-        return {**self.__dict__, "_program": None}
+        return {**self.__dict__, "compiled": None}
 
     def __repr__(self) -> str:
         """Counts of families and terms."""
@@ -237,7 +205,7 @@ class Graph:
     def _add(self, term: Term) -> str:
         self._names.add(term.name)
         self.terms.append(term)
-        self._program = None
+        self.compiled = None
         return term.name
 
     def _arguments(self, name: str, arguments: tuple[Any, ...], active: Any) -> tuple[tuple[Any, ...], Any, int]:

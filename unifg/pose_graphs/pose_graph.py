@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from unifg.answers.graph import Graph
 from unifg.errors import GraphError
 from unifg.kernels.residuals import Residual
 from unifg.kernels.robust import Loss
 from unifg.language.factors import ManifoldResidual, between
-from unifg.language.graph import Graph
 from unifg.language.variables import Family
 from unifg.lie import SE2, SE3, LieGroup, Rn
 from unifg.pose_graphs.residuals import bearing, bearing_range, chart_between, distance, sighting

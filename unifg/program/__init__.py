@@ -1,1 +1,1 @@
-"""TODO."""
+"""From a statement to numbers: one table of terms, compiled passes, sparsity, values."""

@@ -17,8 +17,8 @@ def extents(program: Program) -> tuple[IntArray, IntArray, IntArray]:
     """For every tangent coordinate of a graph, found once, what the numbers are whose largest is its size.
 
     Returns:
-        First and last (exclusive) place in storage, and the kind of part in :mod:`unifg.kernels.steps`. All axes of a position
-        that turns share its numbers; quaternions have none.
+        First and last (exclusive) place in storage, and the kind of part in :mod:`unifg.kernels.steps`. All axes of a
+        position that turns share its numbers; quaternions have none.
     """
     if program not in _KNOWN:
         columns = program.columns

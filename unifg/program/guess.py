@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from unifg.errors import GraphError
+from unifg.language.graph import Statement
 from unifg.language.variables import Family
 from unifg.lie import LieGroup, Manifold
 from unifg.lie.product import leaves
@@ -16,14 +16,11 @@ from unifg.program.linearization import all_finite
 from unifg.program.retraction import Retraction
 from unifg.typing import ArrayLike
 
-if TYPE_CHECKING:
-    from unifg.language.graph import Graph
-
 
 class Start:
     """Reads guesses for the families of a graph."""
 
-    def __init__(self, graph: Graph, columns: Columns, retraction: Retraction) -> None:
+    def __init__(self, graph: Statement, columns: Columns, retraction: Retraction) -> None:
         """Find the parts of the families that need more of a look than whether they are finite."""
         self._graph = graph
         self._columns = columns

@@ -1,7 +1,7 @@
 """The compiled loops over all terms of a graph: evaluate, linearise, accumulate, multiply.
 
-Terms are rows of an integer table (:mod:`unifg.program.table`), residuals are addresses; a pass over a whole graph is one
-call from Python. Terms without a kernel have been evaluated by NumPy beforehand: their raw residuals and Jacobians
+Terms are rows of an integer table (:mod:`unifg.program.table`), residuals are addresses; a pass over a whole graph is
+one call from Python. Terms without a kernel have been evaluated by NumPy beforehand: their raw residuals and Jacobians
 already stand where a kernel would have written them.
 """
 

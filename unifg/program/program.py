@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from unifg.elimination.symmetric import Symmetric
 from unifg.errors import GraphError
 from unifg.kernels.differentiation import convexified
 from unifg.language.binding import Binding
+from unifg.language.graph import Statement
 from unifg.language.terms import Constraint, Cost, ScalarCost
 from unifg.language.variables import Data, Family
 from unifg.machine.buffers import Buffers
@@ -31,9 +31,6 @@ from unifg.program.table import ENTRY, ROW, WIDTH, Table, Terms
 from unifg.program.term import CompiledTerm
 from unifg.program.touched import require_touched, term_columns
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
-
-if TYPE_CHECKING:
-    from unifg.language.graph import Graph
 
 
 class Program:
@@ -56,8 +53,8 @@ class Program:
         scratch: memory for compiled loops.
     """
 
-    def __init__(self, graph: Graph) -> None:
-        """Compile; see :meth:`unifg.Graph.compile`."""
+    def __init__(self, graph: Statement) -> None:
+        """Compile; see :func:`compile_graph`."""
         if not graph.families:
             raise GraphError("the graph has no variables: add a family with graph.variables(...)")
         self.graph = graph
@@ -388,3 +385,14 @@ def _slices(terms: Sequence[CompiledTerm]) -> list[slice]:
 def _stacked(parts: list[Array]) -> Array:
     """One flat array, also of nothing."""
     return np.concatenate([part.ravel() for part in parts]) if parts else np.zeros(0)
+
+
+def compile_graph(graph: Statement) -> Program:
+    """Offsets, ordering and sparsity; computed once and kept until the graph changes.
+
+    Raises:
+        GraphError: when the graph has no variable, or a variable no term touches.
+    """
+    if not isinstance(graph.compiled, Program):
+        graph.compiled = Program(graph)
+    return graph.compiled

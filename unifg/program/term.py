@@ -1,7 +1,7 @@
 """One term with its shapes known: where its numbers stand, and how to evaluate it by itself.
 
-Solvers run all terms at once through :mod:`unifg.program.table`; the batched functions here serve terms without a kernel,
-checks, and messages.
+Solvers run all terms at once through :mod:`unifg.program.table`; the batched functions here serve terms without a
+kernel, checks, and messages.
 """
 
 from __future__ import annotations

@@ -1,0 +1,49 @@
+"""The graph a user holds: what is stated, and what it can be asked before a solve."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from unifg.answers.check import Report, check_graph
+from unifg.elimination.tree import EliminationTree
+from unifg.language.graph import Statement
+from unifg.language.variables import Data, Family
+from unifg.program.program import Program, compile_graph
+from unifg.typing import ArrayLike
+
+
+class Graph(Statement):
+    """Variables on Lie groups, costs and constraints over them.
+
+    The objective is ``sum 1/2 |r|^2`` over the costs plus the scalar costs; constraints read
+    ``lower <= g(x) <= upper``. A graph holds no values: a solve takes a guess and returns a solution,
+    and changes neither the graph nor the guess.
+
+    Attributes:
+        families: variable families by name.
+        terms: costs and constraints in the order they were stated.
+        fixes: fixed variables.
+    """
+
+    def check(self, guess: Mapping[Family, ArrayLike], data: Mapping[Data, ArrayLike] | None = None) -> Report:
+        """Look for mistakes at ``guess``: see :mod:`unifg.answers.check`."""
+        return check_graph(self, guess, data)
+
+    def compile(self) -> Program:
+        """Offsets, ordering and sparsity; computed once and kept until the graph changes.
+
+        Raises:
+            GraphError: when the graph has no variable, or a variable no term touches.
+        """
+        return compile_graph(self)
+
+    def elimination_tree(self) -> EliminationTree:
+        """How the engine eliminates the variables of this graph: its Bayes tree, to print and to look at."""
+        program = self.compile()
+        columns, blocks = program.columns, program.blocks
+        first = [int(columns.free[k]) for k in np.unique(blocks, return_index=True)[1]]
+        names = tuple("{}[{}]".format(*columns.name(column)) for column in first)
+        return replace(program.normal_solver().tree, names=names)
