@@ -65,7 +65,12 @@ class _Cache(FunctionCache):  # type: ignore[misc]
     announced = False
 
     def load_overload(self, signature: Any, target: Any) -> Any:
-        found = super().load_overload(signature, target)
+        try:
+            found = super().load_overload(signature, target)
+        except Exception as error:  # unpickling what is cut off, or names classes that have moved, may raise anything
+            logger.info("the cache of %s cannot be read and begins anew: %s", self._py_func.__qualname__, error)
+            self.flush()
+            found = None
         if found is None and not _Cache.announced:
             _Cache.announced = True
             logger.warning("unifg compiles its kernels for this machine: some ten seconds, once; later runs reuse them")
