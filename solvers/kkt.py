@@ -153,7 +153,7 @@ class KKT(Solver):
                 values = run.program.retract(lin.values, found[0])
                 trial = run.program.evaluate(values, lin.weights)
                 actual = here - merit.value(trial)
-                if trial.finite and actual >= SUFFICIENT * predicted - slack:
+                if np.isfinite(predicted) and trial.finite and actual >= SUFFICIENT * predicted - slack:
                     damping.accept(1.0 if predicted <= slack else min(actual / predicted, 1.0))
                     reached = run.program.linearize(values)
             if found is None or reached is None:
@@ -321,7 +321,7 @@ class Merit:
         descent = float(lin.gradient[program.columns.free] @ step)
         gain = self._violation(lin.constraints) - self._violation(lin.constraints + linear)
         if gain > 0.0:
-            curved = float(step @ program.hessian.times(program.hessian_entries(lin), step))
+            curved = self._curved(lin, step)
             needed = (descent + 0.5 * curved) / ((1.0 - MARGIN) * gain)
             if needed > self.price:
                 self.price = 1.5 * needed
@@ -329,12 +329,16 @@ class Merit:
 
     def predicted(self, lin: Linearization, step: Array, linear: Array) -> float:
         """Decrease by the model, quadratic in the cost and linear in the constraints; arguments as for `slope`."""
-        curved = float(step @ self.program.hessian.times(self.program.hessian_entries(lin), step))
-        return -self.slope(lin, step, linear) - 0.5 * curved
+        return -self.slope(lin, step, linear) - 0.5 * self._curved(lin, step)
 
     def accepts(self, trial: Evaluation, here: float, slope: float, length: float, slack: float) -> bool:
         """Armijo's condition."""
         return trial.finite and self.value(trial) <= here + ARMIJO * length * slope + slack
+
+    def _curved(self, lin: Linearization, step: Array) -> float:
+        """Curvature of the cost along a step, which may be too long for the range of numbers."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return float(step @ self.program.hessian.times(self.program.hessian_entries(lin), step))
 
     def _violation(self, constraints: Array) -> float:
         return float(np.abs(self.program.violation(constraints)).sum())
