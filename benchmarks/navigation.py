@@ -187,7 +187,7 @@ def render(rows: list[Row]) -> str:
         _drives(rows),
         "Time per tick, pooled over all drives of a backend.", _times(rows),
         "Outcome of the control solve, share of ticks.", _statuses(rows),
-        machine("numpy", "scipy", "osqp", "piqp", "qdldl", "pymunk")
+        machine("numpy", "scipy", "osqp", "piqp", "pymunk")
         + f" {_at_once(rows)}",
     ]  # fmt: skip
     return "\n\n".join(parts)

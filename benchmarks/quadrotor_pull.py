@@ -25,11 +25,11 @@ from benchmarks.navigation import campaign
 from benchmarks.report import CHECKOUT, OUT, code_digest, machine, put_results, table
 from unifg.models import quadrotor
 from unifg.scenarios.quadrotor.belief import Belief, Landmarks
+from unifg.scenarios.quadrotor.coupling import make_pilot
 from unifg.scenarios.quadrotor.episode import Flight, FlightSettings
 from unifg.scenarios.quadrotor.joint import JointSettings
 from unifg.scenarios.quadrotor.joint_pilot import JointPilot, joint_pilot
 from unifg.scenarios.quadrotor.layouts import TUNING_SEEDS
-from unifg.scenarios.quadrotor.pilot import make_pilot
 from unifg.scenarios.quadrotor.plan import BACKENDS, Avoidance
 from unifg.typing import Array
 
@@ -52,7 +52,6 @@ class Job:
     solver: str = "ipm"
     weight: float = 1.0
     pull: float = 0.5
-    carry: bool = False
     avoidance: Avoidance = "clearance"
 
     @property
@@ -63,7 +62,7 @@ class Job:
     @property
     def variant(self) -> tuple[Any, ...]:
         """What is compared over seeds."""
-        return self.coupling, self.solver, self.weight, self.pull, self.carry, self.avoidance
+        return self.coupling, self.solver, self.weight, self.pull, self.avoidance
 
 
 def jobs_of(seeds: list[int], seconds: float, code: str) -> list[Job]:
@@ -72,12 +71,7 @@ def jobs_of(seeds: list[int], seconds: float, code: str) -> list[Job]:
     for seed in seeds:
         plain = Job(seed, seconds, code)
         jobs += [replace(plain, coupling="sequential", avoidance=how) for how in AVOIDANCES]
-        jobs += [
-            replace(plain, weight=weight, pull=pull, carry=carry)
-            for carry in (False, True)
-            for pull in PULLS
-            for weight in WEIGHTS
-        ]
+        jobs += [replace(plain, weight=weight, pull=pull) for pull in PULLS for weight in WEIGHTS]
         jobs += [replace(plain, pull=pull, avoidance="potential") for pull in PULLS]
         jobs += [replace(plain, solver=solver) for solver in BACKENDS if solver != plain.solver]
     return jobs
@@ -92,7 +86,7 @@ def flight_of(job: Job) -> Flight:
     believed = flight.pilot.belief.state
     common = (found.layout, believed, found.nominal, settings.estimator, controller)
     if job.coupling == "joint":
-        flight.pilot = joint_pilot(job.solver, *common, JointSettings(job.pull, job.carry))
+        flight.pilot = joint_pilot(job.solver, *common, JointSettings(job.pull))
     else:
         flight.pilot = make_pilot(job.coupling, job.solver, *common)
     return flight
@@ -249,19 +243,18 @@ def render(rows: list[Row], seeds: list[int], seconds: float) -> str:
         f"Flights on {len(seeds)} seeds from {seeds[0]} on, the first {seconds:g} s of each.",
     ]
     base = of_variant(rows, replace(plain, coupling="sequential").variant)
-    head = ["carry", "pull", "control weight"]
+    head = ["pull", "control weight"]
     groups: list[tuple[list[str], dict[int, Row]]] = [
         (
-            ["yes" if carry else "no", bound(pull), f"{weight:g}"],
-            of_variant(rows, replace(plain, weight=weight, pull=pull, carry=carry).variant),
+            [bound(pull), f"{weight:g}"],
+            of_variant(rows, replace(plain, weight=weight, pull=pull).variant),
         )
-        for carry in (False, True)
         for pull in PULLS
         for weight in WEIGHTS
     ]
     parts += ["### How far the plan pulls", pull_table(groups, head)]
     parts.append("Distance from what the past alone says: mean over ticks, in brackets the greatest of any tick.")
-    sequential = (["sequential", "-", "-"], base)
+    sequential = (["sequential", "-"], base)
     parts += ["### What that does to estimates and flights", error_table([sequential, *groups], head, base)]
     parts.append(
         "Errors are means over ticks and seeds; in brackets the 95 % interval of the paired difference to sequential. "

@@ -8,7 +8,7 @@ Ta et al. 2014, Fig. 1, in one solve. The rules, which make this more than gluin
 - ``control_weight`` scales the costs of the future, which pull on the estimate;
 - ``pull`` bounds how far, in standard deviations, from what the past alone says; whatever that is, no wish makes drag
   negative;
-- what the window carries on is what the past alone says, unless ``carry`` is set, so that a bias is not repeated;
+- what the window carries on is what the past alone says, so that a bias is not repeated;
 - covariances count the past's terms alone;
 - what a solve says that has not met its constraints closely is not believed: a dynamics that gives by a millimetre
   says as little about the past as one that is not there;
@@ -51,14 +51,12 @@ class JointSettings:
     Attributes:
         pull: how far the plan may move state, parameters and landmarks, in standard deviations of what the past
             alone says, each coordinate by itself; infinity for no bound.
-        carry: whether the window goes on from what the joint solve believes, and not from the past alone.
 
     Raises:
         ScenarioError: if the pull is not positive; without any the coupling is the sequential one.
     """
 
     pull: float = 0.5
-    carry: bool = False
 
     def __post_init__(self) -> None:
         """Refuse a bound that leaves nothing to estimate."""
@@ -267,7 +265,7 @@ class JointController(Controller):
         self.alone = self.believed = belief
         if not solution.violation <= BELIEVABLE:  # nor if that is not a number
             return
-        window, atlas = self.estimator.window, self.estimator.atlas
+        atlas = self.estimator.atlas
         marks = solution[self._shared.landmarks]
         positions = belief.landmarks.positions.copy()
         for row, name in enumerate(belief.landmarks.ids.tolist()):
@@ -280,8 +278,6 @@ class JointController(Controller):
             parameters=flyable(self._parameters_of(solution)),
             landmarks=replace(belief.landmarks, positions=positions),
         )
-        if self.joint.carry:
-            self._terms.accept(window, solution)
 
     def _parameters_of(self, solution: fg.Solution) -> Array:
         return np.concatenate([solution[family][0] for family in self._shared.parameters])

@@ -18,7 +18,6 @@ from unifg.elimination.plan import (
     POSITIVE,
     ROWS,
     SURPRISE,
-    SURPRISES,
     ZERO,
     Plan,
 )
@@ -194,11 +193,6 @@ class Factorization:
     def unexpected(self) -> int:
         """Scalar of the first pivot whose sign is not the one ``negative`` announced, or -1."""
         return int(self.plan.state[SURPRISE])
-
-    @property
-    def unexpected_count(self) -> int:
-        """Number of pivots whose sign is not the one ``negative`` announced."""
-        return int(self.plan.state[SURPRISES])
 
     def pivots(self) -> Array:
         """(n,) diagonal D of the factorisation L D L' with unit L, in the order of elimination.
