@@ -7,7 +7,7 @@ A row is one solve, update or episode: its status, its iterations, its cost and 
 only moves changes nothing here, not the last bit; code that is meant to change something changes the rows it is meant
 to change and no other. ``compare`` says how many rows are the same to the bit, which are the same but for rounding and
 which are not, and ends with exit code 1 if there are any of the last. The file belongs to one machine and one set of
-versions: it is not part of the project.
+versions: it is not part of the project. Record and compare with warm caches: a process that compiles rounds otherwise.
 """
 
 from __future__ import annotations
