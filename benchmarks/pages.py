@@ -65,6 +65,7 @@ PAGES = {
         Page("models", "benchmarks.obstacle_fields"),
         Page("quadrotor-obstacles", "benchmarks.obstacle_courses", hours=0.5),
         Page("smoothing", "benchmarks.incremental", hours=0.2),
+        Page("iterations", "benchmarks.iterations"),
         Page("osqp", "benchmarks.osqp_share", hours=0.3),
         Page("collection", "benchmarks.collection"),
         Page("velocity-tracking", "benchmarks.ecg2o"),

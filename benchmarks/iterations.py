@@ -1,0 +1,147 @@
+"""How many iterations the backends need: on problems with known answers, among cylinders, from tick to tick.
+
+    python -m benchmarks.iterations
+
+The problems are those every backend is tested on (``tests/problems.py``), the cylinders those of
+:mod:`benchmarks.cylinder_flights`, the loops those of :mod:`benchmarks.control_loops`. Writes docs/iterations.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from importlib.util import find_spec
+
+import numpy as np
+
+import unifg as fg
+from benchmarks import control_loops, cylinder_flights
+from benchmarks.control_problems import Problem
+from benchmarks.report import CHECKOUT, machine, put_results, table
+from unifg.solvers import (
+    KKT,
+    SQP,
+    AugmentedLagrangian,
+    DogLeg,
+    GaussNewton,
+    InteriorPoint,
+    LevenbergMarquardt,
+    Penalty,
+)
+
+sys.path.insert(0, str(CHECKOUT / "tests"))
+
+from problems import PROBLEMS, Guess
+
+PAGE = CHECKOUT / "docs" / "iterations.md"
+BACKENDS: dict[str, fg.Solver] = {
+    "GN": GaussNewton(),
+    "LM": LevenbergMarquardt(),
+    "dog-leg": DogLeg(),
+    "KKT": KKT(),
+    "penalty": Penalty(),
+    "AL": AugmentedLagrangian(),
+    "SQP": SQP(),
+    "SQP, exact": SQP(hessian="exact"),
+    "interior point": InteriorPoint(),
+}
+FLIGHTS: dict[str, fg.Solver] = {
+    "`AugmentedLagrangian`": AugmentedLagrangian(),
+    'the same, `hessian="gauss-newton"`': AugmentedLagrangian(hessian="gauss-newton"),
+    "`InteriorPoint`": InteriorPoint(),
+    "`SQP`": SQP(),
+    '`SQP(hessian="exact")`': SQP(hessian="exact"),
+}
+CARRIED = {"values alone": (False, False), "and multipliers": (True, False), "and penalties": (True, True)}
+
+
+def known_answers() -> str:
+    """Every backend on the problems that all are tested on."""
+    rows = [
+        (problem.name, *(iterations(problem.build, solver) for solver in BACKENDS.values())) for problem in PROBLEMS
+    ]
+    return table(("problem", *BACKENDS), rows)
+
+
+def iterations(build: Callable[[], tuple[fg.Graph, Guess]], solver: fg.Solver) -> str:
+    """Of one solve; a status where it did not converge, a dash where the backend refuses the problem."""
+    graph, guess = build()
+    try:
+        run = solver.prepare(graph)
+    except fg.BackendError:
+        return "-"
+    solution = run.solve(guess)
+    words = "" if solution.converged else f", {solution.status.name.lower().replace('_', ' ')}"
+    return f"{solution.iterations}{words}"
+
+
+def cylinders(seeds: Iterable[int] = cylinder_flights.SEEDS) -> str:
+    """Flights among cylinders: how many each backend solves."""
+    seeds = list(seeds)
+    found = cylinder_flights.study(seeds, FLIGHTS, ipopt=find_spec("casadi") is not None)
+    rows = []
+    for name, outcomes in found.items():
+        solved = [outcome.iterations for outcome in outcomes if outcome.solved]
+        middle = f"{np.median(solved):.0f}" if solved else "-"
+        rows.append((name.replace("ipopt", "IPOPT"), f"{len(solved)} of {len(seeds)}", middle))
+    return table(("solver", "solved", "iterations, median of the solved"), rows)
+
+
+def carried(problem: Problem, multipliers: bool, penalties: bool, steps: int = control_loops.STEPS) -> float:
+    """Mean iterations of the augmented Lagrangian's warm steps in closed loop, by what a tick hands to the next."""
+    stated = problem.formulation()
+    run = AugmentedLagrangian(tolerance=control_loops.TOLERANCE).prepare(stated.graph)
+    state, counts = problem.start, []
+    start = stated.guess
+    for index in range(steps + 1):
+        solution = run.solve(start, data=stated.data(state, index))
+        counts.append(solution.iterations)
+        state = problem.plant(state, solution[stated.u][0], index)
+        start = solution.shifted(stated.x, stated.u, by=1)
+        if not multipliers:
+            start = replace(start, multipliers={})
+        if not penalties:
+            start = replace(start, penalties={})
+    return float(np.mean(counts[1:]))  # the first is no step of the loop
+
+
+def loops() -> str:
+    """What the next tick saves by what it is given."""
+    rows = [
+        (f"{problem.robot} {problem.name}", *(f"{carried(problem, *what):.1f}" for what in CARRIED.values()))
+        for problem in control_loops.cases()
+    ]
+    return table(("closed loop", *CARRIED), rows)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure and write the page."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.iterations", description=__doc__.split("\n")[0])
+    parser.parse_args(arguments)
+    text = "\n\n".join(
+        [
+            "### Problems with known answers",
+            "Iterations to the default tolerance of 1e-6 with default options. A dash means that the backend refuses "
+            "the problem.",
+            known_answers(),
+            "### Among cylinders",
+            f"A quadrotor at {cylinder_flights.SPEED:g} m/s among ten upright cylinders, 20 layouts at random, from a "
+            "straight line through the cylinders.",
+            cylinders(),
+            "### From tick to tick",
+            f"Mean iterations of the augmented Lagrangian over {control_loops.STEPS} steps of the control cases, "
+            f"tolerance {control_loops.TOLERANCE:.0e}, when the next tick begins with the shifted values, with the "
+            "multipliers too, and with the penalties too.",
+            loops(),
+            machine("numpy", "numba", "osqp", "piqp"),
+        ]
+    )
+    print(text)
+    put_results(PAGE, "Iterations", text)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
