@@ -6,7 +6,7 @@ discs. Constraints: unicycle dynamics, velocity limits, hard clearance from wall
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,7 +28,6 @@ BRAKING = 6  # ticks to come to rest when no new plan is found
 PURSUIT = 0.3  # [m] ahead of the robot, where a guess aims at the reference
 PURSUIT_TIME = 0.2  # [s] in which it would turn there
 ARRIVED = 0.05  # [m] to the end of the reference, where it only turns
-SETTLED = (fg.Status.CONVERGED, fg.Status.STOP_RULE)
 PATIENCE = 5  # ticks of being left behind before the plan starts over from the reference
 
 
@@ -185,10 +184,8 @@ class Controller:
         graph.constrain(
             obstacles.disc_clearance, x[1:], self._centres, self._radii, lower=self._disc_limit, name="discs"
         )
-        # Values of the iterates: of a solve out of iterations, the best that may be driven is driven.
-        self._run = replace(backend(solver, s), keep_values=True).prepare(graph)
-        self._cold = replace(backend(solver, s, COLD_PATIENCE), keep_values=True).prepare(graph)
-        self._at = backend(solver, s, 0).prepare(graph)
+        self._run = backend(solver, s).prepare(graph)
+        self._cold = backend(solver, s, COLD_PATIENCE).prepare(graph)
         self._guess: fg.Guess | None = None
         self._applied = np.zeros(2)
         self._stored = np.zeros((n, 2))
@@ -206,7 +203,7 @@ class Controller:
         """
         data = self._data(pose, reference, tracks)
         run, guess = self._beginning(pose, reference)
-        return self._judge(run.solve(guess, data=data), data, pose, reference, tracks)
+        return self._judge(run.solve(guess, data=data), pose, reference, tracks)
 
     def _beginning(self, pose: Array, reference: Array) -> tuple[fg.Prepared, fg.Guess]:
         """The shifted solution; without one, rest after a failure, and the reference otherwise."""
@@ -223,33 +220,18 @@ class Controller:
         """Data of what :meth:`_anchor` stated."""
         return {self._start: pose}
 
-    def _drivable(self, solution: fg.Solution, data: dict[fg.Data, Array]) -> fg.Solution | None:
-        """What a solve found that keeps the constraints; None for nothing.
+    def _judge(self, solution: fg.Solution, pose: Array, reference: Array, tracks: Tracks) -> Plan:
+        """Drive a plan that keeps the constraints; brake along the last one otherwise; rest where a mover nears.
 
-        A solve that ended early stands where it stopped. Of the plans that it has passed, its start among them, those
-        that keep the constraints are measured by their cost.
+        Of a solve that ended early this is where it stopped. The cheapest iterate it has passed that keeps the
+        constraints was tried: such plans brush past obstacles and creep up to those that stand in the way.
         """
         s = self.settings
-        if solution.status in SETTLED:
-            return solution if solution.violation <= s.feasible else None
-        kept = [row for row in solution.history if row.violation <= s.feasible]
-        if not kept:
-            return None
-        values = min(kept, key=lambda row: row.cost).values
-        assert values is not None
-        return self._at.solve(fg.Guess(values, solution.multipliers, solution.penalties), data=data)
-
-    def _judge(
-        self, solution: fg.Solution, data: dict[fg.Data, Array], pose: Array, reference: Array, tracks: Tracks
-    ) -> Plan:
-        """Drive a plan that keeps the constraints; brake along the last one otherwise; rest where a mover nears."""
-        s = self.settings
-        found = self._drivable(solution, data)
-        if found is not None:
-            self._stored, self._age = found[self._u], 0
+        if solution.violation <= s.feasible:
+            self._stored, self._age = solution[self._u], 0
             emergency = self._failed = False
-            states = found[self._x]
-            self._guess = None if self._left_behind(states, reference) else found.shifted(self._x, self._u)
+            states = solution[self._x]
+            self._guess = None if self._left_behind(states, reference) else solution.shifted(self._x, self._u)
         else:
             self._age += 1
             self._guess = None

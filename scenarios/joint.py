@@ -16,7 +16,7 @@ import numpy as np
 
 import unifg as fg
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.controller import SETTLED, Controller, ControllerSettings, Plan
+from unifg.scenarios.controller import Controller, ControllerSettings, Plan
 from unifg.scenarios.perception import Tracks
 from unifg.scenarios.window import Window, WindowTerms
 from unifg.solvers import GaussNewton
@@ -24,6 +24,7 @@ from unifg.typing import Array
 
 ROUNDS = 8  # of choosing the beams that count and moving the estimate
 STEADY = 0.01  # [m, rad]; an estimate that moves less has found its beams
+SETTLED = (fg.Status.CONVERGED, fg.Status.STOP_RULE)
 
 
 class JointController(Controller):
@@ -69,7 +70,7 @@ class JointController(Controller):
         values = {**guess.values, self._terms.past: self._terms.poses(self.window)}
         values[self._x] = np.concatenate([pose[None], guess.values[self._x][1:]])
         solution = run.solve(fg.Guess(values, guess.multipliers, guess.penalties), data=data)
-        plan = self._judge(solution, data, pose, reference, tracks)
+        plan = self._judge(solution, pose, reference, tracks)
         if plan.emergency or plan.status not in SETTLED:
             self._smoother.accept(self.window, self._registered)
         else:

@@ -218,60 +218,34 @@ def test_one_failed_solve_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Ended:
-    """A solve as the controller sees it: a status and the iterates it passed, (cost, violation, turning speed) each."""
+    """A solve as the controller sees it, with another violation."""
 
-    def __init__(self, status: fg.Status, rows: list[tuple[float, float, float]], solution: fg.Solution) -> None:
-        self.multipliers: dict[str, Array] = {}
-        self.penalties: dict[str, Array] = {}
-        self.status, self.violation = status, rows[-1][1]
-        blank = solution.history[0]
-        self.history = []
-        for cost, violation, turn in rows:
-            values = {**solution.values}
-            family = next(f for f in values if f.name == "control")
-            values[family] = np.full_like(values[family], turn)
-            self.history.append(replace(blank, cost=cost, violation=violation, values=values))
+    def __init__(self, solution: fg.Solution, violation: float) -> None:
+        self._solution, self.violation, self.status = solution, violation, fg.Status.ITERATION_LIMIT
+
+    def __getitem__(self, variable: fg.Family) -> Array:
+        return self._solution[variable] + (0.25 if variable.name == "control" else 0.0)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._solution, name)
 
 
 NOBODY = Tracks(
     np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=int), np.zeros(0), np.zeros(0, dtype=bool)
 )
-EARLY, LATE = fg.Status.ITERATION_LIMIT, fg.Status.STOP_RULE
 
 
-@pytest.mark.parametrize(
-    ("status", "rows", "turn"),
-    [
-        (EARLY, [(9.0, 0.0, 0.1), (4.0, 0.0, 0.2), (5.0, 0.0, 0.3)], 0.2),  # the cheapest, neither first nor last
-        (EARLY, [(9.0, 0.0, 0.1), (4.0, 0.1, 0.2), (5.0, 1e-4, 0.3)], 0.3),  # of those that keep the constraints
-        (EARLY, [(3.0, 0.0, 0.1), (4.0, 0.0, 0.2)], 0.1),  # the start may be the best there is
-        (EARLY, [(3.0, 0.1, 0.1), (4.0, 0.2, 0.2)], None),
-        (fg.Status.LOCALLY_INFEASIBLE, [(3.0, 0.0, 0.1), (2.0, 0.2, 0.2)], 0.1),
-        (LATE, [(3.0, 0.0, 0.1), (4.0, 0.2, 0.2)], None),  # a solve that settled is judged by where it settled
-    ],
-)
-def test_of_a_solve_that_ended_early_the_cheapest_plan_is_driven_that_keeps_the_constraints(
-    status: fg.Status, rows: list[tuple[float, float, float]], turn: float | None
-) -> None:
+@pytest.mark.parametrize(("share", "driven"), [(0.9, True), (1.1, False)])
+def test_a_plan_is_driven_where_it_stopped_if_it_keeps_the_constraints(share: float, driven: bool) -> None:
     episode = Episode(CORNER)
     controller = episode.pilot.controller
     pose = np.array(episode.settings.start)
-    data = controller._data(pose, np.tile(pose, (controller.settings.horizon + 1, 1)), NOBODY)
-    solution = controller._at.solve(controller._staying(pose), data=data)
-    ended: Any = Ended(status, rows, solution)
-    found = controller._drivable(ended, data)
-    assert (found is None) == (turn is None)
-    if found is not None:
-        assert np.all(found[controller._u] == turn)
-
-
-def test_of_a_solve_that_settled_its_end_is_driven() -> None:
-    episode = Episode(CORNER)
-    controller = episode.pilot.controller
-    pose = np.array(episode.settings.start)
-    data = controller._data(pose, np.tile(pose, (controller.settings.horizon + 1, 1)), NOBODY)
-    ended: Any = Ended(LATE, [(3.0, 0.0, 0.1), (4.0, 0.0, 0.2)], controller._at.solve(controller._staying(pose)))
-    assert controller._drivable(ended, data) is ended
+    reference = np.tile(pose, (controller.settings.horizon + 1, 1))
+    solution = controller._run.solve(controller._staying(pose), data=controller._data(pose, reference, NOBODY))
+    ended: Any = Ended(solution, share * controller.settings.feasible)
+    plan = controller._judge(ended, pose, reference, NOBODY)
+    assert plan.emergency != driven
+    np.testing.assert_allclose(plan.control, 0.25 + solution[controller._u][0] if driven else 0.0)
 
 
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])

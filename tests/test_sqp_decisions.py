@@ -1,0 +1,108 @@
+"""What SQP decides between subproblems: when violation alone counts, what a price is, which answers it takes."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.solvers import SQP
+from unifg.solvers.qp import QPAnswer
+from unifg.solvers.sqp import FALLING, LEFT, PATIENCE, Merit, Subproblems, Watch
+from unifg.typing import Array
+
+
+def seen(violation: float) -> Any:
+    """A run whose iterate violates its constraints by so much."""
+    return SimpleNamespace(optimality=SimpleNamespace(violation=violation), tolerance=1e-6)
+
+
+def test_a_violation_that_does_not_fall_is_looked_at_ever_more_seldom() -> None:
+    watch = Watch()
+    assert not watch.calls(seen(1.0))
+    calls = [watch.calls(seen(1.0)) for _ in range(7 * PATIENCE)]
+    assert [k + 1 for k, called in enumerate(calls) if called] == [PATIENCE, 3 * PATIENCE, 7 * PATIENCE]
+
+
+@pytest.mark.parametrize("violation", [0.9 * FALLING, 1e-7])
+def test_a_violation_that_falls_or_is_none_begins_the_wait_anew(violation: float) -> None:
+    watch = Watch()
+    watch.calls(seen(1.0))
+    assert not any(watch.calls(seen(1.0)) for _ in range(PATIENCE - 1))
+    assert not watch.calls(seen(violation))
+    assert not any(watch.calls(seen(1.0)) for _ in range(PATIENCE - 1))
+    assert watch.calls(seen(1.0))
+
+
+def test_falling_by_little_at_a_time_is_not_falling() -> None:
+    watch, violation = Watch(), 1.0
+    watch.calls(seen(violation))
+    shrinking = violation * 0.999 ** np.arange(PATIENCE)
+    assert [watch.calls(seen(float(value))) for value in shrinking][-1]
+
+
+def line(limit: float = -1.0) -> tuple[fg.Graph, fg.Family]:
+    """One number, to be at most ``limit``."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [3.0])
+    graph.constrain(lambda p: p, x, upper=limit, name="limit")
+    return graph, x
+
+
+def test_the_highest_price_is_that_of_scaled_rows_and_at_least_one() -> None:
+    graph, x = line()
+    program = graph.compile()
+    lin = program.linearize(program.values_from({x: np.zeros((1, 1))}))
+    for multiplier, row, price in ((6.0, 2.0, 3.0), (6.0, 0.5, 12.0), (0.1, 1.0, 1.0)):
+        scaling: Any = SimpleNamespace(program=program, rows=np.array([row]))
+        assert Merit(scaling, np.array([-multiplier]), lin).price == pytest.approx(price)
+
+
+def test_prices_stay_above_their_multipliers_and_come_down_slowly() -> None:
+    graph, x = line()
+    program = graph.compile()
+    lin = program.linearize(program.values_from({x: np.zeros((1, 1))}))
+    scaling: Any = SimpleNamespace(program=program, rows=np.ones(1))
+    merit = Merit(scaling, np.array([2.0]), lin)
+    answer = QPAnswer(np.zeros(1), np.array([-4.0]), "by hand", 1, 0.0)
+    merit.raise_prices(answer)
+    np.testing.assert_allclose(merit.prices, [4.4])
+    merit.raise_prices(QPAnswer(np.zeros(1), np.array([1.0]), "by hand", 1, 0.0))
+    np.testing.assert_allclose(merit.prices, [2.7])
+
+
+@pytest.mark.parametrize(
+    ("limit", "left", "contradicts"),
+    [(-1.0, 0.5 * LEFT, False), (-1.0, min(1.5 * LEFT, 1.0), True), (-1e-3, 1e-3 * 0.5 * LEFT, False)],
+)
+def test_an_answer_contradicts_when_it_leaves_most_of_the_violation(
+    limit: float, left: float, contradicts: bool
+) -> None:
+    graph, _ = line(limit)
+    work = Subproblems(SQP(), graph.compile())
+    qp: Any = SimpleNamespace(lower=np.array([-np.inf]), upper=np.array([limit]), linear=lambda step: step)
+    step: Array = np.array([limit + left])
+    assert work._contradicts(qp, QPAnswer(step, np.zeros(1), "by hand", 1, 1e-3)) == contradicts
+    assert not work._contradicts(qp, QPAnswer(step, np.zeros(1), "by hand", 1, 1e-8)), "as exact as the test asks"
+
+
+def test_the_first_route_rests_after_a_step_that_led_nowhere() -> None:
+    graph, x = line()
+    work = Subproblems(SQP(), graph.compile())
+    assert not work.distrust(), "it has given no step yet"
+    solution = SQP().solve(graph, {x: np.zeros((1, 1))}, check=True)
+    assert solution[x] == pytest.approx(-1.0)
+
+
+def test_damping_grows_with_shortened_steps_and_fades_with_full_ones() -> None:
+    solver = SQP()
+    first = solver._next_damping(1e-12, 0.5)
+    assert solver._next_damping(first, 0.25) > 2.0 * first
+    fading = solver._next_damping(first, 1.0)
+    assert 0.05 * first < fading < first
+    exact = SQP(hessian="exact")
+    assert exact._next_damping(first, 1.0) < fading, "or convergence would be linear"
