@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.navigation import DEPARTMENT, campaign, data_folder
+from benchmarks.campaign import campaign, interval
+from benchmarks.navigation import DEPARTMENT, data_folder
 from benchmarks.report import CHECKOUT, OUT, code_digest, machine, put_results, table
 from unifg.errors import UnifgError
 from unifg.scenarios.controller import ControllerSettings
@@ -43,7 +44,6 @@ ROUTES: dict[str, tuple[str | None, Pose, tuple[Pose, ...]]] = {
     "building": (None, (13.9, 20.0, -1.6), ((21.5, 8.6, -0.6),)),
 }
 OBSTACLES = 2
-RESAMPLES = 2000
 
 # Name, unit, and how to read each measure from the metrics.
 MEASURES: dict[str, Callable[[Any], float]] = {
@@ -106,14 +106,6 @@ def paired(rows: list[Row], route: str, solver: str, variant: str, measure: str)
     mine, base = values(variant), values("sequential")
     seeds = sorted(set(mine) & set(base))
     return np.array([mine[seed] for seed in seeds]), np.array([base[seed] for seed in seeds])
-
-
-def interval(differences: Array) -> tuple[float, float]:
-    """95 % bootstrap interval of the mean."""
-    rng = np.random.default_rng(0)
-    means = rng.choice(differences, (RESAMPLES, len(differences))).mean(axis=1)
-    low, high = np.quantile(means, [0.025, 0.975])
-    return float(low), float(high)
 
 
 def render(rows: list[Row]) -> str:

@@ -14,15 +14,15 @@ import argparse
 import json
 import multiprocessing
 import os
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks.campaign import campaign
 from benchmarks.report import CHECKOUT, OUT, code_digest, machine, put_results, table
 from unifg.errors import UnifgError
 from unifg.scenarios.controller import ControllerSettings
@@ -30,8 +30,6 @@ from unifg.scenarios.metrics import episode_metrics
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
 from unifg.scenarios.pilot import COUPLINGS
 
-Setting = TypeVar("Setting")
-Result = TypeVar("Result")
 Row = dict[str, Any]
 
 SOLVERS = ("alm", "sqp")
@@ -70,24 +68,6 @@ CASES = (
     Case("arena, narrow", ARENA, (-2.0, -0.5, 0.0), ((0.5, 0.5, 1.57),), 0),
     Case("building", None, None, None, 3),
 )
-
-
-def campaign(
-    task: Callable[[Setting], Result], settings: Iterable[Setting], executor: Executor | None = None
-) -> Iterator[Result]:
-    """Yield the results of a task for every setting, as they come.
-
-    Args:
-        task: a function that can be pickled.
-        settings: what it is to be called with.
-        executor: where it runs, such as a process pool or that of a dask client; None runs one after the other here,
-            which is the only way to times that mean something.
-    """
-    if executor is None:
-        yield from map(task, settings)
-        return
-    for future in as_completed([executor.submit(task, setting) for setting in settings]):
-        yield future.result()
 
 
 def data_folder() -> Path | None:

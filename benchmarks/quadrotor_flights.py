@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.navigation import campaign
+from benchmarks.campaign import campaign
 from benchmarks.quadrotor_tables import HEADLINE, render
 from benchmarks.report import CHECKOUT, OUT, code_digest, machine, put_results
 from unifg.errors import UnifgError

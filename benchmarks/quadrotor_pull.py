@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.coupling import interval
-from benchmarks.navigation import campaign
+from benchmarks.campaign import campaign, interval
 from benchmarks.report import CHECKOUT, OUT, code_digest, machine, put_results, table
 from unifg.models import quadrotor
 from unifg.scenarios.quadrotor.belief import Belief, Landmarks

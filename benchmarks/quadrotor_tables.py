@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.coupling import interval
+from benchmarks.campaign import interval
 from benchmarks.report import table
 from unifg.typing import Array
 
