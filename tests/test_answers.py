@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.linalg import null_space
 
 import unifg as fg
-from unifg.solvers import SQP, GaussNewton, InteriorPoint
+from unifg.solvers import (
+    KKT,
+    SQP,
+    AugmentedLagrangian,
+    DogLeg,
+    GaussNewton,
+    InteriorPoint,
+    LevenbergMarquardt,
+    Penalty,
+)
 from unifg.typing import Array
 
 # ---------------------------------------------------------------- priors of what leaves
@@ -336,3 +347,34 @@ def test_no_iteration_is_a_limit_like_any_other() -> None:
     graph.minimize(fg.prior, x, [2.0])
     solution = GaussNewton(max_iterations=0).solve(graph, {x: np.ones((1, 1))})
     assert solution.status is fg.Status.ITERATION_LIMIT and solution[x] == 1.0
+
+
+STEPPING: dict[str, fg.Solver] = {
+    "gn": GaussNewton(keep_values=True),
+    "lm": LevenbergMarquardt(keep_values=True),
+    "dog-leg": DogLeg(keep_values=True),
+    "kkt": KKT(keep_values=True),
+    "sqp": SQP(keep_values=True),
+    "alm": AugmentedLagrangian(keep_values=True),
+    "ipm": InteriorPoint(keep_values=True),
+    "penalty": Penalty(keep_values=True),
+}
+
+
+@pytest.mark.parametrize("name", STEPPING)
+def test_a_history_gives_the_length_of_the_step_that_was_taken(name: str) -> None:
+    """Far out the arctangent is so flat that full steps overshoot: what was shortened is counted as it was taken."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(lambda p: np.arctan(p - 1.0), x, name="bend")
+    if name not in ("gn", "lm", "dog-leg"):
+        y = graph.variables("y", fg.Rn(1), 1)
+        graph.minimize(fg.prior, y, [0.0], sigma=100.0)
+        graph.constrain(lambda p, q: p - q, x, y, lower=0.0, upper=0.0, name="same")
+    guess = {family: np.array([[4.0]]) for family in graph.families.values()}
+    history = STEPPING[name].solve(graph, guess).history
+    assert len(history) > 2
+    for before, after in pairwise(history):
+        assert before.values is not None and after.values is not None
+        moved = [after.values[family] - before.values[family] for family in after.values]
+        assert after.step_norm == pytest.approx(np.linalg.norm(moved), rel=1e-6, abs=1e-9)
