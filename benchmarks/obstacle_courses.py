@@ -47,6 +47,7 @@ BACKENDS: tuple[tuple[str, Hessian], ...] = (
     ("sqp", "gauss-newton"),
     ("ipm", "exact"),
     ("ipm", "gauss-newton"),
+    ("alm", "exact"),
     ("alm", "gauss-newton"),
 )
 EVERYWHERE: Start = "hover"  # the guess from which all backends begin; the others are tried with exact Hessians

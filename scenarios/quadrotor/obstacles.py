@@ -59,7 +59,7 @@ class CourseSettings:
         horizon: steps N.
         dt: sampling time [s].
         solver: "sqp", "ipm" or "alm".
-        hessian: "exact" or "gauss-newton"; None for exact where the solver has it.
+        hessian: "exact" or "gauss-newton"; None for exact.
         avoidance: "potential" is Ta's cost 1/d for the cylinder and every wall, d from the hull; "hard" keeps the hull
             clear at every node.
         guess: "hover" stays at the start, "line" flies straight to the target through whatever stands there, "way"
@@ -113,7 +113,7 @@ class CourseSettings:
     @property
     def chosen_hessian(self) -> Hessian:
         """The Hessian that is used."""
-        return self.hessian or ("gauss-newton" if self.solver == "alm" else "exact")
+        return self.hessian or "exact"
 
     @property
     def chosen_guess(self) -> Start:
@@ -129,7 +129,7 @@ def backend(settings: CourseSettings, *, keep_values: bool = False) -> fg.Solver
     """The solver the settings ask for.
 
     Raises:
-        ScenarioError: for an unknown solver, or a Hessian it does not have.
+        ScenarioError: for an unknown solver.
     """
     tolerance, hessian = settings.tolerance, settings.chosen_hessian
     if settings.solver == "sqp":
@@ -138,9 +138,7 @@ def backend(settings: CourseSettings, *, keep_values: bool = False) -> fg.Solver
         return InteriorPoint(tolerance=tolerance, hessian=hessian, keep_values=keep_values)
     if settings.solver != "alm":
         raise fg.ScenarioError(f"unknown solver '{settings.solver}': choose one of {', '.join(SOLVERS)}")
-    if hessian != "gauss-newton":
-        raise fg.ScenarioError(f"alm knows the Gauss-Newton Hessian only, found '{hessian}': choose sqp or ipm for it")
-    return AugmentedLagrangian(tolerance=tolerance, keep_values=keep_values)
+    return AugmentedLagrangian(tolerance=tolerance, hessian=hessian, keep_values=keep_values)
 
 
 def state_problem(settings: CourseSettings, layout: Layout) -> tuple[fg.Graph, fg.Family, fg.Family]:

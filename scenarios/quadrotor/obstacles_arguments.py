@@ -21,7 +21,7 @@ GUESSES = ("hover", "line", "way")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the scenario's own options, but not ``--solver`` and ``--out``."""
-    parser.add_argument("--hessian", choices=HESSIANS, help="of the Lagrangian (default: exact; gauss-newton for alm)")
+    parser.add_argument("--hessian", choices=HESSIANS, help="of the Lagrangian (default: exact)")
     parser.add_argument(
         "--avoidance",
         choices=AVOIDANCES,
