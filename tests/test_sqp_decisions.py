@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems import short_drive
 from unifg.solvers import SQP
-from unifg.solvers.qp import QPAnswer
-from unifg.solvers.sqp import FALLING, LEFT, PATIENCE, Merit, Subproblems, Watch
+from unifg.solvers.qp import QPAnswer, subproblem
+from unifg.solvers.sqp import FALLING, LEFT, PATIENCE, RESTING, Merit, Subproblems, Watch
 from unifg.typing import Array
 
 
@@ -91,11 +92,19 @@ def test_an_answer_contradicts_when_it_leaves_most_of_the_violation(
 
 
 def test_the_first_route_rests_after_a_step_that_led_nowhere() -> None:
-    graph, x = line()
-    work = Subproblems(SQP(), graph.compile())
+    """It is asked, not asked for a while when its step was distrusted, and asked again."""
+    graph, guess = short_drive()
+    program = graph.compile()
+    work, lin = Subproblems(SQP(), program), program.linearize(program.values_from(guess))
+    work.start(lin)
     assert not work.distrust(), "it has given no step yet"
-    solution = SQP().solve(graph, {x: np.zeros((1, 1))}, check=True)
-    assert solution[x] == pytest.approx(-1.0)
+    qp = subproblem(program, lin, np.full(program.size, 1e-6), work.pattern)
+    none = np.zeros(program.constraints.count)
+    routes = [work.solve(qp, none, 1e-4).route]
+    assert work.distrust()
+    routes += [work.solve(qp, none, 1e-4).route for _ in range(RESTING + 1)]
+    assert work.fallback is not None
+    assert routes == [work.first.name, *[work.fallback.name] * RESTING, work.first.name]
 
 
 def test_damping_grows_with_shortened_steps_and_fades_with_full_ones() -> None:
