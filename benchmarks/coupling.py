@@ -25,8 +25,8 @@ from benchmarks.campaign import campaign, interval
 from benchmarks.navigation import DEPARTMENT, data_folder
 from benchmarks.report import CHECKOUT, OUT, code_digest, machine, put_results, table
 from unifg.errors import UnifgError
-from unifg.scenarios.controller import ControllerSettings
-from unifg.scenarios.metrics import episode_metrics
+from unifg.scenarios.driving.controller import ControllerSettings
+from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
 from unifg.typing import Array
 

@@ -33,9 +33,9 @@ from benchmarks.report import OUT
 from unifg.errors import UnifgError
 from unifg.pose_graphs import PoseGraph
 from unifg.scenarios import manoeuvres
+from unifg.scenarios.course import CourseSettings, run_course
+from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.navigation import run_navigation
-from unifg.scenarios.quadrotor.episode import FlightSettings, run_flight
-from unifg.scenarios.quadrotor.obstacles import CourseSettings, run_course
 from unifg.solvers import (
     KKT,
     SQP,

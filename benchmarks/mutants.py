@@ -1,7 +1,7 @@
 """Do the tests notice when a decision is changed? Mutants of the decisions' files, each run against its tests.
 
     python -m benchmarks.mutants                            every file of TARGETS (hours)
-    python -m benchmarks.mutants scenarios/joint.py         one file
+    python -m benchmarks.mutants scenarios/driving/joint.py         one file
     python -m benchmarks.mutants --share 0.3 --seed 1 ...   a drawn share of the mutants of each file
 
 Everything happens in a scratch copy of the checkout. The tests of a file run once with every line they touch recorded;
@@ -80,30 +80,30 @@ TARGETS: dict[str, tuple[str, ...]] = {
         "solvers",
         "infeasible",
     ),
-    "scenarios/controller.py": ("control_decisions", "navigation", "joint"),
-    "scenarios/joint.py": ("control_decisions", "joint"),
-    "scenarios/localiser.py": ("navigation",),
+    "scenarios/driving/controller.py": ("control_decisions", "navigation", "joint"),
+    "scenarios/driving/joint.py": ("control_decisions", "joint"),
+    "scenarios/driving/localiser.py": ("navigation",),
     "scenarios/navigation.py": ("navigation",),
-    "scenarios/perception.py": ("perception", "control_decisions"),
-    "scenarios/pilot.py": ("navigation", "joint"),
-    "scenarios/planner.py": ("planner", "route"),
-    "scenarios/route.py": ("route", "navigation"),
-    "scenarios/scene.py": ("scene",),
-    "scenarios/unforeseen.py": ("unforeseen",),
-    "scenarios/window.py": ("joint", "control_decisions"),
-    "scenarios/quadrotor/arrival.py": ("quadrotor_mpc", "quadrotor_flights"),
-    "scenarios/quadrotor/association.py": ("quadrotor_estimator", "quadrotor_world"),
-    "scenarios/quadrotor/braking.py": ("quadrotor_controller",),
-    "scenarios/quadrotor/controller.py": ("quadrotor_decisions", "quadrotor_controller"),
-    "scenarios/quadrotor/estimator.py": ("quadrotor_estimator", "quadrotor_joint"),
-    "scenarios/quadrotor/guide.py": ("quadrotor_controller", "quadrotor_layouts"),
-    "scenarios/quadrotor/joint.py": ("quadrotor_decisions", "quadrotor_joint"),
-    "scenarios/quadrotor/obstacles.py": ("quadrotor_obstacles",),
-    "scenarios/quadrotor/plan.py": ("quadrotor_decisions", "quadrotor_controller"),
-    "scenarios/quadrotor/scene.py": ("quadrotor_scene",),
-    "scenarios/quadrotor/slots.py": ("quadrotor_decisions", "quadrotor_controller"),
-    "scenarios/quadrotor/tracker.py": ("quadrotor_estimator", "quadrotor_world"),
-    "scenarios/quadrotor/window.py": ("quadrotor_estimator", "quadrotor_joint"),
+    "scenarios/seeing/tracks.py": ("perception", "control_decisions"),
+    "scenarios/driving/pilot.py": ("navigation", "joint"),
+    "scenarios/ways/grid.py": ("planner", "route"),
+    "scenarios/driving/route.py": ("route", "navigation"),
+    "scenarios/show/drive_scene.py": ("scene",),
+    "scenarios/worlds/unforeseen.py": ("unforeseen",),
+    "scenarios/driving/window.py": ("joint", "control_decisions"),
+    "scenarios/flying/arrival.py": ("quadrotor_mpc", "quadrotor_flights"),
+    "scenarios/seeing/association.py": ("quadrotor_estimator", "quadrotor_world"),
+    "scenarios/flying/braking.py": ("quadrotor_controller",),
+    "scenarios/flying/controller.py": ("quadrotor_decisions", "quadrotor_controller"),
+    "scenarios/flying/estimator.py": ("quadrotor_estimator", "quadrotor_joint"),
+    "scenarios/flying/guide.py": ("quadrotor_controller", "quadrotor_layouts"),
+    "scenarios/flying/joint.py": ("quadrotor_decisions", "quadrotor_joint"),
+    "scenarios/course.py": ("quadrotor_obstacles",),
+    "scenarios/flying/plan.py": ("quadrotor_decisions", "quadrotor_controller"),
+    "scenarios/show/flight_scene.py": ("quadrotor_scene",),
+    "scenarios/flying/slots.py": ("quadrotor_decisions", "quadrotor_controller"),
+    "scenarios/seeing/mover_tracks.py": ("quadrotor_estimator", "quadrotor_world"),
+    "scenarios/flying/window.py": ("quadrotor_estimator", "quadrotor_joint"),
 }
 
 

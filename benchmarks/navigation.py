@@ -25,10 +25,10 @@ from tqdm import tqdm
 from benchmarks.campaign import campaign
 from benchmarks.report import CHECKOUT, OUT, code_digest, machine, put_results, table
 from unifg.errors import UnifgError
-from unifg.scenarios.controller import ControllerSettings
-from unifg.scenarios.metrics import episode_metrics
+from unifg.scenarios.driving.controller import ControllerSettings
+from unifg.scenarios.driving.pilot import COUPLINGS
+from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
-from unifg.scenarios.pilot import COUPLINGS
 
 Row = dict[str, Any]
 

@@ -27,8 +27,7 @@ from tqdm import tqdm
 
 from benchmarks.report import CHECKOUT, OUT, machine, put_results, table
 from benchmarks.timing import pin
-from unifg.scenarios.quadrotor.layouts import COURSE_SEEDS, TUNING_SEEDS, Layout, obstacle_course
-from unifg.scenarios.quadrotor.obstacles import (
+from unifg.scenarios.course import (
     AVOIDANCES,
     Avoidance,
     Course,
@@ -39,7 +38,8 @@ from unifg.scenarios.quadrotor.obstacles import (
     course_guess,
     state_problem,
 )
-from unifg.scenarios.quadrotor.world import VEHICLE_RADIUS
+from unifg.scenarios.worlds.air import VEHICLE_RADIUS
+from unifg.scenarios.worlds.layouts import COURSE_SEEDS, TUNING_SEEDS, Layout, obstacle_course
 
 SAME = 1e-3  # relative difference of cost below which two minima are one
 BACKENDS: tuple[tuple[str, Hessian], ...] = (

@@ -20,10 +20,10 @@ from tqdm import tqdm
 
 from benchmarks import closed_loop, control_problems, control_starts, unicycle_problems
 from benchmarks.report import CHECKOUT, machine, put_results, table
+from unifg.scenarios.course import CourseSettings, run_course
+from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.manoeuvres import CASES, run_manoeuvre
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
-from unifg.scenarios.quadrotor.episode import FlightSettings, run_flight
-from unifg.scenarios.quadrotor.obstacles import CourseSettings, run_course
 from unifg.solvers import SQP
 from unifg.solvers.qp import QP, QPAnswer
 from unifg.solvers.qp_osqp import OsqpRoute

@@ -26,11 +26,11 @@ from benchmarks.campaign import campaign
 from benchmarks.quadrotor_tables import HEADLINE, render
 from benchmarks.report import CHECKOUT, OUT, code_digest, machine, put_results
 from unifg.errors import UnifgError
-from unifg.scenarios.quadrotor.episode import FlightSettings, run_flight
-from unifg.scenarios.quadrotor.flight_log import FlightLog
-from unifg.scenarios.quadrotor.layouts import CORRIDOR_SEEDS
-from unifg.scenarios.quadrotor.metrics import flight_metrics
-from unifg.scenarios.quadrotor.plan import Avoidance
+from unifg.scenarios.flight import FlightSettings, run_flight
+from unifg.scenarios.flying.plan import Avoidance
+from unifg.scenarios.log.flight_log import FlightLog
+from unifg.scenarios.log.flight_metrics import flight_metrics
+from unifg.scenarios.worlds.layouts import CORRIDOR_SEEDS
 
 Row = dict[str, Any]
 

@@ -23,13 +23,13 @@ from tqdm import tqdm
 from benchmarks.campaign import campaign, interval
 from benchmarks.report import CHECKOUT, OUT, code_digest, machine, put_results, table
 from unifg.models import quadrotor
-from unifg.scenarios.quadrotor.belief import Belief, Landmarks
-from unifg.scenarios.quadrotor.coupling import make_pilot
-from unifg.scenarios.quadrotor.episode import Flight, FlightSettings
-from unifg.scenarios.quadrotor.joint import JointSettings
-from unifg.scenarios.quadrotor.joint_pilot import JointPilot, joint_pilot
-from unifg.scenarios.quadrotor.layouts import TUNING_SEEDS
-from unifg.scenarios.quadrotor.plan import BACKENDS, Avoidance
+from unifg.scenarios.flight import Flight, FlightSettings
+from unifg.scenarios.flying.coupling import make_pilot
+from unifg.scenarios.flying.joint import JointSettings
+from unifg.scenarios.flying.joint_pilot import JointPilot, joint_pilot
+from unifg.scenarios.flying.plan import BACKENDS, Avoidance
+from unifg.scenarios.seeing.belief import Belief, Landmarks
+from unifg.scenarios.worlds.layouts import TUNING_SEEDS
 from unifg.typing import Array
 
 Row = dict[str, Any]

@@ -19,16 +19,16 @@ from unifg.files.ros_map import load_map
 from unifg.lie import wrap_angle
 from unifg.models.distance_map import DistanceMap
 from unifg.models.unicycle import step
-from unifg.scenarios.building import DEMO_GOALS, DEMO_START, building_map
-from unifg.scenarios.controller import ControllerSettings
-from unifg.scenarios.episode import EpisodeLog
-from unifg.scenarios.path import path_length
-from unifg.scenarios.perception import Tracker
-from unifg.scenarios.pilot import make_pilot
-from unifg.scenarios.recording import Recording
-from unifg.scenarios.route import Route
-from unifg.scenarios.unforeseen import place_obstacles
-from unifg.scenarios.world import World
+from unifg.scenarios.driving.controller import ControllerSettings
+from unifg.scenarios.driving.pilot import make_pilot
+from unifg.scenarios.driving.route import Route
+from unifg.scenarios.log.drive_log import EpisodeLog
+from unifg.scenarios.log.drive_recording import Recording
+from unifg.scenarios.seeing.tracks import Tracker
+from unifg.scenarios.ways.path import path_length
+from unifg.scenarios.worlds.building import DEMO_GOALS, DEMO_START, building_map
+from unifg.scenarios.worlds.plane import World
+from unifg.scenarios.worlds.unforeseen import place_obstacles
 from unifg.typing import Array
 
 Progress = Callable[[float, str], None]

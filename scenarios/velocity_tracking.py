@@ -21,7 +21,7 @@ import numpy as np
 import unifg as fg
 from unifg.models import vehicle
 from unifg.models.vehicle import Vehicle
-from unifg.scenarios.velocity_tracking_profile import Profile, drive_cycle, read_profile
+from unifg.scenarios.ways.speed_profile import Profile, drive_cycle, read_profile
 from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
 from unifg.typing import Array
 

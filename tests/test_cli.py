@@ -19,9 +19,9 @@ from unifg import __version__
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import save_map
 from unifg.files.tum import read_tum
-from unifg.scenarios import cli
-from unifg.scenarios.controller import ControllerSettings
-from unifg.scenarios.episode import EpisodeLog
+from unifg.scenarios import command
+from unifg.scenarios.driving.controller import ControllerSettings
+from unifg.scenarios.log.drive_log import EpisodeLog
 
 FILES = ("scene.html", "overview.png", "metrics.json", "trajectory.tum", "estimate.tum")
 
@@ -72,11 +72,11 @@ def navigation(monkeypatch: pytest.MonkeyPatch) -> FakeNavigation:
 @pytest.fixture
 def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spare tests that look at settings alone the drawing of pictures."""
-    monkeypatch.setattr(cli, "write_results", lambda folder, log: [])
+    monkeypatch.setattr(command, "write_results", lambda folder, log: [])
 
 
 def run(tmp_path: Path, *words: str) -> int:
-    return cli.main(["run", "navigation", *words, "--out", str(tmp_path / "out")])
+    return command.main(["run", "navigation", *words, "--out", str(tmp_path / "out")])
 
 
 def test_writes_every_file_and_names_it(
@@ -155,14 +155,14 @@ def test_bad_arguments_exit_2(
 
 @pytest.mark.parametrize("words", [[], ["run"], ["run", "swimming"], ["fly"]])
 def test_unknown_commands_exit_2(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(words) == 2
+    assert command.main(words) == 2
     assert "usage: unifg" in capsys.readouterr().err
 
 
 def test_help_and_version_exit_0(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["--version"]) == 0
+    assert command.main(["--version"]) == 0
     assert capsys.readouterr().out == f"unifg {__version__}\n"
-    assert cli.main(["run", "navigation", "--help"]) == 0
+    assert command.main(["run", "navigation", "--help"]) == 0
     said = capsys.readouterr().out
     for option in ("--map", "--start", "--goal", "--solver", "--coupling", "--obstacles", "--seed", "--out"):
         assert option in said
@@ -250,7 +250,7 @@ def test_first_interrupt_waits_for_the_end_of_the_tick(
 
 def test_as_a_module_without_loading_the_scenario() -> None:
     code = (
-        "import sys; from unifg.scenarios import cli; status = cli.main(['run', 'navigation', '--help']);"
+        "import sys; from unifg.scenarios import command; status = command.main(['run', 'navigation', '--help']);"
         "assert 'pymunk' not in sys.modules and 'meshcat' not in sys.modules; sys.exit(status)"
     )
     root = Path(__file__).parent.parent
@@ -263,7 +263,8 @@ def test_as_a_module_without_loading_the_scenario() -> None:
 
 def test_control_weight_reaches_the_controller(navigation: FakeNavigation, no_files: None, tmp_path: Path) -> None:
     assert (
-        cli.main(["run", "navigation", "--coupling", "joint", "--control-weight", "0.1", "--out", str(tmp_path)]) == 0
+        command.main(["run", "navigation", "--coupling", "joint", "--control-weight", "0.1", "--out", str(tmp_path)])
+        == 0
     )
     assert navigation.settings[0].coupling == "joint"
     assert navigation.settings[0].controller.control_weight == 0.1
@@ -271,5 +272,5 @@ def test_control_weight_reaches_the_controller(navigation: FakeNavigation, no_fi
 
 @pytest.mark.parametrize("weight", ["0", "-1", "nan", "much"])
 def test_control_weight_must_be_positive(weight: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["run", "navigation", f"--control-weight={weight}"]) == 2
+    assert command.main(["run", "navigation", f"--control-weight={weight}"]) == 2
     assert "positive" in capsys.readouterr().err

@@ -12,11 +12,11 @@ import unifg as fg
 from episodes import room
 from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.controller import BRAKING, LEFT_BEHIND, PATIENCE, Controller, ControllerSettings, Plan
-from unifg.scenarios.joint import JointController
-from unifg.scenarios.perception import Tracks
-from unifg.scenarios.window import Window
-from unifg.scenarios.world import Scan, World
+from unifg.scenarios.driving.controller import BRAKING, LEFT_BEHIND, PATIENCE, Controller, ControllerSettings, Plan
+from unifg.scenarios.driving.joint import JointController
+from unifg.scenarios.driving.window import Window
+from unifg.scenarios.seeing.tracks import Tracks
+from unifg.scenarios.worlds.plane import Scan, World
 from unifg.solvers import SQP
 from unifg.typing import Array
 
@@ -348,7 +348,7 @@ def test_a_scan_without_returns_changes_nothing(field: DistanceMap) -> None:
 
 
 def test_backends_take_the_settings_tolerances() -> None:
-    from unifg.scenarios.controller import backend
+    from unifg.scenarios.driving.controller import backend
 
     for name in ("sqp", "alm"):
         warm, cold = (backend(name, SETTINGS, patience) for patience in (1, 3))

@@ -23,7 +23,7 @@ from unifg.models.rkmk import integrator
 from unifg.models.tableau import Tableau
 from unifg.pose_graphs.generate import manhattan
 from unifg.pose_graphs.residuals import chart_between, sighting
-from unifg.scenarios.quadrotor.standardised import standardised
+from unifg.scenarios.flying.standardised import standardised
 from unifg.solvers import SQP
 
 EXCEPTIONS = {

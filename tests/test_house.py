@@ -34,6 +34,18 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("benchmarks",),
 )
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
+# Inside scenarios/, where "" are the files that lie in no room: one per scenario.
+STOREYS: tuple[tuple[str, ...], ...] = (
+    ("ways",),
+    ("seeing", "worlds"),
+    ("driving", "flying"),
+    ("log",),
+    ("",),
+    ("show",),
+    ("commands",),
+    ("command",),
+)
+STOREY = {room: floor for floor, rooms in enumerate(STOREYS) for room in rooms}
 
 
 def sources(folder: Path) -> list[Path]:
@@ -108,6 +120,12 @@ def room_of(module: str) -> str:
     return rest.partition(".")[0] or top if top == "unifg" else top
 
 
+def storey_of(module: str) -> int:
+    """Return the storey of a module of scenarios/."""
+    first, _, rest = module.removeprefix("unifg.scenarios").lstrip(".").partition(".")
+    return STOREY[first if rest or first in STOREY else ""]
+
+
 def known(source: str, package: str) -> Iterator[tuple[int, str]]:
     """Yield (line, module) of what a source imports of this house; of a name in a module, the module."""
     for line, name in imports(ast.parse(source), package):
@@ -135,6 +153,17 @@ def test_every_room_stands_on_a_floor() -> None:
 def test_imports_point_down(module: str) -> None:
     source = MODULES[module].read_text(encoding="utf-8")
     assert wrong_imports(source, module, package_of(module)) == []
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if room_of(m) == "scenarios"])
+def test_imports_of_scenarios_point_down(module: str) -> None:
+    source, package = MODULES[module].read_text(encoding="utf-8"), package_of(module)
+    up = [
+        f"line {line}: {other}"
+        for line, other in known(source, package)
+        if room_of(other) == "scenarios" and storey_of(other) > storey_of(module)
+    ]
+    assert up == []
 
 
 def test_no_file_knows_itself_by_way_of_others() -> None:
@@ -179,14 +208,14 @@ def test_side_folders_use_absolute_imports() -> None:
     [
         ("import unifg.solvers", "unifg.answers.check", True),
         ("from unifg import models, errors", "unifg.solvers.sqp", True),
-        ("def f():\n    from unifg.scenarios.world import World", "unifg.models.lidar", True),
+        ("def f():\n    from unifg.scenarios.worlds.plane import World", "unifg.models.lidar", True),
         ("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from unifg.answers.solution import Solution",
          "unifg.program.table", True),
         ("from .. import solvers", "unifg.lie.so2", True),
         ("import importlib\nimportlib.import_module('unifg.solvers.sqp')", "unifg.models.lidar", True),
         ("import unifg as fg", "unifg.models.lidar", True),
-        ("import unifg as fg", "unifg.scenarios.window", False),
-        ("from unifg.models import unicycle\nfrom unifg.solvers import SQP", "unifg.scenarios.window", False),
+        ("import unifg as fg", "unifg.scenarios.driving.window", False),
+        ("from unifg.models import unicycle\nfrom unifg.solvers import SQP", "unifg.scenarios.driving.window", False),
         ("from unifg.answers.solver import Solver\nimport unifg.modelset", "unifg.models.lidar", False),
     ],
 )  # fmt: skip
@@ -198,7 +227,7 @@ def test_the_library_is_silent() -> None:
     loud = [
         f"{name_of(path)}:{node.lineno}"
         for _, path in LIBRARY
-        if path != CHECKOUT / "scenarios" / "cli.py"
+        if path != CHECKOUT / "scenarios" / "command.py"
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print")
         or (isinstance(node, ast.Attribute) and ast.unparse(node) in ("sys.stdout", "sys.stderr"))

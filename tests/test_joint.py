@@ -9,13 +9,13 @@ import pytest
 
 import unifg as fg
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.building import building_map
-from unifg.scenarios.controller import ControllerSettings
-from unifg.scenarios.joint import JointController
-from unifg.scenarios.metrics import episode_metrics
+from unifg.scenarios.driving.controller import ControllerSettings
+from unifg.scenarios.driving.joint import JointController
+from unifg.scenarios.driving.pilot import JointPilot
+from unifg.scenarios.driving.window import NOW_TERMS, PAST_TERMS, Window
+from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigation
-from unifg.scenarios.pilot import JointPilot
-from unifg.scenarios.window import NOW_TERMS, PAST_TERMS, Window
+from unifg.scenarios.worlds.building import building_map
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
 

@@ -14,7 +14,7 @@ from matplotlib.patches import Circle
 import unifg as fg
 from judge import judge
 from unifg.models import unicycle
-from unifg.scenarios import cli, manoeuvre_plots
+from unifg.scenarios import command
 from unifg.scenarios.manoeuvres import (
     CASES,
     Manoeuvre,
@@ -24,7 +24,8 @@ from unifg.scenarios.manoeuvres import (
     state_problem,
     table,
 )
-from unifg.scenarios.palette import css
+from unifg.scenarios.show import manoeuvre_plot as manoeuvre_plots
+from unifg.scenarios.show.palette import css
 from unifg.solvers import SQP, AugmentedLagrangian
 
 SOLVERS = ("alm", "sqp")
@@ -223,7 +224,7 @@ def test_shades_go_from_green_through_whitening_pink_to_blue() -> None:
 
 @both
 def test_command_writes_its_files(solver: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["run", "manoeuvres", "--solver", solver, "--out", str(tmp_path / "out")]) == 0
+    assert command.main(["run", "manoeuvres", "--solver", solver, "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr()
     for name in ("behind.png", "obstacle.png", "metrics.json"):
         assert str(tmp_path / "out" / name) in said.out.splitlines()
@@ -241,14 +242,14 @@ def test_command_writes_its_files(solver: str, tmp_path: Path, capsys: pytest.Ca
 
 
 def test_command_runs_one_case(tmp_path: Path) -> None:
-    assert cli.main(["run", "manoeuvres", "--case", "behind", "--out", str(tmp_path)]) == 0
+    assert command.main(["run", "manoeuvres", "--case", "behind", "--out", str(tmp_path)]) == 0
     assert {file.name for file in tmp_path.iterdir()} == {"behind.png", "metrics.json"}
-    assert cli.MANOEUVRES == tuple(CASES)
+    assert command.MANOEUVRES == tuple(CASES)
 
 
 def test_command_fails_when_a_solve_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(CASES, "behind", replace(CASES["behind"], discs=((0.0, 0.0, 0.5),)))  # it starts inside
-    assert cli.main(["run", "manoeuvres", "--case", "behind", "--out", str(tmp_path)]) == 1
+    assert command.main(["run", "manoeuvres", "--case", "behind", "--out", str(tmp_path)]) == 1
     numbers = json.loads((tmp_path / "metrics.json").read_text())["cases"]["behind"]
     assert not numbers["converged"] and numbers["status"] != "converged"
     assert (tmp_path / "behind.png").stat().st_size > 0
@@ -261,14 +262,14 @@ def test_an_interrupt_ends_the_run_and_writes_what_there_is(tmp_path: Path, monk
         return run_manoeuvre(CASES["behind"], solver, progress=lambda row: row.number == 2)
 
     monkeypatch.setattr(manoeuvres, "run_manoeuvre", stopped)
-    assert cli.main(["run", "manoeuvres", "--out", str(tmp_path)]) == cli.INTERRUPTED
+    assert command.main(["run", "manoeuvres", "--out", str(tmp_path)]) == command.INTERRUPTED
     assert {file.name for file in tmp_path.iterdir()} == {"behind.png", "metrics.json"}
 
 
 def test_command_refuses_other_cases_and_seeds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["run", "manoeuvres", "--case", "sideways", "--out", str(tmp_path)]) == 2
+    assert command.main(["run", "manoeuvres", "--case", "sideways", "--out", str(tmp_path)]) == 2
     assert "invalid choice: 'sideways'" in capsys.readouterr().err
-    assert cli.main(["run", "manoeuvres", "--seed", "1", "--out", str(tmp_path)]) == 2  # nothing here is random
+    assert command.main(["run", "manoeuvres", "--seed", "1", "--out", str(tmp_path)]) == 2  # nothing here is random
 
 
 def _is_vertical(line: Line2D) -> bool:

@@ -14,16 +14,16 @@ import unifg as fg
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map, save_map
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.building import building_map
-from unifg.scenarios.episode import EpisodeLog
-from unifg.scenarios.geometry import polyline_distance
-from unifg.scenarios.localiser import Localiser
-from unifg.scenarios.metrics import episode_metrics, pose_errors
+from unifg.scenarios.driving.localiser import Localiser
+from unifg.scenarios.driving.route import Route
+from unifg.scenarios.log.drive_log import EpisodeLog
+from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors
 from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigation
-from unifg.scenarios.path import path_length
-from unifg.scenarios.perception import Tracks
-from unifg.scenarios.route import Route
-from unifg.scenarios.world import Scan, World
+from unifg.scenarios.seeing.tracks import Tracks
+from unifg.scenarios.ways.path import path_length
+from unifg.scenarios.worlds.building import building_map
+from unifg.scenarios.worlds.plane import Scan, World
+from unifg.scenarios.worlds.rectangles import polyline_distance
 from unifg.typing import Array
 
 RADIUS = 0.17

@@ -140,9 +140,9 @@ def test_wheel_holds_the_packages_and_nothing_else(source: Path, wheel: Path) ->
     inner = [path.parent for path in (source / "unifg").rglob("__init__.py")]
     folders |= {folder.relative_to(source).as_posix(): folder for folder in inner if folder.name not in SIDES}
     expected = {f"{name}/{path.name}" for name, folder in folders.items() for path in folder.glob("*.py")}
-    maps = [path for kind in ("*.pgm", "*.yaml") for path in (source / "scenarios").glob(kind)]
+    maps = [path for kind in ("*.pgm", "*.yaml") for path in (source / "scenarios" / "worlds").glob(kind)]
     assert {path.suffix for path in maps} == {".pgm", ".yaml"}, "no map is shipped"
-    expected |= {f"unifg/scenarios/{path.name}" for path in maps} | {"unifg/py.typed"}
+    expected |= {f"unifg/scenarios/worlds/{path.name}" for path in maps} | {"unifg/py.typed"}
     assert {name for name in names if ".dist-info/" not in name} == expected
 
 
@@ -190,7 +190,7 @@ def test_the_shipped_map_can_be_loaded(clean: Path) -> None:
         clean / "python", "-I", "-c",
         "from importlib.resources import as_file, files\n"
         "from unifg.files.ros_map import load_map\n"
-        "for entry in files('unifg.scenarios').iterdir():\n"
+        "for entry in files('unifg.scenarios.worlds').iterdir():\n"
         "    if entry.name.endswith('.yaml'):\n"
         "        with as_file(entry) as path: print(load_map(path).shape)\n",
         cwd=clean,

@@ -11,10 +11,10 @@ import pytest
 
 from unifg.files.ros_map import OccupancyMap, load_map
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.discs import DiscFinder
-from unifg.scenarios.perception import Tracker, Tracks, nearest
-from unifg.scenarios.planner import plan
-from unifg.scenarios.world import LidarModel, Obstacle, Scan, World
+from unifg.scenarios.seeing.discs import DiscFinder
+from unifg.scenarios.seeing.tracks import Tracker, Tracks, nearest
+from unifg.scenarios.ways.grid import plan
+from unifg.scenarios.worlds.plane import LidarModel, Obstacle, Scan, World
 from unifg.typing import Array, ArrayLike
 
 DT = 0.1

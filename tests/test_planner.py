@@ -13,8 +13,8 @@ from scipy import ndimage
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map, save_map
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.building import DEMO_GOALS, DEMO_START, building_map, draw_building
-from unifg.scenarios.planner import SPACING, PathFollower, path_exists, path_length, plan, reference
+from unifg.scenarios.ways.grid import SPACING, PathFollower, path_exists, path_length, plan, reference
+from unifg.scenarios.worlds.building import DEMO_GOALS, DEMO_START, building_map, draw_building
 from unifg.typing import Array
 
 RADIUS = 0.17
@@ -231,7 +231,7 @@ def test_the_shipped_building_is_what_the_generator_draws(building: OccupancyMap
         drawn.name,
     )
     save_map(tmp_path / "building.yaml", drawn)
-    shipped = Path(__file__).parents[1] / "scenarios"
+    shipped = Path(__file__).parents[1] / "scenarios" / "worlds"
     for name in ("building.yaml", "building.pgm"):
         assert (tmp_path / name).read_bytes() == (shipped / name).read_bytes()
 

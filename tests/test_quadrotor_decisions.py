@@ -11,11 +11,12 @@ import pytest
 import unifg as fg
 from test_quadrotor_controller import BOUNDS, TARGET, WALLS, belief, landmarks, state
 from unifg.models import quadrotor
-from unifg.scenarios.quadrotor.belief import Landmarks
-from unifg.scenarios.quadrotor.controller import KEPT, LEFT_BEHIND, PATIENCE, Controller
-from unifg.scenarios.quadrotor.guide import Reference
-from unifg.scenarios.quadrotor.plan import ControllerSettings, Movers
-from unifg.scenarios.quadrotor.slots import Slots
+from unifg.scenarios.flying.controller import KEPT, LEFT_BEHIND, PATIENCE, Controller
+from unifg.scenarios.flying.guide import Reference
+from unifg.scenarios.flying.plan import ControllerSettings
+from unifg.scenarios.flying.slots import Slots
+from unifg.scenarios.seeing.belief import Landmarks
+from unifg.scenarios.seeing.mover_tracks import Movers
 from unifg.typing import Array
 
 SETTINGS = ControllerSettings()

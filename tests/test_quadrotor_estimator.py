@@ -13,13 +13,13 @@ import unifg as fg
 from unifg.answers.solver import Prepared
 from unifg.lie import SO3
 from unifg.models import quadrotor
-from unifg.scenarios.quadrotor.arrival import arrival, seen_from_the_vehicle
-from unifg.scenarios.quadrotor.association import DOUBTFUL, NEW, Gates, nearest
-from unifg.scenarios.quadrotor.belief import Belief, Landmarks
-from unifg.scenarios.quadrotor.estimator import DeadReckoningEstimator, Estimator, EstimatorSettings
-from unifg.scenarios.quadrotor.layouts import Layout
-from unifg.scenarios.quadrotor.window import WindowSettings, without
-from unifg.scenarios.quadrotor.world import QuadrotorWorld, Reading
+from unifg.scenarios.flying.arrival import arrival, seen_from_the_vehicle
+from unifg.scenarios.flying.estimator import DeadReckoningEstimator, Estimator, EstimatorSettings
+from unifg.scenarios.flying.window import WindowSettings, without
+from unifg.scenarios.seeing.association import DOUBTFUL, NEW, Gates, nearest
+from unifg.scenarios.seeing.belief import Belief, Landmarks
+from unifg.scenarios.worlds.air import QuadrotorWorld, Reading
+from unifg.scenarios.worlds.layouts import Layout
 from unifg.solvers import KKT
 from unifg.typing import Array
 

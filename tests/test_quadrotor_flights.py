@@ -14,8 +14,8 @@ from scipy import stats
 
 from benchmarks import quadrotor_flights, quadrotor_tables
 from benchmarks.quadrotor_flights import Job, jobs_of, read_rows
-from unifg.scenarios.quadrotor.episode import FlightSettings, run_flight
-from unifg.scenarios.quadrotor.flight_log import FlightLog
+from unifg.scenarios.flight import FlightSettings, run_flight
+from unifg.scenarios.log.flight_log import FlightLog
 
 Row = dict[str, Any]
 

@@ -16,16 +16,17 @@ from benchmarks import quadrotor_pull
 from unifg.lie import SO3
 from unifg.models import quadrotor
 from unifg.program.program import Program
-from unifg.scenarios.quadrotor.belief import Belief
-from unifg.scenarios.quadrotor.episode import Flight, FlightSettings
-from unifg.scenarios.quadrotor.estimator import Estimator
-from unifg.scenarios.quadrotor.joint import JointController, JointSettings
-from unifg.scenarios.quadrotor.joint_pilot import JointPilot, joint_pilot
-from unifg.scenarios.quadrotor.layouts import Layout
-from unifg.scenarios.quadrotor.plan import BACKENDS, ControllerSettings, Movers, Plan
-from unifg.scenarios.quadrotor.slots import FAR_AWAY
-from unifg.scenarios.quadrotor.standardised import standardised
-from unifg.scenarios.quadrotor.window_terms import Shared, WindowTerms
+from unifg.scenarios.flight import Flight, FlightSettings
+from unifg.scenarios.flying.estimator import Estimator
+from unifg.scenarios.flying.joint import JointController, JointSettings
+from unifg.scenarios.flying.joint_pilot import JointPilot, joint_pilot
+from unifg.scenarios.flying.plan import BACKENDS, ControllerSettings, Plan
+from unifg.scenarios.flying.slots import FAR_AWAY
+from unifg.scenarios.flying.standardised import standardised
+from unifg.scenarios.flying.window_terms import Shared, WindowTerms
+from unifg.scenarios.seeing.belief import Belief
+from unifg.scenarios.seeing.mover_tracks import Movers
+from unifg.scenarios.worlds.layouts import Layout
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array
 

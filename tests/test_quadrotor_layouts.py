@@ -10,8 +10,9 @@ import pytest
 from scipy.ndimage import label
 
 from unifg.errors import ScenarioError
-from unifg.scenarios.quadrotor import layouts
-from unifg.scenarios.quadrotor.layouts import (
+from unifg.scenarios.ways.passage import widest_way
+from unifg.scenarios.worlds import layouts
+from unifg.scenarios.worlds.layouts import (
     CORRIDOR_SEEDS,
     COURSE_SEEDS,
     TUNING_SEEDS,
@@ -20,7 +21,6 @@ from unifg.scenarios.quadrotor.layouts import (
     corridor,
     obstacle_course,
 )
-from unifg.scenarios.quadrotor.passage import widest_way
 from unifg.typing import Array
 
 

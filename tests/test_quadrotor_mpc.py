@@ -13,15 +13,17 @@ import pytest
 
 from unifg.errors import ScenarioError
 from unifg.lie import SO3
-from unifg.scenarios import cli
-from unifg.scenarios.quadrotor import episode, mpc_arguments, results
-from unifg.scenarios.quadrotor.conditions import DRAG, MASS, WIND, draw_conditions
-from unifg.scenarios.quadrotor.coupling import COUPLINGS
-from unifg.scenarios.quadrotor.episode import Flight, FlightSettings, run_flight
-from unifg.scenarios.quadrotor.flight_log import FlightLog
-from unifg.scenarios.quadrotor.metrics import flight_metrics, state_errors
-from unifg.scenarios.quadrotor.sensor import Reading
-from unifg.scenarios.quadrotor.tracker import Tracker
+from unifg.scenarios import command
+from unifg.scenarios import flight as episode
+from unifg.scenarios.commands import flight_arguments as mpc_arguments
+from unifg.scenarios.commands import flight_results as results
+from unifg.scenarios.flight import Flight, FlightSettings, run_flight
+from unifg.scenarios.flying.coupling import COUPLINGS
+from unifg.scenarios.log.flight_log import FlightLog
+from unifg.scenarios.log.flight_metrics import flight_metrics, state_errors
+from unifg.scenarios.seeing.mover_tracks import Tracker
+from unifg.scenarios.worlds.bearing_range import Reading
+from unifg.scenarios.worlds.conditions import DRAG, MASS, WIND, draw_conditions
 from unifg.typing import Array
 
 SEED = 1006  # of those open to tuning
@@ -322,12 +324,12 @@ def test_arguments_arrive() -> None:
     assert (settings.coupling, settings.movers, settings.mass_error) == ("joint", 2, 0.1)
     assert settings.estimator.association == "unknown"
     assert settings.controller.avoidance == "potential"
-    assert mpc_arguments.SOLVERS[0] == cli.SCENARIOS["quadrotor-mpc"].solver
+    assert mpc_arguments.SOLVERS[0] == command.SCENARIOS["quadrotor-mpc"].solver
 
 
 @pytest.mark.parametrize("words", [("--movers", "-1"), ("--mass-error", "1"), ("--coupling", "loose")])
 def test_wrong_arguments_are_refused(words: tuple[str, ...], tmp_path: Path) -> None:
-    assert cli.main(["run", "quadrotor-mpc", *words, "--out", str(tmp_path)]) == 2
+    assert command.main(["run", "quadrotor-mpc", *words, "--out", str(tmp_path)]) == 2
 
 
 def only_a_moment(monkeypatch: pytest.MonkeyPatch, change: Callable[[FlightLog], FlightLog]) -> None:
@@ -342,7 +344,7 @@ def only_a_moment(monkeypatch: pytest.MonkeyPatch, change: Callable[[FlightLog],
 def test_the_command_writes_its_results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     only_a_moment(monkeypatch, lambda log: log)
     monkeypatch.setattr(results, "write_scene", lambda path, log: path)  # takes seconds, and has tests of its own
-    assert cli.main(["run", "quadrotor-mpc", "--seed", str(SEED), "--out", str(tmp_path)]) == 1  # not there yet
+    assert command.main(["run", "quadrotor-mpc", "--seed", str(SEED), "--out", str(tmp_path)]) == 1  # not there yet
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["settings"]["seed"] == SEED
     assert metrics["ticks"] == 10
@@ -355,4 +357,4 @@ def test_the_exit_status_says_whether_it_arrived(
 ) -> None:
     only_a_moment(monkeypatch, lambda log: replace(log, reached=True, collisions=collisions))
     monkeypatch.setattr(results, "write_results", lambda folder, log: [])
-    assert cli.main(["run", "quadrotor-mpc", "--seed", str(SEED), "--out", str(tmp_path)]) == status
+    assert command.main(["run", "quadrotor-mpc", "--seed", str(SEED), "--out", str(tmp_path)]) == status

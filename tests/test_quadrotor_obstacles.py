@@ -13,22 +13,15 @@ from benchmarks.obstacle_courses import METHODS, Method, Outcome, distinct, lowe
 from judge import judge
 from unifg.errors import BackendError, ScenarioError
 from unifg.models import avoidance, quadrotor
-from unifg.scenarios import cli
-from unifg.scenarios.quadrotor import obstacles, obstacles_arguments
-from unifg.scenarios.quadrotor.layouts import Layout, obstacle_course
-from unifg.scenarios.quadrotor.obstacles import (
-    HESSIANS,
-    Course,
-    CourseSettings,
-    backend,
-    course_guess,
-    run_course,
-    state_problem,
-)
-from unifg.scenarios.quadrotor.obstacles_log import course_log
-from unifg.scenarios.quadrotor.obstacles_plots import chosen_iterates, picture, plot_above
-from unifg.scenarios.quadrotor.obstacles_results import course_metrics, summary
-from unifg.scenarios.quadrotor.world import VEHICLE_RADIUS
+from unifg.scenarios import command
+from unifg.scenarios import course as obstacles
+from unifg.scenarios.commands import course_arguments as obstacles_arguments
+from unifg.scenarios.commands.course_results import course_metrics, summary
+from unifg.scenarios.course import HESSIANS, Course, CourseSettings, backend, course_guess, run_course, state_problem
+from unifg.scenarios.show.course_log import course_log
+from unifg.scenarios.show.course_plot import chosen_iterates, picture, plot_above
+from unifg.scenarios.worlds.air import VEHICLE_RADIUS
+from unifg.scenarios.worlds.layouts import Layout, obstacle_course
 
 BACKENDS = (("sqp", "exact"), ("sqp", "gauss-newton"), ("ipm", "exact"), ("ipm", "gauss-newton"), ("alm", "exact"),
             ("alm", "gauss-newton"))  # fmt: skip
@@ -191,20 +184,20 @@ def test_numbers_and_words() -> None:
 
 def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["run", "quadrotor-obstacles", "--out", str(tmp_path)]
-    assert cli.main([*words, "--solver", "ipm", "--avoidance", "hard", "--seed", "1003"]) == 0
+    assert command.main([*words, "--solver", "ipm", "--avoidance", "hard", "--seed", "1003"]) == 0
     assert "obstacle course 1003" in capsys.readouterr().out
     assert sorted(path.name for path in tmp_path.iterdir()) == ["iterates.png", "metrics.json", "scene.html"]
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["succeeded"] and metrics["guess"] == "way" and metrics["layout"] == "obstacle course 1003"
-    assert cli.main([*words, "--seed", "-1"]) == 2
+    assert command.main([*words, "--seed", "-1"]) == 2
 
 
 def test_the_command_line_reports_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from unifg.scenarios.quadrotor import obstacles_results
+    from unifg.scenarios.commands import course_results as obstacles_results
 
     monkeypatch.setattr(obstacles_results, "write_results", lambda folder, course: [])
     words = ["run", "quadrotor-obstacles", "--avoidance", "hard", "--guess", "hover", "--out", str(tmp_path)]
-    assert cli.main(words) == 1
+    assert command.main(words) == 1
 
 
 def test_the_command_line_offers_what_the_scenario_has() -> None:

@@ -13,17 +13,18 @@ import pytest
 
 from unifg.errors import ScenarioError
 from unifg.lie import SO3
-from unifg.scenarios.palette import css
-from unifg.scenarios.quadrotor import drone, results
-from unifg.scenarios.quadrotor.flight_log import FlightLog, FlightRecorder
-from unifg.scenarios.quadrotor.layouts import Layout
-from unifg.scenarios.quadrotor.metrics import flight_metrics, landmark_errors
-from unifg.scenarios.quadrotor.plots import moments, overview, plot_moment, write_overview
-from unifg.scenarios.quadrotor.plots_control import control
-from unifg.scenarios.quadrotor.plots_estimates import estimates
-from unifg.scenarios.quadrotor.results import summary, write_results
-from unifg.scenarios.quadrotor.scene import first_sights, frame_ticks, record_scene, scene_html
-from unifg.scenarios.recorder import viewer_script
+from unifg.scenarios.commands import flight_results as results
+from unifg.scenarios.commands.flight_results import summary, write_results
+from unifg.scenarios.log.flight_log import FlightLog, FlightRecorder
+from unifg.scenarios.log.flight_metrics import flight_metrics, landmark_errors
+from unifg.scenarios.show import drone
+from unifg.scenarios.show.control_plot import control
+from unifg.scenarios.show.estimates_plot import estimates
+from unifg.scenarios.show.flight_plot import moments, overview, plot_moment, write_overview
+from unifg.scenarios.show.flight_scene import first_sights, frame_ticks, record_scene, scene_html
+from unifg.scenarios.show.palette import css
+from unifg.scenarios.show.recorder import viewer_script
+from unifg.scenarios.worlds.layouts import Layout
 
 umsgpack = pytest.importorskip("umsgpack")
 

@@ -12,13 +12,13 @@ import pytest
 from unifg.errors import FileFormatError, ScenarioError
 from unifg.lie import SO3
 from unifg.models import quadrotor
-from unifg.scenarios.obstacles import Obstacle
-from unifg.scenarios.quadrotor.belief import Landmarks
-from unifg.scenarios.quadrotor.disturbance import DisturbanceModel, Disturbances
-from unifg.scenarios.quadrotor.flight_log import FlightLog, FlightRecorder
-from unifg.scenarios.quadrotor.layouts import Layout, corridor
-from unifg.scenarios.quadrotor.sensor import SensorModel
-from unifg.scenarios.quadrotor.world import VEHICLE_RADIUS, QuadrotorWorld
+from unifg.scenarios.log.flight_log import FlightLog, FlightRecorder
+from unifg.scenarios.seeing.belief import Landmarks
+from unifg.scenarios.worlds.air import VEHICLE_RADIUS, QuadrotorWorld
+from unifg.scenarios.worlds.bearing_range import SensorModel
+from unifg.scenarios.worlds.disturbance import DisturbanceModel, Disturbances
+from unifg.scenarios.worlds.layouts import Layout, corridor
+from unifg.scenarios.worlds.unmapped import Obstacle
 from unifg.typing import Array
 
 CALM = DisturbanceModel.calm()

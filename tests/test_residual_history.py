@@ -13,7 +13,7 @@ import pytest
 import unifg as fg
 from problems import short_drive
 from unifg.answers.factor_norms import factor_norms
-from unifg.scenarios.residual_plot import ResidualMonitor, residual_picture
+from unifg.scenarios.show.residual_plot import ResidualMonitor, residual_picture
 from unifg.solvers import (
     KKT,
     SQP,

@@ -11,10 +11,10 @@ import pytest
 from unifg.files.ros_map import OccupancyMap
 from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.controller import Controller, ControllerSettings
-from unifg.scenarios.perception import Tracks
-from unifg.scenarios.planner import SPACING
-from unifg.scenarios.route import ALLOWANCE, GAP, PATIENCE, STUCK_TICKS, WALL_GAP, Route
+from unifg.scenarios.driving.controller import Controller, ControllerSettings
+from unifg.scenarios.driving.route import ALLOWANCE, GAP, PATIENCE, STUCK_TICKS, WALL_GAP, Route
+from unifg.scenarios.seeing.tracks import Tracks
+from unifg.scenarios.ways.grid import SPACING
 from unifg.typing import Array
 
 RADIUS = 0.17

@@ -15,8 +15,8 @@ import pytest
 
 from episodes import HORIZON, episode, room
 from unifg.errors import ScenarioError
-from unifg.scenarios.episode import EpisodeLog
-from unifg.scenarios.plots import (
+from unifg.scenarios.log.drive_log import EpisodeLog
+from unifg.scenarios.show.drive_plot import (
     overview,
     plot_clearance,
     plot_controls,
@@ -25,9 +25,9 @@ from unifg.scenarios.plots import (
     plot_solve_times,
     write_overview,
 )
-from unifg.scenarios.recorder import Recorder, viewer_script
-from unifg.scenarios.scene import frame_ticks, record_scene, scan_points, scene_html, write_scene
-from unifg.scenarios.shapes import cover, extrude, flat, known_corners, ribbon
+from unifg.scenarios.show.drive_scene import frame_ticks, record_scene, scan_points, scene_html, write_scene
+from unifg.scenarios.show.recorder import Recorder, viewer_script
+from unifg.scenarios.show.shapes import cover, extrude, flat, known_corners, ribbon
 
 umsgpack = pytest.importorskip("umsgpack")
 
@@ -97,7 +97,7 @@ def test_names_from_outside_cannot_become_markup(log: EpisodeLog) -> None:
 def test_same_log_same_bytes_in_two_processes(page: str, tmp_path: Path, log: EpisodeLog) -> None:
     assert write_scene(tmp_path / "scene.html", log).read_bytes() == page.encode()
     code = (
-        "import hashlib; from episodes import episode; from unifg.scenarios.scene import scene_html;"
+        "import hashlib; from episodes import episode; from unifg.scenarios.show.drive_scene import scene_html;"
         "print(hashlib.sha256(scene_html(episode(ticks=12, obstacles=4)).encode()).hexdigest())"
     )
     here = Path(__file__).parent

@@ -15,8 +15,8 @@ from unifg.files.g2o import read_g2o, write_g2o
 from unifg.files.toro import write_toro
 from unifg.files.tum import read_tum
 from unifg.pose_graphs import PoseGraph, Sightings, manhattan, sphere
-from unifg.scenarios import cli
-from unifg.scenarios.solve import SolveSettings, robust_loss, solve_file
+from unifg.scenarios import command
+from unifg.scenarios.pose_graph import SolveSettings, robust_loss, solve_file
 
 FILES = ("scene.html", "graph.png", "graph.g2o", "trajectory.tum", "metrics.json")
 
@@ -46,7 +46,7 @@ def test_writes_every_file_and_says_what_came_out(
     name: str, request: pytest.FixtureRequest, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, out = request.getfixturevalue(name), tmp_path / "out"
-    assert cli.main(["solve", str(file), "--out", str(out)]) == 0
+    assert command.main(["solve", str(file), "--out", str(out)]) == 0
     said = capsys.readouterr()
     for written in FILES:
         assert (out / written).stat().st_size > 0
@@ -86,7 +86,7 @@ def test_residuals_have_their_own_optima(globe: Path) -> None:
 
 def test_outliers_are_found_and_named(dirty: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    assert cli.main(["solve", str(dirty), "--robust", "gnc", "--out", str(out)]) == 0
+    assert command.main(["solve", str(dirty), "--robust", "gnc", "--out", str(out)]) == 0
     sim, metrics = manhattan(300, 0, outliers=0.3), numbers(out)
     edges = sim.pose_graph.edges
     wrong = {(int(a), int(b)) for a, b in zip(edges.first[sim.outliers], edges.second[sim.outliers], strict=True)}
@@ -134,24 +134,24 @@ def test_loss_names_and_parameters() -> None:
 def test_bad_options_exit_2(
     city: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
 ) -> None:
-    assert cli.main(["solve", str(city), *words, "--out", str(tmp_path / "out")]) == 2
+    assert command.main(["solve", str(city), *words, "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err
 
 
 def test_lago_is_planar(globe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["solve", str(globe), "--init", "lago", "--out", str(tmp_path)]) == 2
+    assert command.main(["solve", str(globe), "--init", "lago", "--out", str(tmp_path)]) == 2
     assert "use --init chordal" in capsys.readouterr().err
 
 
 def test_bad_files_are_messages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["solve", "nowhere.g2o"]) == 2
+    assert command.main(["solve", "nowhere.g2o"]) == 2
     assert "nowhere.g2o: no such file" in capsys.readouterr().err
     for text, message in (
         ("VERTEX_SE2 0 0 0 0\n", "there is no edge"),
         ("VERTEX_SE2 0 0\n", "line 1: VERTEX_SE2 has 2"),
     ):
         (tmp_path / "bad.g2o").write_text(text)
-        assert cli.main(["solve", str(tmp_path / "bad.g2o"), "--out", str(tmp_path)]) == 2
+        assert command.main(["solve", str(tmp_path / "bad.g2o"), "--out", str(tmp_path)]) == 2
         assert message in capsys.readouterr().err.splitlines()[-1]
 
 
@@ -164,7 +164,7 @@ def test_toro_files_and_landmarks(tmp_path: Path) -> None:
         graph.ids, graph.poses, graph.edges, np.array([99]), np.array([[1.0, 1.0]]), {"point": seen}
     )  # fmt: skip
     out = tmp_path / "out"
-    assert cli.main(["solve", str(write_g2o(tmp_path / "marked.g2o", marked)), "--out", str(out)]) == 0
+    assert command.main(["solve", str(write_g2o(tmp_path / "marked.g2o", marked)), "--out", str(out)]) == 0
     after = read_g2o(out / "graph.g2o")
     assert numbers(out)["landmarks"] == 1 and numbers(out)["sightings"] == 40
     assert not np.array_equal(after.landmarks, marked.landmarks)
@@ -181,7 +181,7 @@ def test_an_interrupt_keeps_what_there_is(city: Path) -> None:
 
 
 def test_the_scene_needs_nothing_else(city: Path, tmp_path: Path) -> None:
-    from unifg.scenarios.solve_scene import record_scene, strips
+    from unifg.scenarios.show.graph_scene import record_scene, strips
 
     solved = solve_file(SolveSettings(city))
     recorder, shown = record_scene(solved)
@@ -189,7 +189,7 @@ def test_the_scene_needs_nothing_else(city: Path, tmp_path: Path) -> None:
     assert shown == list(range(len(solved.steps)))
     assert {f"/meshcat/steps/{k}/{part}" for k in shown for part in ("trajectory", "closures")} <= paths
     assert {"/meshcat/start", "/meshcat/first"} <= paths
-    assert cli.main(["solve", str(city), "--out", str(tmp_path)]) == 0
+    assert command.main(["solve", str(city), "--out", str(tmp_path)]) == 0
     page = (tmp_path / "scene.html").read_text()
     assert "default-src 'none'" in page and "@@" not in page.split("<script>")[0]
     assert not re.search(r"(src|href)=\"http", page)

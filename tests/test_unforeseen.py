@@ -13,11 +13,11 @@ from scipy import ndimage
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.geometry import polyline_distance
-from unifg.scenarios.obstacles import Obstacle
-from unifg.scenarios.planner import plan
-from unifg.scenarios.unforeseen import PlacementRules, place_obstacles
-from unifg.scenarios.world import World
+from unifg.scenarios.ways.grid import plan
+from unifg.scenarios.worlds.plane import World
+from unifg.scenarios.worlds.rectangles import polyline_distance
+from unifg.scenarios.worlds.unforeseen import PlacementRules, place_obstacles
+from unifg.scenarios.worlds.unmapped import Obstacle
 from unifg.typing import Array
 
 START = np.array([1.0, 1.5, 0.0])

@@ -15,7 +15,9 @@ import unifg as fg
 from judge import judge
 from unifg.models import vehicle
 from unifg.models.vehicle import Vehicle
-from unifg.scenarios import cli, velocity_tracking, velocity_tracking_arguments, velocity_tracking_plots
+from unifg.scenarios import command, velocity_tracking
+from unifg.scenarios.commands import velocity_arguments as velocity_tracking_arguments
+from unifg.scenarios.show import velocity_plot as velocity_tracking_plots
 from unifg.scenarios.velocity_tracking import (
     BACKENDS,
     Drive,
@@ -25,7 +27,7 @@ from unifg.scenarios.velocity_tracking import (
     state_problem,
     table,
 )
-from unifg.scenarios.velocity_tracking_profile import drive_cycle, read_profile
+from unifg.scenarios.ways.speed_profile import drive_cycle, read_profile
 from unifg.solvers import KKT, AugmentedLagrangian, GaussNewton
 from unifg.typing import Array
 
@@ -230,7 +232,7 @@ def test_picture_shows_the_drive() -> None:
 
 
 def run(folder: Path, *words: str) -> int:
-    return cli.main(["run", "velocity-tracking", *words, "--out", str(folder)])
+    return command.main(["run", "velocity-tracking", *words, "--out", str(folder)])
 
 
 def test_command_writes_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -284,7 +286,7 @@ def test_an_interrupt_writes_what_there_is(tmp_path: Path, monkeypatch: pytest.M
     stopped = run_tracking(TrackingSettings(60), progress=lambda row: row.number == 1)
     assert stopped.solution.status is fg.Status.INTERRUPTED
     monkeypatch.setattr(velocity_tracking, "run_tracking", lambda settings, progress: stopped)
-    assert run(tmp_path) == cli.INTERRUPTED
+    assert run(tmp_path) == command.INTERRUPTED
     assert {file.name for file in tmp_path.iterdir()} == {"velocity_tracking.png", "metrics.json"}
 
 

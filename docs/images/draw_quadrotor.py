@@ -8,9 +8,9 @@ from typing import Any
 import matplotlib.pyplot as plt
 from draw import COST, HARD, beside, factor, frame, variable
 
-from unifg.scenarios.palette import css
-from unifg.scenarios.quadrotor.episode import FlightSettings, run_flight
-from unifg.scenarios.quadrotor.plots import write_overview
+from unifg.scenarios.flight import FlightSettings, run_flight
+from unifg.scenarios.show.flight_plot import write_overview
+from unifg.scenarios.show.palette import css
 
 HERE = Path(__file__).resolve().parent
 SEED = 1003

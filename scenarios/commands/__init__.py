@@ -1,0 +1,1 @@
+"""The command line of each scenario, and what it writes."""

@@ -1,0 +1,136 @@
+"""What an optimised flight past obstacles leaves in its folder, and the table printed for people."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TypedDict
+
+import numpy as np
+
+from unifg.scenarios.course import Course
+from unifg.scenarios.log.drive_metrics import write_metrics
+from unifg.scenarios.show.course_log import course_log
+from unifg.scenarios.show.course_plot import write_iterates
+from unifg.scenarios.show.flight_scene import write_scene
+
+__all__ = ["CourseMetrics", "course_metrics", "summary", "write_results"]
+
+
+class CourseMetrics(TypedDict):
+    """Numbers of one optimised flight; only ``solve_ms`` depends on the clock."""
+
+    scenario: str
+    layout: str
+    solver: str
+    hessian: str
+    avoidance: str
+    guess: str
+    general_cost: bool
+    succeeded: bool
+    status: str
+    converged: bool
+    arrived: bool
+    clear: bool
+    flyable: bool
+    cost: float
+    costs: list[float]
+    violations: list[float]
+    iterations: int
+    stationarity: float
+    violation: float
+    complementarity: float
+    target_distance_m: float
+    min_clearance_m: float
+    min_clearance_between_nodes_m: float
+    widest_way_m: float
+    drift_m: float
+    path_length_m: float
+    max_speed_m_per_s: float
+    max_tilt_rad: float
+    min_thrust_n: float
+    max_thrust_n: float
+    max_rate_rad_per_s: float
+    solve_ms: float
+
+
+def course_metrics(course: Course) -> CourseMetrics:
+    """The numbers of a flight; ``costs`` and ``violations`` are those of every iterate, the guess first."""
+    c, s, solution = course, course.settings, course.solution
+    w, x, y, z = c.states[:, 3:7].T
+    upright = w * w - x * x - y * y + z * z  # how much of the thrust points up
+    return {
+        "scenario": "quadrotor-obstacles",
+        "layout": c.layout.name,
+        "solver": s.solver,
+        "hessian": s.chosen_hessian,
+        "avoidance": s.avoidance,
+        "guess": s.chosen_guess,
+        "general_cost": s.general,
+        "succeeded": c.succeeded,
+        "status": solution.status.name.lower(),
+        "converged": solution.converged,
+        "arrived": c.arrived,
+        "clear": c.clear,
+        "flyable": c.flyable,
+        "cost": float(solution.cost),
+        "costs": [float(row.cost) for row in solution.history],
+        "violations": [float(row.violation) for row in solution.history],
+        "iterations": solution.iterations,
+        "stationarity": float(solution.stationarity),
+        "violation": float(solution.violation),
+        "complementarity": float(solution.complementarity),
+        "target_distance_m": c.target_distance,
+        "min_clearance_m": float(c.clearance.min()),
+        "min_clearance_between_nodes_m": c.clearance_between,
+        "widest_way_m": c.layout.widest_way(),
+        "drift_m": c.drift,
+        "path_length_m": float(np.linalg.norm(np.diff(c.states[:, :3], axis=0), axis=1).sum()),
+        "max_speed_m_per_s": float(np.linalg.norm(c.states[:, 7:], axis=1).max()),
+        "max_tilt_rad": float(np.arccos(np.clip(upright, -1.0, 1.0)).max()),
+        "min_thrust_n": float(c.controls[:, 3].min()),
+        "max_thrust_n": float(c.controls[:, 3].max()),
+        "max_rate_rad_per_s": float(np.abs(c.controls[:, :3]).max()),
+        "solve_ms": 1e3 * solution.seconds,
+    }
+
+
+def write_results(folder: str | Path, course: Course) -> list[Path]:
+    """Write numbers, picture and scene of a flight.
+
+    Args:
+        folder: existing folder; files of the same names are replaced.
+        course: with its iterates.
+
+    Returns:
+        The files written: ``scene.html``, ``iterates.png`` and ``metrics.json``.
+    """
+    folder = Path(folder)
+    numbers = write_metrics(folder / "metrics.json", course_metrics(course))
+    picture = write_iterates(folder / "iterates.png", course)
+    return [write_scene(folder / "scene.html", course_log(course)), picture, numbers]
+
+
+def summary(course: Course) -> str:
+    """The outcome for people, as a table of two columns."""
+    m = course_metrics(course)
+    rows = {
+        "layout": f"{m['layout']}, widest way {m['widest_way_m']:.2f} m to either side",
+        "solver": f"{m['solver']}, {m['hessian']} Hessian, guess: {m['guess']}",
+        "avoidance": m["avoidance"] + (" as a general cost" if m["general_cost"] else ""),
+        "status": m["status"].replace("_", " "),
+        "iterations": f"{m['iterations']} in {m['solve_ms']:.0f} ms",
+        "cost": f"{m['cost']:.4f}",
+        "stationarity, violation": f"{m['stationarity']:.1e}, {m['violation']:.1e}",
+        "end": f"{m['target_distance_m']:.3f} m from the target, " + _said(m["arrived"], "arrived", "NOT ARRIVED"),
+        "least clearance of hull": f"{m['min_clearance_m']:.3f} m at nodes, "
+        f"{m['min_clearance_between_nodes_m']:.3f} m on the way, " + _said(m["clear"], "clear", "COLLISION"),
+        "flown": f"{m['path_length_m']:.2f} m, at most {m['max_speed_m_per_s']:.2f} m/s, tilt "
+        f"{np.degrees(m['max_tilt_rad']):.0f} deg, thrust {m['min_thrust_n']:.1f} to {m['max_thrust_n']:.1f} N",
+        "can be flown as planned": _said(m["flyable"], "yes", "NO"),
+    }
+    width = max(map(len, rows))
+    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows.items())
+
+
+def _said(fact: bool, good: str, bad: str) -> str:
+    return good if fact else bad

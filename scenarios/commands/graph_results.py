@@ -1,0 +1,109 @@
+"""What ``unifg solve`` leaves in its folder, and the table printed for people."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unifg.files.g2o import write_g2o
+from unifg.files.tum import write_tum
+from unifg.scenarios.pose_graph import SolvedGraph
+from unifg.scenarios.show.graph_plot import write_picture
+from unifg.scenarios.show.graph_scene import write_scene
+
+__all__ = ["metrics", "summary", "write_results"]
+
+
+def write_results(folder: Path, solved: SolvedGraph) -> list[Path]:
+    """Write solution, trajectory, numbers, picture and scene.
+
+    Args:
+        folder: existing folder; files of the same names are replaced.
+        solved: a solved pose graph.
+
+    Returns:
+        The files written: ``graph.g2o``, ``trajectory.tum`` (the positions in the file as times), ``metrics.json``,
+        ``graph.png`` and ``scene.html``.
+    """
+    graph = write_g2o(folder / "graph.g2o", solved.after)
+    poses = solved.after.poses
+    trajectory = write_tum(folder / "trajectory.tum", np.arange(len(poses), dtype=np.float64), poses)
+    numbers = folder / "metrics.json"
+    numbers.write_text(json.dumps(metrics(solved), indent=2) + "\n", encoding="utf-8")
+    picture = write_picture(folder / "graph.png", solved)
+    scene = write_scene(folder / "scene.html", solved)
+    return [scene, picture, graph, trajectory, numbers]
+
+
+def metrics(solved: SolvedGraph) -> dict[str, Any]:
+    """The numbers of a solve, ready for JSON. chi2 is the sum of r' Omega r, without 1/2 and without robust loss."""
+    settings, graph, solution = solved.settings, solved.after, solved.solution
+    in_file, at_start, at_end = solved.chi2
+    return {
+        "file": settings.file.name,
+        "poses": len(graph.poses),
+        "dimension": graph.group.point_dim,
+        "edges": len(graph.edges),
+        "loop_closures": len(graph.closures),
+        "landmarks": len(graph.landmarks),
+        "sightings": sum(map(len, graph.sightings.values())),
+        "skipped_lines": dict(graph.skipped),
+        "solver": solution.solver,
+        "robust": settings.robust,
+        "init": settings.init,
+        "residual": settings.residual,
+        "status": solution.status.name,
+        "converged": solution.converged,
+        "interrupted": solved.interrupted,
+        "iterations": solution.iterations,
+        "chi2_file": in_file,
+        "chi2_start": at_start,
+        "chi2": at_end,
+        "chi2_inliers": solved.chi2_inliers,
+        "cost": solution.cost,
+        "stationarity": solution.stationarity,
+        "outliers": int(solved.outliers.sum()),
+        "outlier_edges": _pairs(solved),
+        "rivals": [] if solution.verdict is None else [rival.cost for rival in solution.verdict.rivals],
+        "seconds": {name: round(value, 6) for name, value in solved.seconds.items()},
+    }
+
+
+def summary(solved: SolvedGraph) -> str:
+    """The outcome as a table of two columns."""
+    numbers, verdict = metrics(solved), solved.solution.verdict
+    more = f", {numbers['landmarks']} landmarks" if numbers["landmarks"] else ""
+    skipped = ", ".join(f"{tag} ({count})" for tag, count in numbers["skipped_lines"].items())
+    milliseconds = {name: 1e3 * value for name, value in solved.seconds.items()}
+    rows = [
+        ("file", numbers["file"]),
+        (
+            "graph",
+            f"{numbers['poses']} poses in {numbers['dimension']}D, {numbers['edges']} edges, "
+            f"{numbers['loop_closures']} of them loop closures{more}",
+        ),
+        ("skipped lines", skipped),
+        ("solver, residual", f"{numbers['solver']}, {numbers['residual']}"),
+        ("robust loss", "" if solved.loss is None else f"{solved.loss}, on loop closures"),
+        ("chi2 in the file", f"{numbers['chi2_file']:.9g}"),
+        ("chi2 at the start", f"{numbers['chi2_start']:.9g} ({numbers['init']})"),
+        ("chi2 at the end", f"{numbers['chi2']:.9g}"),
+        ("without outliers", f"{numbers['chi2_inliers']:.9g}" if numbers["outliers"] else ""),
+        ("outliers", "" if solved.loss is None else f"{numbers['outliers']} of the loop closures"),
+        ("believed", "" if verdict is None else verdict.sentence(numbers["cost"])),
+        ("iterations", f"{numbers['iterations']}"),
+        ("status", solved.solution.status.value),
+        ("time", ", ".join(f"{name} {value:.1f} ms" for name, value in milliseconds.items())),
+    ]
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows if value)
+
+
+def _pairs(solved: SolvedGraph) -> list[list[int]]:
+    """Identifiers of the poses that each outlier joins."""
+    edges, ids = solved.after.edges, solved.after.ids
+    pairs: list[list[int]] = np.stack([ids[edges.first], ids[edges.second]], axis=1)[solved.outliers].tolist()
+    return pairs

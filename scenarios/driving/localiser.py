@@ -1,0 +1,82 @@
+"""Where am I? One pose, one odometry prior, 360 beams on the distance map (Bazzana et al. 2022, section IV)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import unifg as fg
+from unifg.models import lidar, odometry
+from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.worlds.plane import Scan
+from unifg.solvers import GaussNewton
+from unifg.typing import Array
+
+BEAM_SIGMA = 0.1  # [m]; beams share the errors of the map's cells, so each counts for less than its own noise
+FEWEST_BEAMS = 20
+LARGEST_JUMP = 0.5  # [m]; a correction beyond this is a mistake of the matching, not of the wheels
+
+
+class Localiser:
+    """A compiled localisation graph, solved anew each tick.
+
+    Attributes:
+        pose: (3,) estimate [m, m, rad].
+        covariance: (3, 3) in the tangent space at the estimate.
+        iterations: Gauss-Newton iterations of the last update.
+    """
+
+    def __init__(self, distance_map: DistanceMap, pose: Array, sigma: Array, beams: int) -> None:
+        """State the graph.
+
+        Args:
+            distance_map: signed distance of the map.
+            pose: (3,) initial estimate [m, m, rad].
+            sigma: (3,) its standard deviations [m, m, rad].
+            beams: number of beams in a scan.
+        """
+        self.pose = np.asarray(pose, dtype=np.float64)
+        self.covariance = np.diag(np.asarray(sigma, dtype=np.float64) ** 2)
+        self.iterations = 0
+        self._noise = odometry.OdometryNoise()
+        graph = fg.Graph()
+        self._x = graph.variables("robot", fg.SE2, 1)
+        self._prior = graph.data("predicted pose", np.zeros(3))
+        self._information = graph.data("information", np.eye(3))
+        self._beams = graph.data("end-points", np.zeros((beams, 2)), each=True)
+        self._seen = graph.data("seen", np.ones(beams, dtype=bool), each=True)
+        graph.minimize(fg.prior, self._x, self._prior, information=self._information, name="odometry")
+        graph.minimize(
+            lidar.endpoint(distance_map),
+            self._x,
+            self._beams,
+            sigma=BEAM_SIGMA,
+            robust=lidar.endpoint_loss(BEAM_SIGMA, distance_map.resolution),
+            active=self._seen,
+            name="lidar",
+        )
+        self._run = GaussNewton(max_iterations=12, step_tolerance=1e-5).prepare(graph)
+
+    def predict(self, u: Array, dt: float) -> None:
+        """Move the estimate by the wheels' measured velocities (2,) [m/s, rad/s]."""
+        self.pose, self.covariance = odometry.predict(self.pose, self.covariance, u, dt, self._noise)
+
+    def correct(self, scan: Scan) -> None:
+        """Register a scan on the map; a scan that says too little leaves the prediction."""
+        seen = lidar.usable(scan.ranges)
+        self.iterations = 0
+        if seen.sum() < FEWEST_BEAMS:
+            return
+        solution = self._run.solve(
+            {self._x: self.pose[None, :]},
+            data={
+                self._prior: self.pose,
+                self._information: np.linalg.inv(self.covariance),
+                self._beams: lidar.beam_endpoints(scan.ranges, scan.angles),
+                self._seen: seen,
+            },
+        )
+        self.iterations = solution.iterations
+        corrected = solution[self._x][0]
+        if np.hypot(*(corrected - self.pose)[:2]) > LARGEST_JUMP:
+            return
+        self.pose, self.covariance = corrected, solution.covariance(self._x)

@@ -1,0 +1,1 @@
+"""The quadrotor: where it is, how it flies, as two graphs or one."""

@@ -1,0 +1,214 @@
+"""Numbers that say how a flight went.
+
+Everything measured by a clock lives under keys that end in ``_ms``; the rest depends on settings and seed alone.
+:func:`unifg.scenarios.log.drive_metrics.write_metrics` writes them as JSON.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any, TypedDict
+
+import numpy as np
+
+from unifg.errors import ScenarioError
+from unifg.models import quadrotor
+from unifg.scenarios.log.drive_metrics import Timing
+from unifg.scenarios.log.flight_log import FlightLog
+from unifg.scenarios.worlds.layouts import Layout
+from unifg.typing import Array, BoolArray
+
+__all__ = [
+    "PARAMETERS",
+    "Errors",
+    "FlightMetrics",
+    "estimated_parameters",
+    "flight_metrics",
+    "has_estimate",
+    "landmark_errors",
+    "state_errors",
+]
+
+PARAMETERS = ("mass", "drag_x", "drag_y", "drag_z", "wind_x", "wind_y", "updraft")
+"""Names of the parameters in the order of `FlightLog.parameters`."""
+
+_EARLY = 5.0  # [s]
+_SIGMAS = 2.0  # half width of the intervals whose coverage is counted
+_KNOWN = 0.01  # relative mass error from which on the mass counts as known
+_SAME = 1.0  # a landmark farther than this from everything stands for nothing [m]
+
+
+class Errors(TypedDict):
+    """Root mean square and greatest norm over the ticks of a flight."""
+
+    rms: float
+    max: float
+
+
+class FlightMetrics(TypedDict):
+    """What `flight_metrics` returns; the key says the unit.
+
+    ``duration_s`` goes from the first tick to the last, at which arrival shows. Coverage is the share of errors within
+    two standard deviations over ticks and components, 0.954 where sigmas are those of the errors. Parameters appear by
+    name, errors as estimate minus truth, and only those that are estimated. ``mass_known_s`` is when the relative mass
+    error fell below 1 % for good. ``time_to_goal_s`` is None without arrival, an early parameter error None in a flight
+    shorter than 5 s, and all of the estimate None where a flight has none.
+    """
+
+    settings: dict[str, Any]
+    layout: str
+    succeeded: bool
+    interrupted: bool
+    reached: bool
+    collisions: int
+    ticks: int
+    duration_s: float
+    time_to_goal_s: float | None
+    target_distance_m: float
+    path_length_m: float
+    mean_speed_m_per_s: float
+    max_speed_m_per_s: float
+    min_clearance_m: float
+    position_error_m: Errors | None
+    velocity_error_m_per_s: Errors | None
+    attitude_error_rad: Errors | None
+    coverage: dict[str, float] | None
+    parameter_error: dict[str, float] | None
+    parameter_error_5s: dict[str, float] | None
+    parameter_sigma: dict[str, float] | None
+    mass_error_relative: float | None
+    mass_error_relative_5s: float | None
+    mass_known_s: float | None
+    landmarks: int
+    landmark_error_m: Errors | None
+    statuses: dict[str, int]
+    emergency_ticks: int
+    tick_ms: Timing
+    estimate_ms: Timing
+    plan_ms: Timing
+
+
+def flight_metrics(log: FlightLog) -> FlightMetrics:
+    """Summarise a flight.
+
+    Args:
+        log: a flight of at least one tick.
+
+    Returns:
+        The metrics, of plain Python numbers.
+
+    Raises:
+        ScenarioError: the flight has no tick.
+    """
+    if log.ticks == 0:
+        raise ScenarioError("the flight has no tick: there is nothing to measure")
+    duration = round(float(log.time[-1]), 9)
+    speed = np.linalg.norm(log.truth[:, 7:], axis=1)
+    errors = state_errors(log)
+    estimated = has_estimate(log)
+    active = estimated_parameters(log)
+    early = round(_EARLY / log.dt)  # the tick of that time
+    long_enough = early < log.ticks
+    mass = np.abs(log.parameters[:, 0] / log.parameters_true[0] - 1.0)
+    return FlightMetrics(
+        settings=dict(log.settings),
+        layout=log.layout.name,
+        succeeded=bool(log.succeeded),
+        interrupted=bool(log.interrupted),
+        reached=bool(log.reached),
+        collisions=int(log.collisions),
+        ticks=log.ticks,
+        duration_s=duration,
+        time_to_goal_s=duration if log.reached else None,
+        target_distance_m=float(log.target_distance[-1]),
+        path_length_m=float(np.linalg.norm(np.diff(log.truth[:, :3], axis=0), axis=1).sum()),
+        mean_speed_m_per_s=float(speed.mean()),
+        max_speed_m_per_s=float(speed.max()),
+        min_clearance_m=float(np.min(log.clearance)),
+        position_error_m=_errors(errors[:, :3]) if estimated else None,
+        velocity_error_m_per_s=_errors(log.believed[:, 7:] - log.truth[:, 7:]) if estimated else None,
+        attitude_error_rad=_errors(errors[:, 3:6]) if estimated else None,
+        coverage=_coverage(log, errors, active) if estimated else None,
+        parameter_error=_by_name(log.parameters[-1] - log.parameters_true, active),
+        parameter_error_5s=_by_name(log.parameters[early] - log.parameters_true, active) if long_enough else None,
+        parameter_sigma=_by_name(log.parameters_sigma[-1], active),
+        mass_error_relative=float(mass[-1]) if active[0] else None,
+        mass_error_relative_5s=float(mass[early]) if active[0] and long_enough else None,
+        mass_known_s=_settled(log, mass) if active[0] else None,
+        landmarks=len(log.landmarks[-1].ids),
+        landmark_error_m=_errors(landmark_errors(log)) if len(landmark_errors(log)) else None,
+        statuses=dict(sorted(Counter(log.statuses).items())),
+        emergency_ticks=int(np.count_nonzero(log.emergency)),
+        tick_ms=_timing(log.estimate_ms + log.plan_ms),
+        estimate_ms=_timing(log.estimate_ms),
+        plan_ms=_timing(log.plan_ms),
+    )
+
+
+def has_estimate(log: FlightLog) -> bool:
+    """Whether somebody estimated the state: a flight along a given plan has neither sigmas nor windows."""
+    return bool((log.believed_sigma > 0.0).any()) or any(len(past) for past in log.pasts)
+
+
+def estimated_parameters(log: FlightLog) -> BoolArray:
+    """(7,) True for parameters that were estimated: those with a standard deviation."""
+    estimated: BoolArray = np.any(log.parameters_sigma > 0.0, axis=0)
+    return estimated
+
+
+def state_errors(log: FlightLog) -> Array:
+    """(T, 9) right perturbation (p, R, v) that takes the belief to the truth [m, rad, m/s]."""
+    return quadrotor.STATE.local(log.believed, log.truth)
+
+
+def landmark_errors(log: FlightLog) -> Array:
+    """(k, 2) last believed position minus the nearest cylinder's axis or wall's end [m].
+
+    Landmarks farther than 1 m from all of them are left out: they stand for something that moves, or for nothing.
+    """
+    means = log.landmarks[-1].means
+    things = _things(log.layout)
+    if not len(means) or not len(things):
+        return np.zeros((0, 2))
+    errors = means[:, None, :] - things[None]
+    nearest = errors[np.arange(len(means)), np.linalg.norm(errors, axis=2).argmin(axis=1)]
+    matched: Array = nearest[np.linalg.norm(nearest, axis=1) <= _SAME]
+    return matched
+
+
+def _things(layout: Layout) -> Array:
+    return np.concatenate([layout.cylinders[:, :2], layout.corners.reshape(-1, 2)])
+
+
+def _coverage(log: FlightLog, errors: Array, active: BoolArray) -> dict[str, float]:
+    """Share of errors within two sigmas, by the part of the state and by parameter."""
+    covered = np.abs(errors) <= _SIGMAS * log.believed_sigma
+    parts = {"position": covered[:, :3], "attitude": covered[:, 3:6], "velocity": covered[:, 6:]}
+    within = np.abs(log.parameters - log.parameters_true) <= _SIGMAS * log.parameters_sigma
+    parts |= {name: within[:, i] for i, name in enumerate(PARAMETERS) if active[i]}
+    return {name: float(part.mean()) for name, part in parts.items()}
+
+
+def _by_name(values: Array, active: BoolArray) -> dict[str, float] | None:
+    named = {name: float(value) for name, value, here in zip(PARAMETERS, values, active, strict=True) if here}
+    return named or None
+
+
+def _settled(log: FlightLog, mass: Array) -> float | None:
+    """Time from which on the relative error of the mass stays small; None where it never does."""
+    wrong = np.flatnonzero(mass >= _KNOWN)
+    if not len(wrong):
+        return 0.0
+    after = int(wrong[-1]) + 1
+    return float(log.time[after]) if after < log.ticks else None
+
+
+def _errors(values: Array) -> Errors:
+    norms = np.linalg.norm(values, axis=1)
+    return Errors(rms=math.sqrt(float(np.mean(norms**2))), max=float(norms.max()))
+
+
+def _timing(values: Array) -> Timing:
+    p50, p99 = np.percentile(values, [50.0, 99.0])
+    return Timing(p50=float(p50), p99=float(p99), max=float(np.max(values)))

@@ -1,0 +1,234 @@
+"""Solving a pose graph from a file: reading, a first guess, a backend, a robust loss, and how it went.
+
+The command ``unifg solve`` is this and `unifg.scenarios.commands.graph_results`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.special import chdtri
+
+from unifg.answers.history import Iteration
+from unifg.answers.solution import Solution
+from unifg.answers.solver import Solver
+from unifg.answers.status import Status
+from unifg.errors import ScenarioError
+from unifg.files.pose_graph import read_pose_graph
+from unifg.kernels.robust import DCS, Cauchy, Huber, Loss, TruncatedLeastSquares, Tukey
+from unifg.pose_graphs.initialise import chordal, lago, odometric
+from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
+from unifg.solvers import GaussNewton, GraduatedNonConvexity, LevenbergMarquardt
+from unifg.typing import Array, BoolArray
+
+__all__ = ["SolveSettings", "SolvedGraph", "robust_loss", "solve_file"]
+
+Progress = Callable[[float, str], None]
+
+SOLVERS: dict[str, Callable[[], Solver]] = {"gn": GaussNewton, "lm": LevenbergMarquardt}
+GUESSES: dict[str, Callable[[PoseGraph], Array]] = {
+    "file": lambda pose_graph: pose_graph.poses,
+    "odometry": odometric,
+    "lago": lago,
+    "chordal": chordal,
+}
+LOSSES: dict[str, Callable[[float], Loss]] = {
+    "huber": Huber,
+    "cauchy": Cauchy,
+    "tukey": Tukey,
+    "dcs": DCS,
+    "gnc": TruncatedLeastSquares,
+}
+_DEFAULTS = {"huber": 1.345, "cauchy": 2.385, "tukey": 4.685, "dcs": 1.0}
+_INLIERS = 0.99  # of right measurements lie within the default threshold of gnc
+OUTLIER_WEIGHT = 0.5
+"""A loop closure that the robust loss gives less weight than this is called an outlier."""
+
+
+@dataclass(frozen=True)
+class SolveSettings:
+    """What to solve, and how.
+
+    Attributes:
+        file: pose graph in the g2o or TORO format.
+        solver: "gn" or "lm".
+        robust: loss of the loop closures, "huber", "cauchy", "tukey", "dcs" or "gnc", with its parameter after a colon
+            if it is not the usual one; None for none.
+        init: "file", "odometry", "lago" or "chordal".
+        residual: "log" or "g2o".
+    """
+
+    file: Path
+    solver: str = "gn"
+    robust: str | None = None
+    init: str = "file"
+    residual: ResidualName = "log"
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedGraph:
+    """A solved pose graph.
+
+    Attributes:
+        settings: what was asked.
+        before: the graph at its first guess.
+        after: the graph at the solution.
+        chi2: sum of r' Omega r, without losses: in the file, at the first guess, at the solution.
+        solution: what the backend returned.
+        loss: on the loop closures; None for none.
+        outliers: (m,) edges that the loss gives less than half of their weight.
+        steps: (k, n, storage) poses of up to a dozen iterates, the first guess and the solution among them.
+        step_numbers: (k,) iteration of each.
+        seconds: wall-clock time by what it was spent on: read, initialise, compile, solve.
+    """
+
+    settings: SolveSettings
+    before: PoseGraph
+    after: PoseGraph
+    chi2: tuple[float, float, float]
+    solution: Solution
+    loss: Loss | None
+    outliers: BoolArray
+    steps: Array
+    step_numbers: list[int]
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """The file's name without its endings."""
+        return self.settings.file.name.removesuffix(".gz").rsplit(".", 1)[0]
+
+    @property
+    def chi2_inliers(self) -> float:
+        """chi2 at the solution without the outliers."""
+        return self.chi2[2] - float(self.after.squared_errors(self.settings.residual)[self.outliers].sum())
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether the user stopped it."""
+        return self.solution.status is Status.INTERRUPTED
+
+
+def solve_file(settings: SolveSettings, progress: Progress = lambda done, text: None) -> SolvedGraph:
+    """Read, initialise and solve.
+
+    Args:
+        settings: what to solve, and how.
+        progress: called with the share done, a guess, and a line of text; may raise KeyboardInterrupt.
+
+    Raises:
+        ScenarioError: the settings do not fit each other or the file.
+        FileFormatError: the file cannot be read.
+        GraphError: the measurements do not determine the poses.
+    """
+    clock = _Clock()
+    progress(0.0, f"reading {settings.file.name}")
+    read = read_pose_graph(settings.file)
+    clock.split("read")
+    if not len(read.edges) and not read.sightings:
+        raise ScenarioError(f"{settings.file}: there is no edge in this file, and nothing to solve")
+    loss = robust_loss(settings.robust, read.group.dim)
+    if settings.init == "lago" and read.group.dim != 3:
+        raise ScenarioError("--init lago is for planar pose graphs; use --init chordal")
+    in_file = read.chi2(settings.residual)
+    progress(0.05, f"first guess: {settings.init}")
+    clock.start()
+    before = read.with_poses(GUESSES[settings.init](read))
+    clock.split("initialise")
+    at_start = before.chi2(settings.residual)
+    clock.start()
+    graph, x, guess = before.graph(robust=loss, residual=settings.residual)
+    graph.compile()
+    clock.split("compile")
+
+    snapshots = _Snapshots()
+
+    def tell(row: Iteration) -> None:
+        snapshots.add(row.number, None if row.values is None else row.values[x])
+        stage = f", stage {row.details['stage']}" if "stage" in row.details else ""
+        progress(1.0 - 0.95 * 0.9**row.number, f"iteration {row.number}{stage}, cost {row.cost:.6g}")
+
+    backend = SOLVERS[settings.solver]()
+    backend.keep_values = True
+    solver = GraduatedNonConvexity(solver=backend) if isinstance(loss, TruncatedLeastSquares) else backend
+    clock.start()
+    solution = solver.solve(graph, guess, callback=tell)
+    clock.split("solve")
+    landmarks = solution[graph.families["landmarks"]] if len(read.landmarks) else None
+    after = before.with_poses(solution[x], landmarks)
+    errors = after.squared_errors(settings.residual)
+    weights = np.ones(len(errors)) if loss is None else np.asarray(loss.weight(errors))
+    outliers = (weights < OUTLIER_WEIGHT) & ~read.edges.odometry
+    snapshots.add(solution.iterations, after.poses)
+    progress(1.0, solution.status.name.lower().replace("_", " "))
+    numbers, steps = snapshots.chosen()
+    chi2 = (in_file, at_start, after.chi2(settings.residual))
+    return SolvedGraph(settings, before, after, chi2, solution, loss, outliers, steps, numbers, clock.seconds)
+
+
+def robust_loss(text: str | None, dim: int) -> Loss | None:
+    """The loss that ``NAME`` or ``NAME:PARAMETER`` stands for.
+
+    Args:
+        text: for instance "huber" or "cauchy:1.0"; None for no loss.
+        dim: degrees of freedom of a pose. The default threshold of gnc is that of a chi-squared test at 99 %.
+
+    Raises:
+        ScenarioError: the name is unknown or the parameter is not a positive number.
+    """
+    if text is None:
+        return None
+    name, _, parameter = text.partition(":")
+    if name not in LOSSES:
+        raise ScenarioError(f"--robust {text}: expected one of {', '.join(LOSSES)}, with :PARAMETER if you like")
+    if ":" not in text:
+        return LOSSES[name](_DEFAULTS.get(name, float(chdtri(dim, 1.0 - _INLIERS)) ** 0.5))
+    try:
+        value = float(parameter)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < np.inf:
+        raise ScenarioError(f"--robust {text}: {parameter!r} is not a positive number")
+    return LOSSES[name](value)
+
+
+class _Clock:
+    """Seconds by name."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self.start()
+
+    def start(self) -> None:
+        self._since = time.perf_counter()
+
+    def split(self, name: str) -> None:
+        self.seconds[name] = time.perf_counter() - self._since
+        self.start()
+
+
+class _Snapshots:
+    """Iterates for pictures: as few as a dozen of any number, early ones preferred."""
+
+    most = 12
+
+    def __init__(self) -> None:
+        self._kept: dict[int, Array] = {}
+
+    def add(self, number: int, poses: Array | None) -> None:
+        """Keep an iterate."""
+        if poses is not None:
+            self._kept[number] = poses
+
+    def chosen(self) -> tuple[list[int], Array]:
+        """Numbers and poses (k, n, storage); the distances between numbers grow."""
+        numbers = sorted(self._kept)
+        places = np.arange(len(numbers))
+        if len(numbers) > self.most:
+            places = np.unique(np.geomspace(1, len(numbers), self.most).round().astype(np.intp)) - 1
+        kept = [numbers[k] for k in places]
+        return kept, np.stack([self._kept[number] for number in kept])

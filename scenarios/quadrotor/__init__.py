@@ -1,1 +1,0 @@
-"""Quadrotor scenarios: flight between cylinders and walls, estimated and controlled by one graph."""

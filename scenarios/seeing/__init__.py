@@ -1,0 +1,1 @@
+"""What measurements say about things that no map shows."""

@@ -1,0 +1,1 @@
+"""Pictures, scenes and pages of runs."""

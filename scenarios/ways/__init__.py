@@ -1,0 +1,1 @@
+"""Ways through the plane: on grids, among bodies, as rows of poses."""

@@ -1,0 +1,1 @@
+"""Simulated truths: what stands there, what moves, what sensors measure of it."""

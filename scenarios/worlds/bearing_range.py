@@ -1,0 +1,180 @@
+"""What the vehicle measures: bearing and range of cylinders and corners, height, tilt and body rates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pymunk
+
+from unifg.lie import SO3
+from unifg.scenarios.seeing.belief import Landmarks
+from unifg.typing import Array, BoolArray, IntArray
+
+__all__ = ["Reading", "Sensor", "SensorModel"]
+
+_FLANK = 0.9  # of the angle between a cylinder's axis and its silhouette
+_CORNER_GAP = 0.01  # a ray to a corner ends this much before it, for it would hit the corner's own wall [m]
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """Standard deviations and reach.
+
+    Attributes:
+        range_max: greatest distance to a cylinder's axis or a corner that is seen [m].
+        sigma_range: [m].
+        sigma_bearing: [rad].
+        sigma_radius: of a cylinder's radius [m].
+        sigma_height: [m].
+        sigma_tilt: of each component of R' e3.
+        sigma_gyro: of each body rate [rad/s].
+    """
+
+    range_max: float = 8.0
+    sigma_range: float = 0.05
+    sigma_bearing: float = 0.01
+    sigma_radius: float = 0.0
+    sigma_height: float = 0.03
+    sigma_tilt: float = 0.01
+    sigma_gyro: float = 0.01
+
+    @staticmethod
+    def exact(range_max: float = 8.0) -> SensorModel:
+        """A sensor without noise."""
+        return SensorModel(range_max, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Everything measured at one instant; K things are seen, in the order of their ids.
+
+    Attributes:
+        time: [s].
+        ids: (K,) true names: cylinders first, then corners, then movers. For known association only.
+        bearings: (K,) in the ground plane from the heading (of R e1) to the axis or corner, in [-pi, pi) [rad].
+        ranges: (K,) in the ground plane to the axis or corner [m].
+        radii: (K,) of the cylinders [m]; 0 for corners.
+        kinds: (K,) ``Landmarks.CYLINDER`` or ``Landmarks.CORNER``.
+        moving: (K,) True for what moves by design.
+        height: above the floor [m].
+        tilt: (3,) R' e3, the world's vertical in the body; not normalised.
+        rates: (3,) mean body rates over the last step [rad/s]; of a vehicle at rest before the first.
+    """
+
+    time: float
+    ids: IntArray
+    bearings: Array
+    ranges: Array
+    radii: Array
+    kinds: IntArray
+    moving: BoolArray
+    height: float
+    tilt: Array
+    rates: Array
+
+
+class Sensor:
+    """Sensors with a stream of noise each.
+
+    Every reading draws the same amount from every stream, whatever is seen: two controllers under one seed meet the
+    same noise, and movers do not shift that of what stands.
+    """
+
+    def __init__(
+        self,
+        model: SensorModel,
+        space: pymunk.Space,
+        shapes: Sequence[pymunk.Shape | None],
+        standing: int,
+        others: pymunk.ShapeFilter,
+        rng: np.random.Generator,
+    ) -> None:
+        """Look around in a space.
+
+        Args:
+            model: noise and reach.
+            space: where the rays go.
+            shapes: shape of each thing by id; None for a corner.
+            standing: number of things that do not move; the rest do.
+            others: filter that lets rays pass the vehicle.
+            rng: its children are spawned, itself it is not advanced.
+        """
+        self.model = model
+        self._space, self._shapes, self._others = space, tuple(shapes), others
+        self._standing, self._moving = standing, len(shapes) - standing
+        self._kinds = np.array(
+            [Landmarks.CORNER if shape is None else Landmarks.CYLINDER for shape in shapes], dtype=np.intp
+        )
+        self._streams = rng.spawn(5)
+
+    def read(self, time: float, state: Array, things: Array, rates: Array) -> Reading:
+        """Measure once; every call draws new noise.
+
+        Args:
+            time: [s].
+            state: (10,) true state.
+            things: (n, 3) x, y, radius of everything by id [m].
+            rates: (3,) true mean body rates [rad/s].
+        """
+        model = self.model
+        standing, moving, height, tilt, gyro = self._streams
+        noise = np.concatenate(
+            [standing.standard_normal((self._standing, 3)), moving.standard_normal((self._moving, 3))]
+        )
+        height_noise, tilt_noise, gyro_noise = (
+            height.standard_normal(),
+            tilt.standard_normal(3),
+            gyro.standard_normal(3),
+        )
+        rotation = SO3.matrix(state[None, 3:7])[0]
+        offset = things[:, :2] - state[:2]
+        distance = np.hypot(offset[:, 0], offset[:, 1])
+        ids = np.array(
+            [i for i in np.flatnonzero(distance <= model.range_max) if self._visible(int(i), state, things)],
+            dtype=np.intp,
+        )
+        heading = math.atan2(rotation[1, 0], rotation[0, 0])
+        bearings = np.arctan2(offset[ids, 1], offset[ids, 0]) - heading + model.sigma_bearing * noise[ids, 0]
+        return Reading(
+            time=time,
+            ids=ids,
+            bearings=(bearings + np.pi) % (2.0 * np.pi) - np.pi,
+            ranges=np.maximum(distance[ids] + model.sigma_range * noise[ids, 1], 0.0),
+            radii=np.where(
+                self._kinds[ids] == Landmarks.CORNER,
+                0.0,
+                np.maximum(things[ids, 2] + model.sigma_radius * noise[ids, 2], 0.0),
+            ),
+            kinds=self._kinds[ids],
+            moving=ids >= self._standing,
+            height=float(state[2] + model.sigma_height * height_noise),
+            tilt=rotation[2] + model.sigma_tilt * tilt_noise,
+            rates=rates + model.sigma_gyro * gyro_noise,
+        )
+
+    def _visible(self, index: int, state: Array, things: Array) -> bool:
+        """Whether a ray to the axis, or one to either flank, meets this thing first."""
+        x, y, radius = things[index].tolist()
+        origin = (float(state[0]), float(state[1]))
+        dx, dy = x - origin[0], y - origin[1]
+        distance = math.hypot(dx, dy)
+        shape = self._shapes[index]
+        if shape is None:
+            if distance <= _CORNER_GAP:
+                return True
+            keep = 1.0 - _CORNER_GAP / distance
+            tip = (origin[0] + keep * dx, origin[1] + keep * dy)
+            return self._space.segment_query_first(origin, tip, 0.0, self._others) is None
+        if distance <= radius:
+            return True
+        flank = _FLANK * math.asin(radius / distance)
+        for angle in (0.0, flank, -flank):
+            c, s = math.cos(angle), math.sin(angle)
+            tip = (origin[0] + c * dx - s * dy, origin[1] + s * dx + c * dy)
+            hit = self._space.segment_query_first(origin, tip, 0.0, self._others)
+            if hit is not None and hit.shape is shape:
+                return True
+        return False
