@@ -14,9 +14,9 @@ from unifg.scenarios.flying.braking import brake, stopping_path
 from unifg.scenarios.flying.controller import Controller, Given
 from unifg.scenarios.flying.guide import Guide, GuideSettings, Reference
 from unifg.scenarios.flying.plan import BACKENDS, ControllerSettings
-from unifg.scenarios.seeing.mover_tracks import Movers
 from unifg.scenarios.flying.slots import Obstacles, Slots
 from unifg.scenarios.seeing.belief import Belief, Landmarks
+from unifg.scenarios.seeing.mover_tracks import Movers
 from unifg.typing import Array
 
 WALLS = np.array([[[0.0, -4.0], [30.0, -4.0]], [[0.0, 4.0], [30.0, 4.0]]])
