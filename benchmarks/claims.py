@@ -1,6 +1,6 @@
 """What the backends claim about problems of control, judged from outside.
 
-    python -m benchmarks.claims [--parkings P] [--seeds S] [--kinds K ...] [--backends B ...]
+    python -m benchmarks.claims [--parkings P] [--seeds S] [--kinds K ...] [--backends B ...] [--workers W]
 
 A hundred parkings of a kinematic bicycle and fourteen other kinds of control problem, each stated twice
 (:mod:`benchmarks.twins`): as a graph with residuals as a user writes them, and in casadi, whose exact derivatives judge
@@ -10,22 +10,20 @@ out/benchmarks/claims.jsonl and is not solved again until the code changes. Writ
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 import unifg as fg
 from benchmarks import twin_flights, twin_ground, twin_machines
 from benchmarks.backends import CONSTRAINED, EQUALITIES_ONLY
+from benchmarks.campaign import Key, Row, options, recorded
 from benchmarks.exact_judge import Judge, Peer
-from benchmarks.report import CHECKOUT, OUT, code_digest, machine, put_results, table
+from benchmarks.report import OUT, code_digest, command, machine, publish, table
 from benchmarks.twins import Twin
 
 TOLERANCE = 1e-6
@@ -259,51 +257,53 @@ def render(cases: list[Case]) -> str:
     return "\n\n".join(parts)
 
 
+@dataclass(frozen=True)
+class Job:
+    """One problem and who solves it."""
+
+    kind: str
+    seed: int
+    equalities_only: bool
+    backends: tuple[str, ...]
+
+
+def solve(job: Job) -> Row:
+    """All answers to one problem, as the file holds them."""
+    build = PARKING if job.kind == "parking" else KINDS[job.kind]
+    backends = {name: EQUALITY_BACKENDS[name] for name in job.backends}
+    return asdict(measure(build, job.seed, backends, job.equalities_only))
+
+
+def jobs(parkings: int, seeds: int, kinds: Sequence[str], only: Sequence[str]) -> dict[Key, Job]:
+    """What is to be solved: the other kinds twice, then the parkings."""
+    whole, equal = (tuple(b for b in some if b in only) for some in (CONSTRAINED, EQUALITY_BACKENDS))
+    found = [
+        Job(kind, seed, equalities_only, equal if equalities_only else whole)
+        for kind in KINDS if kind in kinds for equalities_only in (False, True) for seed in range(seeds)
+    ]  # fmt: skip
+    found += [Job("parking", seed, False, whole) for seed in range(parkings) if "parking" in kinds]
+    return {(job.kind, job.seed, job.equalities_only): job for job in found}
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Measure and write; 0 only without a false claim."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.claims", description=__doc__.split("\n")[0])
+    kinds, names = ["parking", *KINDS], list(EQUALITY_BACKENDS)
+    parser = command(__doc__)
     parser.add_argument("--parkings", type=int, default=100)
     parser.add_argument("--seeds", type=int, default=5, help="of every other kind")
-    parser.add_argument("--kinds", nargs="*", help="only these")
-    parser.add_argument("--backends", nargs="*", help="only these")
-    parser.add_argument("--quick", action="store_true", help="print, write no page")
-    parser.add_argument("--fresh", action="store_true", help="forget earlier answers of this state of the code")
-    parser.add_argument("--report", action="store_true", help="solve nothing, make the tables from what is on file")
-    options = parser.parse_args(arguments)
-    whole = not (options.kinds or options.backends)
-    store, code = OUT / ("claims.jsonl" if whole else "claims-some.jsonl"), code_digest("benchmarks.claims")
-    OUT.mkdir(parents=True, exist_ok=True)
-    if options.fresh or not whole:
-        store.unlink(missing_ok=True)
-    rows = [] if not store.exists() else [json.loads(line) for line in store.read_text(encoding="utf-8").splitlines()]
-    cases = [restored(row) for row in rows if options.report or row["code"] == code]
-
-    def chosen(backends: dict[str, fg.Solver]) -> dict[str, fg.Solver]:
-        return {name: b for name, b in backends.items() if not options.backends or name in options.backends}
-
-    jobs: list[tuple[str, Callable[..., Twin], int, dict[str, fg.Solver], bool]] = []
-    for name, build in KINDS.items():
-        if not options.kinds or name in options.kinds:
-            jobs += [(name, build, seed, chosen(CONSTRAINED), False) for seed in range(options.seeds)]
-            jobs += [(name, build, seed, chosen(EQUALITY_BACKENDS), True) for seed in range(options.seeds)]
-    if not options.kinds or "parking" in options.kinds:
-        jobs += [("parking", PARKING, seed, chosen(CONSTRAINED), False) for seed in range(options.parkings)]
-    done = {(case.kind, case.seed, case.equalities_only) for case in cases}
-    jobs = [] if options.report else [job for job in jobs if (job[0], job[2], job[4]) not in done]
-    with store.open("a", encoding="utf-8") as file:
-        for _, build, seed, backends, equal in tqdm(jobs, unit="problem"):
-            case = measure(build, seed, backends, equal)
-            cases.append(case)
-            file.write(json.dumps({"code": code, **asdict(case)}) + "\n")
-            file.flush()
-            for backend, result in case.answers.items():
-                if result.claim == "false":
-                    tqdm.write(f"{case.kind} {seed}{' =' if equal else ''} {backend}: {result.status}: {result.reason}")
-    text = render(cases)
-    print(text)
-    if whole and not options.quick:
-        codes = {row["code"] for row in rows} if options.report else {code}
-        put_results(CHECKOUT / "docs" / "claims.md", "What the backends claim, judged from outside", text, codes)
+    parser.add_argument("--kinds", nargs="+", choices=kinds, default=kinds, metavar="KIND", help="only these")
+    parser.add_argument("--backends", nargs="+", choices=names, default=names, metavar="BACKEND", help="only these")
+    parser.add_argument("--quick", action="store_true", help="write no page")
+    options(parser)
+    chosen = parser.parse_args(arguments)
+    all_backends = set(chosen.backends) == set(names)
+    chosen.fresh |= not all_backends
+    store = OUT / ("claims.jsonl" if all_backends else "claims-some.jsonl")
+    asked = jobs(chosen.parkings, chosen.seeds, chosen.kinds, chosen.backends)
+    rows = recorded(solve, asked, store, code_digest("benchmarks.claims"), chosen)
+    cases = [restored(row) for row in rows if all_backends or row["key"] in asked]
+    whole = all_backends and set(chosen.kinds) == set(kinds)
+    publish("claims", render(cases), {row["code"] for row in rows}, docs=whole and not chosen.quick)
     return 1 if any(a.claim == "false" for case in cases for a in case.answers.values()) else 0
 
 

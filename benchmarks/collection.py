@@ -9,7 +9,6 @@ shares no code with the solvers. Writes docs/collection.md.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections import Counter
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 import unifg as fg
-from benchmarks.report import CHECKOUT, OUT, machine, put_results, table
+from benchmarks.report import CHECKOUT, command, machine, publish, table, words
 from unifg.solvers import (
     KKT,
     SQP,
@@ -107,7 +106,7 @@ def verdict(case: Problem, graph: fg.Graph, solution: fg.Solution) -> str:
     if solution.status is fg.Status.LOCALLY_INFEASIBLE and not case.feasible:
         return INFEASIBLE_POINT
     if not (solution.converged or (solution.status is fg.Status.UNDETERMINED and not case.determined)):
-        return solution.status.name.lower().replace("_", " ")
+        return words(solution.status)
     if judge(graph, solution).worst() > case.judged:
         return "disproved"
     return _point(case, solution.cost)
@@ -219,14 +218,8 @@ def _cell(outcome: Outcome | None) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Solve everything and write the tables."""
-    argparse.ArgumentParser(prog="python -m benchmarks.collection", description=__doc__.split("\n")[0]).parse_args(
-        arguments
-    )
-    text = render(measure())
-    OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "collection.md").write_text(text + "\n", encoding="utf-8", newline="\n")
-    print(text)
-    put_results(CHECKOUT / "docs" / "collection.md", "A collection of small problems", text)
+    command(__doc__).parse_args(arguments)
+    publish("collection", render(measure()))
     return 0
 
 

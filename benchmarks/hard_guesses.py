@@ -8,14 +8,13 @@ to out/benchmarks.
 
 from __future__ import annotations
 
-import argparse
 from importlib.util import find_spec
 
 import numpy as np
 from tqdm import tqdm
 
 from benchmarks import disc_fields, parkings
-from benchmarks.report import OUT, machine, table
+from benchmarks.report import command, machine, publish, table
 from unifg.solvers import InteriorPoint
 
 PEERS = ("ipopt", "fatrop")
@@ -66,17 +65,14 @@ def render(results: dict[str, dict[str, Outcomes]]) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run both studies; 0 only if the interior point solves at least as many as each peer."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.hard_guesses", description=__doc__.split("\n")[0])
+    parser = command(__doc__)
     parser.add_argument("--layouts", type=int, default=200, help="fields of discs; half as many parkings")
     options = parser.parse_args(arguments)
     if options.layouts < 2:
         parser.error(f"--layouts must be at least 2, found {options.layouts}")
     results = {"discs": fields(options.layouts)}
     results |= {f"parking, {kind}": parked(options.layouts // 2, kind) for kind in GUESSES}
-    text = render(results)
-    OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "hard-guesses.md").write_text(text + "\n", encoding="utf-8", newline="\n")
-    print(text)
+    publish("hard-guesses", render(results))
     solved = [[sum(good for good, _, _ in outcomes) for outcomes in found.values()] for found in results.values()]
     return 0 if all(counts[0] == max(counts) for counts in solved) else 1
 

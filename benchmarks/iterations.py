@@ -8,7 +8,6 @@ The problems are those every backend is tested on (``tests/problems.py``), the c
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -19,7 +18,7 @@ import numpy as np
 import unifg as fg
 from benchmarks import control_loops, cylinder_flights
 from benchmarks.control_problems import Problem
-from benchmarks.report import CHECKOUT, machine, put_results, table
+from benchmarks.report import CHECKOUT, command, machine, publish, table, words
 from unifg.solvers import (
     KKT,
     SQP,
@@ -35,7 +34,6 @@ sys.path.insert(0, str(CHECKOUT / "tests"))
 
 from problems import PROBLEMS, Guess
 
-PAGE = CHECKOUT / "docs" / "iterations.md"
 BACKENDS: dict[str, fg.Solver] = {
     "GN": GaussNewton(),
     "LM": LevenbergMarquardt(),
@@ -73,8 +71,7 @@ def iterations(build: Callable[[], tuple[fg.Graph, Guess]], solver: fg.Solver) -
     except fg.BackendError:
         return "-"
     solution = run.solve(guess)
-    words = "" if solution.converged else f", {solution.status.name.lower().replace('_', ' ')}"
-    return f"{solution.iterations}{words}"
+    return f"{solution.iterations}" + ("" if solution.converged else f", {words(solution.status)}")
 
 
 def cylinders(seeds: Iterable[int] = cylinder_flights.SEEDS) -> str:
@@ -118,8 +115,7 @@ def loops() -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure and write the page."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.iterations", description=__doc__.split("\n")[0])
-    parser.parse_args(arguments)
+    command(__doc__).parse_args(arguments)
     text = "\n\n".join(
         [
             "### Problems with known answers",
@@ -138,8 +134,7 @@ def main(arguments: list[str] | None = None) -> int:
             machine("numpy", "numba", "osqp", "piqp"),
         ]
     )
-    print(text)
-    put_results(PAGE, "Iterations", text)
+    publish("iterations", text)
     return 0
 
 

@@ -9,7 +9,6 @@ the elastic problem. Writes docs/osqp.md.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -19,7 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks import closed_loop, control_problems, control_starts, unicycle_problems
-from benchmarks.report import CHECKOUT, machine, put_results, table
+from benchmarks.report import command, machine, publish, table
 from unifg.scenarios.course import CourseSettings, run_course
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.manoeuvres import CASES, run_manoeuvre
@@ -29,8 +28,6 @@ from unifg.solvers.qp import QP, QPAnswer
 from unifg.solvers.qp_osqp import OsqpRoute
 from unifg.solvers.sqp import Subproblems
 from unifg.typing import Array
-
-PAGE = CHECKOUT / "docs" / "osqp.md"
 
 
 @dataclass
@@ -149,18 +146,14 @@ def render(counts: dict[str, Count]) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Count, and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command(__doc__)
     parser.add_argument("--quick", action="store_true", help="four cases, and no page")
     chosen = parser.parse_args(arguments)
     counts = {}
     for name, run in tqdm(cases(chosen.quick).items(), unit="case"):
         with counting() as counts[name]:
             run()
-    text = render(counts)
-    if chosen.quick:
-        print(text)
-    else:
-        put_results(PAGE, "What OSQP solves", text)
+    publish("osqp", render(counts), docs=not chosen.quick)
     return 0
 
 

@@ -30,12 +30,14 @@ class Page:
 
     Attributes:
         name: of the file, without its ending.
+        title: of the page.
         module: measures and writes it.
         arguments: given to the module.
         hours: about how long on two cores, for those who wait.
     """
 
     name: str
+    title: str
     module: str
     arguments: tuple[str, ...] = ()
     hours: float = 0.1
@@ -61,22 +63,22 @@ class Page:
 PAGES = {
     page.name: page
     for page in (
-        Page("reference-problems", "benchmarks.reference_problems"),
-        Page("models", "benchmarks.obstacle_fields"),
-        Page("quadrotor-obstacles", "benchmarks.obstacle_courses", hours=0.25),
-        Page("smoothing", "benchmarks.incremental"),
-        Page("iterations", "benchmarks.iterations"),
-        Page("osqp", "benchmarks.osqp_share", hours=0.05),
-        Page("collection", "benchmarks.collection"),
-        Page("velocity-tracking", "benchmarks.ecg2o"),
-        Page("control-cases", "benchmarks.control_cases", hours=0.4),
-        Page("claims", "benchmarks.claims", hours=0.2),
-        Page("navigation", "benchmarks.navigation", hours=0.05),
-        Page("joint-drives", "benchmarks.navigation", ("--coupling", "joint"), hours=0.06),
-        Page("joint", "benchmarks.coupling", hours=0.8),
-        Page("quadrotor-joint", "benchmarks.quadrotor_pull", hours=0.15),
-        Page("quadrotor-mpc", "benchmarks.quadrotor_flights", hours=1.5),
-        Page("benchmarks", "benchmarks.elimination"),
+        Page("reference-problems", "Reference problems", "benchmarks.reference_problems"),
+        Page("models", "Models", "benchmarks.obstacle_fields"),
+        Page("quadrotor-obstacles", "Scenario: quadrotor-obstacles", "benchmarks.obstacle_courses", hours=0.25),
+        Page("smoothing", "Smoothing while driving", "benchmarks.incremental"),
+        Page("iterations", "Iterations", "benchmarks.iterations"),
+        Page("osqp", "What OSQP solves", "benchmarks.osqp_share", hours=0.05),
+        Page("collection", "A collection of small problems", "benchmarks.collection"),
+        Page("velocity-tracking", "Velocity tracking", "benchmarks.ecg2o"),
+        Page("control-cases", "Control cases", "benchmarks.control_cases", hours=0.4),
+        Page("claims", "What the backends claim, judged from outside", "benchmarks.claims", hours=0.2),
+        Page("navigation", "Drives, sequential coupling", "benchmarks.navigation", hours=0.05),
+        Page("joint-drives", "Drives, joint coupling", "benchmarks.navigation", ("--coupling", "joint"), hours=0.06),
+        Page("joint", "What the joint graph buys", "benchmarks.coupling", hours=0.8),
+        Page("quadrotor-joint", "One graph that estimates and flies", "benchmarks.quadrotor_pull", hours=0.15),
+        Page("quadrotor-mpc", "Scenario: quadrotor-mpc", "benchmarks.quadrotor_flights", hours=1.5),
+        Page("benchmarks", "Benchmarks", "benchmarks.elimination"),
     )
 }
 

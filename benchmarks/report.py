@@ -1,20 +1,40 @@
-"""What every measurement writes beside its numbers: the machine, the state of the code, a table, a place in docs/."""
+"""What every measurement shares beside its numbers: its command line, the machine, a table, a place in docs/."""
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
+import re
 from collections.abc import Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import unifg
 from benchmarks.pages import DIGEST_LINE, PAGES
+from benchmarks.sources import CHECKOUT as CHECKOUT
 from benchmarks.sources import digest
 
-CHECKOUT = Path(__file__).resolve().parent.parent
 OUT = CHECKOUT / "out" / "benchmarks"
 BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
+
+
+def command(doc: str | None) -> argparse.ArgumentParser:
+    """The command line of a measuring module, whose docstring says what it does and how it is called."""
+    assert doc is not None
+    named = re.search(r"python -m [\w.]+", doc)
+    return argparse.ArgumentParser(prog=named and named[0], description=doc.split("\n")[0], allow_abbrev=False)
+
+
+def shared(folder: str) -> Path | None:
+    """A folder of the data sets beside the checkout or in ``$UNIFG_DATA``, if it is there."""
+    path = Path(os.environ.get("UNIFG_DATA", CHECKOUT.parent / "shared" / "data")) / folder
+    return path if path.is_dir() else None
+
+
+def words(status: unifg.Status) -> str:
+    """A status as tables name it."""
+    return status.name.lower().replace("_", " ")
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], text: int = 1) -> str:
@@ -35,6 +55,22 @@ def machine(*packages: str) -> str:
 def code_digest(module: str) -> str:
     """A short digest of what a measuring module depends on: results of two states of the code are never mixed."""
     return digest([module])
+
+
+def publish(name: str, text: str, codes: Iterable[str] | None = None, docs: bool = True) -> None:
+    """Print what was measured, keep it in out/benchmarks, and put it on the page of that name.
+
+    Args:
+        name: of the text; of a page in docs/ if :data:`benchmarks.pages.PAGES` lists it.
+        text: Markdown.
+        codes: digests of the states of the code that were measured, when that was not now.
+        docs: False leaves docs/ alone, for runs that measured less than the page shows.
+    """
+    print(text)
+    OUT.mkdir(parents=True, exist_ok=True)
+    (OUT / f"{name}.md").write_text(text + "\n", encoding="utf-8", newline="\n")
+    if docs and name in PAGES:
+        put_results(PAGES[name].path, PAGES[name].title, text, codes)
 
 
 def put_results(page: Path, title: str, text: str, codes: Iterable[str] | None = None) -> None:

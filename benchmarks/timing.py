@@ -35,23 +35,29 @@ def clock(action: Callable[[], Any]) -> float:
     return time.perf_counter() - begin
 
 
-def interleave(candidates: Mapping[str, Callable[[], float]], rounds: int, warm: int = 1) -> dict[str, Array]:
+def interleave(
+    candidates: Mapping[str, Callable[[], float]], rounds: int, warm: int = 1, slow: float = np.inf
+) -> dict[str, Array]:
     """Let every candidate run once per round, in shuffled order; (rounds,) of what each returns.
 
     Args:
         candidates: each returns the time it wants counted, so that its preparations are not.
         rounds: that count.
         warm: rounds before them, for compilation and caches.
+        slow: who once took longer does not run again, and has fewer rounds.
     """
     rng = np.random.default_rng(0)
     names = list(candidates)
-    result = {name: np.zeros(rounds) for name in names}
+    result: dict[str, list[float]] = {name: [] for name in names}
     for index in range(-warm, rounds):
         for k in rng.permutation(len(names)):
-            value = candidates[names[k]]()
+            name = names[k]
+            if max(result[name], default=0.0) > slow:
+                continue
+            value = candidates[name]()
             if index >= 0:
-                result[names[k]][index] = value
-    return result
+                result[name].append(value)
+    return {name: np.array(values) for name, values in result.items()}
 
 
 def spread(values: Array) -> Spread:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import pages, report, sources
+from benchmarks import campaign, pages, report, sources
 from benchmarks.pages import PAGES
 from benchmarks.report import BEGIN, put_results
 from benchmarks.sources import CHECKOUT, code_of, depends_on
@@ -109,3 +109,31 @@ def test_a_page_is_stale_until_it_is_measured_again(tmp_path: Path, monkeypatch:
 def test_a_study_without_a_page_of_its_own_carries_no_digest(tmp_path: Path) -> None:
     put_results(tmp_path / "notes.md", "Notes", "text")
     assert (tmp_path / "notes.md").read_text() == f"# Notes\n\n{BEGIN}\ntext\n{report.END}\n"
+
+
+def doubled(setting: int) -> dict[str, int]:
+    return {"double": 2 * setting}
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_a_campaign_runs_what_is_missing(tmp_path: Path, workers: str) -> None:
+    parser = report.command("Doubles.\n\n    python -m benchmarks.doubles [--workers W]\n")
+    assert parser.prog == "python -m benchmarks.doubles"
+    campaign.options(parser)
+    store, plain = tmp_path / "new" / "rows.jsonl", parser.parse_args(["--workers", workers])
+
+    def rows(count: int, code: str, *words: str) -> dict[campaign.Key, int]:
+        chosen = parser.parse_args(["--workers", workers, *words])
+        found = campaign.recorded(doubled, {("job", k): k for k in range(count)}, store, code, chosen)
+        assert {row["code"] for row in found} <= ({code} if not words else {"old", "new"})
+        return {row["key"]: row["double"] for row in found}
+
+    assert plain.workers == int(workers)
+    assert rows(2, "old") == {("job", 0): 0, ("job", 1): 2}
+    assert rows(3, "old") == {("job", 0): 0, ("job", 1): 2, ("job", 2): 4}
+    assert len(store.read_text().splitlines()) == 3, "nothing is measured twice"
+    assert rows(1, "new") == {("job", 0): 0}
+    assert rows(0, "new", "--report") == {("job", 0): 0, ("job", 1): 2, ("job", 2): 4}
+    assert len(store.read_text().splitlines()) == 4, "other states of the code stay on file"
+    rows(1, "new", "--fresh")
+    assert len(store.read_text().splitlines()) == 5
