@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import unifg as fg
-from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
+from unifg.solvers import KKT, SQP
+from unifg.solvers.names import backends
 
 CONSTRAINED: dict[str, fg.Solver] = {
-    "alm": AugmentedLagrangian(),
-    "sqp": SQP(),
+    **backends("alm", "sqp"),
     "sqp exact": SQP(hessian="exact"),
     "sqp graph": SQP(qp="graph"),
-    "ipm": InteriorPoint(),
-    "penalty": Penalty(),
+    **backends("ipm", "penalty"),
 }
 EQUALITIES_ONLY: dict[str, fg.Solver] = {
-    "kkt": KKT(),
+    **backends("kkt"),
     "kkt full": KKT(full_steps=True),
     "kkt lm": KKT(globalization="levenberg-marquardt"),
 }

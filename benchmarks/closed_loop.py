@@ -19,7 +19,7 @@ from benchmarks.report import table
 from benchmarks.unicycle_problems import Problem
 from unifg.lie import wrap_angle
 from unifg.models import obstacles, unicycle
-from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
+from unifg.solvers.names import backends
 from unifg.typing import Array
 
 STEPS = 100
@@ -253,11 +253,8 @@ class Loop:
 
 def drive(problem: Problem) -> dict[str, Loop]:
     """Drive every robot one step in turn: a slow moment of the machine meets all of them."""
-    drivers: dict[str, Driver] = {
-        "ipm": Ours(InteriorPoint(tolerance=TOLERANCE), Formulation(problem)),
-        "alm": Ours(AugmentedLagrangian(tolerance=TOLERANCE), Formulation(problem)),
-        "sqp": Ours(SQP(tolerance=TOLERANCE), Formulation(problem)),
-    }
+    ours = backends("ipm", "alm", "sqp", tolerance=TOLERANCE)
+    drivers: dict[str, Driver] = {name: Ours(solver, Formulation(problem)) for name, solver in ours.items()}
     if find_spec("casadi") is not None:
         drivers["ipopt"] = Warm(Peer(problem, "ipopt", tol=TOLERANCE, mu_init=1e-3, **WARM_IPOPT))
         drivers["fatrop"] = Warm(Peer(problem, "fatrop", tol=TOLERANCE, mu_init=1e-3))

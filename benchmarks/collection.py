@@ -19,16 +19,8 @@ import numpy as np
 
 import unifg as fg
 from benchmarks.report import CHECKOUT, command, machine, publish, table, words
-from unifg.solvers import (
-    KKT,
-    SQP,
-    AugmentedLagrangian,
-    DogLeg,
-    GaussNewton,
-    InteriorPoint,
-    LevenbergMarquardt,
-    Penalty,
-)
+from unifg.solvers import SQP, InteriorPoint
+from unifg.solvers.names import backends
 
 sys.path.insert(0, str(CHECKOUT / "tests"))
 
@@ -49,13 +41,7 @@ GROUPS: dict[str, list[Problem]] = {
 }
 CASES: dict[str, Problem] = {case.name: case for group in GROUPS.values() for case in group}
 BACKENDS: dict[str, fg.Solver] = {
-    "GaussNewton": GaussNewton(),
-    "LevenbergMarquardt": LevenbergMarquardt(),
-    "DogLeg": DogLeg(),
-    "KKT": KKT(),
-    "Penalty": Penalty(),
-    "AugmentedLagrangian": AugmentedLagrangian(),
-    "SQP": SQP(),
+    **{solver.name: solver for solver in backends("gn", "lm", "dogleg", "kkt", "penalty", "alm", "sqp").values()},
     "SQP, exact": SQP(hessian="exact"),
     "InteriorPoint": InteriorPoint(),
 }

@@ -21,18 +21,14 @@ import unifg as fg
 from benchmarks import compiled_peers, control_loops, control_pieces, control_starts
 from benchmarks.control_problems import Problem, problems
 from benchmarks.report import CHECKOUT, OUT, machine, put_results, table
-from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
+from unifg.solvers.names import backends
 
 TOLERANCE = 1e-4
 SAME = 1e-4  # relative difference below which two costs are one optimum
 SLOW = 300.0  # [ms]; a slower solve is not repeated
 PEERS = ("ipopt", "fatrop", "fatrop, compiled")
 """The last one with its functions in machine code, the others in the virtual machine of casadi."""
-SOLVERS: dict[str, fg.Solver] = {
-    "ipm": InteriorPoint(tolerance=TOLERANCE),
-    "sqp": SQP(tolerance=TOLERANCE),
-    "alm": AugmentedLagrangian(tolerance=TOLERANCE),
-}
+SOLVERS = backends("ipm", "sqp", "alm", tolerance=TOLERANCE)
 
 
 @dataclass

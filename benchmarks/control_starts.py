@@ -13,7 +13,7 @@ from benchmarks.control_problems import Problem, problems
 from benchmarks.report import table
 from unifg.lie import wrap_angle
 from unifg.models import quadrotor
-from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
+from unifg.solvers.names import backends
 from unifg.typing import Array
 
 STARTS = 30
@@ -22,11 +22,7 @@ SPREAD = {  # standard deviations of states (tangent) and controls
     "unicycle": (np.array([0.3, 0.3, 0.5]), np.array([0.3, 0.3])),
     "quadrotor": (np.repeat([0.3, 0.3, 0.5], 3), np.array([0.5, 0.5, 0.5, 1.0])),
 }
-SOLVERS: dict[str, fg.Solver] = {
-    "ipm": InteriorPoint(tolerance=1e-4),
-    "sqp": SQP(tolerance=1e-4),
-    "alm": AugmentedLagrangian(tolerance=1e-4),
-}
+SOLVERS = backends("ipm", "sqp", "alm", tolerance=1e-4)
 
 
 def starts(problem: Problem, count: int = STARTS) -> Iterator[tuple[Array, Array]]:

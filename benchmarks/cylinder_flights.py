@@ -21,14 +21,14 @@ from benchmarks.control_peers import QuadrotorPeer
 from benchmarks.control_problems import Quadrotor, QuadrotorGraph
 from benchmarks.report import table
 from unifg.models import avoidance, quadrotor
-from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
+from unifg.solvers.names import backends
 from unifg.typing import Array
 
 SPEED = 6.0  # [m/s]
 CYLINDERS = 10
 SEEDS = range(20)
 FREE = 1.5  # of cylinders, around the start [m]
-SOLVERS: dict[str, fg.Solver] = {"ipm": InteriorPoint(), "sqp": SQP(), "alm": AugmentedLagrangian()}
+SOLVERS = backends("ipm", "sqp", "alm")
 
 
 @dataclass(frozen=True)

@@ -36,22 +36,13 @@ from unifg.scenarios import manoeuvres
 from unifg.scenarios.course import CourseSettings, run_course
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.navigation import run_navigation
-from unifg.solvers import (
-    KKT,
-    SQP,
-    AugmentedLagrangian,
-    DogLeg,
-    GaussNewton,
-    GraduatedNonConvexity,
-    InteriorPoint,
-    LevenbergMarquardt,
-    Penalty,
-)
+from unifg.solvers import DogLeg, GaussNewton, GraduatedNonConvexity
+from unifg.solvers.names import backends
 from unifg.typing import Array
 
 ROUNDING = 1e-9  # relative difference of costs that a changed order of sums may make
 LAG = 50  # poses
-CONTROL: dict[str, fg.Solver] = {"ipm": InteriorPoint(), "sqp": SQP(), "alm": AugmentedLagrangian()}
+CONTROL = backends("ipm", "sqp", "alm")
 
 
 @dataclass(frozen=True)
@@ -185,25 +176,25 @@ def of_collection() -> Rows:
 
 def of_ecg2o() -> Rows:
     """Both case studies."""
-    backends: dict[str, fg.Solver] = {"kkt": KKT(), "penalty": Penalty(), "gn": GaussNewton(), **CONTROL}
+    solvers = {**backends("kkt", "penalty", "gn"), **CONTROL}
     for drag in ("quadratic", "linear"):
         for length in ecg2o.LENGTHS:
-            for name, solver in backends.items():
+            for name, solver in solvers.items():
                 yield f"drive {drag} {length}, {name}", partial(built, solver, partial(ecg2o.drive, length, drag))
     for start in ecg2o.STARTS:
-        for name, solver in {**backends, "literal": ecg2o.literal(10.0), "damped": ecg2o.damped(10.0)}.items():
+        for name, solver in {**solvers, "literal": ecg2o.literal(10.0), "damped": ecg2o.damped(10.0)}.items():
             yield f"small {start}, {name}", partial(built, solver, partial(ecg2o.small, start))
 
 
 def of_graphs() -> Rows:
     """Pose graphs, marginals of some poses, and smoothing pose by pose."""
-    backends: dict[str, Solving] = {
-        "gn": GaussNewton(), "lm": LevenbergMarquardt(), "dog-leg": DogLeg(), "gnc": GraduatedNonConvexity(),
+    solvers: dict[str, Solving] = {
+        **backends("gn", "lm"), "dog-leg": DogLeg(), "gnc": GraduatedNonConvexity(),
     }  # fmt: skip
     cases = pose_graphs.cases()
     for case in cases:
         graph, _, guess = case.pose_graph.graph()
-        for name, solver in backends.items():
+        for name, solver in solvers.items():
             if name != "gnc" or case.name in ("M3500", "intel"):
                 yield f"{case.name}, {name}", partial(solved, solver, graph, guess)
         yield f"{case.name}, covariance", partial(marginals, case.pose_graph)

@@ -29,6 +29,7 @@ from benchmarks.report import CHECKOUT, OUT, machine, put_results, table
 from benchmarks.timing import pin
 from unifg.scenarios.course import (
     AVOIDANCES,
+    HESSIANS,
     Avoidance,
     Course,
     CourseSettings,
@@ -42,14 +43,7 @@ from unifg.scenarios.worlds.air import VEHICLE_RADIUS
 from unifg.scenarios.worlds.layouts import COURSE_SEEDS, TUNING_SEEDS, Layout, obstacle_course
 
 SAME = 1e-3  # relative difference of cost below which two minima are one
-BACKENDS: tuple[tuple[str, Hessian], ...] = (
-    ("sqp", "exact"),
-    ("sqp", "gauss-newton"),
-    ("ipm", "exact"),
-    ("ipm", "gauss-newton"),
-    ("alm", "exact"),
-    ("alm", "gauss-newton"),
-)
+BACKENDS = tuple(product(("sqp", "ipm", "alm"), HESSIANS))
 EVERYWHERE: Start = "hover"  # the guess from which all backends begin; the others are tried with exact Hessians
 GUESSES: tuple[Start, ...] = ("hover", "line", "way")
 

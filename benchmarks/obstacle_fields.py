@@ -26,7 +26,7 @@ from benchmarks.report import CHECKOUT, OUT, machine, put_results, table
 from benchmarks.unicycle_problems import DT, EFFORT, LIMIT, STAGE, TERMINAL
 from unifg.models import obstacles, unicycle
 from unifg.models.potential import Sense, potential
-from unifg.solvers import SQP, AugmentedLagrangian
+from unifg.solvers.names import backends
 from unifg.typing import Array
 
 HORIZON = 50
@@ -140,10 +140,7 @@ METHODS = (
 
 def solvers(search: int) -> dict[str, fg.Solver]:
     """Both constrained backends at the tolerance of the reference problems."""
-    return {
-        "alm": AugmentedLagrangian(tolerance=TOLERANCE, search_iterations=search),
-        "sqp": SQP(tolerance=TOLERANCE, search_iterations=search),
-    }
+    return backends("alm", "sqp", tolerance=TOLERANCE, search_iterations=search)
 
 
 @dataclass(frozen=True)

@@ -21,13 +21,14 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.campaign import campaign, interval
+from benchmarks.quadrotor_flights import SOLVERS
 from benchmarks.report import CHECKOUT, OUT, code_digest, machine, put_results, table
 from unifg.models import quadrotor
 from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.flying.coupling import make_pilot
 from unifg.scenarios.flying.joint import JointSettings
 from unifg.scenarios.flying.joint_pilot import JointPilot, joint_pilot
-from unifg.scenarios.flying.plan import BACKENDS, Avoidance
+from unifg.scenarios.flying.plan import Avoidance
 from unifg.scenarios.seeing.belief import Belief, Landmarks
 from unifg.scenarios.worlds.layouts import TUNING_SEEDS
 from unifg.typing import Array
@@ -72,7 +73,7 @@ def jobs_of(seeds: list[int], seconds: float, code: str) -> list[Job]:
         jobs += [replace(plain, coupling="sequential", avoidance=how) for how in AVOIDANCES]
         jobs += [replace(plain, weight=weight, pull=pull) for pull in PULLS for weight in WEIGHTS]
         jobs += [replace(plain, pull=pull, avoidance="potential") for pull in PULLS]
-        jobs += [replace(plain, solver=solver) for solver in BACKENDS if solver != plain.solver]
+        jobs += [replace(plain, solver=solver) for solver in SOLVERS if solver != plain.solver]
     return jobs
 
 
@@ -266,7 +267,7 @@ def render(rows: list[Row], seeds: list[int], seconds: float) -> str:
     start = of_variant(rows, replace(plain, coupling="sequential", avoidance="potential").variant)
     parts += ["### Ta's own costs", pull_table(potential, ["pull"])]
     parts.append(error_table([(["sequential"], start), *potential], ["pull"], start))
-    backends = [([solver], of_variant(rows, replace(plain, solver=solver).variant)) for solver in BACKENDS]
+    backends = [([solver], of_variant(rows, replace(plain, solver=solver).variant)) for solver in SOLVERS]
     parts += ["### Backends, weight 1, pull 0.5", pull_table(backends, ["backend"])]
     parts.append(error_table([(["sequential, ipm"], base), *backends], ["backend"], base))
     return "\n\n".join(parts)

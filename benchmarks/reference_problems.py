@@ -30,7 +30,8 @@ from benchmarks import closed_loop
 from benchmarks.closed_loop import Formulation, Peer
 from benchmarks.report import CHECKOUT, OUT, machine, put_results, table
 from benchmarks.unicycle_problems import Problem, problems
-from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
+from unifg.solvers import SQP
+from unifg.solvers.names import backends
 from unifg.typing import Array
 
 SAME = 1e-5  # relative difference below which two costs count as one optimum
@@ -123,11 +124,7 @@ def refine(problem: Problem, outcome: Outcome) -> float:
 
 def measure(problem: Problem, rounds: int) -> dict[str, Outcome]:
     """Solve a problem with every solver in turn, ``rounds`` times: a slow moment of the machine meets all of them."""
-    attempts = {
-        "ipm": attempt(InteriorPoint(), problem),
-        "alm": attempt(AugmentedLagrangian(), problem),
-        "sqp": attempt(SQP(), problem),
-    }
+    attempts = {name: attempt(solver, problem) for name, solver in backends("ipm", "alm", "sqp").items()}
     attempts[ALONE] = attempt(SQP(fallback=None, qp_iterations=4000), problem)
     compare = find_spec("casadi") is not None
     if compare:

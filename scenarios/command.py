@@ -28,11 +28,11 @@ from unifg.scenarios.commands import graph_arguments as solve_arguments
 from unifg.scenarios.commands import velocity_arguments as velocity_tracking_arguments
 from unifg.scenarios.commands.drive_results import summary, write_results
 from unifg.scenarios.commands.outcome import Outcome, Progress
+from unifg.solvers import names
 
-__all__ = ["SCENARIOS", "SOLVERS", "Outcome", "Scenario", "main"]
+__all__ = ["SCENARIOS", "Outcome", "Scenario", "main"]
 
 SUCCEEDED, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
-SOLVERS = ("alm", "sqp")
 COUPLINGS = ("sequential", "joint")
 MANOEUVRES = ("behind", "obstacle")
 
@@ -59,7 +59,7 @@ class Scenario:
     arguments: Callable[[argparse.ArgumentParser], None]
     run: Callable[[argparse.Namespace, Progress], Outcome]
     random: bool = True
-    solvers: tuple[str, ...] = SOLVERS
+    solvers: tuple[str, ...] = names.CONSTRAINED
     solver: str = "sqp"
 
 
@@ -96,7 +96,10 @@ def _parser() -> argparse.ArgumentParser:
         one = scenarios.add_parser(name, help=scenario.summary, description=scenario.summary, allow_abbrev=False)
         scenario.arguments(one)
         one.add_argument(
-            "--solver", choices=scenario.solvers, default=scenario.solver, help="backend (default: %(default)s)"
+            "--solver",
+            choices=scenario.solvers,
+            default=scenario.solver,
+            help=f"{names.choices(scenario.solvers)} (default: %(default)s)",
         )
         if scenario.random:
             one.add_argument("--seed", type=_count, default=0, metavar="S", help="of everything random (default: 0)")
@@ -264,7 +267,7 @@ def _navigation_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_navigation(chosen: argparse.Namespace, progress: Progress) -> Outcome:
-    from unifg.scenarios import navigation  # imports solvers and the physics engine: not for --help
+    from unifg.scenarios import navigation  # imports the physics engine: not for --help
     from unifg.scenarios.driving.controller import ControllerSettings
 
     settings = navigation.NavigationSettings(
@@ -368,14 +371,13 @@ SCENARIOS = {
         velocity_tracking_arguments.add_arguments,
         _run_velocity_tracking,
         random=False,
-        solvers=velocity_tracking_arguments.SOLVERS,
+        solvers=names.EQUALITIES,
         solver="kkt",
     ),
     "quadrotor-mpc": Scenario(
         mpc_arguments.DESCRIPTION,
         mpc_arguments.add_arguments,
         mpc_arguments.run,
-        solvers=mpc_arguments.SOLVERS,
         solver="ipm",
     ),
     "quadrotor-obstacles": Scenario(
@@ -383,7 +385,7 @@ SCENARIOS = {
         obstacles_arguments.add_arguments,
         obstacles_arguments.run,
         random=False,  # its seed has no default: without one, the nominal layout
-        solvers=obstacles_arguments.SOLVERS,
+        solvers=names.SECOND_ORDER,
     ),
 }
 """Everything ``unifg run`` can run."""

@@ -18,14 +18,13 @@ from unifg.models import avoidance, landmarks, quadrotor
 from unifg.scenarios.ways.visibility import Ways
 from unifg.scenarios.worlds.air import VEHICLE_RADIUS
 from unifg.scenarios.worlds.layouts import Layout, obstacle_course
-from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
+from unifg.solvers import names
 from unifg.typing import Array
 
 __all__ = [
     "AVOIDANCES",
     "GUESSES",
     "HESSIANS",
-    "SOLVERS",
     "Course",
     "CourseSettings",
     "backend",
@@ -40,7 +39,6 @@ Start = Literal["hover", "line", "way"]
 Hessian = Literal["exact", "gauss-newton"]
 Progress = Callable[[fg.Iteration], bool | None]
 
-SOLVERS = ("sqp", "ipm", "alm")
 AVOIDANCES: tuple[Avoidance, ...] = get_args(Avoidance)
 GUESSES: tuple[Start, ...] = get_args(Start)
 HESSIANS: tuple[Hessian, ...] = get_args(Hessian)
@@ -58,7 +56,7 @@ class CourseSettings:
     Attributes:
         horizon: steps N.
         dt: sampling time [s].
-        solver: "sqp", "ipm" or "alm".
+        solver: one of `unifg.solvers.names.SECOND_ORDER`.
         hessian: "exact" or "gauss-newton"; None for exact.
         avoidance: "potential" is Ta's cost 1/d for the cylinder and every wall, d from the hull; "hard" keeps the hull
             clear at every node.
@@ -129,16 +127,10 @@ def backend(settings: CourseSettings, *, keep_values: bool = False) -> fg.Solver
     """The solver the settings ask for.
 
     Raises:
-        ScenarioError: for an unknown solver.
+        BackendError: for an unknown solver.
     """
-    tolerance, hessian = settings.tolerance, settings.chosen_hessian
-    if settings.solver == "sqp":
-        return SQP(tolerance=tolerance, hessian=hessian, keep_values=keep_values)
-    if settings.solver == "ipm":
-        return InteriorPoint(tolerance=tolerance, hessian=hessian, keep_values=keep_values)
-    if settings.solver != "alm":
-        raise fg.ScenarioError(f"unknown solver '{settings.solver}': choose one of {', '.join(SOLVERS)}")
-    return AugmentedLagrangian(tolerance=tolerance, hessian=hessian, keep_values=keep_values)
+    options = {"tolerance": settings.tolerance, "hessian": settings.chosen_hessian, "keep_values": keep_values}
+    return names.backend(settings.solver, **options)
 
 
 def state_problem(settings: CourseSettings, layout: Layout) -> tuple[fg.Graph, fg.Family, fg.Family]:
@@ -317,8 +309,8 @@ def run_course(settings: CourseSettings | None = None, progress: Progress | None
         progress: called with every row of the history; returning True ends the solve.
 
     Raises:
-        ScenarioError: for an unknown solver or guess, or a Hessian the solver does not have.
-        BackendError: for a general cost and alm.
+        ScenarioError: for an unknown guess.
+        BackendError: for an unknown solver, an option it does not have, or a cost it does not take.
     """
     settings = settings or CourseSettings()
     return solve_course(settings, settings.layout(), backend(settings, keep_values=True), progress)

@@ -42,7 +42,7 @@ class FlightSettings:
     """One flight.
 
     Attributes:
-        solver: of the controller: "ipm", "sqp" or "alm".
+        solver: of the controller, one of `unifg.solvers.names.CONSTRAINED`.
         coupling: "separate", "sequential" or "joint".
         seed: of everything random.
         movers: number of moving discs.

@@ -17,7 +17,7 @@ import numpy as np
 
 import unifg as fg
 from unifg.models import obstacles, unicycle
-from unifg.solvers import SQP, AugmentedLagrangian
+from unifg.solvers import names
 from unifg.typing import Array
 
 __all__ = [
@@ -150,7 +150,7 @@ class Manoeuvre:
     Attributes:
         case: what was asked.
         settings: the numbers.
-        solver: "alm" or "sqp".
+        solver: one of `unifg.solvers.names.CONSTRAINED`.
         solution: with its history.
         states: (N + 1, 3) poses of the solution [m, m, rad].
         controls: (N, 2) controls of the solution [m/s, rad/s].
@@ -220,23 +220,16 @@ def run_manoeuvre(
 
     Args:
         case: one of `CASES`, or another.
-        solver: "alm" or "sqp".
+        solver: one of `unifg.solvers.names.CONSTRAINED`.
         settings: None for the defaults.
         progress: called with every row of the history; returning True ends the solve.
 
     Raises:
-        ScenarioError: for an unknown solver.
+        BackendError: for an unknown solver.
     """
     settings = settings or ManoeuvreSettings()
-    backend: fg.Solver
-    if solver == "alm":
-        backend = AugmentedLagrangian(
-            tolerance=settings.tolerance, max_iterations=settings.max_iterations, keep_values=True
-        )
-    elif solver == "sqp":
-        backend = SQP(tolerance=settings.tolerance, max_iterations=settings.max_iterations, keep_values=True)
-    else:
-        raise fg.ScenarioError(f"unknown solver '{solver}': choose alm or sqp")
+    options = {"tolerance": settings.tolerance, "max_iterations": settings.max_iterations, "keep_values": True}
+    backend = names.backend(solver, **options)
     graph, x, u, guess = state_problem(case, settings)
     solution = backend.solve(graph, guess, callback=progress)
     iterates = np.stack([row.values[x] for row in solution.history if row.values is not None])

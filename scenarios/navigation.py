@@ -49,7 +49,7 @@ class NavigationSettings:
         map: ROS map file; None for the building that ships with the package.
         start: true start pose [m, m, rad]; None for the demonstration's.
         goals: poses to be reached in order; None for the demonstration's.
-        solver: "alm" or "sqp".
+        solver: one of `unifg.solvers.names.CONSTRAINED`.
         coupling: "sequential": estimation first, then control conditioned on it; "joint": one graph for both.
         obstacles: number of unforeseen obstacles.
         seed: of everything random.

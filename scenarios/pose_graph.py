@@ -15,21 +15,19 @@ from scipy.special import chdtri
 
 from unifg.answers.history import Iteration
 from unifg.answers.solution import Solution
-from unifg.answers.solver import Solver
 from unifg.answers.status import Status
 from unifg.errors import ScenarioError
 from unifg.files.pose_graph import read_pose_graph
 from unifg.kernels.robust import DCS, Cauchy, Huber, Loss, TruncatedLeastSquares, Tukey
 from unifg.pose_graphs.initialise import chordal, lago, odometric
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
-from unifg.solvers import GaussNewton, GraduatedNonConvexity, LevenbergMarquardt
+from unifg.solvers import GraduatedNonConvexity, names
 from unifg.typing import Array, BoolArray
 
 __all__ = ["SolveSettings", "SolvedGraph", "robust_loss", "solve_file"]
 
 Progress = Callable[[float, str], None]
 
-SOLVERS: dict[str, Callable[[], Solver]] = {"gn": GaussNewton, "lm": LevenbergMarquardt}
 GUESSES: dict[str, Callable[[PoseGraph], Array]] = {
     "file": lambda pose_graph: pose_graph.poses,
     "odometry": odometric,
@@ -55,7 +53,7 @@ class SolveSettings:
 
     Attributes:
         file: pose graph in the g2o or TORO format.
-        solver: "gn" or "lm".
+        solver: one of `unifg.solvers.names.LEAST_SQUARES`.
         robust: loss of the loop closures, "huber", "cauchy", "tukey", "dcs" or "gnc", with its parameter after a colon
             if it is not the usual one; None for none.
         init: "file", "odometry", "lago" or "chordal".
@@ -152,8 +150,7 @@ def solve_file(settings: SolveSettings, progress: Progress = lambda done, text: 
         stage = f", stage {row.details['stage']}" if "stage" in row.details else ""
         progress(1.0 - 0.95 * 0.9**row.number, f"iteration {row.number}{stage}, cost {row.cost:.6g}")
 
-    backend = SOLVERS[settings.solver]()
-    backend.keep_values = True
+    backend = names.backend(settings.solver, keep_values=True)
     solver = GraduatedNonConvexity(solver=backend) if isinstance(loss, TruncatedLeastSquares) else backend
     clock.start()
     solution = solver.solve(graph, guess, callback=tell)

@@ -22,11 +22,10 @@ import unifg as fg
 from unifg.models import vehicle
 from unifg.models.vehicle import Vehicle
 from unifg.scenarios.ways.speed_profile import Profile, drive_cycle, read_profile
-from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
+from unifg.solvers import names
 from unifg.typing import Array
 
 __all__ = [
-    "BACKENDS",
     "Drive",
     "TrackingMetrics",
     "TrackingSettings",
@@ -40,15 +39,6 @@ __all__ = [
 Progress = Callable[[fg.Iteration], bool | None]
 ROUNDING = 1e-6  # relative, by which a limit may seem exceeded
 
-BACKENDS: dict[str, type[fg.Solver]] = {
-    "kkt": KKT,
-    "alm": AugmentedLagrangian,
-    "sqp": SQP,
-    "penalty": Penalty,
-    "ipm": InteriorPoint,
-}
-"""Solvers by their name on the command line."""
-
 
 @dataclass(frozen=True)
 class TrackingSettings:
@@ -56,7 +46,7 @@ class TrackingSettings:
 
     Attributes:
         length: steps N.
-        solver: one of `BACKENDS`.
+        solver: one of `unifg.solvers.names.EQUALITIES`.
         profile: CSV file of the speeds; None for the drive cycle that ships with unifg.
         linear: replace the air drag by its linear stand-in.
         force_bounds: least and greatest force [N]; None for no bounds.
@@ -184,18 +174,17 @@ def run_tracking(settings: TrackingSettings | None = None, progress: Progress | 
         progress: called with every row of the history; returning True ends the solve.
 
     Raises:
-        ScenarioError: for an unknown solver, force bounds that leave nothing, or a profile that is too short.
+        ScenarioError: for force bounds that leave nothing, or a profile that is too short.
         FileFormatError: when the file is no profile.
-        BackendError: when the solver cannot take force bounds.
+        BackendError: for an unknown solver, and when the solver cannot take force bounds.
     """
     s = settings or TrackingSettings()
-    if s.solver not in BACKENDS:
-        raise fg.ScenarioError(f"unknown solver '{s.solver}': choose one of {', '.join(BACKENDS)}")
+    backend = names.backend(s.solver, tolerance=s.tolerance)
     if s.force_bounds is not None and not s.force_bounds[0] < s.force_bounds[1]:
         raise fg.ScenarioError(f"force bounds {s.force_bounds} leave nothing: the first must be below the second")
     profile = s.speeds()
     graph, v, f, guess = state_problem(s, profile)
-    solution = BACKENDS[s.solver](tolerance=s.tolerance).solve(graph, guess, callback=progress)
+    solution = backend.solve(graph, guess, callback=progress)
     return Drive(s, profile, solution, solution[v][:, 0], solution[f][:, 0], solution.dual("dynamics")[:, 0])
 
 

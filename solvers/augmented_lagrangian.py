@@ -29,7 +29,6 @@ from unifg.machine.jit import compiled
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.solvers.damping import Damping, damped_step, largest, norm
-from unifg.solvers.least_squares import require_squares
 from unifg.solvers.least_violation import leave, settle
 from unifg.solvers.model import STRAIGHT, model_step
 from unifg.solvers.primal import Primal
@@ -68,6 +67,8 @@ class AugmentedLagrangian(Solver):
             convex) or "gauss-newton". Bazzana's schedules and graphs without constraints have Gauss-Newton's.
     """
 
+    scalar_costs = False
+
     max_iterations: int = 300
     penalty: float | None = None
     penalty_growth: float = 10.0
@@ -89,10 +90,6 @@ class AugmentedLagrangian(Solver):
             raise BackendError(f"{self.name}: hessian must be 'exact' or 'gauss-newton', found '{self.hessian}'")
         if self.penalty is not None and not self.penalty > 0.0:
             raise BackendError(f"{self.name}: penalty must be positive, found {self.penalty}")
-
-    def require(self, program: Program) -> None:
-        """Refuse scalar costs: the primal step is least squares."""
-        require_squares(program, self.name)
 
     def workspace(self, program: Program) -> Primal:
         """The factorisation of the primal step."""

@@ -33,7 +33,7 @@ import numpy as np
 
 from unifg.answers.history import Iteration
 from unifg.answers.solution import NotConverged, Solution
-from unifg.answers.solver import Callback, Prepared, Solver, Start
+from unifg.answers.solver import Backend, Callback, Prepared, Solver, Start
 from unifg.answers.status import Status
 from unifg.answers.verdict import Verdict
 from unifg.errors import BackendError
@@ -113,7 +113,7 @@ class _Stage:
 
 
 @dataclass(kw_only=True)
-class GraduatedNonConvexity:
+class GraduatedNonConvexity(Backend):
     """Solves graphs with `unifg.TruncatedLeastSquares` or `unifg.GemanMcClure` in one or more terms.
 
     The answer is the best found, not the best there is: no local method knows that. CONVERGED says that it is
@@ -130,6 +130,9 @@ class GraduatedNonConvexity:
         stage_iterations: iterations of the backend for each surrogate, at most; a rough answer will do.
     """
 
+    constraints = "none"
+    scalar_costs = False
+
     solver: Solver = field(default_factory=GaussNewton)
     growth: float = 1.4
     stage_iterations: int = 20
@@ -140,11 +143,6 @@ class GraduatedNonConvexity:
             raise BackendError(f"{self.name}: growth must be above 1, found {self.growth}")
         if self.stage_iterations < 1:
             raise BackendError(f"{self.name}: stage_iterations must be positive, found {self.stage_iterations}")
-
-    @property
-    def name(self) -> str:
-        """The class name."""
-        return type(self).__name__
 
     def solve(
         self,
@@ -157,21 +155,14 @@ class GraduatedNonConvexity:
     ) -> Solution:
         """Solve without the losses, through their surrogates, and with the losses themselves.
 
-        Args:
-            graph: the problem.
-            guess: values per family, where every surrogate starts.
-            data: values of data for this solve.
-            check: raise instead of returning a solution that did not converge.
-            callback: called with every row of the history; returning True ends the solve.
+        Arguments as for :class:`unifg.answers.solver.Backend`; every surrogate starts at the guess.
 
         Returns:
             The solution of the graph as stated, judged with its own losses. The history holds all stages, numbered
             through; ``stage`` among the details of a row is 0 without the losses.
 
         Raises:
-            GraphError: when the graph, guess or data is malformed.
-            BackendError: when no term has a loss with surrogates, or the backend cannot take the graph.
-            NotConverged: with ``check=True``.
+            BackendError: also when no term has a loss with surrogates.
         """
         started = time.perf_counter()
         staged, stages = _staged(graph)

@@ -26,6 +26,7 @@ from typing import Literal
 
 import numpy as np
 
+from unifg.answers.requirements import require
 from unifg.answers.solver import Run, Solver
 from unifg.answers.status import Status
 from unifg.errors import BackendError
@@ -33,7 +34,6 @@ from unifg.program.linearization import Evaluation, Linearization
 from unifg.program.program import Program
 from unifg.solvers.damping import LARGEST, SUFFICIENT, Damping, largest, norm
 from unifg.solvers.kkt_system import KktSystem, aim, fill
-from unifg.solvers.least_squares import require_squares
 from unifg.solvers.least_violation import leave, settle
 from unifg.solvers.primal import DIAGONAL_FLOOR
 from unifg.typing import Array
@@ -63,6 +63,9 @@ class KKT(Solver):
             there). A positive number switches it on; it does not grant CONVERGED.
     """
 
+    constraints = "equalities"
+    scalar_costs = False
+
     full_steps: bool = False
     second_order_correction: bool = True
     globalization: Literal["line-search", "levenberg-marquardt"] = "line-search"
@@ -76,11 +79,6 @@ class KKT(Solver):
             raise BackendError(f"{self.name}: globalization must be {words}, found '{self.globalization}'")
         if self.full_steps and self.globalization == "levenberg-marquardt":
             raise BackendError(f"{self.name}: full_steps=True leaves nothing to Levenberg-Marquardt: choose one")
-
-    def require(self, program: Program) -> None:
-        """Refuse scalar costs and inequalities."""
-        require_squares(program, self.name)
-        require_equalities(program, self.name)
 
     def workspace(self, program: Program) -> Newton:
         """Structure of the KKT matrix."""
@@ -227,7 +225,7 @@ class Newton:
         """
         program = self.program
         if not np.array_equal(program.equality, self.system.equality):
-            require_equalities(program, solver)
+            require(program, solver, "equalities")
             self._structure(program)
         self._begun = False  # equal solves take equal steps
 
@@ -342,22 +340,6 @@ class Merit:
 
     def _violation(self, constraints: Array) -> float:
         return float(np.abs(self.program.violation(constraints)).sum())
-
-
-def require_equalities(program: Program, solver: str) -> None:
-    """Raise unless every constraint that is switched on is an equality.
-
-    Raises:
-        BackendError: naming the first inequality.
-    """
-    limited = np.isfinite(program.lower) | np.isfinite(program.upper)
-    rows = np.flatnonzero(limited & ~program.equality)
-    if len(rows):
-        name, index = program.row_name(int(rows[0]))
-        raise BackendError(
-            f"{solver} cannot take the inequality '{name}' (factor {index}): it knows equalities only; use "
-            "InteriorPoint, SQP or AugmentedLagrangian"
-        )
 
 
 def _next_damping(damping: float, length: float) -> float:

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from unifg.answers.graph import Graph
+from unifg.answers.requirements import require
 from unifg.answers.solution import Guess, Solution
 from unifg.errors import BackendError, GraphError
 from unifg.kernels.differentiation import convexified
@@ -18,7 +19,6 @@ from unifg.program.program import Program
 from unifg.program.rows import Rows
 from unifg.program.term import CompiledTerm
 from unifg.program.touched import term_columns
-from unifg.solvers.kkt import require_equalities
 from unifg.solvers.linear_factors import Factor, LinearFactor, QuadraticFactor
 from unifg.solvers.linear_graphs import LinearGraph, dual_graph
 from unifg.solvers.qp import QP, subproblem
@@ -68,7 +68,7 @@ class LinearGraphs:
             raise BackendError(f"LinearGraphs: hessian must be 'exact' or 'gauss-newton', found '{hessian}'")
         program = graph.compile()
         program.bind(data or {})
-        require_equalities(program, "LinearGraphs")
+        require(program, "LinearGraphs", "equalities")
         known = {} if isinstance(start, Mapping) else start.multipliers
         lin = program.linearize(program.values_from(start if isinstance(start, Mapping) else start.values))
         qp = subproblem(program, lin, 0.0)

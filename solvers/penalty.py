@@ -18,7 +18,6 @@ from unifg.errors import BackendError
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.solvers.damping import Damping, damped_step, norm
-from unifg.solvers.least_squares import require_squares
 from unifg.solvers.least_violation import settle
 from unifg.solvers.model import model_step
 from unifg.solvers.phr import update
@@ -44,6 +43,8 @@ class Penalty(Solver):
         damping: initial Levenberg-Marquardt damping of each weight.
     """
 
+    scalar_costs = False
+
     max_iterations: int = 300
     penalty: float = 1.0
     penalty_growth: float = 10.0
@@ -58,10 +59,6 @@ class Penalty(Solver):
             raise BackendError(f"{self.name}: penalty must be positive, found {self.penalty}")
         if not self.penalty_growth > 1.0:
             raise BackendError(f"{self.name}: penalty_growth must be above 1, found {self.penalty_growth}")
-
-    def require(self, program: Program) -> None:
-        """Refuse scalar costs: the step is least squares."""
-        require_squares(program, self.name)
 
     def workspace(self, program: Program) -> Primal:
         """The factorisation of the normal equations."""

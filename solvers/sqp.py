@@ -15,13 +15,13 @@ from typing import Literal
 
 import numpy as np
 
+from unifg.answers.requirements import require
 from unifg.answers.solver import Run, Solver
 from unifg.answers.status import Status
 from unifg.errors import BackendError
 from unifg.program.linearization import Evaluation, Linearization
 from unifg.program.program import Program
 from unifg.solvers.damping import largest, norm
-from unifg.solvers.kkt import require_equalities
 from unifg.solvers.least_violation import leave, settle
 from unifg.solvers.qp import QP, QPAnswer, Route, solve_convex, subproblem
 from unifg.solvers.qp_elimination import EliminationRoute
@@ -102,7 +102,7 @@ class SQP(Solver):
     def require(self, program: Program) -> None:
         """Refuse inequalities where the linear algebra knows equalities only."""
         if self.qp == "elimination":
-            require_equalities(program, f"{self.name}(qp='elimination')")
+            require(program, f"{self.name}(qp='elimination')", "equalities")
 
     def workspace(self, program: Program) -> Subproblems:
         """QP workspaces."""
@@ -379,7 +379,7 @@ class Subproblems:
         if self._scaled:
             self.scaling = Scaling.of(self.program, lin, self._neutral)
         if isinstance(self.first, EliminationRoute):
-            require_equalities(self.program, "SQP(qp='elimination')")
+            require(self.program, "SQP(qp='elimination')", "equalities")
 
     def subproblem(self, run: Run, damping: float) -> QP:
         """The quadratic model at the present iterate."""

@@ -10,15 +10,11 @@ from scipy.linalg import null_space
 
 import unifg as fg
 from unifg.solvers import (
-    KKT,
     SQP,
-    AugmentedLagrangian,
-    DogLeg,
     GaussNewton,
     InteriorPoint,
-    LevenbergMarquardt,
-    Penalty,
 )
+from unifg.solvers.names import EQUALITIES, LEAST_SQUARES, backends
 from unifg.typing import Array
 
 # ---------------------------------------------------------------- priors of what leaves
@@ -349,16 +345,7 @@ def test_no_iteration_is_a_limit_like_any_other() -> None:
     assert solution.status is fg.Status.ITERATION_LIMIT and solution[x] == 1.0
 
 
-STEPPING: dict[str, fg.Solver] = {
-    "gn": GaussNewton(keep_values=True),
-    "lm": LevenbergMarquardt(keep_values=True),
-    "dog-leg": DogLeg(keep_values=True),
-    "kkt": KKT(keep_values=True),
-    "sqp": SQP(keep_values=True),
-    "alm": AugmentedLagrangian(keep_values=True),
-    "ipm": InteriorPoint(keep_values=True),
-    "penalty": Penalty(keep_values=True),
-}
+STEPPING = backends(*LEAST_SQUARES, *EQUALITIES, keep_values=True)
 
 
 @pytest.mark.parametrize("name", STEPPING)

@@ -10,7 +10,8 @@ from benchmarks import control_loops, control_starts
 from benchmarks.control_problems import Problem, Quadrotor, Unicycle, problems
 from judge import judge
 from unifg.models import quadrotor
-from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
+from unifg.solvers import InteriorPoint
+from unifg.solvers.names import backends
 
 # A minimum that is not listed; IPOPT stays when it is started there (docs/reference-problems.md).
 CONFIRMED = {
@@ -18,11 +19,7 @@ CONFIRMED = {
     ("ahead", True, 50): (580.25905,),
     ("goto", True, 50): (3387.08409,),  # lower than what is listed
 }
-SOLVERS: dict[str, fg.Solver] = {
-    "ipm": InteriorPoint(tolerance=1e-4),
-    "sqp": SQP(tolerance=1e-4),
-    "alm": AugmentedLagrangian(tolerance=1e-4),
-}
+SOLVERS = backends("ipm", "sqp", "alm", tolerance=1e-4)
 
 
 @pytest.mark.parametrize("problem", problems(), ids=lambda p: f"{p.robot} {p.name}")

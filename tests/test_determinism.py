@@ -17,16 +17,17 @@ from unifg.solvers import (
     LevenbergMarquardt,
     Penalty,
 )
+from unifg.solvers.names import backends
 from unifg.typing import Array
 from units import drive
 
 CONSTRAINED: dict[str, fg.Solver] = {
-    "alm": AugmentedLagrangian(),
+    **backends("alm"),
     "alm, literal": AugmentedLagrangian(schedule="bazzana", penalty=10.0, max_iterations=50),
     "penalty": Penalty(max_iterations=30),
-    "ipm": InteriorPoint(),
+    **backends("ipm"),
     "ipm, gauss-newton": InteriorPoint(hessian="gauss-newton"),
-    "sqp": SQP(),
+    **backends("sqp"),
     "sqp, exact": SQP(hessian="exact"),
     "sqp, graph": SQP(qp="graph"),
     "sqp, piqp": SQP(qp="piqp", fallback="graph"),

@@ -26,7 +26,7 @@ from unifg.scenarios.manoeuvres import (
 )
 from unifg.scenarios.show import manoeuvre_plot as manoeuvre_plots
 from unifg.scenarios.show.palette import css
-from unifg.solvers import SQP, AugmentedLagrangian
+from unifg.solvers import SQP, names
 
 SOLVERS = ("alm", "sqp")
 BEHIND = 59.47520  # J of the path behind the robot without a cost on changes, by IPOPT and by Crocoddyl's Box-FDDP
@@ -60,7 +60,7 @@ def test_converges_within_every_limit(name: str, solver: str) -> None:
 def test_an_independent_judge_agrees(name: str, solver: str) -> None:
     settings = ManoeuvreSettings()
     graph, _, _, guess = state_problem(CASES[name], settings)
-    backend = {"alm": AugmentedLagrangian(max_iterations=300), "sqp": SQP(max_iterations=300)}[solver]
+    backend = names.backend(solver, max_iterations=300)
     solution = backend.solve(graph, guess)
     assert judge(graph, solution).worst() < 5e-6
     assert solution.cost == pytest.approx(solved(name, solver).solution.cost, rel=1e-12)
@@ -124,7 +124,7 @@ def test_omega_turns_over_at_the_inflections_where_v_is_greatest(solver: str) ->
 def test_the_guess_chooses_the_side(solver: str) -> None:
     graph, x, _, guess = state_problem(CASES["obstacle"], ManoeuvreSettings())
     guess.values[x][1:, 1] -= 0.2
-    backend = {"alm": AugmentedLagrangian(max_iterations=300), "sqp": SQP(max_iterations=300)}[solver]
+    backend = names.backend(solver, max_iterations=300)
     below = backend.solve(graph, guess, check=True)
     assert below.cost == pytest.approx(29.5439, rel=1e-5)
     assert below[x][25, 1] < -0.5 and solved("obstacle", solver).states[25, 1] > 0.4
@@ -170,7 +170,7 @@ def test_a_broken_limit_is_no_success() -> None:
 
 
 def test_unknown_solver_is_refused() -> None:
-    with pytest.raises(fg.ScenarioError, match="unknown solver 'ipopt': choose alm or sqp"):
+    with pytest.raises(fg.BackendError, match="unknown backend 'ipopt': choose one of gn, lm"):
         run_manoeuvre(CASES["behind"], "ipopt")
 
 

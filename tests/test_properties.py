@@ -13,19 +13,18 @@ from numpy.random import Generator
 
 import unifg as fg
 from judge import judge
-from unifg.solvers import KKT, SQP, AugmentedLagrangian, GaussNewton, InteriorPoint, LevenbergMarquardt, Penalty
+from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint
+from unifg.solvers.names import backends
 from unifg.typing import Array, IntArray
 
 Guess = dict[fg.Family, Array]
 
 CONSTRAINED: dict[str, fg.Solver] = {
-    "alm": AugmentedLagrangian(),
-    "penalty": Penalty(),
-    "sqp": SQP(),
+    **backends("alm", "penalty", "sqp"),
     "sqp-exact": SQP(hessian="exact"),
-    "ipm": InteriorPoint(),
+    **backends("ipm"),
 }
-UNCONSTRAINED: dict[str, fg.Solver] = {"gn": GaussNewton(), "lm": LevenbergMarquardt()}
+UNCONSTRAINED = backends("gn", "lm")
 SEEDS = st.integers(0, 10_000)
 PHASES = (Phase.explicit, Phase.generate)  # a seed has no simpler form to shrink to
 FEW, MORE = settings(max_examples=6, phases=PHASES), settings(max_examples=12, phases=PHASES)
@@ -208,11 +207,7 @@ def test_the_interior_point_decides_random_graphs(seed: int) -> None:
     assert solution.status in (fg.Status.CONVERGED, fg.Status.LOCALLY_INFEASIBLE), solution.report()
 
 
-EXACT: dict[str, fg.Solver] = {
-    "alm": AugmentedLagrangian(tolerance=1e-9),
-    "sqp": SQP(tolerance=1e-9, qp="graph"),
-    "ipm": InteriorPoint(tolerance=1e-9),
-}
+EXACT = {**backends("alm", "ipm", tolerance=1e-9), "sqp": SQP(tolerance=1e-9, qp="graph")}
 
 
 @pytest.mark.parametrize("name", EXACT)

@@ -13,10 +13,11 @@ from unifg.models import avoidance, quadrotor
 from unifg.scenarios.flying.braking import brake, stopping_path
 from unifg.scenarios.flying.controller import Controller, Given
 from unifg.scenarios.flying.guide import Guide, GuideSettings, Reference
-from unifg.scenarios.flying.plan import BACKENDS, ControllerSettings
+from unifg.scenarios.flying.plan import ControllerSettings
 from unifg.scenarios.flying.slots import Obstacles, Slots
 from unifg.scenarios.seeing.belief import Belief, Landmarks
 from unifg.scenarios.seeing.mover_tracks import Movers
+from unifg.solvers.names import CONSTRAINED
 from unifg.typing import Array
 
 WALLS = np.array([[[0.0, -4.0], [30.0, -4.0]], [[0.0, 4.0], [30.0, 4.0]]])
@@ -110,14 +111,14 @@ def test_a_reference_can_be_flown() -> None:
 
 @pytest.fixture(scope="module")
 def controllers() -> dict[str, Controller]:
-    return {name: Controller(TARGET, WALLS, name, bounds=BOUNDS) for name in BACKENDS}
+    return {name: Controller(TARGET, WALLS, name, bounds=BOUNDS) for name in CONSTRAINED}
 
 
 AHEAD = landmarks((3.5, 0.1, 0.5), (5.0, 1.2, 0.4))
 MOVING = belief(state(2.0, velocity=(1.8, 0.0, 0.0)), AHEAD, HEAVY)
 
 
-@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("name", CONSTRAINED)
 def test_a_plan_moves_as_the_vehicle_does_and_keeps_every_limit(name: str, controllers: dict[str, Controller]) -> None:
     controller, s = controllers[name], controllers[name].settings
     controller.forget()

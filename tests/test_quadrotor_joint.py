@@ -20,7 +20,7 @@ from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.flying.estimator import Estimator
 from unifg.scenarios.flying.joint import JointController, JointSettings
 from unifg.scenarios.flying.joint_pilot import JointPilot, joint_pilot
-from unifg.scenarios.flying.plan import BACKENDS, ControllerSettings, Plan
+from unifg.scenarios.flying.plan import ControllerSettings, Plan
 from unifg.scenarios.flying.slots import FAR_AWAY
 from unifg.scenarios.flying.standardised import standardised
 from unifg.scenarios.flying.window_terms import Shared, WindowTerms
@@ -28,6 +28,7 @@ from unifg.scenarios.seeing.belief import Belief
 from unifg.scenarios.seeing.mover_tracks import Movers
 from unifg.scenarios.worlds.layouts import Layout
 from unifg.solvers import InteriorPoint
+from unifg.solvers.names import CONSTRAINED
 from unifg.typing import Array
 
 SEED = 1000  # of those open to tuning
@@ -152,7 +153,7 @@ def test_the_pull_is_bounded(past: Past) -> None:
         assert bound - 2e-3 < found.max() < bound + 2e-3
 
 
-@pytest.mark.parametrize("solver", BACKENDS)
+@pytest.mark.parametrize("solver", CONSTRAINED)
 def test_a_plan_moves_as_the_shared_parameters_say_and_keeps_clear_of_the_shared_map(solver: str, past: Past) -> None:
     controller = past.controller(JointSettings(), solver, margin=0.9)  # so wide that the way does not keep it
     s, plan, believed = controller.settings, controller.plan(past.belief), controller.believed
@@ -172,7 +173,7 @@ def test_a_plan_moves_as_the_shared_parameters_say_and_keeps_clear_of_the_shared
 
 def test_backends_believe_the_same(past: Past) -> None:
     found = {}
-    for solver in BACKENDS:
+    for solver in CONSTRAINED:
         controller = past.controller(FREE, solver)
         controller.plan(past.belief)
         found[solver] = past.pulled(controller.believed)

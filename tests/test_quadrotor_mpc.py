@@ -324,7 +324,7 @@ def test_arguments_arrive() -> None:
     assert (settings.coupling, settings.movers, settings.mass_error) == ("joint", 2, 0.1)
     assert settings.estimator.association == "unknown"
     assert settings.controller.avoidance == "potential"
-    assert mpc_arguments.SOLVERS[0] == command.SCENARIOS["quadrotor-mpc"].solver
+    assert command.SCENARIOS["quadrotor-mpc"].solver == FlightSettings().solver
 
 
 @pytest.mark.parametrize("words", [("--movers", "-1"), ("--mass-error", "1"), ("--coupling", "loose")])

@@ -134,7 +134,7 @@ def test_the_hessian_that_is_asked_for_is_used(solver: str) -> None:
 
 
 def test_what_cannot_be_asked_for() -> None:
-    with pytest.raises(ScenarioError, match="unknown solver 'newton'"):
+    with pytest.raises(BackendError, match="unknown backend 'newton'"):
         run_course(CourseSettings(solver="newton"))
     with pytest.raises(ScenarioError, match="unknown guess"):
         run_course(CourseSettings(guess="luck"))  # type: ignore[arg-type]
@@ -201,7 +201,7 @@ def test_the_command_line_reports_failure(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_the_command_line_offers_what_the_scenario_has() -> None:
-    for name in ("SOLVERS", "HESSIANS", "AVOIDANCES", "GUESSES"):
+    for name in ("HESSIANS", "AVOIDANCES", "GUESSES"):
         assert getattr(obstacles_arguments, name) == getattr(obstacles, name)
 
 

@@ -5,19 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import unifg as fg
 from benchmarks.closed_loop import Formulation
 from benchmarks.unicycle_problems import Problem, problems
 from judge import judge
-from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
+from unifg.solvers.names import backends
 
 # Minima that are not listed, at which IPOPT stays when it is started there (docs/reference-problems.md).
 CONFIRMED = {("ahead", True, 20): (586.14768,), ("ahead", True, 50): (580.25905,)}
-SOLVERS: dict[str, fg.Solver] = {
-    "alm": AugmentedLagrangian(tolerance=1e-5),
-    "sqp": SQP(tolerance=1e-5),
-    "ipm": InteriorPoint(tolerance=1e-5),
-}
+SOLVERS = backends("alm", "sqp", "ipm", tolerance=1e-5)
 
 
 @pytest.mark.parametrize("problem", problems(), ids=lambda p: p.name)

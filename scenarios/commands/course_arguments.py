@@ -10,10 +10,9 @@ from unifg.scenarios.commands.outcome import Outcome, Progress
 if TYPE_CHECKING:
     from unifg.answers.history import Iteration
 
-__all__ = ["AVOIDANCES", "DESCRIPTION", "GUESSES", "HESSIANS", "SOLVERS", "add_arguments", "run"]
+__all__ = ["AVOIDANCES", "DESCRIPTION", "GUESSES", "HESSIANS", "add_arguments", "run"]
 
 DESCRIPTION = "A quadrotor's flight past three walls and a cylinder, optimised as a whole."
-SOLVERS = ("sqp", "ipm", "alm")
 HESSIANS = ("exact", "gauss-newton")
 AVOIDANCES = ("potential", "hard")
 GUESSES = ("hover", "line", "way")
@@ -47,8 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(chosen: argparse.Namespace, progress: Progress) -> Outcome:
     """Optimise the flight that was asked for."""
     from unifg.answers.status import Status
-    from unifg.scenarios import course as obstacles  # solvers and physics: not for --help
-    from unifg.scenarios.commands import course_results as obstacles_results  # solvers and physics: not for --help
+    from unifg.scenarios import course as obstacles  # physics: not for --help
+    from unifg.scenarios.commands import course_results as obstacles_results  # physics: not for --help
 
     settings = obstacles.CourseSettings(
         solver=chosen.solver,

@@ -11,10 +11,9 @@ from unifg.scenarios.commands.outcome import Outcome, Progress
 if TYPE_CHECKING:
     from unifg.scenarios.flight import FlightSettings
 
-__all__ = ["DESCRIPTION", "SOLVERS", "add_arguments", "run"]
+__all__ = ["DESCRIPTION", "add_arguments", "run"]
 
 DESCRIPTION = "A quadrotor flies through a corridor of unknown cylinders, estimating and planning on factor graphs."
-SOLVERS = ("ipm", "sqp", "alm")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def settings_of(chosen: argparse.Namespace) -> FlightSettings:
     """The flight that was asked for."""
-    from unifg.scenarios.flight import FlightSettings  # imports solvers and the physics engine
+    from unifg.scenarios.flight import FlightSettings  # imports the physics engine
 
     plain = FlightSettings(
         chosen.solver, chosen.coupling, chosen.seed, movers=chosen.movers, mass_error=chosen.mass_error

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from unifg.solvers import names
+
 __all__ = ["DESCRIPTION", "add_arguments"]
 
 DESCRIPTION = "Solve a pose graph from a file (g2o or TORO, gzipped or not)."
@@ -15,9 +17,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=_graph_file, metavar="GRAPH", help="pose graph: .g2o or .graph, also .gz")
     parser.add_argument(
         "--solver",
-        choices=("gn", "lm"),
+        choices=names.LEAST_SQUARES,
         default="gn",
-        help="Gauss-Newton or Levenberg-Marquardt (default: %(default)s)",
+        help=f"{names.choices(names.LEAST_SQUARES)} (default: %(default)s)",
     )
     parser.add_argument(
         "--robust",

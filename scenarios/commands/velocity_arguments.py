@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-__all__ = ["DESCRIPTION", "SOLVERS", "add_arguments"]
+__all__ = ["DESCRIPTION", "add_arguments"]
 
 DESCRIPTION = "Forces that make a car follow a speed profile: one optimal control problem over the whole drive."
-SOLVERS = ("kkt", "alm", "sqp", "penalty", "ipm")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -16,7 +16,7 @@ from unifg.models import obstacles, unicycle
 from unifg.models.distance_map import DistanceMap
 from unifg.models.smooth_field import SmoothField
 from unifg.scenarios.seeing.tracks import Tracks, nearest
-from unifg.solvers import SQP, AugmentedLagrangian
+from unifg.solvers import names
 from unifg.typing import Array, BoolArray
 
 FAR_AWAY = 1e3  # [m]; where an unused disc waits
@@ -96,27 +96,20 @@ def backend(name: str, settings: ControllerSettings, patience: int = 1) -> fg.So
     """The backend of a control loop by its short name.
 
     Args:
-        name: "alm" or "sqp".
+        name: one of `unifg.solvers.names.CONSTRAINED`.
         settings: tolerances.
         patience: factor on the iterations of a warm-started tick.
 
     Raises:
-        ScenarioError: for an unknown name.
+        BackendError: for an unknown name.
     """
-    tolerance, step, violation = settings.tolerance, settings.step_tolerance, 0.5 * settings.feasible
-    if name == "sqp":
-        return SQP(
-            tolerance=tolerance, step_tolerance=step, violation_tolerance=violation, max_iterations=10 * patience
-        )
-    if name == "alm":
-        return AugmentedLagrangian(
-            penalty=PENALTY,
-            tolerance=tolerance,
-            step_tolerance=step,
-            violation_tolerance=violation,
-            max_iterations=18 * patience,
-        )
-    raise fg.ScenarioError(f"unknown solver '{name}': choose alm or sqp")
+    early = {"step_tolerance": settings.step_tolerance, "violation_tolerance": 0.5 * settings.feasible}
+    own: dict[str, dict[str, float]] = {
+        "sqp": {**early, "max_iterations": 10 * patience},
+        "alm": {**early, "max_iterations": 18 * patience, "penalty": PENALTY},
+        "ipm": {"max_iterations": 25 * patience},
+    }
+    return names.backend(name, tolerance=settings.tolerance, **own.get(name, {}))
 
 
 @dataclass(frozen=True)

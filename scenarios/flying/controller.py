@@ -22,6 +22,7 @@ from unifg.scenarios.flying.plan import ControllerSettings, Plan, Source, backen
 from unifg.scenarios.flying.slots import FAR_AWAY, SPARE, Obstacles, Slots
 from unifg.scenarios.seeing.belief import Belief
 from unifg.scenarios.seeing.mover_tracks import Movers
+from unifg.solvers import names
 from unifg.typing import Array, ArrayLike
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -59,7 +60,7 @@ class Controller:
         Args:
             target: (3,) [m].
             walls: (W, 2, 2) segments on the ground plane [m].
-            solver: "ipm", "sqp" or "alm".
+            solver: one of `unifg.solvers.names.CONSTRAINED`.
             settings: weights and limits.
             bounds: (2, 2) least and greatest x, y of where a way may lead [m]; None for anywhere.
 
@@ -73,7 +74,7 @@ class Controller:
         self.guide = Guide(self.target, self.walls, s.guide, bounds)
         self.emergencies: dict[Source, int] = {"violating": 0, "kept": 0, "braking": 0}
         self._slots = Slots(s, self.walls)
-        self._squares = not s.general_costs or solver == "alm"
+        self._squares = not s.general_costs or not names.entry(solver).made_by.scalar_costs
         self._least = np.array([*(-limit for limit in s.rate_limits), s.thrust_limits[0]])
         self._most = np.array([*s.rate_limits, s.thrust_limits[1]])
         graph = fg.Graph()

@@ -85,7 +85,7 @@ class JointController(Controller):
         Args:
             estimator: of the past.
             layout: of which target and walls are known.
-            solver: "ipm", "sqp" or "alm".
+            solver: one of `unifg.solvers.names.CONSTRAINED`.
             settings: weights and limits of the future.
             joint: how far it may lean on the past.
         """

@@ -7,12 +7,11 @@ from typing import Literal, TypeAlias
 
 import unifg as fg
 from unifg.scenarios.flying.guide import GuideSettings
-from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
+from unifg.solvers import names
 from unifg.typing import Array
 
 Source: TypeAlias = Literal["solved", "violating", "kept", "braking"]
 Avoidance: TypeAlias = Literal["clearance", "potential"]
-BACKENDS = ("ipm", "sqp", "alm")
 
 
 @dataclass(frozen=True)
@@ -116,22 +115,17 @@ def backend(name: str, settings: ControllerSettings, cold: bool = False) -> fg.S
     """The backend of a control loop by its short name.
 
     Args:
-        name: "ipm", "sqp" or "alm".
+        name: one of `unifg.solvers.names.CONSTRAINED`.
         settings: tolerances.
         cold: whether there is no warm start, so that a tick may iterate longer.
 
     Raises:
-        ScenarioError: for an unknown name.
+        BackendError: for an unknown name.
     """
-    tolerance, step, violation = settings.tolerance, settings.step_tolerance, 0.5 * settings.feasible
-    if name == "ipm":
-        return InteriorPoint(tolerance=tolerance, max_iterations=40 if cold else 25)
-    if name == "sqp":
-        return SQP(
-            tolerance=tolerance, step_tolerance=step, violation_tolerance=violation, max_iterations=20 if cold else 5
-        )
-    if name == "alm":
-        return AugmentedLagrangian(
-            tolerance=tolerance, step_tolerance=step, violation_tolerance=violation, max_iterations=60 if cold else 20
-        )
-    raise fg.ScenarioError(f"unknown solver '{name}': choose {', '.join(BACKENDS)}")
+    early = {"step_tolerance": settings.step_tolerance, "violation_tolerance": 0.5 * settings.feasible}
+    own: dict[str, dict[str, float]] = {
+        "ipm": {"max_iterations": 40 if cold else 25},
+        "sqp": {**early, "max_iterations": 20 if cold else 5},
+        "alm": {**early, "max_iterations": 60 if cold else 20},
+    }
+    return names.backend(name, tolerance=settings.tolerance, **own.get(name, {}))

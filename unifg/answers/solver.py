@@ -7,7 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from unifg.answers.factor_norms import Deferred, factor_norms
 from unifg.answers.history import HEADER, Iteration, line
 from unifg.answers.optimality import infeasible_stationary, optimality, within_bounds
 from unifg.answers.relative_offset import Factored
+from unifg.answers.requirements import Constraints, require
 from unifg.answers.solution import Guess, NotConverged, Solution
 from unifg.answers.status import Status
 from unifg.errors import BackendError, GraphError
@@ -33,8 +34,50 @@ Callback: TypeAlias = Callable[[Iteration], bool | None]
 UNBOUNDED_COST = -1e20
 
 
+class Backend(ABC):
+    """What solves a graph.
+
+    Attributes:
+        constraints: which it takes.
+        scalar_costs: whether it takes costs that are no squares.
+    """
+
+    constraints: ClassVar[Constraints] = "all"
+    scalar_costs: ClassVar[bool] = True
+
+    @property
+    def name(self) -> str:
+        """The backend's class name."""
+        return type(self).__name__
+
+    @abstractmethod
+    def solve(
+        self,
+        graph: Statement,
+        guess: Start,
+        *,
+        data: Mapping[Data, ArrayLike] | None = None,
+        check: bool = False,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """Solve once.
+
+        Args:
+            graph: the problem.
+            guess: values per family, or a guess or solution that carries multipliers too.
+            data: values of data for this solve; others keep their defaults.
+            check: raise instead of returning a solution that did not converge.
+            callback: called with every row of the history; returning True ends the solve.
+
+        Raises:
+            GraphError: when the graph, guess or data is malformed.
+            BackendError: when this backend cannot take this class of problem.
+            NotConverged: with ``check=True``.
+        """
+
+
 @dataclass(kw_only=True)
-class Solver(ABC):
+class Solver(Backend):
     """Options common to all backends.
 
     Attributes:
@@ -65,11 +108,6 @@ class Solver(ABC):
         if self.search_iterations < 0:
             raise BackendError(f"{self.name}: search_iterations must not be negative, found {self.search_iterations}")
 
-    @property
-    def name(self) -> str:
-        """The backend's class name."""
-        return type(self).__name__
-
     def solve(
         self,
         graph: Statement,
@@ -80,20 +118,9 @@ class Solver(ABC):
         check: bool = False,
         callback: Callback | None = None,
     ) -> Solution:
-        """Solve once; a control loop uses :meth:`prepare` and keeps structure and workspaces.
+        """Solve as :class:`Backend`; a control loop uses :meth:`prepare` and keeps structure and workspaces.
 
-        Args:
-            graph: the problem.
-            guess: values per family, or a guess or solution that carries multipliers too.
-            data: values of data for this solve; others keep their defaults.
-            duals: multipliers by term name, overriding those of the guess.
-            check: raise instead of returning a solution that did not converge.
-            callback: called with every row of the history; returning True ends the solve.
-
-        Raises:
-            GraphError: when the graph, guess or data is malformed.
-            BackendError: when this backend cannot take this class of problem.
-            NotConverged: with ``check=True``.
+        ``duals`` are multipliers by term name, overriding those of the guess.
         """
         return self.prepare(graph).solve(guess, data=data, duals=duals, check=check, callback=callback)
 
@@ -103,8 +130,9 @@ class Solver(ABC):
         self.require(program)
         return Prepared(self, program)
 
-    def require(self, program: Program) -> None:  # noqa: B027 - most backends take everything
+    def require(self, program: Program) -> None:
         """Raise BackendError when the backend cannot take this class of problem."""
+        require(program, self.name, self.constraints, self.scalar_costs)
 
     def runs_alone(self, program: Program) -> bool:
         """Whether :meth:`iterate` evaluates the start itself and ends with :meth:`Run.conclude` when nobody watches."""
