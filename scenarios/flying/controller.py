@@ -65,7 +65,8 @@ class Controller:
             bounds: (2, 2) least and greatest x, y of where a way may lead [m]; None for anywhere.
 
         Raises:
-            ScenarioError: for an unknown solver or avoidance.
+            ScenarioError: for an unknown avoidance.
+            BackendError: for an unknown solver.
         """
         self.settings = s = settings or ControllerSettings()
         if s.avoidance not in ("clearance", "potential"):
