@@ -1,26 +1,43 @@
-"""Campaigns of many jobs: run once each, kept line by line, and what their paired differences say."""
+"""Campaigns of many jobs: run once each, kept line by line, and what their paired differences say.
+
+Episodes are jobs stated by a dataclass whose fields say everything about them: these fields stand in the row as well.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
 import multiprocessing
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import ExitStack
+from dataclasses import Field, fields
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, ClassVar, Protocol, TypeAlias, TypeVar
 
 import numpy as np
+from scipy.stats import binomtest
 from tqdm import tqdm
 
+from benchmarks.report import OUT, code_digest, table
+from unifg.errors import UnifgError
 from unifg.typing import Array
+
+
+class Job(Protocol):
+    """Any dataclass with fields of strings and numbers."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
 
 Setting = TypeVar("Setting")
 Result = TypeVar("Result")
 Key: TypeAlias = tuple[Any, ...]
 Row: TypeAlias = dict[str, Any]
+Read: TypeAlias = Callable[[Row], float | None]
+"""A measure of a row; None where it has none."""
+JobT = TypeVar("JobT", bound=Job)
 
 RESAMPLES = 2000
 
@@ -30,6 +47,61 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, default=1, help="jobs at once; times mean something for one alone")
     parser.add_argument("--fresh", action="store_true", help="repeat jobs that are on file")
     parser.add_argument("--report", action="store_true", help="run nothing, write the tables from what is on file")
+    parser.add_argument("--any-code", action="store_true", help="jobs of earlier states of the code count, too")
+
+
+def seeds(text: str) -> range:
+    """A range of seeds from the command line, such as 0:100."""
+    begin, _, end = text.partition(":")
+    if not (begin.isdecimal() and end.isdecimal() and int(begin) < int(end)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a range of seeds: expected FIRST:END, such as 0:100")
+    return range(int(begin), int(end))
+
+
+def episodes(
+    name: str,
+    episode: Callable[[JobT], Row],
+    jobs: Iterable[JobT],
+    chosen: argparse.Namespace,
+    alone: Callable[[JobT], bool] = lambda job: False,
+) -> list[Row]:
+    """Rows of all episodes on file, after running those of the jobs that are missing there; see :func:`recorded`.
+
+    Args:
+        name: of the measuring module, and of the file in out/benchmarks.
+        episode: what is kept of a job; a function that can be pickled.
+        jobs: to run.
+        chosen: of :func:`options`.
+        alone: jobs that run one at a time, after the others.
+
+    Returns:
+        Rows with the fields of the job, "workers" (how many ran at once), and what was kept, or why it was refused as
+        "error".
+
+    Raises:
+        SystemExit: when there is nothing on file.
+    """
+    rows: list[Row] = []
+    keyed = {tuple(_stated(job).values()): job for job in jobs}
+    for workers, single in ((chosen.workers, False), (1, True)):
+        batch = {key: job for key, job in keyed.items() if alone(job) is single}
+        how = argparse.Namespace(**{**vars(chosen), "workers": workers})
+        task = partial(_episode, episode, workers)
+        rows = recorded(task, batch, OUT / f"{name}.jsonl", code_digest(f"benchmarks.{name}"), how)
+    if not rows:
+        raise SystemExit(f"Nothing on file in {OUT / name}.jsonl for this state of the code.")
+    return rows
+
+
+def _episode(episode: Callable[[JobT], Row], workers: int, job: JobT) -> Row:
+    try:
+        return {**_stated(job), "workers": workers, **episode(job)}
+    except UnifgError as error:
+        return {**_stated(job), "workers": workers, "error": str(error)}
+
+
+def _stated(job: Job) -> Row:
+    return {field.name: getattr(job, field.name) for field in fields(job)}
 
 
 def recorded(
@@ -48,13 +120,13 @@ def recorded(
         jobs: its settings; a key holds strings and numbers.
         store: the file, one JSON object a line.
         code: digest of what the task depends on; rows of another one are not used.
-        chosen: of :func:`options`; ``report`` runs nothing and uses rows of any state of the code.
+        chosen: of :func:`options`; ``report`` runs nothing, and like ``any_code`` uses rows of any state of the code.
 
     Returns:
         What the task returned, with "key" (a tuple) and "code"; jobs of earlier calls too.
     """
-    lines = store.read_text(encoding="utf-8").splitlines() if store.is_file() else []
-    rows = {tuple(row["key"]): row for row in map(json.loads, lines) if chosen.report or row["code"] == code}
+    any_code = chosen.report or chosen.any_code
+    rows = {tuple(row["key"]): row for row in lines_of(store) if any_code or row["code"] == code}
     missing = {key: job for key, job in jobs.items() if not chosen.report and (chosen.fresh or key not in rows)}
     store.parent.mkdir(parents=True, exist_ok=True)
     pool = None
@@ -63,6 +135,8 @@ def recorded(
         if chosen.workers > 1:
             pool = ProcessPoolExecutor(chosen.workers, mp_context=multiprocessing.get_context("spawn"))
             stack.callback(pool.shutdown, cancel_futures=True)
+        if file.tell() and not store.read_bytes().endswith(b"\n"):
+            file.write("\n")  # a run that was killed left half a line
         for key, row in campaign(partial(_keyed, task), missing.items(), pool):
             rows[key] = {"key": key, "code": code, **row}
             file.write(json.dumps(rows[key]) + "\n")
@@ -70,6 +144,15 @@ def recorded(
             bar.set_postfix_str(", ".join(map(str, key)))
             bar.update()
     return [{**row, "key": key} for key, row in rows.items()]
+
+
+def lines_of(store: Path) -> Iterator[Row]:
+    """What is on file; a line that was cut off does not count."""
+    for line in store.read_text(encoding="utf-8").splitlines() if store.is_file() else []:
+        try:
+            yield json.loads(line)
+        except json.JSONDecodeError:
+            continue
 
 
 def _keyed(task: Callable[[Setting], Row], job: tuple[Key, Setting]) -> tuple[Key, Row]:
@@ -94,9 +177,62 @@ def campaign(
         yield future.result()
 
 
+# ---------------------------------------------------------------- what the rows say
+
+
+def where(rows: Iterable[Row], **wanted: Any) -> list[Row]:
+    """Rows with these values, without those that were refused."""
+    return [row for row in rows if "error" not in row and all(row[name] == value for name, value in wanted.items())]
+
+
+def paired(mine: Iterable[Row], base: Iterable[Row], read: Read) -> tuple[Array, Array]:
+    """(n,) values of two variants for the seeds of which both have one."""
+    a, b = ({row["seed"]: read(row) for row in rows} for rows in (mine, base))
+    both = [(a[seed], b[seed]) for seed in sorted(set(a) & set(b)) if a[seed] is not None and b[seed] is not None]
+    values = np.array(both, dtype=np.float64).reshape(-1, 2)
+    return values[:, 0], values[:, 1]
+
+
 def interval(differences: Array) -> tuple[float, float]:
     """95 % bootstrap interval of the mean."""
     rng = np.random.default_rng(0)
     means = rng.choice(differences, (RESAMPLES, len(differences))).mean(axis=1)
     low, high = np.quantile(means, [0.025, 0.975])
     return float(low), float(high)
+
+
+def against(mine: Sequence[Row], base: Sequence[Row], read: Read) -> str:
+    """Mean of a variant and, in brackets, the interval of its paired difference to the base, which has none.
+
+    The number of pairs is told where some seeds have none.
+    """
+    values, others = paired(mine, base, read)
+    if not len(values):
+        return "-"
+    if mine is base:
+        return f"{values.mean():.3g}"
+    low, high = interval(values - others)
+    pairs = "" if len(values) == min(len(mine), len(base)) else f", n={len(values)}"
+    return f"{values.mean():.3g} ({digits(low, '+')} .. {digits(high, '+')}){pairs}"
+
+
+def comparison(measures: Mapping[str, Read], variants: Mapping[str, Sequence[Row]], base: str, head: str = "") -> str:
+    """A table of measures by variants that have rows, each against the base."""
+    flown = {name: rows for name, rows in variants.items() if rows}
+    lines = [
+        [measure, *(against(rows, flown[base], read) for rows in flown.values())] for measure, read in measures.items()
+    ]
+    return table([head, *flown], lines)
+
+
+def share(hits: int, of: int) -> tuple[float, float]:
+    """95 % confidence interval of a rate (Wilson 1927)."""
+    if not of:
+        return 0.0, 1.0
+    found = binomtest(hits, of).proportion_ci(0.95, "wilson")
+    return float(found.low), float(found.high)
+
+
+def digits(value: float, sign: str = "") -> str:
+    """Two significant digits, all of those before the point."""
+    return f"{value:{sign}.0f}" if abs(value) >= 10.0 else f"{value:{sign}.2g}"

@@ -20,6 +20,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -28,7 +29,7 @@ from tqdm import tqdm
 
 import unifg as fg
 from benchmarks import collection, control_problems, control_starts, ecg2o, incremental, pose_graphs
-from benchmarks.navigation import CASES, Drive, data_folder
+from benchmarks.navigation import CASES, Drive
 from benchmarks.report import OUT
 from unifg.errors import UnifgError
 from unifg.pose_graphs import PoseGraph
@@ -213,13 +214,11 @@ def of_manoeuvres() -> Rows:
 
 def of_drives() -> Rows:
     """Drives in closed loop."""
-    folder = data_folder()
-    for case, seeds in zip(CASES, ((0, 1), (0,), (0,), (0, 1)), strict=True):
-        for seed in seeds:
-            for solver, coupling in (("alm", "sequential"), ("sqp", "joint")):
-                if case.map is None or folder is not None:
-                    drive = Drive(case, solver, seed, folder, "", 1, coupling)
-                    yield f"{case.name}, {solver}, {coupling}, seed {seed}", partial(driven, drive)
+    for (name, case), seeds in zip(CASES.items(), ((0, 1), (0,), (0,), (0, 1)), strict=True):
+        for seed, (solver, coupling) in product(seeds, (("alm", "sequential"), ("sqp", "joint"))):
+            if case.available:
+                drive = Drive(name, solver, coupling, seed)
+                yield f"{name}, {solver}, {coupling}, seed {seed}", partial(driven, drive)
 
 
 def of_flights() -> Rows:

@@ -1,6 +1,6 @@
 """How far one graph pulls its estimate: the plan's costs against what the past alone says, tick by tick.
 
-    python -m benchmarks.quadrotor_pull [--seeds 8] [--seconds 6] [--workers K] [--fresh] [--report]
+    python -m benchmarks.quadrotor_pull [--seeds 1000:1008] [--seconds 6] [--workers K] [--fresh] [--report]
 
 The first seconds of flights through corridors on seeds that are open to tuning, with the weight of the future's costs,
 the bound on the pull and what the window carries on swept. Every variant of a seed meets the same corridor, mass,
@@ -9,23 +9,19 @@ wind, disturbances and noise; differences are taken seed by seed. Writes docs/qu
 
 from __future__ import annotations
 
-import argparse
-import json
-import multiprocessing
 import time
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
-from tqdm import tqdm
 
-from benchmarks.campaign import campaign, interval
+from benchmarks import campaign
+from benchmarks.campaign import Row, against, digits, where
 from benchmarks.quadrotor_flights import SOLVERS
-from benchmarks.report import CHECKOUT, OUT, code_digest, machine, put_results, table
+from benchmarks.report import command, machine, publish, table
 from unifg.models import quadrotor
 from unifg.scenarios.flight import Flight, FlightSettings
-from unifg.scenarios.flying.coupling import make_pilot
 from unifg.scenarios.flying.joint import JointSettings
 from unifg.scenarios.flying.joint_pilot import JointPilot, joint_pilot
 from unifg.scenarios.flying.plan import Avoidance
@@ -33,62 +29,46 @@ from unifg.scenarios.seeing.belief import Belief, Landmarks
 from unifg.scenarios.worlds.layouts import TUNING_SEEDS
 from unifg.typing import Array
 
-Row = dict[str, Any]
-
 WEIGHTS = (0.01, 0.1, 1.0, 10.0)
 PULLS = (np.inf, 0.5)
-AVOIDANCES: tuple[Avoidance, ...] = ("clearance", "potential")
 WARMING_UP = 5  # ticks whose times do not count
 
 
 @dataclass(frozen=True)
 class Job:
-    """The beginning of one flight."""
+    """The beginning of one flight; the fields after the first two are what is varied."""
 
     seed: int
     seconds: float
-    code: str
     coupling: str = "joint"
     solver: str = "ipm"
     weight: float = 1.0
     pull: float = 0.5
     avoidance: Avoidance = "clearance"
 
-    @property
-    def key(self) -> str:
-        """What makes two flights the same."""
-        return json.dumps(asdict(self))
 
-    @property
-    def variant(self) -> tuple[Any, ...]:
-        """What is compared over seeds."""
-        return self.coupling, self.solver, self.weight, self.pull, self.avoidance
-
-
-def jobs_of(seeds: list[int], seconds: float, code: str) -> list[Job]:
+def jobs_of(seeds: Sequence[int], seconds: float) -> list[Job]:
     """All variants on some seeds."""
     jobs = []
     for seed in seeds:
-        plain = Job(seed, seconds, code)
-        jobs += [replace(plain, coupling="sequential", avoidance=how) for how in AVOIDANCES]
-        jobs += [replace(plain, weight=weight, pull=pull) for pull in PULLS for weight in WEIGHTS]
-        jobs += [replace(plain, pull=pull, avoidance="potential") for pull in PULLS]
+        plain = Job(seed, seconds)
+        ta = replace(plain, avoidance="potential")
+        jobs += [replace(job, coupling="sequential") for job in (plain, ta)]
+        jobs += [replace(plain, weight=weight, pull=pull) for pull, weight in product(PULLS, WEIGHTS)]
+        jobs += [replace(ta, pull=pull) for pull in PULLS]
         jobs += [replace(plain, solver=solver) for solver in SOLVERS if solver != plain.solver]
     return jobs
 
 
 def flight_of(job: Job) -> Flight:
     """World and pilot."""
-    settings = FlightSettings(job.solver, job.coupling, job.seed)
-    controller = replace(settings.controller, control_weight=job.weight, avoidance=job.avoidance)
-    flight = Flight(replace(settings, controller=controller))
-    found = flight.conditions
-    believed = flight.pilot.belief.state
-    common = (found.layout, believed, found.nominal, settings.estimator, controller)
+    plain = FlightSettings(job.solver, job.coupling, job.seed)
+    controller = replace(plain.controller, control_weight=job.weight, avoidance=job.avoidance)
+    flight = Flight(replace(plain, controller=controller))
     if job.coupling == "joint":
+        found, believed = flight.conditions, flight.pilot.belief.state
+        common = (found.layout, believed, found.nominal, plain.estimator, controller)
         flight.pilot = joint_pilot(job.solver, *common, JointSettings(job.pull))
-    else:
-        flight.pilot = make_pilot(job.coupling, job.solver, *common)
     return flight
 
 
@@ -115,13 +95,16 @@ def fly(job: Job) -> Row:
         if world.collisions:
             break
     numbers = {name: np.array([tick[name] for tick in ticks]) for name in ticks[0]}
-    row: Row = {"key": job.key, "collisions": world.collisions, "emergencies": emergencies, "clearance": clearance}
-    row["distance"] = float(world.state[0] - world.layout.start[0])
-    known = {name: value[np.isfinite(value)] for name, value in numbers.items()}
-    row["mean"] = {name: float(value.mean()) for name, value in known.items() if len(value)}
-    row["max"] = {name: float(value.max()) for name, value in known.items() if len(value)}
-    row["tick"] = numbers["tick"][WARMING_UP:].tolist()
-    return row
+    known = {name: values for name, some in numbers.items() if len(values := some[np.isfinite(some)])}
+    return {
+        "collisions": world.collisions,
+        "emergencies": emergencies,
+        "clearance": clearance,
+        "distance": float(world.state[0] - world.layout.start[0]),
+        "mean": {name: float(values.mean()) for name, values in known.items()},
+        "max": {name: float(values.max()) for name, values in known.items()},
+        "tick": numbers["tick"][WARMING_UP:].tolist(),
+    }
 
 
 def pulled(belief: Belief, alone: Belief) -> dict[str, float]:
@@ -160,6 +143,7 @@ def errors(belief: Belief, truth: Array, flight: Flight, cylinders: Array) -> di
 
 # ---------------------------------------------------------------- the page
 
+# Columns of a table: what is measured at each tick, and its unit.
 PULLED = {
     "position [mm]": ("position", 1e3),
     "velocity [mm/s]": ("velocity", 1e3),
@@ -175,21 +159,42 @@ ERRORS = {
     "wind [mm/s^2]": ("wind error", 1e3),
     "cylinders [mm]": ("cylinder error", 1e3),
 }
+FLOWN: dict[str, Callable[[Sequence[Row]], str]] = {
+    "flown [m]": lambda rows: f"{np.mean([row['distance'] for row in rows]):.2f}",
+    "least clearance [cm]": lambda rows: f"{100 * min(row['clearance'] for row in rows):.0f}",
+    "emergencies": lambda rows: str(sum(row["emergencies"] for row in rows)),
+    "collisions": lambda rows: str(sum(row["collisions"] for row in rows)),
+    "tick [ms]": lambda rows: "{:.1f} ({:.1f})".format(
+        *np.quantile(np.concatenate([row["tick"] for row in rows]), [0.5, 0.99])
+    ),
+}
+Groups = Mapping[tuple[str, ...], Sequence[Row]]
+"""The rows of each line of a table, by the words the line begins with."""
 
 
-def of_variant(rows: list[Row], variant: tuple[Any, ...]) -> dict[int, Row]:
-    """Rows of one variant by seed."""
-    found = {}
-    for row in rows:
-        job = Job(**json.loads(row["key"]))
-        if job.variant == variant:
-            found[job.seed] = row
-    return dict(sorted(found.items()))
+def pull_table(groups: Groups, head: Sequence[str]) -> str:
+    """Mean over all ticks and greatest of any tick."""
+
+    def cell(rows: Sequence[Row], name: str, scale: float) -> str:
+        mean = scale * float(np.mean([row["mean"][name] for row in rows]))
+        return f"{digits(mean)} ({digits(scale * max(row['max'][name] for row in rows))})"
+
+    lines = [[*words, *(cell(rows, *what) for what in PULLED.values())] for words, rows in groups.items()]
+    return table([*head, *PULLED], lines, len(head))
 
 
-def digits(value: float, sign: str = "") -> str:
-    """Two significant digits, all of those before the point."""
-    return f"{value:{sign}.0f}" if abs(value) >= 10.0 else f"{value:{sign}.2g}"
+def error_table(groups: Groups, head: Sequence[str]) -> str:
+    """Errors, the first row's as they are, the others' with their paired difference to it."""
+
+    def cell(rows: Sequence[Row], name: str, scale: float) -> str:
+        return against(rows, base, lambda row: scale * row["mean"][name] if name in row["mean"] else None)
+
+    base = next(iter(groups.values()))
+    lines = [
+        [*words, *(cell(rows, *what) for what in ERRORS.values()), *(tell(rows) for tell in FLOWN.values())]
+        for words, rows in groups.items()
+    ]
+    return table([*head, *ERRORS, *FLOWN], lines, len(head))
 
 
 def bound(pull: float) -> str:
@@ -197,110 +202,51 @@ def bound(pull: float) -> str:
     return "none" if np.isinf(pull) else f"{pull:g}"
 
 
-def pull_table(groups: list[tuple[list[str], dict[int, Row]]], head: list[str]) -> str:
-    """Mean over all ticks and greatest of any tick."""
-    lines = []
-    for words, rows in groups:
-        line = list(words)
-        for name, scale in PULLED.values():
-            mean = scale * float(np.mean([row["mean"][name] for row in rows.values()]))
-            most = scale * max(row["max"][name] for row in rows.values())
-            line.append(f"{digits(mean)} ({digits(most)})")
-        lines.append(line)
-    return table([*head, *PULLED], lines, len(head))
-
-
-def error_table(groups: list[tuple[list[str], dict[int, Row]]], head: list[str], base: dict[int, Row]) -> str:
-    """Errors, the first row's as they are, the others' with their paired difference to it."""
-    lines = []
-    for words, rows in groups:
-        line = list(words)
-        for name, scale in ERRORS.values():
-            both = [seed for seed in rows if all(np.isfinite(r[seed]["mean"].get(name, np.nan)) for r in (rows, base))]
-            mine, other = (scale * np.array([r[seed]["mean"][name] for seed in both]) for r in (rows, base))
-            if rows is base:
-                line.append(f"{mine.mean():.3g}")
-                continue
-            low, high = interval(mine - other)
-            line.append(f"{mine.mean():.3g} ({digits(low, '+')} .. {digits(high, '+')})")
-        least = min(row["clearance"] for row in rows.values())
-        line.append(f"{np.mean([row['distance'] for row in rows.values()]):.2f}")
-        line.append(f"{100 * least:.0f}")
-        line.append(str(sum(row["emergencies"] for row in rows.values())))
-        line.append(str(sum(row["collisions"] for row in rows.values())))
-        times = np.concatenate([row["tick"] for row in rows.values()])
-        line.append(f"{np.median(times):.1f} ({np.quantile(times, 0.99):.1f})")
-        lines.append(line)
-    flown = ["flown [m]", "least clearance [cm]", "emergencies", "collisions", "tick [ms]"]
-    return table([*head, *ERRORS, *flown], lines, len(head))
-
-
-def render(rows: list[Row], seeds: list[int], seconds: float) -> str:
+def render(rows: list[Row], seeds: Sequence[int], seconds: float) -> str:
     """Markdown of all variants."""
-    plain = Job(0, seconds, "")
-    parts = [
-        machine("numpy", "scipy", "numba", "pymunk"),
-        f"Flights on {len(seeds)} seeds from {seeds[0]} on, the first {seconds:g} s of each.",
-    ]
-    base = of_variant(rows, replace(plain, coupling="sequential").variant)
-    head = ["pull", "control weight"]
-    groups: list[tuple[list[str], dict[int, Row]]] = [
-        (
-            [bound(pull), f"{weight:g}"],
-            of_variant(rows, replace(plain, weight=weight, pull=pull).variant),
-        )
-        for pull in PULLS
-        for weight in WEIGHTS
-    ]
-    parts += ["### How far the plan pulls", pull_table(groups, head)]
-    parts.append("Distance from what the past alone says: mean over ticks, in brackets the greatest of any tick.")
-    sequential = (["sequential", "-"], base)
-    parts += ["### What that does to estimates and flights", error_table([sequential, *groups], head, base)]
-    parts.append(
-        "Errors are means over ticks and seeds; in brackets the 95 % interval of the paired difference to sequential. "
-        "Emergencies are ticks whose solve gave nothing that may be flown. Ticks are process times, median and, in "
-        "brackets, 99th percentile."
+    plain = {"coupling": "joint", "solver": "ipm", "weight": 1.0, "pull": 0.5, "avoidance": "clearance"}
+
+    def of(**changes: object) -> list[Row]:
+        return where(rows, **(plain | changes))
+
+    base, start = of(coupling="sequential"), of(coupling="sequential", avoidance="potential")
+    sweep: Groups = {
+        (bound(pull), f"{weight:g}"): of(pull=pull, weight=weight) for pull, weight in product(PULLS, WEIGHTS)
+    }
+    potential: Groups = {(bound(pull),): of(pull=pull, avoidance="potential") for pull in PULLS}
+    backends: Groups = {(solver,): of(solver=solver) for solver in SOLVERS}
+    return "\n\n".join(
+        [
+            machine("numpy", "scipy", "numba", "pymunk"),
+            f"Flights on {len(seeds)} seeds from {seeds[0]} on, the first {seconds:g} s of each.",
+            "### How far the plan pulls",
+            pull_table(sweep, ["pull", "control weight"]),
+            "Distance from what the past alone says: mean over ticks, in brackets the greatest of any tick.",
+            "### What that does to estimates and flights",
+            error_table({("sequential", "-"): base, **sweep}, ["pull", "control weight"]),
+            "Errors are means over ticks and seeds; in brackets the 95 % interval of the paired difference to "
+            "sequential. Emergencies are ticks whose solve gave nothing that may be flown. Ticks are process times, "
+            "median and, in brackets, 99th percentile.",
+            "### Ta's own costs",
+            pull_table(potential, ["pull"]),
+            error_table({("sequential",): start, **potential}, ["pull"]),
+            "### Backends, weight 1, pull 0.5",
+            pull_table(backends, ["backend"]),
+            error_table({("sequential, ipm",): base, **backends}, ["backend"]),
+        ]
     )
-    potential = [
-        ([bound(pull)], of_variant(rows, replace(plain, pull=pull, avoidance="potential").variant)) for pull in PULLS
-    ]
-    start = of_variant(rows, replace(plain, coupling="sequential", avoidance="potential").variant)
-    parts += ["### Ta's own costs", pull_table(potential, ["pull"])]
-    parts.append(error_table([(["sequential"], start), *potential], ["pull"], start))
-    backends = [([solver], of_variant(rows, replace(plain, solver=solver).variant)) for solver in SOLVERS]
-    parts += ["### Backends, weight 1, pull 0.5", pull_table(backends, ["backend"])]
-    parts.append(error_table([(["sequential, ipm"], base), *backends], ["backend"], base))
-    return "\n\n".join(parts)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Fly what is missing and rewrite docs/quadrotor-joint.md."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.quadrotor_pull", description=__doc__)
-    parser.add_argument("--seeds", type=int, default=8)
+    parser = command(__doc__)
+    campaign.options(parser)
+    parser.add_argument("--seeds", type=campaign.seeds, default=TUNING_SEEDS[:8], metavar="FIRST:END")
     parser.add_argument("--seconds", type=float, default=6.0)
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--fresh", action="store_true", help="forget earlier flights")
-    parser.add_argument("--report", action="store_true", help="only rewrite the page from what has been flown")
     options = parser.parse_args(arguments)
-    store = OUT / "quadrotor_pull.jsonl"
-    store.parent.mkdir(parents=True, exist_ok=True)
-    if options.fresh:
-        store.unlink(missing_ok=True)
-    rows = [json.loads(line) for line in store.read_text().splitlines()] if store.exists() else []
-    code, seeds = code_digest("benchmarks.quadrotor_pull"), list(TUNING_SEEDS[: options.seeds])
-    rows = rows if options.report else [row for row in rows if json.loads(row["key"])["code"] == code]
-    done = {row["key"] for row in rows}
-    todo = [] if options.report else [job for job in jobs_of(seeds, options.seconds, code) if job.key not in done]
-    spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(options.workers, mp_context=spawn) if options.workers > 1 else None
-    with store.open("a") as file:
-        for row in tqdm(campaign(fly, todo, pool), total=len(todo), desc="pull"):
-            rows.append(row)
-            file.write(json.dumps(row) + "\n")
-            file.flush()
-    page = CHECKOUT / "docs" / "quadrotor-joint.md"
-    codes = {json.loads(row["key"])["code"] for row in rows}
-    put_results(page, "One graph that estimates and flies", render(rows, seeds, options.seconds), codes)
+    found = campaign.episodes("quadrotor_pull", fly, jobs_of(options.seeds, options.seconds), options)
+    rows = [row for row in found if row["seed"] in options.seeds and row["seconds"] == options.seconds]
+    publish("quadrotor-joint", render(rows, options.seeds, options.seconds), {row["code"] for row in rows})
     return 0
 
 

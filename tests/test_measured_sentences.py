@@ -37,7 +37,8 @@ def test_couplings_are_compared_seed_by_seed() -> None:
             "collisions": 0, "duration_s": 1.0, "min_clearance_m": 0.1, "solve_ms": {"p50": 2.0, "p99": 4.0},
             "reached": reached,
         }  # fmt: skip
-        return {"key": ["building", variant, "sqp", seed, "code"], "metrics": metrics}
+        job = {"case": "building", "solver": "sqp", "coupling": variant, "weight": 1.0, "seed": seed}
+        return {**job, "metrics": metrics}
 
     rows = [row("sequential", seed, 0.01 + seed) for seed in range(4)]
     rows += [row("joint", seed, 0.012 + seed, seed > 0) for seed in range(4)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks import quadrotor_flights, quadrotor_tables
-from benchmarks.quadrotor_flights import Job, jobs_of, read_rows
+from benchmarks import campaign, quadrotor_flights, quadrotor_tables, report
+from benchmarks.quadrotor_flights import SOLVERS, STUDIES, Job, jobs_of
+from unifg.errors import ScenarioError
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.log.flight_log import FlightLog
 
@@ -27,7 +28,8 @@ def short_rows() -> dict[str, Row]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(quadrotor_flights, "run_flight", moment)
         for coupling in quadrotor_tables.VARIANTS:
-            row = quadrotor_flights.fly(Job("flights", "ipm", coupling, 1006))
+            job = Job("flights", "ipm", coupling, 1006)
+            row = {**asdict(job), **quadrotor_flights.fly(job)}
             rows[coupling] = json.loads(json.dumps(row, allow_nan=False))
     return rows
 
@@ -38,15 +40,13 @@ def moment(settings: FlightSettings) -> FlightLog:
 
 
 def test_every_study_flies_what_it_should() -> None:
-    jobs = jobs_of(
-        quadrotor_flights.STUDIES, quadrotor_flights.SOLVERS, quadrotor_flights.COUPLINGS, range(100), "code"
-    )
-    count = {study: sum(job.study == study for job in jobs) for study in quadrotor_flights.STUDIES}
+    jobs = jobs_of(STUDIES, SOLVERS, quadrotor_tables.VARIANTS, range(100))
+    count = {study: sum(job.study == study for job in jobs) for study in STUDIES}
     assert count == {
         "flights": 7 * 100, "potential": 3 * 100, "association": 100, "movers": 100, "weights": 60,
         "timing": 20 * 2 * (3 + 1 + 1),
     }  # fmt: skip
-    assert len({job.key for job in jobs}) == len(jobs)
+    assert len(set(jobs)) == len(jobs)
     weighted = next(job for job in jobs if job.weight == 10.0).settings()
     assert (weighted.coupling, weighted.controller.control_weight) == ("joint", 10.0)
     assert next(job for job in jobs if job.study == "potential").settings().controller.avoidance == "potential"
@@ -59,23 +59,33 @@ def test_finished_flights_are_not_repeated(monkeypatch: pytest.MonkeyPatch, tmp_
 
     def fly(job: Job) -> Row:
         flown.append(job)
-        return {"key": list(job.key), "error": "none", **job.__dict__}
+        raise ScenarioError("no wind today")
+
+    def run(*words: str) -> int:
+        flown.clear()
+        given = ["--seeds", "1000:1003", "--studies", "flights", "timing", "--solvers", "sqp", *words]
+        assert quadrotor_flights.main(given) == 0
+        return len(flown)
 
     monkeypatch.setattr(quadrotor_flights, "fly", fly)
-    monkeypatch.setattr(quadrotor_flights, "code_digest", lambda _: "now")
-    store = tmp_path / "rows.jsonl"
-    words = ["--seeds", "1000:1003", "--studies", "flights", "--solvers", "sqp", "--store", str(store)]
-    assert quadrotor_flights.main(words) == 0
-    assert len(flown) == 6
+    monkeypatch.setattr(campaign, "OUT", tmp_path)
+    monkeypatch.setattr(report, "OUT", tmp_path)
+    monkeypatch.setattr(campaign, "code_digest", lambda _: "now")
+    store = tmp_path / "quadrotor_flights.jsonl"
+    assert run() == 12
+    assert [job.study for job in flown] == ["flights"] * 6 + ["timing"] * 6
     store.write_text(store.read_text() + '{"cut off')
-    assert quadrotor_flights.main(words) == 0
-    assert len(flown) == 6
-    monkeypatch.setattr(quadrotor_flights, "code_digest", lambda _: "later")
-    store.write_text(store.read_text() + "\n")
-    assert quadrotor_flights.main(words) == 0
-    assert len(flown) == 12
-    assert len(read_rows(store, None)) == 12
-    assert len(read_rows(store, "later")) == 6
+    assert run() == 0
+    monkeypatch.setattr(campaign, "code_digest", lambda _: "later")
+    assert run("--any-code") == run("--report") == 0
+    assert run() == 12
+    assert run("--fresh", "--solvers", "alm") == 12
+    codes = [row["code"] for row in campaign.lines_of(store)]
+    assert codes == ["now"] * 12 + ["later"] * 24
+    assert "Flights refused: 24." in (tmp_path / "quadrotor-mpc.md").read_text()
+    with pytest.raises(SystemExit, match="Nothing on file"):
+        monkeypatch.setattr(campaign, "OUT", tmp_path / "elsewhere")
+        run("--report")
 
 
 def test_rows_have_what_tables_need(short_rows: dict[str, Row]) -> None:
@@ -100,15 +110,18 @@ def test_a_failure_is_told(short_rows: dict[str, Row]) -> None:
 
 
 def test_differences_are_paired(short_rows: dict[str, Row]) -> None:
-    def variant(value: float | None) -> Row:
-        row = copy.deepcopy(short_rows["joint"])
+    def variant(seed: int, value: float | None) -> Row:
+        row = {**copy.deepcopy(short_rows["joint"]), "seed": seed}
         row["metrics"]["time_to_goal_s"] = value
         return row
 
     read = quadrotor_tables.MEASURES["time to goal [s]"]
-    mine = {0: variant(3.0), 1: variant(4.0), 2: variant(None), 4: variant(9.0)}
-    base = {0: variant(1.0), 1: variant(5.0), 2: variant(6.0), 3: variant(7.0)}
-    np.testing.assert_array_equal(quadrotor_tables.paired(mine, base, read), ([3.0, 4.0], [1.0, 5.0]))
+    mine = [variant(0, 3.0), variant(1, 4.0), variant(2, None), variant(4, 9.0)]
+    base = [variant(3, 7.0), variant(1, 5.0), variant(0, 1.0), variant(2, 6.0)]
+    np.testing.assert_array_equal(campaign.paired(mine, base, read), ([3.0, 4.0], [1.0, 5.0]))
+    assert campaign.against(mine, base, read) == "3.5 (-1 .. +2), n=2"
+    assert campaign.against(base, base, read) == "4.75"
+    assert campaign.against(mine[2:3], base, read) == "-"
 
 
 def test_the_worst_run_counts_and_enough_ticks_are_needed() -> None:
@@ -126,4 +139,4 @@ def test_the_worst_run_counts_and_enough_ticks_are_needed() -> None:
 def test_wilson_intervals() -> None:
     for good, count in ((95, 100), (5, 5), (0, 7), (1, 2)):
         wanted = stats.binomtest(good, count).proportion_ci(0.95, "wilson")
-        assert quadrotor_tables.wilson(good, count) == pytest.approx((wanted.low, wanted.high), abs=1e-4)
+        assert campaign.share(good, count) == pytest.approx((wanted.low, wanted.high), abs=1e-4)

@@ -6,7 +6,7 @@ One window, filled by a flight, serves most tests: several controllers solve it,
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -358,18 +358,12 @@ def test_standardised_differences(manifold: fg.Manifold) -> None:
 
 def test_the_pull_is_measured() -> None:
     """Two short flights of the benchmark: without a bound, and with so small a weight that nothing pulls."""
-    strong = quadrotor_pull.Job(SEED, 0.5, "", weight=10.0, pull=np.inf)
+    strong = quadrotor_pull.Job(SEED, 0.5, weight=10.0, pull=np.inf)
     weak = replace(strong, weight=1e-6)
-    rows = {job.weight: {SEED: quadrotor_pull.fly(job)} for job in (strong, weak)}
-    assert rows[10.0][SEED]["mean"]["sigma"] > 0.5 > 1e-2 > rows[1e-6][SEED]["max"]["sigma"]
-    groups = [([str(weight)], found) for weight, found in rows.items()]
-    assert quadrotor_pull.of_variant([row for found in rows.values() for row in found.values()], weak.variant) == {
-        SEED: rows[1e-6][SEED]
-    }
-    for text in (
-        quadrotor_pull.pull_table(groups, ["weight"]),
-        quadrotor_pull.error_table(groups, ["weight"], rows[1e-6]),
-    ):
+    rows = {job.weight: {**asdict(job), **quadrotor_pull.fly(job)} for job in (strong, weak)}
+    assert rows[10.0]["mean"]["sigma"] > 0.5 > 1e-2 > rows[1e-6]["max"]["sigma"]
+    groups: quadrotor_pull.Groups = {(str(weight),): [row] for weight, row in rows.items()}
+    for text in (quadrotor_pull.pull_table(groups, ["weight"]), quadrotor_pull.error_table(groups, ["weight"])):
         assert len(text.splitlines()) == 4
         assert len({line.count("|") for line in text.splitlines()}) == 1
         assert "nan" not in text
