@@ -3,135 +3,30 @@
     python -m benchmarks.claims [--parkings P] [--seeds S] [--kinds K ...] [--backends B ...] [--workers W]
 
 A hundred parkings of a kinematic bicycle and fourteen other kinds of control problem, each stated twice
-(:mod:`benchmarks.twins`): as a graph with residuals as a user writes them, and in casadi, whose exact derivatives judge
-what every backend answers (:mod:`benchmarks.exact_judge`). Needs casadi. Every problem is a line of
+(tests/problems/twins): as a graph with residuals as a user writes them, and in casadi, whose exact derivatives judge
+what every backend answers (tests/exact_judge.py). Needs casadi. Every problem is a line of
 out/benchmarks/claims.jsonl and is not solved again until the code changes. Writes docs/claims.md.
 """
 
 from __future__ import annotations
 
-import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 import unifg as fg
-from benchmarks import twin_flights, twin_ground, twin_machines
 from benchmarks.backends import CONSTRAINED, EQUALITIES_ONLY
 from benchmarks.campaign import Key, Row, options, recorded
-from benchmarks.exact_judge import Judge, Peer
 from benchmarks.report import OUT, code_digest, command, machine, publish, table
-from benchmarks.twins import Twin
+from exact_judge import AGREED, Answer, Judge, Peer, answer, disagreement
+from problems.twins import KINDS
 
 TOLERANCE = 1e-6
 SAME = 1e-4  # relative difference below which two costs are one optimum
-AGREED = 1e-7
-"""Relative difference of the two statements, whose gradients we get by central differences, casadi exactly."""
-DOUBT = 1.1
-"""A KKT number this many times the tolerance contradicts CONVERGED: differences are not exact to the last digit."""
-STATIONARY = 1e-4
-"""Relative gradient of the violation below which a point counts as stationary for it."""
-
-PARKING: Callable[..., Twin] = twin_ground.parking
-KINDS: dict[str, Callable[..., Twin]] = {
-    "free final time": twin_flights.free_time,
-    "two robots": twin_ground.two_robots,
-    "relay": twin_ground.relay,
-    "thrust cone": twin_flights.landing,
-    "attitude slew": twin_flights.slew,
-    "minimum snap": twin_flights.minimum_snap,
-    "pendulum": twin_ground.pendulum,
-    "cart-pole": twin_ground.cart_pole,
-    "gates": twin_flights.gates,
-    "two-link arm": twin_machines.arm,
-    "hover with drag": twin_flights.hover,
-    "lane change": twin_ground.lane_change,
-    "payload": twin_machines.payload,
-    "orbit": twin_flights.orbit,
-}
 EQUALITY_BACKENDS: dict[str, fg.Solver] = {"kkt": EQUALITIES_ONLY["kkt"], **CONSTRAINED}
-
-
-@dataclass
-class Answer:
-    """One backend's answer and what the judge says about its claim.
-
-    Attributes:
-        status: claimed, a name of :class:`unifg.Status`.
-        iterations: counted by the backend.
-        seconds: processor time, the graph compiled before.
-        cost: as judged.
-        stationarity, violation, complementarity: as judged, at the multipliers of the answer.
-        claim: "true", "false", "saddle" (stationary for the violation, but left by IPOPT for a feasible point), or
-            "none" where nothing was claimed.
-        reason: of a false claim.
-    """
-
-    status: str
-    iterations: int
-    seconds: float
-    cost: float
-    stationarity: float
-    violation: float
-    complementarity: float
-    claim: str = "none"
-    reason: str = ""
-
-
-def answer(backend: fg.Solver, twin: Twin, judge: Judge) -> Answer:
-    """Solve from the guess and judge."""
-    run = backend.prepare(twin.graph)
-    begin = time.process_time()
-    solution = run.solve(twin.guess)
-    seconds = time.process_time() - begin
-    exact = judge.numbers(solution.values, solution.multipliers)
-    result = Answer(
-        solution.status.name, solution.iterations, seconds, exact.cost, exact.stationarity, exact.violation,
-        exact.complementarity,
-    )  # fmt: skip
-    if solution.status is fg.Status.CONVERGED:
-        result.claim = "true"
-        for name in ("stationarity", "violation", "complementarity"):
-            if not getattr(exact, name) <= DOUBT * backend.tolerance:
-                result.claim, result.reason = "false", f"{name} is {getattr(exact, name):.2g}"
-    elif solution.status is fg.Status.LOCALLY_INFEASIBLE:
-        result.claim, result.reason = infeasible(solution, judge, backend.tolerance)
-    elif solution.status is fg.Status.UNBOUNDED:
-        result.claim, result.reason = "false", "every objective here is a sum of squares"
-    return result
-
-
-def infeasible(solution: fg.Solution, judge: Judge, tolerance: float) -> tuple[str, str]:
-    """Judge a claim that no nearby point violates the constraints less."""
-    seen = min(row.violation for row in solution.history)
-    if seen <= tolerance:
-        return "false", f"an iterate keeps the constraints to {seen:.1g}"
-    values = solution.values
-    least, slope = judge.least_from(values), judge.slope_of_violation(values)
-    if slope <= STATIONARY:
-        return ("saddle", "") if least.feasible else ("true", "")
-    if least.after >= 0.99 * least.before:
-        return "true", ""  # no sum of absolute violations is less: stationary in that norm
-    end = "none" if least.feasible else f"{least.after:.2g}"
-    return "false", f"the violation falls from {least.before:.2g} to {end} within {least.far:.2g}; slope {slope:.1g}"
-
-
-def disagreement(twin: Twin, judge: Judge) -> float:
-    """Largest difference of cost, rows and gradient of the two statements, relative, at a random point by the guess."""
-    rng = np.random.default_rng(0)
-    values = {
-        family: family.manifold.retract(v, 0.05 * rng.normal(size=(len(v), family.manifold.dim)))
-        for family, v in twin.guess.items()
-    }
-    program = twin.graph.compile()
-    lin = program.linearize(program.values_from(values))
-    cost, rows, gradient, _ = judge.at(lin.values)
-    free = program.columns.free
-    pairs = ((lin.cost, cost), (lin.constraints, rows), (lin.gradient[free], gradient[free]))
-    return max(float(np.abs(a - b).max(initial=0.0) / max(1.0, np.abs(b).max(initial=0.0))) for a, b in pairs)
 
 
 @dataclass
@@ -146,18 +41,26 @@ class Case:
     fatrop: Peer | None
 
 
-def measure(
-    build: Callable[..., Twin], seed: int, backends: Mapping[str, fg.Solver], equalities_only: bool = False
-) -> Case:
+@dataclass(frozen=True)
+class Job:
+    """One problem and who solves it."""
+
+    kind: str
+    seed: int
+    equalities_only: bool
+    backends: tuple[str, ...]
+
+
+def measure(job: Job) -> Case:
     """State a problem, solve it with everything."""
-    twin = build(seed, equalities_only)
+    twin = KINDS[job.kind](job.seed, job.equalities_only)
     judge = Judge(twin)
     apart = disagreement(twin, judge)
     if apart > AGREED:
         raise RuntimeError(f"{twin.name}: the graph and the casadi statement differ by {apart:.1e}")
-    answers = {name: answer(backend, twin, judge) for name, backend in backends.items()}
+    answers = {name: answer(EQUALITY_BACKENDS[name], twin, judge) for name in job.backends}
     ipopt, fatrop = judge.ipopt(twin.guess, TOLERANCE), judge.fatrop(twin.guess, TOLERANCE)
-    return Case(twin.kind, seed, equalities_only, answers, ipopt, fatrop)
+    return Case(job.kind, job.seed, job.equalities_only, answers, ipopt, fatrop)
 
 
 def results(cases: Iterable[Case]) -> dict[str, list[Case]]:
@@ -257,37 +160,26 @@ def render(cases: list[Case]) -> str:
     return "\n\n".join(parts)
 
 
-@dataclass(frozen=True)
-class Job:
-    """One problem and who solves it."""
-
-    kind: str
-    seed: int
-    equalities_only: bool
-    backends: tuple[str, ...]
-
-
 def solve(job: Job) -> Row:
     """All answers to one problem, as the file holds them."""
-    build = PARKING if job.kind == "parking" else KINDS[job.kind]
-    backends = {name: EQUALITY_BACKENDS[name] for name in job.backends}
-    return asdict(measure(build, job.seed, backends, job.equalities_only))
+    return asdict(measure(job))
 
 
 def jobs(parkings: int, seeds: int, kinds: Sequence[str], only: Sequence[str]) -> dict[Key, Job]:
-    """What is to be solved: the other kinds twice, then the parkings."""
-    whole, equal = (tuple(b for b in some if b in only) for some in (CONSTRAINED, EQUALITY_BACKENDS))
-    found = [
-        Job(kind, seed, equalities_only, equal if equalities_only else whole)
-        for kind in KINDS if kind in kinds for equalities_only in (False, True) for seed in range(seeds)
-    ]  # fmt: skip
-    found += [Job("parking", seed, False, whole) for seed in range(parkings) if "parking" in kinds]
+    """What is to be solved, by what tells it apart: every kind but the parkings without its inequalities, too."""
+    found = []
+    for kind in kinds:
+        for equalities_only in (False,) if kind == "parking" else (False, True):
+            backends = EQUALITY_BACKENDS if equalities_only else CONSTRAINED
+            asked = tuple(name for name in backends if name in only)
+            count = parkings if kind == "parking" else seeds
+            found += [Job(kind, seed, equalities_only, asked) for seed in range(count)]
     return {(job.kind, job.seed, job.equalities_only): job for job in found}
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure and write; 0 only without a false claim."""
-    kinds, names = ["parking", *KINDS], list(EQUALITY_BACKENDS)
+    kinds, names = list(KINDS), list(EQUALITY_BACKENDS)
     parser = command(__doc__)
     parser.add_argument("--parkings", type=int, default=100)
     parser.add_argument("--seeds", type=int, default=5, help="of every other kind")

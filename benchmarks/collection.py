@@ -9,7 +9,6 @@ shares no code with the solvers. Writes docs/collection.md.
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -18,17 +17,14 @@ from typing import Any, TypeAlias
 import numpy as np
 
 import unifg as fg
-from benchmarks.report import CHECKOUT, command, machine, publish, table, words
+from benchmarks.report import command, machine, publish, table, words
+from judge import judge
+from problems.hock_schittkowski import SMALL, Case
+from problems.hock_schittkowski_later import LATER
+from problems.lie import LIE, LieCase
+from problems.small import DEGENERATE, INFEASIBLE, SQUARES
 from unifg.solvers import SQP, InteriorPoint
 from unifg.solvers.names import backends
-
-sys.path.insert(0, str(CHECKOUT / "tests"))
-
-from hock_schittkowski import SMALL, Case
-from hock_schittkowski_later import LATER
-from judge import judge
-from lie_problems import LIE, LieCase
-from small_problems import DEGENERATE, INFEASIBLE, SQUARES
 
 Problem: TypeAlias = Case | LieCase
 

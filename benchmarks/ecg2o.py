@@ -9,9 +9,7 @@ the drive cycle that ships with unifg takes its place, and there is nothing to c
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -21,15 +19,15 @@ from typing import Any, TypeAlias
 import numpy as np
 
 import unifg as fg
-from benchmarks.report import CHECKOUT, OUT, machine, put_results, table
+from benchmarks.report import OUT, command, machine, publish, shared, table
 from benchmarks.timing import interleave, number
+from problems.known import STARTS, Guess, ecg2o_inequality
+from problems.known import ecg2o as small
 from unifg.scenarios.velocity_tracking import TrackingSettings, state_problem
 from unifg.solvers import KKT, SQP, AugmentedLagrangian, GaussNewton, InteriorPoint, Penalty
-from unifg.typing import Array
 
 Result: TypeAlias = dict[str, Any]
 
-PAGE = CHECKOUT / "docs" / "velocity-tracking.md"
 LENGTHS = (50, 100, 200, 385)
 COSTS = {  # J of the first study, worked out independently with IPOPT and Newton's method
     "quadratic": (34481.995068, 75967.385885, 168678.611533, 345514.797577),
@@ -38,7 +36,6 @@ COSTS = {  # J of the first study, worked out independently with IPOPT and Newto
 BOUNDS = (-2000.0, 1500.0)
 BOUNDED = {(50, "quadratic"): 35297.4202, (385, "quadratic"): 384058.6892,
            (50, "linear"): 37466.2547, (385, "linear"): 394670.5021}  # fmt: skip
-STARTS = ((-0.2, -0.2), (-1.2, -1.0), (1.0, 1.0), (-2.0, -2.0), (0.5, -0.5), (2.0, 2.0))
 # Of the same starts, independently: Newton-KKT steps until the step is below 1e-3, and the outer loops of GTSAM 4.3
 # around its own Levenberg-Marquardt, restated. Its optimisers cannot be given this problem from Python: there they take
 # a QpProblem or a QcqpProblem, whose costs and constraints are quadratic; a CustomFactor ends in "qcqpFactors is not
@@ -56,11 +53,14 @@ SMALL_PENALTIES = (0.1, 1.0, 10.0, 1e2, 1e3, 1e4)
 LEVENBERG = KKT(globalization="levenberg-marquardt")
 
 
+Stated: TypeAlias = tuple[fg.Graph, fg.Guess | Guess]
+
+
 def profile() -> Path | None:
     """The paper's profile, if it is there."""
-    folder = Path(os.environ.get("UNIFG_DATA", CHECKOUT.parent / "shared" / "data"))
-    path = folder / "profiles" / "velocity_profile_388.csv"
-    return path if path.is_file() else None
+    folder = shared("profiles")
+    path = folder and folder / "velocity_profile_388.csv"
+    return path if path and path.is_file() else None
 
 
 def drive(
@@ -82,42 +82,13 @@ def damped(penalty: float) -> AugmentedLagrangian:
     return AugmentedLagrangian(schedule="bazzana-damped", penalty=penalty)
 
 
-def squares(x: Array) -> Array:
-    """Residuals of the second study."""
-    return np.stack([x[:, 0] + np.exp(-x[:, 1]), x[:, 0] ** 2 + 2.0 * x[:, 1] + 1.0], axis=1)
-
-
-def curve(x: Array) -> Array:
-    """Its equality."""
-    return (x[:, 0] + x[:, 0] ** 3 + x[:, 1] + x[:, 1] ** 2)[:, None]
-
-
-def small(start: tuple[float, float]) -> tuple[fg.Graph, fg.Guess]:
-    """The second study."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
-    graph.minimize(squares, x, name="cost")
-    graph.constrain(curve, x, lower=0.0, upper=0.0, name="curve")
-    return graph, fg.Guess({x: np.array([start])})
-
-
-def small_inequality() -> tuple[fg.Graph, fg.Guess]:
-    """A circle cut by an ellipse, after GTSAM's tests."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
-    graph.minimize(fg.prior, x, [1.0, 1.0])
-    graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0, name="circle")
-    graph.constrain(lambda p: p**2 @ np.array([[4.0], [0.25]]), x, upper=1.0, name="ellipse")
-    return graph, fg.Guess({x: np.array([[-1.0, 2.0]])})
-
-
-def steps(solver: fg.Solver, problem: tuple[fg.Graph, fg.Guess], multiplier: float | None = None) -> str:
+def steps(solver: fg.Solver, problem: Stated, multiplier: float | None = None) -> str:
     """Iterations of a solve, marked with a dagger when it ended without the KKT conditions."""
     graph, guess = problem
     duals = None
     if multiplier is not None:
         force = graph.families.get("force")
-        count, name = (1, "curve") if force is None else (len(guess.values[force]), "dynamics")
+        count, name = (1, "curve") if force is None else (force.count, "dynamics")
         duals = {name: np.full((count, 1), multiplier)}
     try:
         solution = solver.solve(graph, guess, duals=duals)
@@ -206,7 +177,7 @@ def small_sensitivity() -> str:
 def inner() -> str:
     """Fig. 5: inner iterations of every outer one."""
     rows = []
-    problems: list[tuple[str, tuple[fg.Graph, fg.Guess]]] = [("drive, N = 385", drive(385))]
+    problems: list[tuple[str, Stated]] = [("drive, N = 385", drive(385))]
     problems += [(f"second study, {start}", small(start)) for start in ((-2.0, -2.0), (2.0, 2.0))]
     for name, problem in problems:
         for penalty in (None, 10.0):
@@ -244,7 +215,7 @@ def case_study_2() -> tuple[str, str]:
     counts = [[int(word) if word.isdecimal() else np.nan for word in row[1:]] for row in rows]
     rows.append(["average", *(number(float(value), 2) for value in np.mean(counts, axis=0))])
     head = ["start", *solvers, "reference: KKT, step < 1e-3", "GTSAM AL, restated", "GTSAM penalty, restated"]
-    variant = {name: steps(solver, small_inequality()) for name, solver in solvers.items()}
+    variant = {name: steps(solver, ecg2o_inequality()) for name, solver in solvers.items()}
     text = ", ".join(f"{name} {count}" for name, count in variant.items() if count != "-")
     return table(head, rows), text
 
@@ -317,21 +288,19 @@ def report(solves: int) -> tuple[str, Result]:
     return "\n\n".join(parts), {"solves": solves, "times": numbers}
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> int:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description="The two case studies of ecg2o.", allow_abbrev=False)
+    parser = command(__doc__)
     parser.add_argument("--solves", type=int, default=1000, help="solves behind every time (default: %(default)s)")
-    parser.add_argument("--no-docs", action="store_true", help=f"leave docs/{PAGE.name} alone")
-    chosen = parser.parse_args()
+    parser.add_argument("--no-docs", action="store_true", help="leave the page in docs/ alone")
+    chosen = parser.parse_args(arguments)
     if chosen.solves < 1:
         parser.error("--solves must be at least 1")
     text, numbers = report(chosen.solves)
-    OUT.mkdir(parents=True, exist_ok=True)
+    publish("velocity-tracking", text, docs=not chosen.no_docs)
     (OUT / "ecg2o.json").write_text(json.dumps(numbers, indent=2) + "\n", encoding="utf-8")
-    if not chosen.no_docs:
-        put_results(PAGE, "Velocity tracking", text)
-    print(text)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

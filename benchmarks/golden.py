@@ -31,6 +31,8 @@ import unifg as fg
 from benchmarks import collection, control_problems, control_starts, ecg2o, incremental, pose_graphs
 from benchmarks.navigation import CASES, Drive
 from benchmarks.report import OUT
+from problems.known import STARTS
+from problems.known import ecg2o as small
 from unifg.errors import UnifgError
 from unifg.pose_graphs import PoseGraph
 from unifg.scenarios import manoeuvres
@@ -182,9 +184,9 @@ def of_ecg2o() -> Rows:
         for length in ecg2o.LENGTHS:
             for name, solver in solvers.items():
                 yield f"drive {drag} {length}, {name}", partial(built, solver, partial(ecg2o.drive, length, drag))
-    for start in ecg2o.STARTS:
+    for start in STARTS:
         for name, solver in {**solvers, "literal": ecg2o.literal(10.0), "damped": ecg2o.damped(10.0)}.items():
-            yield f"small {start}, {name}", partial(built, solver, partial(ecg2o.small, start))
+            yield f"small {start}, {name}", partial(built, solver, partial(small, start))
 
 
 def of_graphs() -> Rows:

@@ -2,13 +2,12 @@
 
     python -m benchmarks.iterations
 
-The problems are those every backend is tested on (``tests/problems.py``), the cylinders those of
+The problems are those every backend is tested on (``tests/problems/known.py``), the cylinders those of
 :mod:`benchmarks.cylinder_flights`, the loops those of :mod:`benchmarks.control_loops`. Writes docs/iterations.md.
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from importlib.util import find_spec
@@ -18,7 +17,8 @@ import numpy as np
 import unifg as fg
 from benchmarks import control_loops, cylinder_flights
 from benchmarks.control_problems import Problem
-from benchmarks.report import CHECKOUT, command, machine, publish, table, words
+from benchmarks.report import command, machine, publish, table, words
+from problems.known import PROBLEMS, Guess
 from unifg.solvers import (
     KKT,
     SQP,
@@ -29,10 +29,6 @@ from unifg.solvers import (
     LevenbergMarquardt,
     Penalty,
 )
-
-sys.path.insert(0, str(CHECKOUT / "tests"))
-
-from problems import PROBLEMS, Guess
 
 BACKENDS: dict[str, fg.Solver] = {
     "GN": GaussNewton(),

@@ -65,8 +65,8 @@ def located(module: str) -> Path | None:
             for path in (stem.with_suffix(".py"), stem / "__init__.py"):
                 if path.is_file():
                     return path
-    bare = BARE / f"{module}.py"
-    return bare if "." not in module and bare.is_file() else None
+    bare = BARE.joinpath(*module.split("."))
+    return next((path for path in (bare.with_suffix(".py"), bare / "__init__.py") if path.is_file()), None)
 
 
 @cache

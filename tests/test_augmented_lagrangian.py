@@ -15,7 +15,7 @@ from benchmarks.control_problems import Unicycle
 from benchmarks.cylinder_flights import study
 from judge import judge
 from out_of_reach import goal_too_far
-from problems import STARTS, ecg2o, ecg2o_inequality, pose_beside_disc, short_drive
+from problems.known import STARTS, ecg2o, ecg2o_inequality, pose_beside_disc, short_drive
 from unifg.models import obstacles, unicycle
 from unifg.scenarios.manoeuvres import CASES, ManoeuvreSettings, state_problem
 from unifg.solvers import SQP, AugmentedLagrangian

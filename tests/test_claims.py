@@ -1,4 +1,4 @@
-"""A small part of benchmarks/claims.py: what backends claim, judged by casadi's exact derivatives."""
+"""What backends claim about a few of the problems stated twice, judged by casadi's exact derivatives."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from unifg.solvers import KKT, SQP, AugmentedLagrangian
 
 pytest.importorskip("casadi", reason="the judge differentiates with casadi, which comes with the extra 'bench'")
 
-from benchmarks import claims, twin_ground
 from benchmarks.backends import CONSTRAINED
-from benchmarks.claims import answer, disagreement, infeasible
-from benchmarks.exact_judge import Judge
-from benchmarks.twins import Twin
+from exact_judge import AGREED, Judge, answer, disagreement, infeasible
+from problems.twins import KINDS
+from problems.twins.twin import Twin
 
 
 def stated(kind: str, seed: int = 0, equalities_only: bool = False) -> tuple[Twin, Judge]:
-    twin = {"parking": twin_ground.parking, **claims.KINDS}[kind](seed, equalities_only)
+    twin = KINDS[kind](seed, equalities_only)
     return twin, Judge(twin)
 
 
@@ -27,15 +26,15 @@ def test_both_statements_are_one_problem(kind: str) -> None:
     """Cost, rows and gradient along the right perturbation agree; the study asserts it of every problem."""
     twin, judge = stated(kind, seed=1)
     np.testing.assert_array_equal(twin.graph.compile().columns.free, np.flatnonzero(~twin.held))
-    assert disagreement(twin, judge) < claims.AGREED
+    assert disagreement(twin, judge) < AGREED
 
 
 def test_two_different_problems_are_told_apart() -> None:
     twin, judge = stated("orbit")
-    assert disagreement(twin, judge) < claims.AGREED
+    assert disagreement(twin, judge) < AGREED
     (u,) = (family for family in twin.guess if family.name == "u")
     twin.graph.minimize(fg.prior, u[:1], [0.0, 0.0], sigma=30.0)  # one stage, weak, in one of them
-    assert disagreement(twin, judge) > claims.AGREED
+    assert disagreement(twin, judge) > AGREED
 
 
 @pytest.mark.parametrize("kind", ["hover with drag", "attitude slew"])

@@ -12,10 +12,10 @@ import pytest
 import unifg as fg
 from benchmarks import collection
 from benchmarks.collection import BACKENDS, CASES, GROUPS, OPTIMUM, RIGHT, attempt, ipopt, verdict
-from hock_schittkowski import Case
 from judge import judge
-from lie_problems import LieCase
-from problems import short_drive
+from problems.hock_schittkowski import Case
+from problems.known import short_drive
+from problems.lie import LieCase
 from unifg.language.terms import Constraint
 from unifg.typing import Array
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems import Guess, short_drive
+from problems.known import Guess, short_drive
 from unifg.solvers import (
     KKT,
     SQP,

@@ -9,8 +9,8 @@ import pytest
 import scipy.optimize
 
 import unifg as fg
-from benchmarks import disc_fields, parkings
 from out_of_reach import Stated, blocked_corridor, goal_too_far, wall_too_close
+from problems import disc_fields, parkings
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array
 
@@ -72,7 +72,7 @@ def test_obstacles_in_the_way_are_told(name: str) -> None:
 @pytest.mark.parametrize("cars", [False, True])
 def test_parkings_from_rest(cars: bool, kind: parkings.Guess) -> None:
     """The linearised dynamics of a standing car do not reach a place beside it."""
-    stated = parkings.Ours(InteriorPoint(), cars)
+    stated = parkings.Parking(InteriorPoint(), cars)
     for seed in range(200, 204):
         solution = stated.solve(parkings.layout(seed, cars), kind)
         assert solution.converged, solution.report()
@@ -80,7 +80,7 @@ def test_parkings_from_rest(cars: bool, kind: parkings.Guess) -> None:
 
 
 def test_a_watched_solve_takes_the_same_steps_with_elastic_equalities() -> None:
-    stated, drawn = parkings.Ours(InteriorPoint()), parkings.layout(0)
+    stated, drawn = parkings.Parking(InteriorPoint()), parkings.layout(0)
     alone = stated.solve(drawn, "rest")
     rows: list[fg.Iteration] = []
     watched = stated.solve(drawn, "rest", callback=rows.append)
@@ -94,7 +94,7 @@ def test_a_watched_solve_takes_the_same_steps_with_elastic_equalities() -> None:
 
 def test_fields_of_discs_take_few_iterations() -> None:
     """A slice of the study, of which IPOPT and fatrop solve 21 in a median of 35 and 34 iterations."""
-    stated = disc_fields.Ours(InteriorPoint())
+    stated = disc_fields.Field(InteriorPoint())
     found = [stated.solve(disc_fields.layout(seed)) for seed in range(300, 325)]
     assert sum(solution.converged for solution in found) >= 21
     assert np.median([solution.iterations for solution in found]) <= 35

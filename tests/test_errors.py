@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems import short_drive
+from problems.known import short_drive
 from test_house import LIBRARY, name_of
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.symmetric import Symmetric

@@ -9,7 +9,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems import line, short_drive
+from problems.known import line, short_drive
 from unifg.models import obstacles, unicycle
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, LevenbergMarquardt
 

@@ -192,6 +192,25 @@ def test_nobody_imports_side_folders_by_bare_name() -> None:
     assert wrong == []
 
 
+# Tests of the measurements themselves; all others take their problems from tests/problems.
+OF_MEASUREMENTS = {
+    "test_augmented_lagrangian.py", "test_benchmarks.py", "test_claims.py", "test_collection.py",
+    "test_compiled_peers.py", "test_control_cases.py", "test_golden.py", "test_infeasible.py", "test_interior_point.py",
+    "test_least_violation.py", "test_measured_sentences.py", "test_mutants.py", "test_osqp.py", "test_pages.py",
+    "test_quadrotor_flights.py", "test_quadrotor_joint.py", "test_quadrotor_obstacles.py",
+    "test_reference_problems.py", "test_robust.py",
+}  # fmt: skip
+
+
+def test_tests_and_their_problems_know_no_measurements() -> None:
+    knowing = {
+        path.name
+        for path in sources(CHECKOUT / "tests")
+        if any(is_in(module, "benchmarks") for _, module in imports(ast.parse(path.read_text(encoding="utf-8"))))
+    }
+    assert knowing == OF_MEASUREMENTS
+
+
 def test_side_folders_use_absolute_imports() -> None:
     wrong = [
         f"{name_of(path)}:{node.lineno}"

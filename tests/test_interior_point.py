@@ -7,7 +7,7 @@ import pytest
 
 import unifg as fg
 from benchmarks.control_problems import Quadrotor, Unicycle
-from problems import short_drive
+from problems.known import short_drive
 from unifg.solvers import SQP, InteriorPoint
 from unifg.solvers.interior_point import Workspace
 

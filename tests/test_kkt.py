@@ -10,7 +10,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems import STARTS, ecg2o, pose_chain, short_drive, three_variable_qp
+from problems.known import STARTS, ecg2o, pose_chain, short_drive, three_variable_qp
 from unifg.models import unicycle
 from unifg.solvers import KKT, SQP
 from unifg.typing import Array

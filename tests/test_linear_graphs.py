@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems import PROBLEMS, Guess, ecg2o, ecg2o_inequality, short_drive, three_variable_qp
+from problems.known import PROBLEMS, Guess, ecg2o, ecg2o_inequality, short_drive, three_variable_qp
 from test_sqp_exact import two_rotations
 from unifg.models import unicycle
 from unifg.program.program import Program

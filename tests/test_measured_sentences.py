@@ -73,13 +73,13 @@ def test_one_iteration_a_step_is_named_where_it_is_not_safe() -> None:
 def test_claims_survive_the_file_and_are_counted() -> None:
     pytest.importorskip("casadi", reason="the judge differentiates with casadi, which comes with the extra 'bench'")
     from benchmarks import claims
-    from benchmarks.exact_judge import Peer
+    from exact_judge import Answer, Peer
 
     peer = Peer("Solve_Succeeded", True, 9, 1.0, 0.0, 1.0)
     answers = {
-        "sqp": claims.Answer("CONVERGED", 5, 0.1, 1.0, 1e-7, 0.0, 0.0, "true"),
-        "ipm": claims.Answer("CONVERGED", 5, 0.1, 0.5, 3e-3, 0.0, 0.0, "false", "stationarity is 0.003"),
-        "alm": claims.Answer("LOCALLY_INFEASIBLE", 5, 0.1, 2.0, 1.0, 0.1, 0.0, "saddle"),
+        "sqp": Answer("CONVERGED", 5, 0.1, 1.0, 1e-7, 0.0, 0.0, "true"),
+        "ipm": Answer("CONVERGED", 5, 0.1, 0.5, 3e-3, 0.0, 0.0, "false", "stationarity is 0.003"),
+        "alm": Answer("LOCALLY_INFEASIBLE", 5, 0.1, 2.0, 1.0, 0.1, 0.0, "saddle"),
     }
     case = claims.Case("parking", 3, False, answers, peer, None)
     assert claims.restored(json.loads(json.dumps({"code": "now", **asdict(case)}))) == case

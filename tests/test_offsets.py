@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from benchmarks import offsets
+from problems import offsets
 from unifg.kernels.differentiation import gradient_and_hessian, jacobian
 from unifg.models import quadrotor, unicycle
 from unifg.program.second_order import lagrangian_hessian

@@ -10,7 +10,7 @@ import pytest
 import unifg as fg
 from benchmarks.control_problems import problems
 from benchmarks.osqp_share import Count, counting
-from problems import active_bounds, short_drive
+from problems.known import active_bounds, short_drive
 from unifg.program.program import Program
 from unifg.solvers import SQP
 from unifg.solvers.qp import QP, qp_error, subproblem

@@ -11,7 +11,7 @@ import pytest
 import unifg as fg
 from fences import fences
 from judge import judge
-from problems import PROBLEMS, Problem
+from problems.known import PROBLEMS, Problem
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "own-backend.md"
 

@@ -7,7 +7,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems import STARTS, active_bounds, ecg2o, ecg2o_inequality, inactive_inequality, short_drive
+from problems.known import STARTS, active_bounds, ecg2o, ecg2o_inequality, inactive_inequality, short_drive
 from unifg.solvers import AugmentedLagrangian, Penalty
 
 

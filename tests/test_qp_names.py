@@ -7,7 +7,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems import PROBLEMS, Problem, active_bounds, short_drive
+from problems.known import PROBLEMS, Problem, active_bounds, short_drive
 from unifg.solvers import SQP
 from unifg.solvers.qp import qp_error, subproblem
 from unifg.solvers.qp_graph import GraphRoute

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems import line, short_drive
+from problems.known import line, short_drive
 from unifg.models import unicycle
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton
 from unifg.typing import Array

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems import short_drive
+from problems.known import short_drive
 from unifg.answers.factor_norms import factor_norms
 from unifg.scenarios.show.residual_plot import ResidualMonitor, residual_picture
 from unifg.solvers import (

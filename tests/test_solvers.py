@@ -7,7 +7,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems import PROBLEMS, Problem, ecg2o, inactive_inequality, short_drive
+from problems.known import PROBLEMS, Problem, ecg2o, inactive_inequality, short_drive
 from unifg.solvers import (
     KKT,
     SQP,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems import short_drive
+from problems.known import short_drive
 from unifg.solvers import SQP
 from unifg.solvers.qp import QPAnswer, subproblem
 from unifg.solvers.sqp import FALLING, LEFT, PATIENCE, RESTING, Merit, Subproblems, Watch

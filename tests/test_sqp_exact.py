@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from hock_schittkowski import SMALL
 from judge import judge
-from problems import PROBLEMS, Guess, Problem, ecg2o, ecg2o_inequality, hs6, pose_beside_disc, short_drive
+from problems.hock_schittkowski import SMALL
+from problems.known import PROBLEMS, Guess, Problem, ecg2o, ecg2o_inequality, hs6, pose_beside_disc, short_drive
 from unifg.program.program import Program
 from unifg.solvers import SQP
 from unifg.solvers.qp import QP, Route, qp_error, solve_convex, subproblem

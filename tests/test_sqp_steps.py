@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from hock_schittkowski import SMALL
+from problems.hock_schittkowski import SMALL
 from unifg.solvers import SQP
 from unifg.solvers.qp import subproblem
 from unifg.solvers.scaling import Scaling

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import unifg as fg
-from problems import Guess
+from problems.known import Guess
 from unifg.typing import Array
 
 DT = 0.2

@@ -1,8 +1,8 @@
-"""Parallel parkings of a kinematic bicycle from rest into random gaps; run by :mod:`benchmarks.hard_guesses`.
+"""Parallel parkings of a kinematic bicycle from rest into random gaps.
 
 A car that stands still cannot move sideways, and at rest its wheels steer nothing: the linearised dynamics of the guess
 (the car stands where it is, or slides along a straight line) do not reach the goal. A solver has to find its way from
-there. Every backend and, with casadi installed, IPOPT and fatrop solve the same variables, rows and limits.
+there.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def guess(drawn: Layout, kind: Guess) -> tuple[Array, Array]:
     return drawn.start + share * (drawn.goal - drawn.start), np.zeros((HORIZON, 2))
 
 
-class Ours:
+class Parking:
     """The parking for one of our backends: one structure, start, goal and cars as data.
 
     Attributes:
@@ -120,57 +120,3 @@ class Ours:
         if self._cars is not None:
             data[self._cars] = drawn.cars.ravel()
         return self._run.solve({self.x: states, self.u: controls}, data=data, **options)
-
-
-class Peer:
-    """The same for a solver of casadi, in the order x_0, u_0, x_1, ... from which fatrop sees the stages."""
-
-    def __init__(self, plugin: str, cars: bool = True, tolerance: float = 1e-6) -> None:
-        """Build and differentiate the expressions; start, goal and cars are parameters."""
-        import casadi as ca
-
-        n, discs = HORIZON, 2 * len(HULL) if cars else 0
-        x, u = [ca.SX.sym("x", 4) for _ in range(n + 1)], [ca.SX.sym("u", 2) for _ in range(n)]
-        start, goal, parked = ca.SX.sym("start", 4), ca.SX.sym("goal", 4), ca.SX.sym("cars", 2, discs)
-        cost: Any = 0.0
-        rows: list[Any] = []
-        equality: list[bool] = []
-        for k in range(n + 1):
-            if k < n:
-                cost += 0.5 * ca.dot(ca.DM(EFFORT), u[k] ** 2)
-                v = x[k][3] + 0.5 * DT * u[k][0]
-                turn = DT * v * ca.tan(u[k][1]) / BASE
-                heading = x[k][2] + 0.5 * turn
-                moved = ca.vertcat(DT * v * ca.cos(heading), DT * v * ca.sin(heading), turn, DT * u[k][0])
-                rows.append(x[k + 1] - x[k] - moved)
-                equality += [True] * 4
-            if k in (0, n):
-                rows.append(x[k] - (start if k == 0 else goal))
-                equality += [True] * 4
-            else:
-                for ahead in HULL.tolist():
-                    place = x[k][:2] + ahead * ca.vertcat(ca.cos(x[k][2]), ca.sin(x[k][2]))
-                    rows += [ca.sumsqr(place - parked[:, d]) - (2.0 * RADIUS) ** 2 for d in range(discs)]
-                    equality += [False] * discs
-        unknowns = ca.vertcat(*(part for pair in zip(x[:-1], u, strict=True) for part in pair), x[-1])
-        program = {"x": unknowns, "p": ca.vertcat(start, goal, ca.vec(parked)), "f": cost, "g": ca.vertcat(*rows)}
-        chosen: dict[str, Any] = {"print_time": False, plugin: {"print_level": 0, "tol": tolerance}}
-        if plugin == "fatrop":
-            chosen |= {"structure_detection": "auto", "equality": equality}
-        else:
-            chosen[plugin]["sb"] = "yes"
-        self._solver: Any = ca.nlpsol("solver", plugin, program, chosen)
-        free = np.array([np.inf, np.inf, np.inf, FASTEST])
-        bound = np.tile(np.append(free, LIMITS), n)
-        bound[3] = np.inf  # the first and last state are given
-        bound = np.append(bound, [np.inf] * 4)
-        self._limits = {"lbx": -bound, "ubx": bound, "lbg": 0.0, "ubg": np.where(equality, 0.0, np.inf)}
-
-    def solve(self, drawn: Layout, kind: Guess) -> tuple[bool, int, float]:
-        """Solve one parking: whether it succeeded, iterations, cost."""
-        states, controls = guess(drawn, kind)
-        first = np.append(np.hstack([states[:-1], controls]).ravel(), states[-1])
-        given = np.concatenate([drawn.start, drawn.goal, drawn.cars.ravel()])
-        answer = self._solver(x0=first, p=given, **self._limits)
-        statistics = self._solver.stats()
-        return bool(statistics["success"]), int(statistics["iter_count"]), float(answer["f"])

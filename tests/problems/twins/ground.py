@@ -14,7 +14,7 @@ import numba
 import numpy as np
 
 import unifg as fg
-from benchmarks.twins import Twin
+from problems.twins.twin import Twin
 from unifg.models import unicycle
 from unifg.typing import Array
 

@@ -7,6 +7,7 @@ the point where the claim was made.
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,11 +16,17 @@ import casadi as ca
 import numpy as np
 
 import unifg as fg
-from benchmarks.twins import Twin
+from problems.twins.twin import Twin
 from unifg.typing import Array, BoolArray, IntArray
 
 FEASIBLE = 1e-6
 """Largest violation of a point that keeps the constraints, in their own units."""
+AGREED = 1e-7
+"""Relative difference of the two statements, whose gradients we get by central differences, casadi exactly."""
+DOUBT = 1.1
+"""A KKT number this many times the tolerance contradicts CONVERGED: differences are not exact to the last digit."""
+STATIONARY = 1e-4
+"""Relative gradient of the violation below which a point counts as stationary for it."""
 
 
 @dataclass(frozen=True)
@@ -264,3 +271,82 @@ class Judge:
         moves = np.concatenate([np.zeros(0, bool), *(np.full(len(r.lower), r.moves) for r in self.twin.rows)])
         rows = np.lexsort((~moves, self._row_stages))
         return (np.argsort(place, kind="stable"), rows) if x.count == u.count + 1 else None
+
+
+@dataclass
+class Answer:
+    """One backend's answer and what the judge says about its claim.
+
+    Attributes:
+        status: claimed, a name of :class:`unifg.Status`.
+        iterations: counted by the backend.
+        seconds: processor time, the graph compiled before.
+        cost: as judged.
+        stationarity, violation, complementarity: as judged, at the multipliers of the answer.
+        claim: "true", "false", "saddle" (stationary for the violation, but left by IPOPT for a feasible point), or
+            "none" where nothing was claimed.
+        reason: of a false claim.
+    """
+
+    status: str
+    iterations: int
+    seconds: float
+    cost: float
+    stationarity: float
+    violation: float
+    complementarity: float
+    claim: str = "none"
+    reason: str = ""
+
+
+def answer(backend: fg.Solver, twin: Twin, judge: Judge) -> Answer:
+    """Solve from the guess and judge."""
+    run = backend.prepare(twin.graph)
+    begin = time.process_time()
+    solution = run.solve(twin.guess)
+    seconds = time.process_time() - begin
+    exact = judge.numbers(solution.values, solution.multipliers)
+    result = Answer(
+        solution.status.name, solution.iterations, seconds, exact.cost, exact.stationarity, exact.violation,
+        exact.complementarity,
+    )  # fmt: skip
+    if solution.status is fg.Status.CONVERGED:
+        result.claim = "true"
+        for name in ("stationarity", "violation", "complementarity"):
+            if not getattr(exact, name) <= DOUBT * backend.tolerance:
+                result.claim, result.reason = "false", f"{name} is {getattr(exact, name):.2g}"
+    elif solution.status is fg.Status.LOCALLY_INFEASIBLE:
+        result.claim, result.reason = infeasible(solution, judge, backend.tolerance)
+    elif solution.status is fg.Status.UNBOUNDED:
+        result.claim, result.reason = "false", "every objective here is a sum of squares"
+    return result
+
+
+def infeasible(solution: fg.Solution, judge: Judge, tolerance: float) -> tuple[str, str]:
+    """Judge a claim that no nearby point violates the constraints less."""
+    seen = min(row.violation for row in solution.history)
+    if seen <= tolerance:
+        return "false", f"an iterate keeps the constraints to {seen:.1g}"
+    values = solution.values
+    least, slope = judge.least_from(values), judge.slope_of_violation(values)
+    if slope <= STATIONARY:
+        return ("saddle", "") if least.feasible else ("true", "")
+    if least.after >= 0.99 * least.before:
+        return "true", ""  # no sum of absolute violations is less: stationary in that norm
+    end = "none" if least.feasible else f"{least.after:.2g}"
+    return "false", f"the violation falls from {least.before:.2g} to {end} within {least.far:.2g}; slope {slope:.1g}"
+
+
+def disagreement(twin: Twin, judge: Judge) -> float:
+    """Largest difference of cost, rows and gradient of the two statements, relative, at a random point by the guess."""
+    rng = np.random.default_rng(0)
+    values = {
+        family: family.manifold.retract(v, 0.05 * rng.normal(size=(len(v), family.manifold.dim)))
+        for family, v in twin.guess.items()
+    }
+    program = twin.graph.compile()
+    lin = program.linearize(program.values_from(values))
+    cost, rows, gradient, _ = judge.at(lin.values)
+    free = program.columns.free
+    pairs = ((lin.cost, cost), (lin.constraints, rows), (lin.gradient[free], gradient[free]))
+    return max(float(np.abs(a - b).max(initial=0.0) / max(1.0, np.abs(b).max(initial=0.0))) for a, b in pairs)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy import exp, log, sin, sqrt
 
-from hock_schittkowski import INF, ROOT2, Case, banana, product
+from problems.hock_schittkowski import INF, ROOT2, Case, banana, product
 
 ARC = math.asin(math.sqrt(1 / 4.2))
 HS57_A = [8, 8] + 4 * [10] + 4 * [12] + 3 * [14] + 3 * [16] + 2 * [18] + 3 * [20] + 3 * [22] + 3 * [24] + 3 * [26]

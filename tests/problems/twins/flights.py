@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 import unifg as fg
-from benchmarks.twins import Twin, quaternion_exp, quaternion_times
+from problems.twins.twin import Twin, quaternion_exp, quaternion_times
 from unifg.typing import Array
 
 GRAVITY = 9.81

@@ -28,7 +28,7 @@ class LieCase:
         best: the known minimum; NaN when no point satisfies the constraints.
         others: objective at other KKT points, each verified.
         answer: (count, storage) by family name, where the minimiser is unique.
-        qualified, judged, determined: as for :class:`hock_schittkowski.Case`.
+        qualified, judged, determined: as for :class:`problems.hock_schittkowski.Case`.
     """
 
     name: str

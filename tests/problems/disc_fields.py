@@ -1,14 +1,12 @@
-"""Random fields of twenty discs with residuals a user writes; run by :mod:`benchmarks.hard_guesses`.
+"""Random fields of twenty discs with residuals a user writes.
 
 A unicycle, forty steps, hard dynamics, a soft goal and the guess a user begins with: the straight line through the
-discs. Dynamics and clearance are compiled functions without Jacobian, the peers differentiate the same expressions
-exactly. All solve the same variables, rows and limits, cold.
+discs. Dynamics and clearance are compiled functions without Jacobian.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numba
 import numpy as np
@@ -26,7 +24,6 @@ TOLERANCE = 1e-6
 LIMITS = np.array([1.5, 2.0])  # of the controls [m/s, rad/s]
 GOAL = np.array([50.0, 50.0, 1.0])  # weights of the last pose
 EFFORT = np.array([0.1, 0.1])
-PEERS = ("ipopt", "fatrop")
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
@@ -65,7 +62,7 @@ def guess() -> tuple[Array, Array]:
     return states, controls
 
 
-class Ours:
+class Field:
     """The fields for one of our backends: one structure, discs as data.
 
     Attributes:
@@ -92,51 +89,3 @@ class Ours:
         """Solve one field from the straight line."""
         states, controls = guess()
         return self._run.solve({self.x: states, self.u: controls}, data={self._discs: discs.ravel()})
-
-
-class Peer:
-    """The same for a solver of casadi, in the order x_0, u_0, x_1, ... from which fatrop sees the stages."""
-
-    def __init__(self, plugin: str) -> None:
-        """Build and differentiate the expressions; the discs are parameters."""
-        import casadi as ca
-
-        n = HORIZON
-        x, u = [ca.SX.sym("x", 3) for _ in range(n + 1)], [ca.SX.sym("u", 2) for _ in range(n)]
-        discs = ca.SX.sym("discs", 3, DISCS)
-        cost: Any = 0.5 * ca.dot(ca.DM(GOAL), (x[n] - ca.DM([LENGTH, 0.0, 0.0])) ** 2)
-        rows: list[Any] = []
-        equality: list[bool] = []
-        for k in range(n + 1):
-            if k < n:
-                cost += 0.5 * ca.dot(ca.DM(EFFORT), u[k] ** 2)
-                heading = x[k][2] + 0.5 * DT * u[k][1]
-                moved = ca.vertcat(DT * u[k][0] * ca.cos(heading), DT * u[k][0] * ca.sin(heading), DT * u[k][1])
-                rows.append(x[k + 1] - x[k] - moved)
-                equality += [True] * 3
-            if k == 0:
-                rows.append(x[0])
-                equality += [True] * 3
-            else:
-                rows += [ca.sumsqr(x[k][:2] - discs[:2, d]) - discs[2, d] ** 2 for d in range(DISCS)]
-                equality += [False] * DISCS
-        unknowns = ca.vertcat(*(part for pair in zip(x[:-1], u, strict=True) for part in pair), x[-1])
-        program = {"x": unknowns, "p": ca.vec(discs), "f": cost, "g": ca.vertcat(*rows)}
-        chosen: dict[str, Any] = {"print_time": False, plugin: {"print_level": 0, "tol": TOLERANCE}}
-        if plugin == "fatrop":
-            chosen |= {"structure_detection": "auto", "equality": equality}
-        else:
-            chosen[plugin]["sb"] = "yes"
-        self._solver: Any = ca.nlpsol("solver", plugin, program, chosen)
-        bound = np.append(np.tile(np.append([np.inf] * 3, LIMITS), n), [np.inf] * 3)
-        states, controls = guess()
-        self._call = {
-            "x0": np.append(np.hstack([states[:-1], controls]).ravel(), states[-1]),
-            "lbx": -bound, "ubx": bound, "lbg": 0.0, "ubg": np.where(equality, 0.0, np.inf),
-        }  # fmt: skip
-
-    def solve(self, discs: Array) -> tuple[bool, int, float]:
-        """Solve one field: whether it succeeded, iterations, cost."""
-        answer = self._solver(p=discs.ravel(), **self._call)
-        statistics = self._solver.stats()
-        return bool(statistics["success"]), int(statistics["iter_count"]), float(answer["f"])

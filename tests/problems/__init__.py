@@ -1,0 +1,1 @@
+"""Problems with known answers, or with two statements that judge each other; tests and measurements share them."""
