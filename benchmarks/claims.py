@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 
 import unifg as fg
-from benchmarks.backends import CONSTRAINED, EQUALITIES_ONLY
 from benchmarks.campaign import Key, Row, options, recorded
 from benchmarks.report import OUT, code_digest, command, machine, publish, table
 from exact_judge import AGREED, Answer, Judge, Peer, answer, disagreement
 from problems.twins import KINDS
+from variants import CONSTRAINED, EQUALITIES_ONLY
 
 TOLERANCE = 1e-6
 SAME = 1e-4  # relative difference below which two costs are one optimum

@@ -10,10 +10,10 @@ from unifg.solvers import KKT, SQP, AugmentedLagrangian
 
 pytest.importorskip("casadi", reason="the judge differentiates with casadi, which comes with the extra 'bench'")
 
-from benchmarks.backends import CONSTRAINED
 from exact_judge import AGREED, Judge, answer, disagreement, infeasible
 from problems.twins import KINDS
 from problems.twins.twin import Twin
+from variants import CONSTRAINED
 
 
 def stated(kind: str, seed: int = 0, equalities_only: bool = False) -> tuple[Twin, Judge]:

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from benchmarks.backends import CONSTRAINED, EQUALITIES_ONLY
 from unifg.answers.optimality import infeasible_stationary
 from unifg.models import obstacles, unicycle
 from unifg.solvers import SQP, AugmentedLagrangian
 from unifg.solvers.least_violation import least_violation
 from unifg.typing import Array
 from units import drive
+from variants import CONSTRAINED, EQUALITIES_ONLY
 
 BACKENDS = {**EQUALITIES_ONLY, **CONSTRAINED}
 LEAST = 0.00253189415  # squared, of a drive whose end is out of reach

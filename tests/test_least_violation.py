@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from benchmarks.backends import CONSTRAINED, EQUALITIES_ONLY
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
+from variants import CONSTRAINED, EQUALITIES_ONLY
 
 Expected = tuple[fg.Graph, dict[fg.Family, Array], dict[str, float]]
 
