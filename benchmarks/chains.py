@@ -174,7 +174,7 @@ def _assemble_often(terms: Any, jacobian: Array, weights: Array, hessian: Array,
 def _compiled_parts(program: Program, guess: fg.Guess, repeats: int, rounds: int) -> Result:
     """One elimination and one assembly of the constraints' normal equations, without Python around them."""
     lin = program.linearize(program.values_from(guess.values))
-    factorization = program.normal_solver()
+    factorization = program.systems.normal()
     weights = np.full(program.constraints.count, 100.0)
     hessian = program.normal_entries(lin, weights)
     spare, none = hessian.copy(), np.full(program.size, 1e-6)

@@ -23,6 +23,7 @@ import numpy as np
 from benchmarks.gtsam_peer import ORDERINGS, Peer, available
 from benchmarks.report import CHECKOUT, table
 from benchmarks.timing import clock, interleave, milliseconds, number, shown, spread
+from unifg.elimination.factorization import Factorization
 from unifg.pose_graphs import PoseGraph, manhattan
 from unifg.solvers import GaussNewton
 
@@ -76,7 +77,7 @@ def measure_size(poses: int, rounds: int, small: bool) -> Result:
         begin = time.perf_counter()
         program = fresh.compile()
         compiling.append(time.perf_counter() - begin)
-        return clock(lambda: program.normal_solver().plan)
+        return clock(lambda: Factorization(program.normal, program.blocks).plan)
 
     candidates: dict[str, Callable[[], float]] = {"ours": ours}
     structure: dict[str, Callable[[], float]] = {"analyse": symbolic}
@@ -94,7 +95,7 @@ def measure_size(poses: int, rounds: int, small: bool) -> Result:
         "ours": milliseconds(times["ours"]),
         "analyse": milliseconds(times["analyse"]),
         "compile": milliseconds(np.array(compiling[-few:])),
-        "factor": int(graph.compile().normal_solver().plan.numbers.nbytes),
+        "factor": int(graph.compile().systems.normal().plan.numbers.nbytes),
         "gtsam": None,
     }
     if "gtsam" in times:

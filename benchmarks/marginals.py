@@ -133,7 +133,7 @@ class Tree:
     def __init__(self, program: Program, solution: fg.Solution) -> None:
         """Linearise, order, factorise."""
         self.lin = program.linearize(solution.values)
-        self.factorization = program.normal_solver()
+        self.factorization = program.systems.normal()
         if not self.factorization.factor(self.lin.hessian):
             raise RuntimeError("the normal equations of this pose graph are singular")
 

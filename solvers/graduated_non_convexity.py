@@ -276,7 +276,7 @@ class _Search:
     def _revised(self, answer: _Answer) -> _Answer:
         """Take back what was left out but agrees with the rest, take out what the rest contradicts."""
         program = self._last.program
-        factorization = program.normal_solver()
+        factorization = program.systems.normal()
         for _ in range(ROUNDS):
             for stage in self._stages:
                 stage.now = _Square()

@@ -20,11 +20,11 @@ from unifg.machine.links import memory
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.program.second_order import lagrangian_hessian
+from unifg.program.systems import stacked
 from unifg.program.table import CONSTRAINT, COUNT, KIND, ROW, ROWS
 from unifg.solvers import barrier_state as state
 from unifg.solvers.barrier_loop import addresses, call
 from unifg.solvers.barrier_state import Problem, Work, empty_work
-from unifg.solvers.kkt_system import KktSystem, stacked
 from unifg.solvers.least_violation import nearest
 from unifg.typing import Array
 
@@ -167,7 +167,7 @@ class Workspace:
 
     def _build(self, iterations: int) -> None:
         program = self.program
-        self.system = KktSystem(program, program.equality)
+        self.system = program.systems.kkt(program.equality)
         arrays, table = self.system.arrays, program.table
         plan, doubles = stacked(arrays)
         fields = program.arrays.fields
@@ -229,7 +229,7 @@ class Workspace:
 
     def prepare(self, run: Run, options: InteriorPoint) -> Work:
         """Set up one solve with the present data."""
-        if not (self.program.equality == self.system.equality).all():
+        if not (self.program.equality == self.system.held).all():
             self._build(options.max_iterations)
         if len(self.work.log) < options.max_iterations + 2:
             self.work = self.work._replace(log=np.zeros((options.max_iterations + 2, 9)))

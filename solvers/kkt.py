@@ -32,8 +32,8 @@ from unifg.answers.status import Status
 from unifg.errors import BackendError
 from unifg.program.linearization import Evaluation, Linearization
 from unifg.program.program import Program
+from unifg.program.systems import aim, fill
 from unifg.solvers.damping import LARGEST, SUFFICIENT, Damping, largest, norm
-from unifg.solvers.kkt_system import KktSystem, aim, fill
 from unifg.solvers.least_violation import leave, settle
 from unifg.solvers.primal import DIAGONAL_FLOOR
 from unifg.typing import Array
@@ -224,7 +224,7 @@ class Newton:
             BackendError: when a limit no longer is an equality.
         """
         program = self.program
-        if not np.array_equal(program.equality, self.system.equality):
+        if not np.array_equal(program.equality, self.system.held):
             require(program, solver, "equalities")
             self._structure(program)
         self._begun = False  # equal solves take equal steps
@@ -286,7 +286,7 @@ class Newton:
         return found[:n], change
 
     def _structure(self, program: Program) -> None:
-        self.system = KktSystem(program, program.equality)
+        self.system = program.systems.kkt(program.equality)
         self._data, self._begun = np.zeros(self.system.pattern.nnz), False
 
 

@@ -104,7 +104,7 @@ def least_violation(
         tolerance: largest violation that counts as none.
         out_of_time: asked before every step whether to end where it is.
     """
-    solver = program.normal_solver()
+    solver = program.systems.normal()
     lin = within_bounds(program, lin)
     damping, size = FIRST_DAMPING, np.zeros(program.size)
     for _ in range(STEPS):

@@ -37,7 +37,7 @@ class Primal:
     def __init__(self, program: Program) -> None:
         """Analyse the structure of the normal equations."""
         self.program = program
-        self.solver = program.normal_solver()
+        self.solver = program.systems.normal()
         self.damping = 0.0
         self.hopeful = False
         self.reached: Linearization | None = None

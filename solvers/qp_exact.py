@@ -17,7 +17,7 @@ import numpy as np
 from unifg.program.linearization import Linearization
 from unifg.program.passes import add_constraints
 from unifg.program.program import Program
-from unifg.solvers.kkt_system import KktSystem, fill
+from unifg.program.systems import KktSystem, fill
 from unifg.solvers.qp import QP, QPAnswer, subproblem
 from unifg.solvers.scaling import Scaling
 from unifg.typing import Array, BoolArray
@@ -32,7 +32,7 @@ class ExactHessian:
     def __init__(self, program: Program) -> None:
         """Remember the program; structures are analysed when first needed."""
         self.program = program
-        self._definite = program.normal_solver()
+        self._definite = program.systems.normal()
         self._system: KktSystem | None = None
 
     def subproblem(self, lin: Linearization, multipliers: Array, damping: float | Array, scaling: Scaling) -> QP:
@@ -76,8 +76,8 @@ class ExactHessian:
     def _inertia_is_right(self, qp: QP, weights: Array) -> bool:
         """Whether H with squares of the weighted rows is positive definite where the equalities leave freedom."""
         program, n = self.program, self.program.size
-        if self._system is None or not np.array_equal(self._system.equality, program.equality):
-            self._system = KktSystem(program, program.equality)
+        if self._system is None or not np.array_equal(self._system.held, program.equality):
+            self._system = program.systems.kkt(program.equality)
         system = self._system
         data, shift = np.zeros(system.pattern.nnz), np.zeros(system.pattern.size)
         fill(system.arrays, self._with_squares(qp, weights), qp.jacobian, data)

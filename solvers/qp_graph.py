@@ -16,8 +16,8 @@ from unifg.elimination.substitution import solve
 from unifg.machine.jit import compiled
 from unifg.program.passes import add_constraints, times, transposed_times
 from unifg.program.program import Program
+from unifg.program.systems import KktArrays, fill
 from unifg.program.table import Terms
-from unifg.solvers.kkt_system import KktArrays, KktSystem, fill
 from unifg.solvers.qp import QP, QPAnswer, qp_error
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -40,14 +40,14 @@ class GraphRoute:
     def __init__(self, program: Program) -> None:
         """Analyse the KKT matrix."""
         self.program = program
-        self._system = KktSystem(program, program.equality)
+        self._system = program.systems.kkt(program.equality)
 
     def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
         """Solve to ``accuracy`` and measure."""
         program = self.program
         equality = qp.lower == qp.upper
-        if not np.array_equal(equality, self._system.equality):
-            self._system = KktSystem(program, equality)
+        if not np.array_equal(equality, self._system.held):
+            self._system = program.systems.kkt(equality)
         below = np.flatnonzero(np.isfinite(qp.lower) & ~equality)
         above = np.flatnonzero(np.isfinite(qp.upper) & ~equality)
         step, dual = np.zeros(program.size), np.where(equality, multipliers, 0.0)

@@ -23,7 +23,6 @@ import numpy as np
 import osqp
 
 from unifg.program.program import Program
-from unifg.solvers.kkt_system import KktSystem
 from unifg.solvers.qp import QP, QPAnswer, qp_error
 from unifg.solvers.scaling import Scaling
 from unifg.typing import Array
@@ -150,7 +149,7 @@ def counted_iterations(program: Program) -> int:
     """
     if not program.constraints.count:
         return EVERY
-    tree = KktSystem(program, np.ones(program.constraints.count, dtype=bool)).factorization.tree
+    tree = program.systems.kkt(np.ones(program.constraints.count, dtype=bool)).factorization.tree
     solving = 4.0 * tree.fill
     passing = 10.0 * (program.size + program.constraints.count)
     count = WORTH * (tree.flops + 2.0 * solving) / (solving + passing)

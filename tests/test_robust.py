@@ -214,7 +214,7 @@ def test_innovations_are_those_of_dense_algebra() -> None:
     term = next(term for term, _ in program.table.robust)
     out = lin.residual.reshape(-1, 3)[-term.count :].any(axis=1) == 0
     assert 3 < out.sum() < term.count - 1
-    innovations = Innovations(program, program.normal_solver(), lin.hessian)
+    innovations = Innovations(program, program.systems.normal(), lin.hessian)
     assert innovations.determined
     found = innovations.squared(term, plain, out)
     upper = program.normal.matrix(lin.hessian).toarray()
@@ -257,7 +257,7 @@ def test_what_a_measurement_would_be_without_itself() -> None:
     step = -np.linalg.solve(hessian, jacobian.T @ residual)
     linear = lin.residual + jacobian @ step  # the optimum of the linear problem
     lin.residual[:] = linear
-    innovations = Innovations(program, program.normal_solver(), lin.hessian)
+    innovations = Innovations(program, program.systems.normal(), lin.hessian)
     every = np.ones(term.count, dtype=np.bool_)
     fall, far = innovations.without(term, lin, every, np.ones(term.count))
     first = len(linear) - 3 * term.count

@@ -9,7 +9,7 @@ import numpy as np
 import unifg as fg
 from unifg.language.variables import as_selection
 from unifg.program.program import Program
-from unifg.solvers.kkt_system import KktSystem, fill
+from unifg.program.systems import fill
 from unifg.typing import Array
 
 SHIFT = 1e-10  # constraints are softened by a standard deviation of 1e-5, in their own units
@@ -26,7 +26,7 @@ class JointCovariance:
         self._free = np.flatnonzero(unknown >= 0)
         self._chosen = unknown[self._free].astype(np.int64)
         self._size = len(columns)
-        self._system = KktSystem(program, program.equality)
+        self._system = program.systems.kkt(program.equality)
         self._data = np.zeros(self._system.pattern.nnz)
         n, m = int(self._system.arrays.size[0]), int(self._system.arrays.size[1])
         self._shift = np.repeat([SHIFT, -SHIFT], [n, m])

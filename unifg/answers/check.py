@@ -131,12 +131,12 @@ def _undetermined(program: Program, values: Values) -> list[Finding]:
     columns = np.repeat(np.arange(program.size), np.diff(program.normal.indptr))
     scaled = matrix.data * scale[matrix.indices] * scale[columns]
     scaled[program.normal.diagonal] += 1e-14
-    factorization = program.normal_solver()
     loose = np.flatnonzero(diagonal <= 1e-300)
-    if not len(loose) and factorization.factor(scaled):
-        if factorization.pivots().min() > PIVOT_TOLERANCE:
-            return []
-        loose = np.flatnonzero(np.abs(_null_direction(factorization, program.size)) > 0.1)
+    with program.systems.borrowed() as factorization:
+        if not len(loose) and factorization.factor(scaled):
+            if factorization.pivots().min() > PIVOT_TOLERANCE:
+                return []
+            loose = np.flatnonzero(np.abs(_null_direction(factorization, program.size)) > 0.1)
     members: dict[str, list[int]] = {}
     for column in loose.tolist():
         family, member = program.columns.name(int(program.columns.free[column]))

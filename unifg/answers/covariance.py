@@ -7,16 +7,12 @@ active constraint forbids has no variance. The tree would give the inverse of th
 
 from __future__ import annotations
 
-from weakref import WeakKeyDictionary
-
 import numpy as np
 
-from unifg.elimination.factorization import Factorization
-from unifg.elimination.saddle import SaddlePoint
-from unifg.elimination.symmetric import Symmetric
 from unifg.errors import GraphError
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
+from unifg.program.systems import KktSystem, fill
 from unifg.typing import Array, BoolArray, IntArray
 
 SOLVED = 1e-6  # residual of a column, in the equilibrated system, that belongs to a determined unknown
@@ -39,13 +35,15 @@ class Covariances:
             GraphError: when the information is singular or not finite.
         """
         self._program = program
-        self._held: Held | None = None
+        self._system: KktSystem | None = None
         if active.any():
-            self._held = Held.of(program, active)
-            self._data = self._held.entries(lin)
-            self._held.factor(self._data)
+            self._system = program.systems.kkt(active)
+            data = np.zeros(self._system.pattern.nnz)
+            fill(self._system.arrays, lin.hessian, lin.constraint_jacobian, data)
+            if not self._system.saddle.factor(data):
+                raise GraphError("the covariance does not exist: the Hessian is not finite")
             return
-        self._factorization = program.normal_solver()
+        self._factorization = program.systems.normal()
         if not self._factorization.factor(lin.hessian):
             raise GraphError(UNDETERMINED)
         scale = lin.hessian[program.normal.diagonal][self._factorization.plan.order[: program.size]]
@@ -63,11 +61,12 @@ class Covariances:
         result = np.zeros((len(columns), len(columns)))
         if not len(free):
             return result
-        if self._held is None:
-            result[np.ix_(free, free)] = self._factorization.inverse_block(chosen[free])
-        else:
-            self._held.factor(self._data)
-            result[np.ix_(free, free)] = self._held.block(chosen[free])
+        block = (
+            self._factorization.inverse_block(chosen[free])
+            if self._system is None
+            else _inverse_block(self._system, chosen[free])
+        )
+        result[np.ix_(free, free)] = block
         return result
 
     def blocks(self, columns: IntArray) -> Array:
@@ -76,7 +75,7 @@ class Covariances:
         Raises:
             GraphError: when one of them is not determined.
         """
-        if self._held is not None:
+        if self._system is not None:
             return np.array([self.joint(row) for row in columns])
         chosen = self._program.columns.unknown[columns]
         _, first, node = np.unique(self._program.blocks, return_index=True, return_inverse=True)
@@ -91,77 +90,18 @@ class Covariances:
         return result
 
 
-class Held:
-    """The KKT matrix of a graph with some rows held; its structure is kept for the next solution of the same graph."""
+def _inverse_block(system: KktSystem, chosen: IntArray) -> Array:
+    """(k, k) block of the inverse of a factorised KKT matrix over unknowns.
 
-    def __init__(self, program: Program, active: BoolArray) -> None:
-        """Number the held rows after the unknowns."""
-        n, constraints = program.size, program.constraints
-        self.active = active.copy()
-        number = np.full(len(active), -1, dtype=np.intp)
-        number[active] = n + np.arange(int(active.sum()))
-        kept = number[constraints.free_rows] >= 0
-        self._entries = constraints.free[kept]
-        columns, rows = constraints.free_columns[kept], number[constraints.free_rows[kept]]
-        normal = program.normal
-        across = np.repeat(np.arange(n), np.diff(normal.indptr))
-        pattern = Symmetric(n + int(active.sum()), [(normal.indices, across), (columns, rows)])
-        self._normal, self._places = pattern.positions(normal.indices, across), pattern.positions(columns, rows)
-        self._saddle = SaddlePoint(Factorization(pattern, _labels(program, active)), n)
-        self._factored: Array | None = None  # no solution, which would keep its program alive
-
-    @staticmethod
-    def of(program: Program, active: BoolArray) -> Held:
-        """The structure used last, if it is for the same rows."""
-        held = _LAST.get(program)
-        if held is None or not np.array_equal(held.active, active):
-            held = _LAST[program] = Held(program, active)
-        return held
-
-    def entries(self, lin: Linearization) -> Array:
-        """(nnz,) entries of the matrix at a linearisation."""
-        data = np.zeros(self._saddle.factorization.pattern.nnz)
-        data[self._normal] = lin.hessian
-        np.add.at(data, self._places, lin.constraint_jacobian[self._entries])
-        return data
-
-    def factor(self, data: Array) -> None:
-        """Factorise, unless these very entries were the last to be.
-
-        Raises:
-            GraphError: when an entry is not finite.
-        """
-        if self._factored is data:
-            return
-        self._factored = None
-        if not self._saddle.factor(data):
-            raise GraphError("the covariance does not exist: the Hessian is not finite")
-        self._factored = data
-
-    def block(self, chosen: IntArray) -> Array:
-        """(k, k) block of the inverse over unknowns.
-
-        Raises:
-            GraphError: when one of them is not determined.
-        """
-        block, right = np.empty((len(chosen), len(chosen))), np.zeros(self._saddle.factorization.pattern.size)
-        for k, row in enumerate(chosen):
-            right[row] = 1.0
-            solution, _ = self._saddle.solve(right)
-            if not np.abs(self._saddle.residual(solution, right)).max() <= SOLVED * self._saddle.scale[row]:
-                raise GraphError(UNDETERMINED)
-            block[:, k] = solution[chosen]
-            right[row] = 0.0
-        return 0.5 * (block + block.T)
-
-
-_LAST: WeakKeyDictionary[Program, Held] = WeakKeyDictionary()
-
-
-def _labels(program: Program, active: BoolArray) -> IntArray:
-    """(n + m,) node of each unknown and held row: the rows of one factor are one node."""
-    factor = np.zeros(len(active), dtype=np.int64)
-    for k, (term, part) in enumerate(zip(program.constraint_terms, program.slices, strict=True)):
-        factor[part] = (k << 40) + np.arange(part.stop - part.start) // term.size
-    last = int(program.blocks[-1]) + 1 if program.size else 0
-    return np.concatenate([program.blocks, last + np.unique(factor[active], return_inverse=True)[1].ravel()])
+    Raises:
+        GraphError: when one of them is not determined.
+    """
+    block, right = np.empty((len(chosen), len(chosen))), np.zeros(system.pattern.size)
+    for k, row in enumerate(chosen):
+        right[row] = 1.0
+        solution, _ = system.saddle.solve(right)
+        if not np.abs(system.saddle.residual(solution, right)).max() <= SOLVED * system.saddle.scale[row]:
+            raise GraphError(UNDETERMINED)
+        block[:, k] = solution[chosen]
+        right[row] = 0.0
+    return 0.5 * (block + block.T)

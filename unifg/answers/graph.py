@@ -46,4 +46,4 @@ class Graph(Statement):
         columns, blocks = program.columns, program.blocks
         first = [int(columns.free[k]) for k in np.unique(blocks, return_index=True)[1]]
         names = tuple("{}[{}]".format(*columns.name(column)) for column in first)
-        return replace(program.normal_solver().tree, names=names)
+        return replace(program.systems.normal().tree, names=names)

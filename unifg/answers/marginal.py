@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -74,9 +73,6 @@ class Removal:
     gone: int
     kept: IntArray
     free: BoolArray
-
-
-_removals: WeakKeyDictionary[Program, dict[object, Removal]] = WeakKeyDictionary()
 
 
 def information(program: Program, lin: Linearization, terms: Sequence[str], columns: IntArray) -> tuple[Array, Array]:
@@ -162,10 +158,15 @@ def _removal(
 ) -> Removal:
     """The structure, from the cache or anew."""
     key = (terms, *[(s.family.name, s.component, s.indices.tobytes()) for s in (*leaving, *staying)], len(leaving))
-    known = _removals.setdefault(program, {})
+    known = program.once(_known)
     if key not in known:
         known[key] = _analyse(program, terms, leaving, staying)
     return known[key]
+
+
+def _known(_: Program) -> dict[object, Removal]:
+    """Nothing is known of a program to begin with."""
+    return {}
 
 
 def _analyse(

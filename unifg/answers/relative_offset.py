@@ -25,7 +25,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from typing import Protocol
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -95,7 +94,7 @@ def relative_offset(
         lent: factorisation of a backend that may be reused, and overwritten.
         guess: stored values that the solve began with; unknowns that have shrunk since count as large as they were.
     """
-    return _structure(program).measure(program, lin, enough, lent, guess)
+    return program.once(Structure).measure(program, lin, enough, lent, guess)
 
 
 class Structure:
@@ -111,7 +110,6 @@ class Structure:
         """Look at the terms and at the manifolds."""
         self.counted = _counted(program)
         self.first, self.last, self.least = _extents(program)
-        self._own: Factorization | None = None
 
     def measure(
         self, program: Program, lin: Linearization, enough: float, lent: Factored | None, guess: Array | None
@@ -137,65 +135,73 @@ class Structure:
         limit = max(enough, floor)
         if enough > 0.0 and cosine > limit:
             return Offset(cosine, True, True)
-        energy, determined = self._energy(program, lin, (limit * size) ** 2 if enough > 0.0 else np.inf, lent)
+        with program.systems.borrowed() as own:
+            energy, determined = _energy(program, lin, (limit * size) ** 2 if enough > 0.0 else np.inf, lent, own)
         value = math.sqrt(energy) / size if size else 0.0
         return Offset(0.0 if value <= floor else value, determined, True)
 
-    def _energy(self, program: Program, lin: Linearization, limit: float, lent: Factored | None) -> tuple[float, bool]:
-        """Return g' H^-1 g, or a lower bound above ``limit``; and whether H is regular."""
-        gradient = lin.gradient[program.columns.free]
-        diagonal = lin.hessian[program.normal.diagonal]
-        if lent is not None and lent.solver.definite:
-            energy, exact = _climb(program, lin.hessian, gradient, lent.solver, limit)
-            if energy > limit:
-                return energy, True
-            # A loss may have taken away since then what held a variable.
-            if exact and not program.table.robust and self._regular(program, lin.hessian, diagonal, lent):
-                return energy, True
-        solver = self._solver(program) if lent is None else lent.solver
-        if lent is not None:
-            lent.damping = 0.0
-        if solver.factor(lin.hessian) and _sound(solver, diagonal, program.size):
+
+def _energy(
+    program: Program, lin: Linearization, limit: float, lent: Factored | None, own: Factorization
+) -> tuple[float, bool]:
+    """Return g' H^-1 g, or a lower bound above ``limit``; and whether H is regular.
+
+    Args:
+        program: the compiled graph.
+        lin: linearisation at the point.
+        limit: a bound above this is enough.
+        lent: factorisation of a backend.
+        own: to factorise with where that does not do.
+    """
+    gradient = lin.gradient[program.columns.free]
+    diagonal = lin.hessian[program.normal.diagonal]
+    if lent is not None and lent.solver.definite:
+        energy, exact = _climb(program, lin.hessian, gradient, lent.solver, limit)
+        if energy > limit:
+            return energy, True
+        # A loss may have taken away since then what held a variable.
+        if exact and not program.table.robust and _regular(program, lin.hessian, diagonal, lent):
+            return energy, True
+    solver = own if lent is None else lent.solver
+    if lent is not None:
+        lent.damping = 0.0
+    if solver.factor(lin.hessian) and _sound(solver, diagonal, program.size):
+        return float(gradient @ solver.solve(gradient)), True
+    idle = _idle(program, diagonal)
+    if idle.any():  # what no active factor touches is not asked for
+        added = np.where(idle, 1.0, 0.0)
+        if solver.factor(lin.hessian, added) and _sound(solver, diagonal + added, program.size):
             return float(gradient @ solver.solve(gradient)), True
-        idle = _idle(program, diagonal)
-        if idle.any():  # what no active factor touches is not asked for
-            added = np.where(idle, 1.0, 0.0)
-            if solver.factor(lin.hessian, added) and _sound(solver, diagonal + added, program.size):
-                return float(gradient @ solver.solve(gradient)), True
-        largest = diagonal.max(initial=0.0)
-        if largest == 0.0:
-            return 0.0, False
-        if not solver.factor(lin.hessian, SINGULAR_SHIFT * np.maximum(diagonal, 1e-9 * largest)):
-            return np.inf, False
-        energy, _ = _climb(program, lin.hessian, gradient, solver, limit)
-        bent = self._bent(program, lin)
-        return (energy, False) if bent is None else (float(gradient @ bent.solve(gradient)), True)
+    largest = diagonal.max(initial=0.0)
+    if largest == 0.0:
+        return 0.0, False
+    if not solver.factor(lin.hessian, SINGULAR_SHIFT * np.maximum(diagonal, 1e-9 * largest)):
+        return np.inf, False
+    energy, _ = _climb(program, lin.hessian, gradient, solver, limit)
+    bent = _bent(program, lin, own)
+    return (energy, False) if bent is None else (float(gradient @ bent.solve(gradient)), True)
 
-    def _bent(self, program: Program, lin: Linearization) -> Factorization | None:
-        """The Hessian with the curvature of the residuals, factorised; None where that is singular or indefinite."""
-        hessian = lagrangian_hessian(program, lin, np.zeros(0))
-        diagonal = hessian[program.normal.diagonal]
-        solver = self._solver(program)
-        regular = bool((diagonal > 0.0).all()) and solver.factor(hessian)
-        return solver if regular and _sound(solver, diagonal, program.size, FLAT) else None
 
-    def _regular(self, program: Program, hessian: Array, diagonal: Array, lent: Factored) -> bool:
-        """Whether a factor near the Hessian shows that every direction is determined."""
-        if not (_sound(lent.solver, diagonal, program.size) and diagonal.all()):
-            return False
-        if lent.damping == 0.0:
-            return True
-        # Inverse iteration: a direction without information would dominate after two solves through the damping.
-        vector = np.random.default_rng(1).choice([-1.0, 1.0], program.size) / np.sqrt(diagonal)
-        for _ in range(2):
-            vector = lent.solver.solve(diagonal * vector)
-            vector /= math.sqrt(float(diagonal @ np.square(vector)))
-        return float(vector @ program.normal.times(hessian, vector)) > DAMPED * lent.damping
+def _bent(program: Program, lin: Linearization, solver: Factorization) -> Factorization | None:
+    """The Hessian with the curvature of the residuals, factorised; None where that is singular or indefinite."""
+    hessian = lagrangian_hessian(program, lin, np.zeros(0))
+    diagonal = hessian[program.normal.diagonal]
+    regular = bool((diagonal > 0.0).all()) and solver.factor(hessian)
+    return solver if regular and _sound(solver, diagonal, program.size, FLAT) else None
 
-    def _solver(self, program: Program) -> Factorization:
-        if self._own is None:
-            self._own = program.normal_solver()
-        return self._own
+
+def _regular(program: Program, hessian: Array, diagonal: Array, lent: Factored) -> bool:
+    """Whether a factor near the Hessian shows that every direction is determined."""
+    if not (_sound(lent.solver, diagonal, program.size) and diagonal.all()):
+        return False
+    if lent.damping == 0.0:
+        return True
+    # Inverse iteration: a direction without information would dominate after two solves through the damping.
+    vector = np.random.default_rng(1).choice([-1.0, 1.0], program.size) / np.sqrt(diagonal)
+    for _ in range(2):
+        vector = lent.solver.solve(diagonal * vector)
+        vector /= math.sqrt(float(diagonal @ np.square(vector)))
+    return float(vector @ program.normal.times(hessian, vector)) > DAMPED * lent.damping
 
 
 def _climb(
@@ -317,13 +323,3 @@ def _bounds(
             if root > 0.0:
                 cosine = max(cosine, abs(slope) / root / norm)
     return norm, cosine, math.sqrt(rounding)
-
-
-_STRUCTURES: WeakKeyDictionary[Program, Structure] = WeakKeyDictionary()
-
-
-def _structure(program: Program) -> Structure:
-    found = _STRUCTURES.get(program)
-    if found is None:
-        found = _STRUCTURES[program] = Structure(program)
-    return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -248,6 +249,10 @@ class Solution:
     def __repr__(self) -> str:
         """The report."""
         return f"<Solution {self.report()}>"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle without factorisations, which are found again where somebody asks."""
+        return {name: value for name, value in self.__dict__.items() if name != "_covariances"}
 
     def _held(self) -> BoolArray:
         """Inequalities that are active: the multiplier outweighs the distance to its limit."""

@@ -79,11 +79,12 @@ class ViolationModel:
             return True
         if 0.5 * slope > enough * float(sums.max()):  # no eigenvalue exceeds the largest sum of a row
             return False
-        solver, damping = self._program.normal_solver(), FIRST_DAMPING
-        while damping <= LARGEST_DAMPING:
-            if _definite(solver, self.damped(damping, self.size)):
-                return 0.5 * float(self.gradient @ solver.solve(self.gradient)) <= enough
-            damping *= GROWTH
+        damping = FIRST_DAMPING
+        with self._program.systems.borrowed() as solver:
+            while damping <= LARGEST_DAMPING:
+                if _definite(solver, self.damped(damping, self.size)):
+                    return 0.5 * float(self.gradient @ solver.solve(self.gradient)) <= enough
+                damping *= GROWTH
         return False
 
 

@@ -10,7 +10,7 @@ from unifg.elimination.chain import stages
 from unifg.elimination.dissection import separators
 from unifg.elimination.layout import lay_out
 from unifg.elimination.ordering import block_graph, indistinguishable, minimum_degree
-from unifg.elimination.plan import PANEL, PIVOTS, ROWS, Plan
+from unifg.elimination.plan import LARGEST, PANEL, PIVOTS, ROWS, SCALARS, Plan
 from unifg.elimination.symbolic import supernodes
 from unifg.errors import UnifgError
 from unifg.typing import BoolArray, IntArray
@@ -19,13 +19,15 @@ Ordering: TypeAlias = Literal["auto", "minimum-degree", "nested-dissection", "na
 SLACK = 16  # numbers the kernels may read beyond the last matrix
 DISSECT = 4e6, 3e3  # predicted nanoseconds, in all and per node, from which nested dissection is tried
 COST = 4  # where `supernodes` returns its forecast
+NOTHING = np.zeros(0)
 
 
 class Structure(NamedTuple):
     """What the analysis found.
 
     Attributes:
-        plan: arguments of the compiled kernels.
+        plan: arguments of the compiled kernels, without memory to work in.
+        numbers: how many a factorisation works in.
         starts: (nodes + 1,) first scalar of each node.
         order: (nodes,) nodes in the order of elimination.
         bounds: (S + 1,) where the nodes of each front begin in ``order``.
@@ -34,11 +36,24 @@ class Structure(NamedTuple):
     """
 
     plan: Plan
+    numbers: int
     starts: IntArray
     order: IntArray
     bounds: IntArray
     parent: IntArray
     kind: str
+
+    def with_memory(self) -> Plan:
+        """The plan with memory of its own: whoever factorises needs one."""
+        plan = self.plan
+        size, largest = int(plan.shape[SCALARS]), int(plan.shape[LARGEST])
+        return plan._replace(
+            numbers=np.zeros(self.numbers),
+            pivots=np.ones(size + 3),
+            signs=np.ones(size + 3),
+            work=np.zeros(size + largest + SLACK),
+            state=np.array([0, 0, 0, -1, 0, -1]),
+        )
 
 
 def analyse(
@@ -101,13 +116,13 @@ def analyse(
         runs=runs,
         slots=slots,
         expected=expected,
-        numbers=np.zeros(panels + waiting + SLACK),
-        pivots=np.ones(size + 3),
-        signs=np.ones(size + 3),
-        work=np.zeros(size + largest + SLACK),
-        state=np.array([0, 0, 0, -1, 0, -1]),
+        numbers=NOTHING,
+        pivots=NOTHING,
+        signs=NOTHING,
+        work=NOTHING,
+        state=np.zeros(0, np.int64),
     )
-    return Structure(plan, starts, order, bounds, parent, kind)
+    return Structure(plan, panels + waiting + SLACK, starts, order, bounds, parent, kind)
 
 
 def _labels(blocks: IntArray, size: int) -> IntArray:

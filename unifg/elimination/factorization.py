@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -30,14 +31,44 @@ __all__ = ["Factorization", "Ordering"]
 NOTHING = np.zeros(0)
 
 
+class Symbolic:
+    """What factorisations of one pattern share: the structure asked for, analysed when first needed, once.
+
+    Attributes:
+        pattern: upper triangle of the matrices.
+        asked: labels, ordering and signs, as for :class:`Factorization`.
+        indptr, indices: the pattern as compiled code reads it.
+    """
+
+    def __init__(
+        self, pattern: Symmetric, blocks: IntArray | None, ordering: Ordering, negative: BoolArray | None
+    ) -> None:
+        """Remember what is asked for."""
+        self.pattern = pattern
+        self.asked = blocks, ordering, negative
+        self.indptr = pattern.indptr.astype(np.int64, copy=False)
+        self.indices = pattern.indices.astype(np.int64, copy=False)
+        self._structure: Structure | None = None
+        self._lock = Lock()
+
+    @property
+    def structure(self) -> Structure:
+        """Result of the symbolic analysis; threads that ask at once wait for one of them."""
+        with self._lock:
+            if self._structure is None:
+                self._structure = analyse(self.indptr, self.indices, *self.asked)
+            return self._structure
+
+
 class Factorization:
     """Signed Cholesky factorisation A = L S L' of matrices of one pattern, by dense fronts on the elimination tree.
 
     Serves positive definite matrices and, in any order, symmetric quasi-definite ones, [[H + dI, A'], [A, -dI]].
-    Structure is analysed when first needed, once.
+    Structure is analysed when first needed, once; others of the same pattern share it, see :meth:`twin`.
 
     Attributes:
         pattern: upper triangle of the matrices.
+        symbolic: what twins share.
     """
 
     def __init__(
@@ -58,17 +89,23 @@ class Factorization:
                 takes the cheapest of minimum degree, nested dissection (large graphs) and a chain of stages.
             negative: (n,) whether the pivot of each scalar is expected to be negative; see `unexpected`.
         """
-        self.pattern = pattern
-        self._asked = (blocks, ordering, negative)
-        self._structure: Structure | None = None
-        self._indptr, self._indices = pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64)
+        self._begin(Symbolic(pattern, blocks, ordering, negative))
+
+    def _begin(self, symbolic: Symbolic) -> None:
+        self.symbolic, self.pattern = symbolic, symbolic.pattern
+        self._plan: Plan | None = None
         self._ready = False
         self._inverse: tuple[Array, IntArray, BoolArray] | None = None  # panels, front of each scalar, fronts filled in
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the structure asked for, without numbers: a plan holds addresses of this process."""
-        blocks, ordering, negative = self._asked
-        return _rebuilt, (self.pattern, blocks, ordering, negative)
+        return _rebuilt, (self.pattern, *self.symbolic.asked)
+
+    def twin(self) -> Factorization:
+        """Another factorisation of this pattern, with numbers of its own: the analysis is shared."""
+        other = Factorization.__new__(Factorization)
+        other._begin(self.symbolic)
+        return other
 
     @property
     def structure(self) -> Structure:
@@ -77,14 +114,14 @@ class Factorization:
         Raises:
             UnifgError: labels, signs or permutation are not what they should be.
         """
-        if self._structure is None:
-            self._structure = analyse(self._indptr, self._indices, *self._asked)
-        return self._structure
+        return self.symbolic.structure
 
     @property
     def plan(self) -> Plan:
         """Arguments of the compiled kernels `fronts.factor`, `substitution.solve` and `substitution.factor_solve`."""
-        return self.structure.plan
+        if self._plan is None:
+            self._plan = self.structure.with_memory()
+        return self._plan
 
     def factor(self, data: Array, added: Array | None = None) -> bool:
         """Factorise; False when an entry is not finite or a pivot vanishes (see `failure`).
@@ -169,8 +206,8 @@ class Factorization:
         data = _numbers(data, self.pattern.nnz, "data")
         right = _numbers(right, self.pattern.size, "the right-hand side")
         out = np.empty(len(right))
-        own, rows = np.ones(len(right)), len(right)
-        substitution.refine(self.plan, self._indptr, self._indices, data, right, own, rows, out, tolerance, steps)
+        own, rows, symbolic = np.ones(len(right)), len(right), self.symbolic
+        substitution.refine(self.plan, symbolic.indptr, symbolic.indices, data, right, own, rows, out, tolerance, steps)
         return out
 
     @property
@@ -207,7 +244,7 @@ class Factorization:
     @property
     def tree(self) -> EliminationTree:
         """The elimination tree, to look at and to print."""
-        plan, starts, order, bounds, parent, kind = self.structure
+        plan, _, starts, order, bounds, parent, kind = self.structure
         node = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
         begins = plan.fronts[:, INDEX]
         separators = []

@@ -48,8 +48,7 @@ class SaddlePoint:
         self.factorization = factorization
         self.unknowns = unknowns
         self.scale: Array = np.ones(size)
-        self._indptr = factorization.pattern.indptr.astype(np.int64)
-        self._indices = factorization.pattern.indices.astype(np.int64)
+        self._indptr, self._indices = factorization.symbolic.indptr, factorization.symbolic.indices
         self._data: Array = np.zeros(factorization.pattern.nnz)
         self._entries = np.zeros_like(self._indptr), np.zeros_like(self._indices), np.zeros_like(self._data)
         self._added: Array = np.zeros(size)

@@ -6,12 +6,12 @@ costs; rows of constraints read ``lower <= g <= upper``. Columns are tangent coo
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from unifg.elimination.factorization import Factorization
 from unifg.elimination.symmetric import Symmetric
 from unifg.errors import GraphError
 from unifg.kernels.differentiation import convexified
@@ -27,10 +27,13 @@ from unifg.program.guess import Start
 from unifg.program.linearization import Evaluation, HeldWeights, Linearization
 from unifg.program.retraction import Retraction
 from unifg.program.rows import Rows
+from unifg.program.systems import Systems
 from unifg.program.table import ENTRY, ROW, WIDTH, Table, Terms
 from unifg.program.term import CompiledTerm
 from unifg.program.touched import require_touched, term_columns
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
+
+T = TypeVar("T")
 
 
 class Program:
@@ -47,6 +50,7 @@ class Program:
         cost_terms, scalar_terms, constraint_terms: compiled terms in row order.
         slices: rows of each constraint term.
         bound_rows: (M,) whether a row bounds an unknown itself.
+        systems: the normal equations and KKT matrices, their structure found once.
         table: all terms as compiled loops take them.
         batched: terms without a kernel, evaluated by NumPy.
         retraction: moves all variables.
@@ -74,6 +78,8 @@ class Program:
         self.batched = [term for term in stacked if term.kernel is None and not term.is_bound]
         self.costs = Rows(self.table, self.cost_terms, True, self.size)
         self.constraints = Rows(self.table, self.constraint_terms, False, self.size)
+        self.systems = Systems(self.normal, self.blocks, self.constraints)
+        self._found: dict[Callable[[Program], Any], Any] = {}
         self._cost_slices = _slices(self.cost_terms)
         self.slices = _slices(self.constraint_terms)
         self.bound_rows = np.zeros(self.constraints.count, dtype=bool)
@@ -316,9 +322,15 @@ class Program:
         """(M,) signed distance outside the limits: positive above, negative below, zero inside."""
         return np.maximum(constraints - self.upper, 0.0) - np.maximum(self.lower - constraints, 0.0)
 
-    def normal_solver(self) -> Factorization:
-        """A factorisation for matrices in the pattern ``normal``."""
-        return Factorization(self.normal, self.blocks)
+    def once(self, find: Callable[[Program], T]) -> T:
+        """What a function finds out about this program, found when first asked for and kept as long as the program."""
+        if find not in self._found:
+            self._found[find] = find(self)
+        return cast(T, self._found[find])
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle without what can be found again."""
+        return {**self.__dict__, "_found": {}}
 
     def row_name(self, row: int) -> tuple[str, int]:
         """Term and factor of a constraint row."""

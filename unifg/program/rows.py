@@ -51,6 +51,13 @@ class Rows:
         return np.repeat(np.arange(self.count), np.concatenate([np.zeros(0, dtype=np.int64), *widths]))
 
     @cached_property
+    def factors(self) -> IntArray:
+        """(count,) factor of every row, numbered over all terms."""
+        sizes = [np.full(term.count, term.size) for term in self._terms]
+        rows = np.concatenate([np.zeros(0, dtype=np.int64), *sizes])
+        return np.repeat(np.arange(len(rows)), rows)
+
+    @cached_property
     def columns(self) -> IntArray:
         """(length,) full tangent column of every entry."""
         parts = [np.zeros(0, dtype=np.int64)]
