@@ -84,12 +84,12 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "scenarios/driving/joint.py": ("control_decisions", "joint"),
     "scenarios/driving/localiser.py": ("navigation",),
     "scenarios/navigation.py": ("navigation",),
-    "scenarios/seeing/tracks.py": ("perception", "control_decisions"),
+    "scenarios/seeing/disc_tracker.py": ("perception", "control_decisions"),
     "scenarios/driving/pilot.py": ("navigation", "joint"),
     "scenarios/ways/grid.py": ("planner", "route"),
     "scenarios/driving/route.py": ("route", "navigation"),
     "scenarios/show/drive_scene.py": ("scene",),
-    "scenarios/worlds/unforeseen.py": ("unforeseen",),
+    "scenarios/worlds/placement.py": ("unforeseen",),
     "scenarios/driving/window.py": ("joint", "control_decisions"),
     "scenarios/flying/arrival.py": ("quadrotor_mpc", "quadrotor_flights"),
     "scenarios/seeing/association.py": ("quadrotor_estimator", "quadrotor_world"),
@@ -102,7 +102,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "scenarios/flying/plan.py": ("quadrotor_decisions", "quadrotor_controller"),
     "scenarios/show/flight_scene.py": ("quadrotor_scene",),
     "scenarios/flying/slots.py": ("quadrotor_decisions", "quadrotor_controller"),
-    "scenarios/seeing/mover_tracks.py": ("quadrotor_estimator", "quadrotor_world"),
+    "scenarios/seeing/line_tracker.py": ("quadrotor_estimator", "quadrotor_world"),
     "scenarios/flying/window.py": ("quadrotor_estimator", "quadrotor_joint"),
 }
 

@@ -15,6 +15,7 @@ import numpy as np
 
 import unifg as fg
 from unifg.models import avoidance, landmarks, quadrotor
+from unifg.scenarios.ways.polyline import arc_lengths, at_stations
 from unifg.scenarios.ways.visibility import Ways
 from unifg.scenarios.worlds.air import VEHICLE_RADIUS
 from unifg.scenarios.worlds.layouts import Layout, obstacle_course
@@ -184,10 +185,8 @@ def course_guess(settings: CourseSettings, layout: Layout) -> tuple[Array, Array
         raise fg.ScenarioError(f"unknown guess '{kind}': choose one of {', '.join(GUESSES)}")
     if kind != "hover":
         path = _way(layout) if kind == "way" else np.stack([layout.start[:2], layout.target[:2]])
-        arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-        share = np.linspace(0.0, 1.0, s.horizon + 1)
-        for axis in range(2):
-            states[:, axis] = np.interp(share * arc[-1], arc, path[:, axis])
+        arc, share = arc_lengths(path), np.linspace(0.0, 1.0, s.horizon + 1)
+        states[:, :2] = at_stations(path, arc, share * arc[-1])
         states[:, 2] = layout.start[2] + share * (layout.target[2] - layout.start[2])
         states[1:, 7:] = np.diff(states[:, :3], axis=0) / s.dt
     return states, controls

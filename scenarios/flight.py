@@ -20,8 +20,8 @@ from unifg.scenarios.flying.coupling import make_pilot
 from unifg.scenarios.flying.estimator import EstimatorSettings
 from unifg.scenarios.flying.plan import ControllerSettings, Plan
 from unifg.scenarios.log.flight_log import FlightLog, FlightRecorder
+from unifg.scenarios.seeing.readings import Reading
 from unifg.scenarios.worlds.air import QuadrotorWorld
-from unifg.scenarios.worlds.bearing_range import Reading
 from unifg.scenarios.worlds.conditions import draw_conditions
 from unifg.typing import Array
 

@@ -24,11 +24,11 @@ from unifg.scenarios.driving.pilot import make_pilot
 from unifg.scenarios.driving.route import Route
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_recording import Recording
-from unifg.scenarios.seeing.tracks import Tracker
-from unifg.scenarios.ways.path import path_length
+from unifg.scenarios.seeing.disc_tracker import DiscTracker
+from unifg.scenarios.ways.polyline import path_length
 from unifg.scenarios.worlds.building import DEMO_GOALS, DEMO_START, building_map
+from unifg.scenarios.worlds.placement import place_obstacles
 from unifg.scenarios.worlds.plane import World
-from unifg.scenarios.worlds.unforeseen import place_obstacles
 from unifg.typing import Array
 
 Progress = Callable[[float, str], None]
@@ -113,7 +113,7 @@ class Episode:
         self.world = World(self.occupancy, self.start, discs, sensors, robot_radius=control.robot_radius)
         sigma = np.array(INITIAL_SIGMA)
         believed = self.start + sigma * belief.standard_normal(3)
-        self.tracker = Tracker(self.distance_map)
+        self.tracker = DiscTracker(self.distance_map)
         self.pilot = make_pilot(
             settings.coupling, self.distance_map, settings.solver, control, believed, sigma, self.world.lidar.beams
         )

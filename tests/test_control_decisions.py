@@ -15,8 +15,9 @@ from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.driving.controller import BRAKING, LEFT_BEHIND, PATIENCE, Controller, ControllerSettings, Plan
 from unifg.scenarios.driving.joint import JointController
 from unifg.scenarios.driving.window import Window
+from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.seeing.tracks import Tracks
-from unifg.scenarios.worlds.plane import Scan, World
+from unifg.scenarios.worlds.plane import World
 from unifg.solvers import SQP
 from unifg.typing import Array
 

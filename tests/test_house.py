@@ -37,7 +37,8 @@ FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 # Inside scenarios/, where "" are the files that lie in no room: one per scenario.
 STOREYS: tuple[tuple[str, ...], ...] = (
     ("ways",),
-    ("seeing", "worlds"),
+    ("seeing",),
+    ("worlds",),
     ("driving", "flying"),
     ("log",),
     ("",),

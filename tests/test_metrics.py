@@ -10,7 +10,7 @@ import pytest
 from episodes import DT, episode
 from unifg.errors import ScenarioError
 from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors, without_timings, write_metrics
-from unifg.scenarios.ways.path import path_length
+from unifg.scenarios.ways.polyline import path_length
 
 PROMISED = {
     "reached",

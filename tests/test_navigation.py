@@ -19,11 +19,11 @@ from unifg.scenarios.driving.route import Route
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors
 from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigation
+from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.seeing.tracks import Tracks
-from unifg.scenarios.ways.path import path_length
+from unifg.scenarios.ways.polyline import path_length, polyline_distance
 from unifg.scenarios.worlds.building import building_map
-from unifg.scenarios.worlds.plane import Scan, World
-from unifg.scenarios.worlds.rectangles import polyline_distance
+from unifg.scenarios.worlds.plane import World
 from unifg.typing import Array
 
 RADIUS = 0.17

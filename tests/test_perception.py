@@ -11,10 +11,13 @@ import pytest
 
 from unifg.files.ros_map import OccupancyMap, load_map
 from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.seeing.disc_tracker import DiscTracker
 from unifg.scenarios.seeing.discs import DiscFinder
-from unifg.scenarios.seeing.tracks import Tracker, Tracks, nearest
+from unifg.scenarios.seeing.readings import Scan
+from unifg.scenarios.seeing.tracks import Tracks, nearest
 from unifg.scenarios.ways.grid import plan
-from unifg.scenarios.worlds.plane import LidarModel, Obstacle, Scan, World
+from unifg.scenarios.worlds.plane import LidarModel, World
+from unifg.scenarios.worlds.space import Obstacle
 from unifg.typing import Array, ArrayLike
 
 DT = 0.1
@@ -40,7 +43,7 @@ def disc(x: float, y: float, radius: float = 0.2) -> Obstacle:
     return Obstacle(np.array([x, y]), radius)
 
 
-def watch(world: World, tracker: Tracker, ticks: int, noise: Array, rng: np.random.Generator) -> Tracks:
+def watch(world: World, tracker: DiscTracker, ticks: int, noise: Array, rng: np.random.Generator) -> Tracks:
     """Stand still for some ticks and track; returns the last tracks."""
     tracks = tracker.tracks()
     for _ in range(ticks):
@@ -49,7 +52,7 @@ def watch(world: World, tracker: Tracker, ticks: int, noise: Array, rng: np.rand
     return tracks
 
 
-def follow(world: World, path: Array, tracker: Tracker, noise: Array, rng: np.random.Generator) -> list[Tracks]:
+def follow(world: World, path: Array, tracker: DiscTracker, noise: Array, rng: np.random.Generator) -> list[Tracks]:
     """Drive along a path by pure pursuit of the true pose, tracking from a disturbed one."""
     seen: list[Tracks] = []
     reached = 0
@@ -90,7 +93,7 @@ def test_tracks_are_right_with_a_disturbed_estimate(distance: float) -> None:
     for seed in range(15):
         rng = np.random.default_rng(seed)
         world = World(occupancy, (3.0, 2.0, 0.4), [disc(3.0, 2.0 + distance)], rng)
-        tracks = watch(world, Tracker(field(occupancy)), 6, noise, np.random.default_rng(100 + seed))
+        tracks = watch(world, DiscTracker(field(occupancy)), 6, noise, np.random.default_rng(100 + seed))
         assert len(tracks) == 1
         assert np.linalg.norm(tracks.centre[0] - (3.0, 2.0 + distance)) < 0.05
         assert tracks.velocity.tolist() == [[0.0, 0.0]]
@@ -101,7 +104,7 @@ def test_two_hits_confirm() -> None:
     """One sighting is not yet an obstacle; the second makes it one, under an identity that stays."""
     occupancy = hall()
     world = World(occupancy, (3.0, 4.0, 0.0), [disc(4.5, 4.0), disc(3.0, 6.0)], np.random.default_rng(0))
-    tracker = Tracker(field(occupancy))
+    tracker = DiscTracker(field(occupancy))
     assert len(tracker.update(world.scan(), world.pose, DT)) == 0
     second = tracker.update(world.scan(), world.pose, DT)
     third = tracker.update(world.scan(), world.pose, DT)
@@ -112,8 +115,8 @@ def test_two_hits_confirm() -> None:
 def test_mapped_things_are_not_obstacles() -> None:
     """Walls and a pillar on the map give no tracks; the pillar missing from the map does."""
     world = World(hall(pillar=True), (3.0, 4.0, 0.0), rng=np.random.default_rng(0))
-    assert len(watch(world, Tracker(field(hall(pillar=True))), 30, np.zeros(3), np.random.default_rng(0))) == 0
-    found = watch(world, Tracker(field(hall())), 5, np.zeros(3), np.random.default_rng(0))
+    assert len(watch(world, DiscTracker(field(hall(pillar=True))), 30, np.zeros(3), np.random.default_rng(0))) == 0
+    found = watch(world, DiscTracker(field(hall())), 5, np.zeros(3), np.random.default_rng(0))
     assert len(found) >= 1
     assert np.linalg.norm(found.centre - (5.0, 4.0), axis=1).min() < 0.25
 
@@ -124,7 +127,7 @@ def test_wide_things_become_several_discs() -> None:
     occupied[60:100, 100:104] = True
     solid = OccupancyMap(occupied=occupied, free=~occupied, resolution=0.05, origin=(0.0, 0.0, 0.0), name="hall")
     world = World(solid, (3.0, 4.0, 0.0), rng=np.random.default_rng(0))
-    tracks = watch(world, Tracker(field(hall())), 5, np.zeros(3), np.random.default_rng(0))
+    tracks = watch(world, DiscTracker(field(hall())), 5, np.zeros(3), np.random.default_rng(0))
     face = np.stack([np.full(41, 5.0), np.linspace(3.0, 5.0, 41)], axis=1)
     gap = np.linalg.norm(face[:, None] - tracks.centre[None], axis=2) - tracks.radius
     assert len(tracks) >= 3
@@ -143,7 +146,7 @@ def test_velocity_of_a_mover(heading: float) -> None:
         world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(seed))
         world.step(0.0, 0.0)
         noise = np.array([0.01, 0.01, 0.004])
-        tracks = watch(world, Tracker(field(occupancy)), 11, noise, np.random.default_rng(50 + seed))
+        tracks = watch(world, DiscTracker(field(occupancy)), 11, noise, np.random.default_rng(50 + seed))
         assert len(tracks) == 1
         assert np.linalg.norm(tracks.centre[0] - world.obstacle_states()[0, :2]) < 0.08
         errors.append(np.linalg.norm(tracks.velocity[0] - 0.3 * direction))
@@ -156,7 +159,7 @@ def test_mover_that_turns_round_is_followed() -> None:
     occupancy = hall()
     mover = Obstacle(np.array([4.0, 5.5]), 0.2, np.array([6.0, 5.5]), 0.3)
     world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(4))
-    tracker, rng = Tracker(field(occupancy)), np.random.default_rng(5)
+    tracker, rng = DiscTracker(field(occupancy)), np.random.default_rng(5)
     identities: set[int] = set()
     away: list[float] = []
     for _ in range(200):
@@ -174,7 +177,7 @@ def test_mover_that_waited_is_followed_when_it_goes_on() -> None:
     occupancy = hall()
     mover = Obstacle(np.array([6.5, 4.0]), 0.2, np.array([4.0, 4.0]), 0.3)
     world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(4))
-    tracker, rng = Tracker(field(occupancy)), np.random.default_rng(5)
+    tracker, rng = DiscTracker(field(occupancy)), np.random.default_rng(5)
     still = np.zeros(3)
     waited = 0
     for _ in range(80):
@@ -194,7 +197,7 @@ def test_memory_of_things_out_of_view() -> None:
     """A fixed disc behind a pillar is remembered; a mover is forgotten after a second and a half."""
     occupancy = hall(pillar=True)
     fixed = disc(8.0, 4.0)
-    tracker = Tracker(field(occupancy))
+    tracker = DiscTracker(field(occupancy))
     beside = World(occupancy, (5.0, 2.0, 0.0), [fixed], np.random.default_rng(0))
     watch(beside, tracker, 5, np.zeros(3), np.random.default_rng(0))
     behind = World(occupancy, (3.0, 4.0, 0.0), [fixed], np.random.default_rng(0))
@@ -204,7 +207,7 @@ def test_memory_of_things_out_of_view() -> None:
     assert np.linalg.norm(remembered.centre[0] - (8.0, 4.0)) < 0.05
 
     mover = Obstacle(np.array([7.3, 3.0]), 0.2, np.array([7.3, 5.0]), 0.3)
-    tracker = Tracker(field(occupancy))
+    tracker = DiscTracker(field(occupancy))
     beside = World(occupancy, (5.0, 2.0, 0.0), [mover], np.random.default_rng(0))
     moving = watch(beside, tracker, 20, np.zeros(3), np.random.default_rng(0))
     assert np.linalg.norm(moving.velocity, axis=1).tolist() == pytest.approx([0.3], abs=0.1)
@@ -218,7 +221,7 @@ def test_memory_of_things_out_of_view() -> None:
 def test_disc_taken_away_is_dropped() -> None:
     """Beams that pass clearly through a remembered disc end it within half a second."""
     occupancy = hall()
-    tracker = Tracker(field(occupancy))
+    tracker = DiscTracker(field(occupancy))
     there = World(occupancy, (3.0, 4.0, 0.0), [disc(5.0, 4.0)], np.random.default_rng(0))
     assert len(watch(there, tracker, 10, np.zeros(3), np.random.default_rng(0))) == 1
     gone = World(occupancy, (3.0, 4.0, 0.0), rng=np.random.default_rng(0))
@@ -246,7 +249,7 @@ def test_poor_scans_are_survived() -> None:
     """All beams lost, none returned, everything unexplained: no error, no track from nothing."""
     occupancy = hall()
     angles = World(occupancy, (5.0, 4.0, 0.0), lidar=LidarModel()).scan().angles
-    tracker = Tracker(field(occupancy))
+    tracker = DiscTracker(field(occupancy))
     for ranges in (np.full(360, np.nan), np.full(360, np.inf), np.where(np.arange(360) == 5, 1.0, np.inf)):
         for _ in range(3):
             assert len(tracker.update(Scan(angles, ranges), (5.0, 4.0, 0.0), DT)) == 0
@@ -262,7 +265,7 @@ def test_empty_building_gives_no_tracks(shared_data: Path) -> None:
     distance_map = field(occupancy)
     path = plan(occupancy, distance_map, (2.3, 30.0, -1.57), (26.0, 1.7, 0.0), robot_radius=0.17)
     world = World(occupancy, (2.3, 30.0, -1.57), rng=np.random.default_rng(0))
-    seen = follow(world, path, Tracker(distance_map), np.array([0.03, 0.03, 0.008]), np.random.default_rng(1))
+    seen = follow(world, path, DiscTracker(distance_map), np.array([0.03, 0.03, 0.008]), np.random.default_rng(1))
     assert len(seen) > 400
     assert np.linalg.norm(world.pose[:2] - (26.0, 1.7)) < 0.5
     assert sum(len(tracks) > 0 for tracks in seen) == 0
@@ -286,7 +289,7 @@ def test_discs_in_the_building(shared_data: Path) -> None:
     spent: list[float] = []
     errors: list[float] = []
 
-    class Judged(Tracker):
+    class Judged(DiscTracker):
         """A tracker whose answers are timed and held against the truth."""
 
         def update(self, scan: Scan, pose: ArrayLike, dt: float) -> Tracks:

@@ -13,7 +13,9 @@ from scipy import ndimage
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map, save_map
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.ways.grid import SPACING, PathFollower, path_exists, path_length, plan, reference
+from unifg.scenarios.ways.follow import PathFollower
+from unifg.scenarios.ways.grid import SPACING, path_exists, plan
+from unifg.scenarios.ways.polyline import path_length
 from unifg.scenarios.worlds.building import DEMO_GOALS, DEMO_START, building_map, draw_building
 from unifg.typing import Array
 
@@ -205,13 +207,15 @@ def test_the_reference_is_spaced_turns_with_the_path_and_ends_at_the_goal() -> N
     assert np.array_equal(past, np.repeat(path[-1:], 3, axis=0))
 
 
-def test_the_reference_never_goes_back_and_a_single_use_agrees() -> None:
+def test_the_reference_never_goes_back_and_a_follower_remembers_nothing() -> None:
     path = eight()
-    once, arc = reference(path, path[50], 0.06, 10, 0.0)
+    used = PathFollower(path)
+    used.reference(path[90], 0.06, 10, 0.0)
+    once, arc = used.reference(path[50], 0.06, 10, 0.0)
     again, arc_again = PathFollower(path).reference(path[50], 0.06, 10, 0.0)
     assert np.array_equal(once, again)
     assert arc == arc_again
-    assert reference(path, path[0], 0.06, 10, 3.0)[1] == 3.0
+    assert used.reference(path[0], 0.06, 10, 3.0)[1] == 3.0
     with pytest.raises(ScenarioError, match="at least two poses"):
         PathFollower(path[:1])
 

@@ -16,7 +16,7 @@ from unifg.scenarios.flying.guide import Guide, GuideSettings, Reference
 from unifg.scenarios.flying.plan import ControllerSettings
 from unifg.scenarios.flying.slots import Obstacles, Slots
 from unifg.scenarios.seeing.belief import Belief, Landmarks
-from unifg.scenarios.seeing.mover_tracks import Movers
+from unifg.scenarios.seeing.tracks import Tracks
 from unifg.solvers.names import CONSTRAINED
 from unifg.typing import Array
 
@@ -239,7 +239,7 @@ def test_an_obstacle_keeps_its_slot() -> None:
     names = []
     for x in (1.0, 5.5, 9.0):
         positions = np.linspace([x, 0.0, 1.5], [x + 2.0, 0.0, 1.5], settings.horizon + 1)
-        names.append(slots.fill(state(x), positions, known, Movers.none()).names.tolist())
+        names.append(slots.fill(state(x), positions, known, Tracks.none()).names.tolist())
     assert names == [[0, 1], [2, 1], [2, 1]]
 
 
@@ -249,7 +249,7 @@ def test_limits_leave_time_to_dodge_what_stands_close() -> None:
     fast = state(1.0, velocity=(2.0, 0.0, 0.0))
     known = landmarks((2.2, 0.0, 0.5))
     positions = np.tile(fast[:3], (settings.horizon + 1, 1))
-    obstacles = Slots(settings, WALLS).fill(fast, positions, known, Movers.none())
+    obstacles = Slots(settings, WALLS).fill(fast, positions, known, Tracks.none())
     _, states = brake(fast, quadrotor.Parameters(), settings.horizon, settings.dt, *limits(settings))
     kept = obstacles.limits[:, obstacles.names.tolist().index(0)]
     assert np.all(gaps(states[1:8], known)[:, 0] >= kept[:7] - 0.01)
@@ -292,7 +292,7 @@ def test_a_mover_that_crosses_is_avoided_by_those_who_know(aware: bool) -> None:
     )
     least = np.inf
     for _ in range(60):
-        movers = Movers(centre[None], velocity[None], np.array([radius])) if aware else Movers.none()
+        movers = Tracks.of_movers(centre[None], velocity[None], np.array([radius])) if aware else Tracks.none()
         plan = controller.plan(belief(here), movers)
         here = quadrotor.fly(here, plan.controls[0], dt, quadrotor.Parameters())
         centre = centre + dt * velocity

@@ -16,7 +16,7 @@ from unifg.scenarios.flying.guide import Reference
 from unifg.scenarios.flying.plan import ControllerSettings
 from unifg.scenarios.flying.slots import Slots
 from unifg.scenarios.seeing.belief import Landmarks
-from unifg.scenarios.seeing.mover_tracks import Movers
+from unifg.scenarios.seeing.tracks import Tracks
 from unifg.typing import Array
 
 SETTINGS = ControllerSettings()
@@ -56,7 +56,7 @@ def test_multipliers_stay_with_their_obstacle_and_go_with_it() -> None:
     watched = Watched(controller._run)
     controller._run = watched  # type: ignore[assignment]
     other = named(landmarks((3.0, 0.15, 0.5), (9.0, 1.0, 0.4)), 4, 8)
-    movers = Movers(np.array([[8.0, -2.0]]), np.array([[0.0, 0.3]]), np.array([0.4]))
+    movers = Tracks.of_movers(np.array([[8.0, -2.0]]), np.array([[0.0, 0.3]]), np.array([0.4]))
     plan = controller.plan(belief(here, other), movers)
     assert plan.source == "solved"
     assert controller._slots._names.tolist()[gone] == 8
@@ -71,7 +71,7 @@ def test_a_slot_says_whether_it_holds_something_else() -> None:
     positions = np.linspace([1.0, 0.0, 1.5], [3.0, 0.0, 1.5], SETTINGS.horizon + 1)
 
     def fill(known: Landmarks) -> list[bool]:
-        changed: list[bool] = slots.fill(state(1.0), positions, known, Movers.none()).changed.tolist()
+        changed: list[bool] = slots.fill(state(1.0), positions, known, Tracks.none()).changed.tolist()
         return changed
 
     near, far = landmarks((3.0, 1.0, 0.3)), landmarks((3.0, 1.0, 0.3), (4.0, -1.0, 0.3))
@@ -94,7 +94,7 @@ def test_what_is_kept_clear_of() -> None:
         landmarks((9.0, 2.0, 0.3), (9.0, -2.0, 0.3)),
         covariances=np.stack([np.diag([doubt**2, (0.5 * doubt) ** 2]), 9.0 * np.eye(2)]),
     )
-    movers = Movers(
+    movers = Tracks.of_movers(
         np.array([[11.0, 1.0], [11.0, -1.0], [12.0, 3.0]]),
         np.array([[0.5, 0.2], [-0.5, 0.0], [0.0, 0.0]]),
         np.array([0.4, 0.4, 0.3]),
@@ -106,16 +106,16 @@ def test_what_is_kept_clear_of() -> None:
     assert obstacles.limits[:, slots[1]] == pytest.approx(least + s.margin_limit)
     times = s.dt * np.arange(1.0, s.horizon + 1)
     for slot, row in ((s.cylinders, 0), (s.cylinders + 1, 1)):  # the two nearest ones, in their order
-        assert obstacles.radii[slot] == movers.radii[row]
+        assert obstacles.radii[slot] == movers.radius[row]
         assert obstacles.limits[:, slot] == pytest.approx(least + s.mover_margin + s.mover_growth * times)
-    line = here[:2] - movers.centres[0]
+    line = here[:2] - movers.centre[0]
     line /= np.hypot(*line)
     aside = np.array([-line[1], line[0]])
-    moved = obstacles.centres[-1, s.cylinders] - movers.centres[0]
+    moved = obstacles.centres[-1, s.cylinders] - movers.centre[0]
     assert moved @ line == pytest.approx(0.0, abs=1e-12)  # it goes away: it may turn round
-    assert moved @ aside == pytest.approx(times[-1] * movers.velocities[0] @ aside)
-    closing = obstacles.centres[-1, s.cylinders + 1] - movers.centres[1]
-    assert closing == pytest.approx(times[-1] * movers.velocities[1])  # it comes: that is believed in full
+    assert moved @ aside == pytest.approx(times[-1] * movers.velocity[0] @ aside)
+    closing = obstacles.centres[-1, s.cylinders + 1] - movers.centre[1]
+    assert closing == pytest.approx(times[-1] * movers.velocity[1])  # it comes: that is believed in full
     assert np.all(obstacles.wall_limits == least)
 
 
@@ -124,7 +124,9 @@ def test_the_nearest_movers_are_those_whose_hulls_are_nearest() -> None:
     s = replace(SETTINGS, cylinders=1, movers=1)
     here = state(9.0, y=2.0)
     positions = np.tile(here[:3], (s.horizon + 1, 1))
-    movers = Movers(np.array([[9.0, 0.8], [9.0, 3.5], [0.5, 0.0]]), np.zeros((3, 2)), np.array([0.2, 0.9, 0.3]))
+    movers = Tracks.of_movers(
+        np.array([[9.0, 0.8], [9.0, 3.5], [0.5, 0.0]]), np.zeros((3, 2)), np.array([0.2, 0.9, 0.3])
+    )
     obstacles = Slots(s, WALLS).fill(here, positions, Landmarks.none(), movers)
     assert obstacles.radii[1] == 0.9
     assert np.all(obstacles.centres[:, 1] == [9.0, 3.5])
@@ -184,7 +186,7 @@ class Told:
     def __init__(self, **changes: Any) -> None:
         self.controller = Controller(TARGET, WALLS, settings=replace(SETTINGS, **changes), bounds=BOUNDS)
         self.obstacles = self.controller._slots.fill(
-            state(1.0), np.tile([1.0, 0.0, 1.5], (SETTINGS.horizon + 1, 1)), Landmarks.none(), Movers.none()
+            state(1.0), np.tile([1.0, 0.0, 1.5], (SETTINGS.horizon + 1, 1)), Landmarks.none(), Tracks.none()
         )
 
     def judge(self, controls: Array, present: Array, *, defect: float = 0.0, discs: Landmarks | None = None) -> Any:
@@ -194,7 +196,7 @@ class Told:
         states[-1, 0] += defect
         believed = belief(present, discs)
         reference = c.guide.reference(present, believed.landmarks, s.horizon + 1, s.dt)
-        obstacles = c._slots.fill(present, reference.positions, believed.landmarks, Movers.none())
+        obstacles = c._slots.fill(present, reference.positions, believed.landmarks, Tracks.none())
 
         class Answer:
             def __getitem__(self, variable: Any) -> Array:

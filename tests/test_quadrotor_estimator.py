@@ -18,7 +18,8 @@ from unifg.scenarios.flying.estimator import DeadReckoningEstimator, Estimator, 
 from unifg.scenarios.flying.window import WindowSettings, without
 from unifg.scenarios.seeing.association import DOUBTFUL, NEW, Gates, nearest
 from unifg.scenarios.seeing.belief import Belief, Landmarks
-from unifg.scenarios.worlds.air import QuadrotorWorld, Reading
+from unifg.scenarios.seeing.readings import Reading
+from unifg.scenarios.worlds.air import QuadrotorWorld
 from unifg.scenarios.worlds.layouts import Layout
 from unifg.solvers import KKT
 from unifg.typing import Array

@@ -25,7 +25,7 @@ from unifg.scenarios.flying.slots import FAR_AWAY
 from unifg.scenarios.flying.standardised import standardised
 from unifg.scenarios.flying.window_terms import Shared, WindowTerms
 from unifg.scenarios.seeing.belief import Belief
-from unifg.scenarios.seeing.mover_tracks import Movers
+from unifg.scenarios.seeing.tracks import Tracks
 from unifg.scenarios.worlds.layouts import Layout
 from unifg.solvers import InteriorPoint
 from unifg.solvers.names import CONSTRAINED
@@ -250,7 +250,7 @@ def test_multipliers_stay_with_what_they_belong_to(past: Past) -> None:
     controller = past.controller(JointSettings())
     controller.plan(past.belief)
     obstacles = controller._slots.fill(
-        past.belief.state, np.tile(past.belief.state[:3], (31, 1)), past.belief.landmarks, Movers.none()
+        past.belief.state, np.tile(past.belief.state[:3], (31, 1)), past.belief.landmarks, Tracks.none()
     )
     guess = controller._guess
     assert guess is not None

@@ -21,8 +21,8 @@ from unifg.scenarios.flight import Flight, FlightSettings, run_flight
 from unifg.scenarios.flying.coupling import COUPLINGS
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics, state_errors
-from unifg.scenarios.seeing.mover_tracks import Tracker
-from unifg.scenarios.worlds.bearing_range import Reading
+from unifg.scenarios.seeing.line_tracker import LineTracker
+from unifg.scenarios.seeing.readings import Reading
 from unifg.scenarios.worlds.conditions import DRAG, MASS, WIND, draw_conditions
 from unifg.typing import Array
 
@@ -288,7 +288,7 @@ def sighting(time: float, places: Array, ids: list[int], state: Array) -> Readin
 
 @pytest.mark.parametrize("association", ["known", "unknown"])
 def test_tracks_find_velocities(association: str) -> None:
-    tracker = Tracker(association=association)
+    tracker = LineTracker(association=association)
     velocities = np.array([[0.5, -0.3], [-0.4, 0.0]])
     for k in range(12):
         time = 0.05 * k
@@ -296,14 +296,14 @@ def test_tracks_find_velocities(association: str) -> None:
         places = np.array([[5.0, 1.0], [5.0, -1.5]]) + time * velocities
         order = [0, 1] if k % 2 else [1, 0]  # an unknown association must not depend on the order
         movers = tracker.update(sighting(time, places[order], [[20, 21][i] for i in order], state), state)
-    rows = np.argsort(-movers.centres[:, 1])
-    np.testing.assert_allclose(movers.centres[rows], places, atol=1e-9)
-    np.testing.assert_allclose(movers.velocities[rows], velocities, atol=1e-9)
-    np.testing.assert_allclose(movers.radii, 0.4)
+    rows = np.argsort(-movers.centre[:, 1])
+    np.testing.assert_allclose(movers.centre[rows], places, atol=1e-9)
+    np.testing.assert_allclose(movers.velocity[rows], velocities, atol=1e-9)
+    np.testing.assert_allclose(movers.radius, 0.4)
     # Out of sight a disc goes on for a while and is then given up.
     unseen = sighting(1.0, np.zeros((0, 2)), [], state)
     later = tracker.update(unseen, state)
-    np.testing.assert_allclose(later.centres[rows], places + (1.0 - time) * velocities, atol=1e-9)
+    np.testing.assert_allclose(later.centre[rows], places + (1.0 - time) * velocities, atol=1e-9)
     assert len(tracker.update(replace(unseen, time=3.0), state)) == 0
 
 

@@ -18,7 +18,7 @@ from unifg.scenarios.worlds.air import VEHICLE_RADIUS, QuadrotorWorld
 from unifg.scenarios.worlds.bearing_range import SensorModel
 from unifg.scenarios.worlds.disturbance import DisturbanceModel, Disturbances
 from unifg.scenarios.worlds.layouts import Layout, corridor
-from unifg.scenarios.worlds.unmapped import Obstacle
+from unifg.scenarios.worlds.space import Obstacle
 from unifg.typing import Array
 
 CALM = DisturbanceModel.calm()

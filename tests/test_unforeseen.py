@@ -14,10 +14,10 @@ from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ways.grid import plan
+from unifg.scenarios.ways.polyline import polyline_distance
+from unifg.scenarios.worlds.placement import PlacementRules, place_obstacles
 from unifg.scenarios.worlds.plane import World
-from unifg.scenarios.worlds.rectangles import polyline_distance
-from unifg.scenarios.worlds.unforeseen import PlacementRules, place_obstacles
-from unifg.scenarios.worlds.unmapped import Obstacle
+from unifg.scenarios.worlds.space import Obstacle
 from unifg.typing import Array
 
 START = np.array([1.0, 1.5, 0.0])

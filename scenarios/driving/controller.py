@@ -328,11 +328,7 @@ class Controller:
         """
         s = self.settings
         stages = s.dt * np.arange(1, s.horizon + 1)
-        towards = pose[:2] - tracks.centre
-        towards /= np.maximum(np.hypot(*towards.T), 1e-9)[:, None]
-        leaving = np.minimum(np.einsum("ij,ij->i", tracks.velocity, towards), 0.0)
-        velocity = tracks.velocity - leaving[:, None] * towards
-        centres: Array = tracks.centre + stages[:, None, None] * velocity
+        centres: Array = tracks.centre + stages[:, None, None] * tracks.expected_velocity(pose[:2])
         gap = np.hypot(*np.moveaxis(centres - pose[:2], 2, 0)) - tracks.radius - s.robot_radius
         blocked = np.maximum.accumulate(gap < s.courtesy, axis=0)
         last = np.maximum((~blocked).sum(axis=0) - 1, 0)  # the stage before the mover has to wait

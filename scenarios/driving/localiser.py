@@ -7,7 +7,7 @@ import numpy as np
 import unifg as fg
 from unifg.models import lidar, odometry
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.worlds.plane import Scan
+from unifg.scenarios.seeing.readings import Scan
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
 

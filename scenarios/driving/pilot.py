@@ -12,8 +12,8 @@ from unifg.scenarios.driving.controller import Controller, ControllerSettings, P
 from unifg.scenarios.driving.joint import JointController
 from unifg.scenarios.driving.localiser import Localiser
 from unifg.scenarios.driving.window import Window
+from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.seeing.tracks import Tracks
-from unifg.scenarios.worlds.plane import Scan
 from unifg.typing import Array
 
 COUPLINGS = ("sequential", "joint")

@@ -8,8 +8,9 @@ from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.seeing.tracks import Tracks
+from unifg.scenarios.ways.follow import PathFollower
 from unifg.scenarios.ways.grid import SPACING, plan
-from unifg.scenarios.ways.path import PathFollower, headed, path_length, resample
+from unifg.scenarios.ways.polyline import headed, path_length, resample
 from unifg.typing import Array
 
 LOOK_AHEAD = 4.0  # [m] of path checked against tracked discs

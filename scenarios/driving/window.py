@@ -14,7 +14,7 @@ import unifg as fg
 from unifg.models import lidar, odometry, unicycle
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.driving.localiser import BEAM_SIGMA
-from unifg.scenarios.worlds.plane import Scan
+from unifg.scenarios.seeing.readings import Scan
 from unifg.typing import Array, BoolArray
 
 PAST_TERMS = ("arrival", "odometry", "lidar past")

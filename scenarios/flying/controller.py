@@ -21,7 +21,7 @@ from unifg.scenarios.flying.guide import Guide, Reference
 from unifg.scenarios.flying.plan import ControllerSettings, Plan, Source, backend
 from unifg.scenarios.flying.slots import FAR_AWAY, SPARE, Obstacles, Slots
 from unifg.scenarios.seeing.belief import Belief
-from unifg.scenarios.seeing.mover_tracks import Movers
+from unifg.scenarios.seeing.tracks import Tracks
 from unifg.solvers import names
 from unifg.typing import Array, ArrayLike
 
@@ -100,7 +100,7 @@ class Controller:
 
     # ---------------------------------------------------------------- a tick
 
-    def plan(self, belief: Belief, movers: Movers | None = None) -> Plan:
+    def plan(self, belief: Belief, movers: Tracks | None = None) -> Plan:
         """Decide the next controls; never raises for a hard problem.
 
         Args:
@@ -110,7 +110,7 @@ class Controller:
         begin = time.perf_counter()
         s = self.settings
         reference = self.guide.reference(belief.state, belief.landmarks, s.horizon + 1, s.dt)
-        obstacles = self._slots.fill(belief.state, reference.positions, belief.landmarks, movers or Movers.none())
+        obstacles = self._slots.fill(belief.state, reference.positions, belief.landmarks, movers or Tracks.none())
         data = {**self._anchored(belief), **self._moved(belief), **self._limited(belief), **self._spent(belief)}
         if s.avoidance == "potential":
             data |= self._attracted_and_repelled(belief, obstacles)

@@ -17,10 +17,10 @@ from unifg.models import quadrotor
 from unifg.scenarios.flying.spread import JointCovariance
 from unifg.scenarios.flying.window import PARAMETER_SIZE, STATE_SIZE, Window, WindowSettings
 from unifg.scenarios.flying.window_terms import Shared, WindowTerms
-from unifg.scenarios.seeing.association import DOUBTFUL, NEW, Gates, expected, nearest
+from unifg.scenarios.seeing.association import DOUBTFUL, NEW, Gates, expected, nearest, places
 from unifg.scenarios.seeing.atlas import Atlas
 from unifg.scenarios.seeing.belief import Belief, Landmarks
-from unifg.scenarios.worlds.bearing_range import Reading
+from unifg.scenarios.seeing.readings import Reading
 from unifg.solvers import SQP
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -172,7 +172,7 @@ class Estimator:
                 slot = self._slot()
                 if slot is None:
                     continue
-                window.admit(slot, self._position(bearing, distance))
+                window.admit(slot, places(window.present, np.array([bearing]), np.array([distance]))[0])
                 name = int(reading.ids[row]) if self.settings.association == "known" else None
                 atlas.admit(slot, int(reading.kinds[row]), name)
                 self._look_up(slot)
@@ -290,13 +290,6 @@ class Estimator:
         nearest = int(np.argmin(gaps))
         if gaps[nearest] < SAME_CORNER:
             window.survey[slot], window.surveyed[slot] = self._survey[nearest], True
-
-    def _position(self, bearing: float, distance: float) -> Array:
-        """Where a sighting from the present puts a landmark, (2,)."""
-        forward = fg.SO3.matrix(self.window.present[3:7])[:, 0]
-        angle = np.arctan2(forward[1], forward[0]) + bearing
-        position: Array = self.window.present[:2] + distance * np.array([np.cos(angle), np.sin(angle)])
-        return position
 
 
 class DeadReckoningEstimator(Estimator):

@@ -6,7 +6,7 @@ import numpy as np
 
 from unifg.models import quadrotor
 from unifg.scenarios.flying.slots import Obstacles
-from unifg.scenarios.ways.passage import segment_distance
+from unifg.scenarios.ways.polyline import segment_distance
 from unifg.typing import Array
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unifg.scenarios.seeing.belief import Landmarks
+from unifg.scenarios.ways.polyline import arc_lengths, at_stations, curvature, nearest_piece, path_length, resample
 from unifg.scenarios.ways.visibility import Ways
 from unifg.typing import Array
 
@@ -97,7 +98,7 @@ class Guide:
     def _renew(self, position: Array, discs: Array) -> None:
         """Plan again where the map has changed or the vehicle has left the way."""
         same = len(discs) == len(self._discs) and np.abs(discs - self._discs).max(initial=0.0) < MOVED
-        if same and self._way is not None and _distance(self._way, position) < STRAYED:
+        if same and self._way is not None and nearest_piece(self._way, position)[2] < STRAYED:
             return
         if not same or self._ways is None:
             self._discs = discs
@@ -108,7 +109,7 @@ class Guide:
         kept = None if self._way is None else _onwards(self._way, position)
         if found is None or self._ways is None:
             self._way = None
-        elif kept is None or not self._ways.passes(kept, GIVE) or _length(found) < _length(kept) - SHORTER:
+        elif kept is None or not self._ways.passes(kept, GIVE) or path_length(found) < path_length(kept) - SHORTER:
             self._way = smoothed(found)
 
     def _widest(self, position: Array) -> Array | None:
@@ -123,28 +124,28 @@ class Guide:
     def _sample(self, state: Array, way: Array, count: int, dt: float) -> Reference:
         """Follow the way from beside the vehicle, as fast as it may."""
         s = self.settings
-        arc = _arc(way)
-        here = _station(way, arc, state[:2])
+        arc = arc_lengths(way)
+        piece, share, _ = nearest_piece(way, state[:2])
+        here = float(arc[piece] + share * (arc[piece + 1] - arc[piece]))
         tangent = np.gradient(way, arc, axis=0) if len(way) > 1 else np.zeros((1, 2))
         tangent /= np.maximum(np.hypot(*tangent.T), 1e-9)[:, None]
-        along = np.array([np.interp(here, arc, tangent[:, k]) for k in (0, 1)])
+        along = at_stations(tangent, arc, np.array([here]))[0]
         now = max(float(along @ state[7:9]), SLOWEST)
         stations = here + np.linspace(0.0, arc[-1] - here, max(2, 2 + int((arc[-1] - here) / SPACING)))
         squared = np.minimum(self._allowed(way, arc, stations), now**2 + 2.0 * s.acceleration * (stations - here))
         speed = np.sqrt(np.maximum(squared, 0.0))
         # Each piece is flown with constant acceleration.
-        piece = np.diff(stations)
-        clock = np.concatenate([[0.0], np.cumsum(piece / np.maximum(0.5 * (speed[1:] + speed[:-1]), 1e-2))])
-        rising = np.diff(speed**2) / (2.0 * np.maximum(piece, 1e-9))
+        lengths = np.diff(stations)
+        clock = np.concatenate([[0.0], np.cumsum(lengths / np.maximum(0.5 * (speed[1:] + speed[:-1]), 1e-2))])
+        rising = np.diff(speed**2) / (2.0 * np.maximum(lengths, 1e-9))
         times = dt * np.arange(count)
-        at = np.clip(np.searchsorted(clock, times, side="right") - 1, 0, len(piece) - 1)
+        at = np.clip(np.searchsorted(clock, times, side="right") - 1, 0, len(lengths) - 1)
         since = np.minimum(times, clock[-1]) - clock[at]
         reached = np.minimum(stations[at] + speed[at] * since + 0.5 * rising[at] * since**2, stations[at + 1])
         rate = np.where(times < clock[-1], np.maximum(speed[at] + rising[at] * since, 0.0), 0.0)
         positions, velocities = np.zeros((count, 3)), np.zeros((count, 3))
-        for k in (0, 1):
-            positions[:, k] = np.interp(reached, arc, way[:, k])
-            velocities[:, k] = rate * np.interp(reached, arc, tangent[:, k])
+        positions[:, :2] = at_stations(way, arc, reached)
+        velocities[:, :2] = rate[:, None] * at_stations(tangent, arc, reached)
         rise = self.target[2] - state[2]
         climbed = np.clip(rise, -s.climb * times, s.climb * times)
         positions[:, 2] = state[2] + climbed
@@ -154,7 +155,7 @@ class Guide:
     def _allowed(self, way: Array, arc: Array, stations: Array) -> Array:
         """Squares of the greatest speeds at stations, from the bends, the cruise and the stop at the end."""
         s = self.settings
-        squared = np.minimum(s.speed**2, s.lateral / np.maximum(_curvature(way, arc), 1e-6))
+        squared = np.minimum(s.speed**2, s.lateral / np.maximum(curvature(way, arc), 1e-6))
         squared[-1] = 0.0
         # What lies ahead must be reachable by braking.
         reachable = (
@@ -166,11 +167,10 @@ class Guide:
 
 def smoothed(way: Array) -> Array:
     """Points (Q, 2) ``SPACING`` apart on a polyline (P, 2), with its corners rounded; the ends stay."""
-    arc = _arc(way)
-    if arc[-1] < SPACING:
-        return way[[0, -1]] if arc[-1] > 0.0 else np.stack([way[0], way[0] + [1e-6, 0.0]])
-    stations = np.linspace(0.0, arc[-1], max(2, 1 + round(arc[-1] / SPACING)))
-    points = np.column_stack([np.interp(stations, arc, way[:, k]) for k in (0, 1)])
+    length = path_length(way)
+    if length < SPACING:
+        return way[[0, -1]] if length > 0.0 else np.stack([way[0], way[0] + [1e-6, 0.0]])
+    points = resample(way, SPACING)
     half = SMOOTHING // 2
     if len(points) <= 2 * half:
         return points
@@ -181,45 +181,7 @@ def smoothed(way: Array) -> Array:
     return np.column_stack([np.convolve(padded[:, k], kernel, mode="valid") for k in (0, 1)])
 
 
-def _arc(way: Array) -> Array:
-    """Arc lengths (P,) [m] at the points of a polyline."""
-    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
-
-
-def _length(way: Array) -> float:
-    return float(_arc(way)[-1])
-
-
-def _nearest(way: Array, position: Array) -> tuple[int, float, float]:
-    """Piece, share of it, and distance of the nearest point of a way."""
-    begin, span = way[:-1], np.diff(way, axis=0)
-    share = np.clip(((position - begin) * span).sum(axis=1) / np.maximum((span**2).sum(axis=1), 1e-18), 0.0, 1.0)
-    gap = np.hypot(*(begin + share[:, None] * span - position).T)
-    at = int(np.argmin(gap))
-    return at, float(share[at]), float(gap[at])
-
-
-def _distance(way: Array, position: Array) -> float:
-    return _nearest(way, position)[2]
-
-
-def _station(way: Array, arc: Array, position: Array) -> float:
-    """Arc length [m] of the nearest point."""
-    at, share, _ = _nearest(way, position)
-    return float(arc[at] + share * (arc[at + 1] - arc[at]))
-
-
 def _onwards(way: Array, position: Array) -> Array:
     """What is left of a way, from ``position`` on."""
-    at, _, _ = _nearest(way, position)
+    at, _, _ = nearest_piece(way, position)
     return np.concatenate([position[None], way[at + 1 :]])
-
-
-def _curvature(way: Array, arc: Array) -> Array:
-    """(P,) [1/m], the greater of two neighbouring pieces' turn over their length."""
-    if len(way) < 3:
-        return np.zeros(len(way))
-    span = np.diff(way, axis=0)
-    heading = np.unwrap(np.arctan2(span[:, 1], span[:, 0]))
-    bend = np.abs(np.diff(heading)) / np.maximum(0.5 * (arc[2:] - arc[:-2]), 1e-6)
-    return np.concatenate([[0.0], bend, [0.0]])

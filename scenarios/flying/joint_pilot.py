@@ -7,7 +7,7 @@ from unifg.scenarios.flying.estimator import Estimator, EstimatorSettings
 from unifg.scenarios.flying.joint import JointController, JointSettings
 from unifg.scenarios.flying.pilot import Pilot
 from unifg.scenarios.flying.plan import ControllerSettings, Plan
-from unifg.scenarios.worlds.bearing_range import Reading
+from unifg.scenarios.seeing.readings import Reading
 from unifg.scenarios.worlds.layouts import Layout
 from unifg.typing import Array
 

@@ -8,8 +8,8 @@ from unifg.scenarios.flying.controller import Controller
 from unifg.scenarios.flying.estimator import Estimator
 from unifg.scenarios.flying.plan import Plan
 from unifg.scenarios.seeing.belief import Belief
-from unifg.scenarios.seeing.mover_tracks import Tracker
-from unifg.scenarios.worlds.bearing_range import Reading
+from unifg.scenarios.seeing.line_tracker import LineTracker
+from unifg.scenarios.seeing.readings import Reading
 from unifg.typing import Array
 
 __all__ = ["Pilot"]
@@ -30,7 +30,7 @@ class Pilot:
     def __init__(self, estimator: Estimator, controller: Controller) -> None:
         """Join two graphs that stand for themselves."""
         self.estimator, self.controller = estimator, controller
-        self.tracker = Tracker(association=estimator.settings.association)
+        self.tracker = LineTracker(association=estimator.settings.association)
         self.belief: Belief = estimator.belief()
         self.estimate_ms = self.plan_ms = 0.0
 

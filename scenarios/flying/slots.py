@@ -13,8 +13,8 @@ import numpy as np
 from unifg.scenarios.flying.braking import DELAY, stopping_path
 from unifg.scenarios.flying.plan import ControllerSettings
 from unifg.scenarios.seeing.belief import Landmarks
-from unifg.scenarios.seeing.mover_tracks import Movers
-from unifg.scenarios.ways.passage import segment_distance
+from unifg.scenarios.seeing.tracks import Tracks
+from unifg.scenarios.ways.polyline import segment_distance
 from unifg.typing import Array, BoolArray, IntArray
 
 FAR_AWAY = 1e3  # [m]; where an unused slot waits
@@ -52,7 +52,7 @@ class Slots:
         self._walls = walls
         self._names = np.full(settings.cylinders, -1, dtype=np.intp)
 
-    def fill(self, state: Array, positions: Array, landmarks: Landmarks, movers: Movers) -> Obstacles:
+    def fill(self, state: Array, positions: Array, landmarks: Landmarks, movers: Tracks) -> Obstacles:
         """Fill the slots for a vehicle in a state (10,) that is to go along positions (N + 1, 3) [m]."""
         s = self._settings
         n, m = s.horizon, s.cylinders + s.movers
@@ -66,10 +66,10 @@ class Slots:
         spread = np.sqrt(np.linalg.eigvalsh(known.covariances[chosen])[:, -1]) if len(chosen) else np.zeros(0)
         wider[:, used] = np.minimum(s.sigmas * spread, s.margin_limit)
         times = s.dt * np.arange(1.0, n + 1)
-        near = np.argsort(np.hypot(*(movers.centres - state[:2]).T) - movers.radii, kind="stable")[: s.movers]
+        near = np.argsort(np.hypot(*(movers.centre - state[:2]).T) - movers.radius, kind="stable")[: s.movers]
         places = s.cylinders + np.arange(len(near))
-        centres[:, places] = movers.centres[near] + times[:, None, None] * _towards(movers, state)[near]
-        radii[places] = movers.radii[near]
+        centres[:, places] = movers.centre[near] + times[:, None, None] * movers.expected_velocity(state[:2])[near]
+        radii[places] = movers.radius[near]
         wider[:, places] = s.mover_margin + s.mover_growth * times[:, None]
         # What is near already, or cannot be avoided in the next moment, is not forbidden until there was time to dodge.
         stopping = stopping_path(state[:3], state[7:10], times)
@@ -94,12 +94,3 @@ class Slots:
             rows[int(np.argmin(rows))] = row
         self._names = np.where(rows >= 0, known.ids[rows] if len(known) else -1, -1)
         return rows
-
-
-def _towards(movers: Movers, state: Array) -> Array:
-    """(K, 2) velocities without what leads away from the vehicle, for a mover may turn round [m/s]."""
-    line = state[:2] - movers.centres
-    line /= np.maximum(np.hypot(*line.T), 1e-9)[:, None]
-    leaving = np.minimum((movers.velocities * line).sum(axis=1), 0.0)
-    trusted: Array = movers.velocities - leaving[:, None] * line
-    return trusted

@@ -18,7 +18,7 @@ import numpy as np
 from unifg.errors import ScenarioError
 from unifg.lie import wrap_angle
 from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.ways.path import path_length
+from unifg.scenarios.ways.polyline import path_length
 from unifg.typing import Array, IntArray
 
 __all__ = [

@@ -12,8 +12,9 @@ from unifg.typing import Array
 if TYPE_CHECKING:
     from unifg.scenarios.driving.controller import Plan
     from unifg.scenarios.driving.pilot import Pilot
+    from unifg.scenarios.seeing.readings import Scan
     from unifg.scenarios.seeing.tracks import Tracks
-    from unifg.scenarios.worlds.plane import Scan, World
+from unifg.scenarios.worlds.plane import World
 
 
 class Recording:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.lie import wrap_angle
+from unifg.lie import SO3, wrap_angle
 from unifg.models import landmarks
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -85,3 +85,11 @@ def nearest(seen: Array, forecast: Array, innovation: Array, possible: BoolArray
             return found
         found[m] = k
         distance[m], distance[:, k] = np.inf, np.inf
+
+
+def places(state: Array, bearings: Array, ranges: Array) -> Array:
+    """(K, 2) where sightings (K,) from a state (10,) put what was seen [m]."""
+    forward = SO3.matrix(state[None, 3:7])[0, :, 0]
+    angles = np.arctan2(forward[1], forward[0]) + bearings
+    found: Array = state[:2] + ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+    return found

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from unifg.models import quadrotor
+from unifg.scenarios.seeing.rows import Rows
 from unifg.typing import Array, IntArray
 
 
 @dataclass(frozen=True)
-class Landmarks:
+class Landmarks(Rows):
     """Cylinders and walls' corners as far as they have been seen; one row each, in the order of first sight.
 
     Attributes:
@@ -37,17 +38,10 @@ class Landmarks:
         empty = np.zeros(0, dtype=np.intp)
         return Landmarks(empty, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), empty)
 
-    def __len__(self) -> int:
-        """How many."""
-        return len(self.ids)
-
     @property
     def cylinders(self) -> Landmarks:
         """Those with a body to keep clear of."""
-        which = self.kinds == Landmarks.CYLINDER
-        return Landmarks(
-            self.ids[which], self.positions[which], self.covariances[which], self.radii[which], self.kinds[which]
-        )
+        return self.at(self.kinds == Landmarks.CYLINDER)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.worlds.plane import Scan
+from unifg.scenarios.seeing.readings import Scan
+from unifg.scenarios.seeing.rows import Rows
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 __all__ = ["DiscFinder", "Discs"]
@@ -24,7 +25,7 @@ _BEHIND = 0.15  # [m]; a neighbouring beam this much longer shows that the clust
 
 
 @dataclass(frozen=True)
-class Discs:
+class Discs(Rows):
     """Discs seen in one scan.
 
     Attributes:
@@ -38,6 +39,11 @@ class Discs:
     radius: Array
     radius_sigma: Array
     distance: Array
+
+    @staticmethod
+    def none() -> Discs:
+        """Nothing has been seen."""
+        return Discs(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -94,7 +100,7 @@ class DiscFinder:
         unexplained[near] = self.distance_map.distance(world) > self.threshold + self.growth * ranges[near]
         clusters = self._cluster(scan, points, unexplained) if unexplained.any() else None
         if clusters is None:
-            return Discs(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0))
+            return Discs.none()
         centre, radius, radius_sigma = self._fit(clusters, 2.0 * np.pi / len(scan.angles))
         return Discs(centre @ rotation.T + (x, y), radius, radius_sigma, np.linalg.norm(centre, axis=1))
 

@@ -18,7 +18,7 @@ from scipy.sparse import csgraph
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.ways.path import PathFollower, headed, path_length, reference, resample
+from unifg.scenarios.ways.polyline import headed, resample
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 _log = logging.getLogger("unifg")
@@ -358,6 +358,3 @@ def _settle(clearance: _Clearance, points: Array, level: float) -> Array:
         move[[0, -1]] = 0.0
         points += (move / np.maximum(np.einsum("ij,ij->i", gradient, gradient), 0.25))[:, None] * gradient
     return points
-
-
-__all__ = ["SPACING", "PathFollower", "path_exists", "path_length", "plan", "reference"]

@@ -14,27 +14,10 @@ import itertools
 
 import numpy as np
 
+from unifg.scenarios.ways.polyline import segment_distance
 from unifg.typing import Array, ArrayLike
 
-__all__ = ["obstacle_distance", "segment_distance", "widest_way"]
-
-
-def segment_distance(points: Array, segments: Array) -> Array:
-    """Distances from points to segments.
-
-    Args:
-        points: (n, 2) [m].
-        segments: (W, 2, 2) end points [m].
-
-    Returns:
-        (n, W) [m].
-    """
-    begin, span = segments[:, 0], segments[:, 1] - segments[:, 0]
-    offset = points[:, None, :] - begin[None]
-    length_squared = np.maximum(np.sum(span**2, axis=1), 1e-300)
-    along = np.clip(np.sum(offset * span, axis=2) / length_squared, 0.0, 1.0)
-    distance: Array = np.linalg.norm(offset - along[:, :, None] * span, axis=2)
-    return distance
+__all__ = ["obstacle_distance", "widest_way"]
 
 
 def obstacle_distance(points: Array, cylinders: Array, walls: Array) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from unifg.scenarios.ways.passage import segment_distance
+from unifg.scenarios.ways.polyline import segment_distance
 from unifg.typing import Array, BoolArray
 
 DISC_CORNERS = 12

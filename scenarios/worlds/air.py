@@ -1,11 +1,11 @@
 """The simulated truth of a flight: a 3-D integrator for the vehicle, pymunk for what it can run into.
 
-The state is integrated by :func:`unifg.models.quadrotor.fly` in substeps of 5 ms with parameters and disturbances
-that the controller does not know. The vehicle's disc lives in a pymunk space with the cylinders, the walls and the
-movers. In each substep the disc is given the velocity that takes it where the integrator has gone, less the parts
-into things it touches already; where it does not arrive, the 3-D state takes the disc's position and loses the
-velocity into what holds it. The engine moves bodies before it looks for contacts, so without one the disc arrives to
-rounding, and a first contact overlaps by one substep's motion at most (1 cm at 2 m/s).
+The state is integrated by :func:`unifg.models.quadrotor.fly` in substeps with parameters and disturbances that the
+controller does not know. The vehicle's disc lives in a space with the cylinders, the walls and the movers. In each
+substep the disc is given the velocity that takes it where the integrator has gone, less the parts into things it
+touches already; where it does not arrive, the 3-D state takes the disc's position and loses the velocity into what
+holds it. Without a contact the disc arrives to rounding, and a first contact overlaps by one substep's motion at most
+(1 cm at 2 m/s).
 
 What the vehicle may know of this world is what `QuadrotorWorld.sense` returns; everything else is ground truth for
 metrics and pictures.
@@ -13,37 +13,29 @@ metrics and pictures.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pymunk
 
 from unifg.errors import ScenarioError
 from unifg.models import quadrotor
+from unifg.scenarios.seeing.readings import Reading
 from unifg.scenarios.ways.passage import obstacle_distance
-from unifg.scenarios.worlds.bearing_range import Reading, Sensor, SensorModel
+from unifg.scenarios.worlds.bearing_range import Sensor, SensorModel
 from unifg.scenarios.worlds.disturbance import DisturbanceModel, Disturbances
 from unifg.scenarios.worlds.layouts import Layout
-from unifg.scenarios.worlds.random_movers import random_movers
-from unifg.scenarios.worlds.unmapped import Mover, Obstacle
+from unifg.scenarios.worlds.placement import random_movers
+from unifg.scenarios.worlds.space import Obstacle, Space
 from unifg.typing import Array, ArrayLike
 
-__all__ = ["VEHICLE_RADIUS", "DisturbanceModel", "QuadrotorWorld", "Reading", "SensorModel"]
+__all__ = ["VEHICLE_RADIUS", "QuadrotorWorld"]
 
 VEHICLE_RADIUS = 0.25
 """Radius of the vehicle's disc on the ground plane [m]; it has no height, and its tilt is not looked at."""
 
-_SUBSTEP = 0.005  # [s]
-_EVENT_GAP = 0.5  # [s]; a contact renewed sooner belongs to the same event
 _ARRIVED = 1e-9  # [m]
 _WORLD_TAG = 53  # keeps the noise apart from the layouts of the same seed
-
-_VEHICLE_CATEGORY = 1
-_VEHICLE_TYPE = 1
-_THING_TYPE = 2
-_OTHERS = pymunk.ShapeFilter(mask=pymunk.ShapeFilter.ALL_MASKS() ^ _VEHICLE_CATEGORY)
 _FLOOR = -1  # owner of contacts with the floor; those of things are their ids, those of walls follow
 
 
@@ -58,7 +50,6 @@ class QuadrotorWorld:
         sensor_model: noise and reach of the sensors.
         disturbance_model: statistics of the disturbances.
         movers: what moves.
-        collisions: contact events so far, with the floor too; contacts with one thing less than 0.5 s apart are one.
     """
 
     def __init__(
@@ -96,22 +87,12 @@ class QuadrotorWorld:
         self._disturbances = Disturbances(self.disturbance_model, disturbance_rng)
         self._state = _start_state(layout, start)
         self._rates = np.zeros(3)
-        self._time = 0.0
-        self.collisions = 0
-        self._touching: dict[int, int] = {_FLOOR: int(self._state[2] <= 0.0)}  # a start on the ground is no collision
-        self._separated: dict[int, float] = {}
-
-        self._space = pymunk.Space()
-        self._space.collision_slop = 1e-4  # the engine's default lets shapes overlap by 0.1 m
-        self._space.collision_bias = 1e-6
-        self._owner: dict[pymunk.Shape, int] = {}
-        self._mover_bodies: list[Mover] = []
+        self._space = space = Space(self._state[:2], VEHICLE_RADIUS)
+        if self._state[2] <= 0.0:
+            space.begin(_FLOOR, counts=False)  # a start on the ground is no collision
         shapes = self._add_things()
-        self._body = self._add_vehicle()
-        self._space.on_collision(_VEHICLE_TYPE, _THING_TYPE, begin=self._on_begin, separate=self._on_separate)
-        self._sensor = Sensor(
-            self.sensor_model, self._space, shapes, len(shapes) - len(self.movers), _OTHERS, sensor_rng
-        )
+        space.add_vehicle()
+        self._sensor = Sensor(self.sensor_model, space.engine, shapes, len(shapes) - len(self.movers), sensor_rng)
         if self.clearance() < 0.0:
             x, y, z = self._state[:3]
             raise ScenarioError(
@@ -121,37 +102,18 @@ class QuadrotorWorld:
 
     def _add_things(self) -> list[pymunk.Shape | None]:
         """Shapes by id, None for corners; walls are added too, their ends are what is named."""
-        static = self._space.static_body
+        space, layout = self._space, self.layout
+        static = space.engine.static_body
         shapes: list[pymunk.Shape | None] = []
-        for x, y, radius in self.layout.cylinders.tolist():
-            shapes.append(self._add_shape(pymunk.Circle(static, radius, (x, y)), len(shapes)))
-        shapes += [None] * len(self.layout.corners)
+        for x, y, radius in layout.cylinders.tolist():
+            shapes.append(space.add(pymunk.Circle(static, radius, (x, y)), len(shapes)))
+        shapes += [None] * len(layout.corners)
         for obstacle in self.movers:
-            end = obstacle.centre if obstacle.end is None else obstacle.end
-            mover = Mover(obstacle, end)
-            self._mover_bodies.append(mover)
-            self._space.add(mover.body)
-            shapes.append(self._add_shape(pymunk.Circle(mover.body, obstacle.radius), len(shapes)))
-        for index, (begin, end) in enumerate(self.layout.walls.tolist()):
+            shapes.append(space.add_disc(obstacle, len(shapes)))
+        for index, (begin, end) in enumerate(layout.walls.tolist()):
             wall = pymunk.Segment(static, (begin[0], begin[1]), (end[0], end[1]), 0.0)
-            self._add_shape(wall, len(shapes) + index)
+            space.add(wall, len(shapes) + index)
         return shapes
-
-    def _add_shape(self, shape: pymunk.Shape, owner: int) -> pymunk.Shape:
-        shape.collision_type = _THING_TYPE
-        shape.filter = pymunk.ShapeFilter(categories=pymunk.ShapeFilter.ALL_MASKS() ^ _VEHICLE_CATEGORY)
-        self._space.add(shape)
-        self._owner[shape] = owner
-        return shape
-
-    def _add_vehicle(self) -> pymunk.Body:
-        body = pymunk.Body(mass=1.0, moment=float("inf"))
-        body.position = (float(self._state[0]), float(self._state[1]))
-        shape = pymunk.Circle(body, VEHICLE_RADIUS)
-        shape.collision_type = _VEHICLE_TYPE
-        shape.filter = pymunk.ShapeFilter(categories=_VEHICLE_CATEGORY)
-        self._space.add(body, shape)
-        return body
 
     # ------------------------------------------------------------------ motion
 
@@ -171,85 +133,41 @@ class QuadrotorWorld:
                 f"a control is four finite numbers, body rates and thrust; got {control!r}. Fly a stored plan or hover "
                 "rather than a plan that failed"
             )
-        if not (math.isfinite(dt) and dt > 0.0):
-            raise ScenarioError(f"the duration of a step must be positive and finite, got {dt}")
-        substeps = max(1, math.ceil(dt / _SUBSTEP - 1e-9))
-        pause, start_time = dt / substeps, self._time
-        rates = np.zeros(3)
-        for count in range(substeps):
+        rates, pauses = np.zeros(3), 0
+        for pause in self._space.substeps(dt):
             noise = self._disturbances.draw(pause)
             rates += u[:3] + noise[:3]
             flown = quadrotor.fly(self._state, u, pause, self.parameters, noise, substeps=1)
-            self._time = start_time + (count + 1) * pause
             self._state = self._land(self._collide(flown, pause))
-        self._rates = rates / substeps
+            pauses += 1
+        self._rates = rates / pauses
 
     def _collide(self, flown: Array, pause: float) -> Array:
         """Let the disc follow the integrator as far as it can; the state (10,) that is left."""
-        body = self._body
+        space, body = self._space, self._space.vehicle
         wanted = pymunk.Vec2d(float(flown[0]), float(flown[1]))
-        body.velocity = self._without_contacts((wanted - body.position) / pause)
-        for mover in self._mover_bodies:
-            mover.advance(body, VEHICLE_RADIUS, False, pause)  # waits for nobody: its path is the same in every flight
-        self._space.step(pause)
+        body.velocity = space.without_contacts((wanted - body.position) / pause)
+        space.step(pause)  # movers wait for nobody: their path is the same in every flight
         if body.position.get_distance(wanted) > _ARRIVED:
             flown[:2] = body.position
-        flown[7:9] = self._without_contacts(pymunk.Vec2d(float(flown[7]), float(flown[8])))
+        flown[7:9] = space.without_contacts(pymunk.Vec2d(float(flown[7]), float(flown[8])))
         return flown
-
-    def _without_contacts(self, velocity: pymunk.Vec2d) -> pymunk.Vec2d:
-        """A velocity without its parts into things touched, relative to their own motion."""
-        contacts: list[tuple[pymunk.Vec2d, float]] = []
-
-        def note(arbiter: pymunk.Arbiter) -> None:
-            first, second = arbiter.shapes
-            normal, thing = arbiter.contact_point_set.normal, second
-            if first in self._owner:
-                normal, thing = -normal, first
-            assert thing.body is not None
-            contacts.append((normal, thing.body.velocity.dot(normal)))
-
-        self._body.each_arbiter(note)
-        for _ in range(2 if contacts else 0):  # twice, for two things that are not square to one another
-            for normal, allowed in contacts:
-                velocity -= max(velocity.dot(normal) - allowed, 0.0) * normal
-        return velocity
 
     def _land(self, state: Array) -> Array:
         """Keep a state (10,) above the floor."""
         if state[2] <= 0.0:
-            self._begin(_FLOOR)
+            if not self._space.touches(_FLOOR):
+                self._space.begin(_FLOOR)
             state[2], state[9] = 0.0, max(state[9], 0.0)
-        elif self._touching[_FLOOR]:
-            self._separate(_FLOOR)
+        elif self._space.touches(_FLOOR):
+            self._space.separate(_FLOOR)
         return state
-
-    # ---------------------------------------------------------------- contacts
-
-    def _on_begin(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
-        self._begin(self._thing(arbiter))
-
-    def _on_separate(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
-        self._separate(self._thing(arbiter))
-
-    def _thing(self, arbiter: pymunk.Arbiter) -> int:
-        first, second = arbiter.shapes
-        return self._owner[first] if first in self._owner else self._owner[second]
-
-    def _begin(self, owner: int) -> None:
-        if not self._touching.get(owner, 0) and self._time - self._separated.get(owner, -math.inf) >= _EVENT_GAP:
-            self.collisions += 1
-        self._touching[owner] = 1
-
-    def _separate(self, owner: int) -> None:
-        self._touching[owner] = 0
-        self._separated[owner] = self._time
 
     # ----------------------------------------------------------------- sensors
 
     def sense(self) -> Reading:
         """Measure once at the present state; every call draws new noise."""
-        return self._sensor.read(self._time, self._state, self.things(), self._rates)
+        return self._sensor.read(self.time, self._state, self.things(), self._rates)
 
     # ------------------------------------------------------------ ground truth
 
@@ -261,12 +179,16 @@ class QuadrotorWorld:
     @property
     def time(self) -> float:
         """Time since the start [s]."""
-        return self._time
+        return self._space.time
+
+    @property
+    def collisions(self) -> int:
+        """Contact events so far, with the floor too."""
+        return self._space.collisions
 
     def mover_states(self) -> Array:
         """(K, 3) x, y, radius of the movers now [m]."""
-        rows = [(*mover.body.position, mover.radius) for mover in self._mover_bodies]
-        return np.array(rows, dtype=np.float64).reshape(-1, 3)
+        return self._space.discs()[:, :3]
 
     def things(self) -> Array:
         """(n, 3) x, y, radius of everything that can be seen, by id, as it stands now [m]; corners have radius 0."""

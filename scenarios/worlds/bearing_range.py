@@ -11,9 +11,11 @@ import pymunk
 
 from unifg.lie import SO3
 from unifg.scenarios.seeing.belief import Landmarks
-from unifg.typing import Array, BoolArray, IntArray
+from unifg.scenarios.seeing.readings import Reading
+from unifg.scenarios.worlds.space import OTHERS
+from unifg.typing import Array
 
-__all__ = ["Reading", "Sensor", "SensorModel"]
+__all__ = ["Sensor", "SensorModel"]
 
 _FLANK = 0.9  # of the angle between a cylinder's axis and its silhouette
 _CORNER_GAP = 0.01  # a ray to a corner ends this much before it, for it would hit the corner's own wall [m]
@@ -47,35 +49,6 @@ class SensorModel:
         return SensorModel(range_max, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class Reading:
-    """Everything measured at one instant; K things are seen, in the order of their ids.
-
-    Attributes:
-        time: [s].
-        ids: (K,) true names: cylinders first, then corners, then movers. For known association only.
-        bearings: (K,) in the ground plane from the heading (of R e1) to the axis or corner, in [-pi, pi) [rad].
-        ranges: (K,) in the ground plane to the axis or corner [m].
-        radii: (K,) of the cylinders [m]; 0 for corners.
-        kinds: (K,) ``Landmarks.CYLINDER`` or ``Landmarks.CORNER``.
-        moving: (K,) True for what moves by design.
-        height: above the floor [m].
-        tilt: (3,) R' e3, the world's vertical in the body; not normalised.
-        rates: (3,) mean body rates over the last step [rad/s]; of a vehicle at rest before the first.
-    """
-
-    time: float
-    ids: IntArray
-    bearings: Array
-    ranges: Array
-    radii: Array
-    kinds: IntArray
-    moving: BoolArray
-    height: float
-    tilt: Array
-    rates: Array
-
-
 class Sensor:
     """Sensors with a stream of noise each.
 
@@ -89,7 +62,6 @@ class Sensor:
         space: pymunk.Space,
         shapes: Sequence[pymunk.Shape | None],
         standing: int,
-        others: pymunk.ShapeFilter,
         rng: np.random.Generator,
     ) -> None:
         """Look around in a space.
@@ -99,11 +71,10 @@ class Sensor:
             space: where the rays go.
             shapes: shape of each thing by id; None for a corner.
             standing: number of things that do not move; the rest do.
-            others: filter that lets rays pass the vehicle.
             rng: its children are spawned, itself it is not advanced.
         """
         self.model = model
-        self._space, self._shapes, self._others = space, tuple(shapes), others
+        self._space, self._shapes = space, tuple(shapes)
         self._standing, self._moving = standing, len(shapes) - standing
         self._kinds = np.array(
             [Landmarks.CORNER if shape is None else Landmarks.CYLINDER for shape in shapes], dtype=np.intp
@@ -167,14 +138,14 @@ class Sensor:
                 return True
             keep = 1.0 - _CORNER_GAP / distance
             tip = (origin[0] + keep * dx, origin[1] + keep * dy)
-            return self._space.segment_query_first(origin, tip, 0.0, self._others) is None
+            return self._space.segment_query_first(origin, tip, 0.0, OTHERS) is None
         if distance <= radius:
             return True
         flank = _FLANK * math.asin(radius / distance)
         for angle in (0.0, flank, -flank):
             c, s = math.cos(angle), math.sin(angle)
             tip = (origin[0] + c * dx - s * dy, origin[1] + s * dx + c * dy)
-            hit = self._space.segment_query_first(origin, tip, 0.0, self._others)
+            hit = self._space.segment_query_first(origin, tip, 0.0, OTHERS)
             if hit is not None and hit.shape is shape:
                 return True
         return False

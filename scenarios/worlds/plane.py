@@ -1,13 +1,12 @@
-"""The simulated truth: a disc robot, walls and unforeseen obstacles in pymunk, a lidar and wheel odometry.
+"""The simulated truth of a drive: a disc robot, walls and unforeseen obstacles, a lidar and wheel odometry.
 
 The world is built from an occupancy map and from obstacles that the map does not show. What the robot may
 know of it is what `World.scan` and `World.odometry` return; everything else (`World.pose`, `World.clearance`,
 ...) is ground truth for metrics and pictures.
 
-Two habits of the engine shape this file. A velocity written before ``space.step`` is integrated before
-contacts are solved, so a robot driven that way passes through walls: the command is written in
-``velocity_func`` instead, and at the start of a tick only without its parts into walls already touched. And
-contacts count only once shapes overlap, so a tick is cut into substeps of 5 ms.
+A velocity written before the engine's step is integrated before contacts are solved, so a robot driven that way passes
+through walls: the command is written in ``velocity_func`` instead, and at the start of a tick only without its parts
+into walls already touched.
 """
 
 from __future__ import annotations
@@ -15,55 +14,25 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pymunk
 
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
+from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.worlds.rectangles import wall_rectangles
-from unifg.scenarios.worlds.unmapped import Mover, Obstacle
-from unifg.typing import Array, ArrayLike, BoolArray
+from unifg.scenarios.worlds.space import OTHERS, Obstacle, Space
+from unifg.typing import Array, ArrayLike
 
-__all__ = ["ROBOT_RADIUS", "LidarModel", "Obstacle", "OdometryModel", "Scan", "World"]
+__all__ = ["ROBOT_RADIUS", "LidarModel", "OdometryModel", "World"]
 
 ROBOT_RADIUS = 0.17
 """Radius of the robot's disc [m]."""
 
-_SUBSTEP = 0.005  # [s]; at 1 m/s a first contact overlaps by at most 5 mm
-_EVENT_GAP = 0.5  # [s]; a contact renewed sooner belongs to the same event
 _REST_SPEED = 0.02  # [m/s]; below it the robot counts as being at rest
 
-_ROBOT_CATEGORY = 1
-_ROBOT_TYPE = 1
-_THING_TYPE = 2  # walls and obstacles
-_OTHERS = pymunk.ShapeFilter(mask=pymunk.ShapeFilter.ALL_MASKS() ^ _ROBOT_CATEGORY)
-
-
-@dataclass(frozen=True)
-class Scan:
-    """One turn of the lidar, taken at one instant.
-
-    Attributes:
-        angles: (B,) beam directions in the body frame [rad].
-        ranges: (B,) measured ranges [m]; NaN is a dropout, +inf means nothing within the lidar's range.
-    """
-
-    angles: Array
-    ranges: Array
-
-    @property
-    def valid(self) -> BoolArray:
-        """(B,) True for beams that came back."""
-        returned: BoolArray = np.isfinite(self.ranges)
-        return returned
-
-    def endpoints(self) -> Array:
-        """(n, 2) body-frame points [m] of the n beams that came back, in beam order."""
-        keep = self.valid
-        angles, ranges = self.angles[keep], self.ranges[keep]
-        return np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=1)
+_WALLS = -1  # owner of all walls together; obstacles are owned by their index
 
 
 @dataclass(frozen=True)
@@ -143,20 +112,13 @@ class World:
         self._measured = np.zeros(2)
         self._angles = -np.pi + 2.0 * np.pi * np.arange(self.lidar.beams) / self.lidar.beams
         self._command = (0.0, 0.0)
-        self._time = 0.0
-        self.collisions = 0
-        self._touching: dict[int, int] = {}
-        self._separated: dict[int, float] = {}
-
-        self._space = pymunk.Space()
-        self._space.collision_slop = 1e-4  # the engine's default lets shapes overlap by 0.1 m
-        self._space.collision_bias = 1e-6
-        self._owner: dict[pymunk.Shape, int] = {}  # obstacle index; all walls together are -1
-        self._movers: dict[int, Mover] = {}
+        self._space = Space(pose, robot_radius)
         self._add_walls()
-        self._add_obstacles()
-        self._robot, self._robot_shape = self._add_robot(pose)
-        self._space.on_collision(_ROBOT_TYPE, _THING_TYPE, begin=self._on_begin, separate=self._on_separate)
+        for index, obstacle in enumerate(self.obstacles):
+            self._space.add_disc(obstacle, index)
+        self._robot = self._space.vehicle
+        self._robot.velocity_func = self._drive
+        self._space.add_vehicle()
         if self.clearance() < 0.0:
             raise ScenarioError(
                 f"the robot (radius {robot_radius:g} m) cannot start at ({pose[0]:g}, {pose[1]:g}): "
@@ -178,36 +140,7 @@ class World:
         )
         world_corners = self.occupancy.grid_to_world(corners.reshape(-1, 2)).reshape(-1, 4, 2)
         for polygon in world_corners.tolist():
-            shape = pymunk.Poly(self._space.static_body, [(x, y) for x, y in polygon])
-            self._add_thing(shape, -1)
-
-    def _add_obstacles(self) -> None:
-        for index, obstacle in enumerate(self.obstacles):
-            if obstacle.end is not None and obstacle.moving:
-                mover = Mover(obstacle, obstacle.end)
-                self._movers[index] = mover
-                self._space.add(mover.body)
-                self._add_thing(pymunk.Circle(mover.body, obstacle.radius), index)
-            else:
-                offset = (float(obstacle.centre[0]), float(obstacle.centre[1]))
-                self._add_thing(pymunk.Circle(self._space.static_body, obstacle.radius, offset), index)
-
-    def _add_thing(self, shape: pymunk.Shape, owner: int) -> None:
-        shape.collision_type = _THING_TYPE
-        shape.filter = pymunk.ShapeFilter(categories=pymunk.ShapeFilter.ALL_MASKS() ^ _ROBOT_CATEGORY)
-        self._space.add(shape)
-        self._owner[shape] = owner
-
-    def _add_robot(self, pose: Array) -> tuple[pymunk.Body, pymunk.Circle]:
-        body = pymunk.Body(mass=1.0, moment=float("inf"))  # a wall stops the robot, it does not turn it
-        body.position = (float(pose[0]), float(pose[1]))
-        body.angle = float(pose[2])
-        body.velocity_func = self._drive
-        shape = pymunk.Circle(body, self.robot_radius)
-        shape.collision_type = _ROBOT_TYPE
-        shape.filter = pymunk.ShapeFilter(categories=_ROBOT_CATEGORY)
-        self._space.add(body, shape)
-        return body, shape
+            self._space.add(pymunk.Poly(self._space.engine.static_body, [(x, y) for x, y in polygon]), _WALLS)
 
     # ------------------------------------------------------------------ motion
 
@@ -226,20 +159,12 @@ class World:
             raise ScenarioError(
                 f"the control (v, omega) = ({v}, {omega}) is not finite; stop the robot, do not drive on it"
             )
-        if not (math.isfinite(dt) and dt > 0.0):
-            raise ScenarioError(f"the duration of a step must be positive and finite, got {dt}")
         self._command = (float(v), float(omega))
-        substeps = max(1, math.ceil(dt / _SUBSTEP - 1e-9))
-        pause = dt / substeps
         before, heading_before = self._robot.position, self._robot.angle
-        self._start_tick(pause)
-        start_time = self._time
-        for count in range(substeps):
-            resting = self._robot.velocity.length < _REST_SPEED
-            for mover in self._movers.values():
-                mover.advance(self._robot, self.robot_radius, resting, pause)
-            self._time = start_time + (count + 1) * pause
-            self._space.step(pause)
+        for count, pause in enumerate(self._space.substeps(dt)):
+            if not count:
+                self._start_tick(pause)
+            self._space.step(pause, resting=self._robot.velocity.length < _REST_SPEED)
         self._measure(before, heading_before, dt)
 
     def _drive(self, body: pymunk.Body, gravity: tuple[float, float], damping: float, dt: float) -> None:
@@ -256,18 +181,7 @@ class World:
         tick would still run on the last tick's command.
         """
         self._drive(self._robot, (0.0, 0.0), 1.0, pause)
-        normals: list[pymunk.Vec2d] = []
-
-        def note(arbiter: pymunk.Arbiter) -> None:
-            normal = arbiter.contact_point_set.normal
-            normals.append(normal if arbiter.shapes[0] is self._robot_shape else -normal)
-
-        self._robot.each_arbiter(note)
-        velocity = self._robot.velocity
-        for _ in range(2):  # twice, for a corner whose walls are not square
-            for normal in normals:
-                velocity -= max(velocity.dot(normal), 0.0) * normal
-        self._robot.velocity = velocity
+        self._robot.velocity = self._space.without_contacts(self._robot.velocity, relative=False)
 
     def _measure(self, before: pymunk.Vec2d, heading_before: float, dt: float) -> None:
         """Read the wheels: forward and turning part of the SE(2) logarithm of the motion really made."""
@@ -279,24 +193,6 @@ class World:
         noise = self._odometry_model.noise_sigma * self._odometry_rng.standard_normal(2)
         self._measured = np.array([forward, turn]) / dt * (self._scale + noise)
 
-    # ---------------------------------------------------------------- contacts
-
-    def _on_begin(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
-        owner = self._thing(arbiter)
-        touching = self._touching.get(owner, 0)
-        self._touching[owner] = touching + 1
-        if touching == 0 and self._time - self._separated.get(owner, -math.inf) >= _EVENT_GAP:
-            self.collisions += 1
-
-    def _on_separate(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
-        owner = self._thing(arbiter)
-        self._touching[owner] = self._touching.get(owner, 1) - 1
-        self._separated[owner] = self._time
-
-    def _thing(self, arbiter: pymunk.Arbiter) -> int:
-        first, second = arbiter.shapes
-        return self._owner.get(first, self._owner.get(second, -1))
-
     # ----------------------------------------------------------------- sensors
 
     def scan(self) -> Scan:
@@ -305,8 +201,8 @@ class World:
         x, y = self._robot.position
         bearing = self._robot.angle + self._angles
         tips = np.stack([x + lidar.range_max * np.cos(bearing), y + lidar.range_max * np.sin(bearing)], axis=1)
-        query, origin = self._space.segment_query_first, (x, y)
-        hits = [query(origin, (tip[0], tip[1]), 0.0, _OTHERS) for tip in tips.tolist()]
+        query, origin = self._space.engine.segment_query_first, (x, y)
+        hits = [query(origin, (tip[0], tip[1]), 0.0, OTHERS) for tip in tips.tolist()]
         fraction = np.array([math.inf if hit is None else hit.alpha for hit in hits])
         noise = lidar.sigma * self._lidar_rng.standard_normal(lidar.beams)
         lost = self._lidar_rng.random(lidar.beams) < lidar.dropout
@@ -335,13 +231,18 @@ class World:
     @property
     def time(self) -> float:
         """Time since the start [s]."""
-        return self._time
+        return self._space.time
+
+    @property
+    def collisions(self) -> int:
+        """Contact events so far."""
+        return self._space.collisions
 
     def clearance(self) -> float:
         """Distance from the robot's hull to the nearest wall or obstacle [m]; negative when they overlap."""
         reach, (x, y) = 2.0, self._robot.position
         while reach < 1000.0:  # the engine tests every shape in reach, so begin near
-            nearest = self._space.point_query_nearest((x, y), reach, _OTHERS)
+            nearest = self._space.engine.point_query_nearest((x, y), reach, OTHERS)
             if nearest is not None:
                 return float(nearest.distance) - self.robot_radius
             reach *= 4.0
@@ -349,9 +250,4 @@ class World:
 
     def obstacle_states(self) -> Array:
         """(K, 4) x, y, radius [m] of the obstacles now, and 1 for those that move by design, else 0."""
-        states = np.zeros((len(self.obstacles), 4))
-        for index, obstacle in enumerate(self.obstacles):
-            mover = self._movers.get(index)
-            centre = obstacle.centre if mover is None else mover.body.position
-            states[index] = centre[0], centre[1], obstacle.radius, mover is not None
-        return states
+        return self._space.discs()

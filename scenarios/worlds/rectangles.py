@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.typing import Array, BoolArray, IntArray
+from unifg.typing import BoolArray, IntArray
 
-__all__ = ["polyline_distance", "surface_cells", "wall_rectangles"]
+__all__ = ["surface_cells", "wall_rectangles"]
 
 
 def surface_cells(occupied: BoolArray) -> BoolArray:
@@ -77,22 +77,3 @@ def _solid_run(line: BoolArray, start: int) -> tuple[int, int]:
     high = start + int(after[0]) if after.size else line.size
     low = int(before[-1]) + 1 if before.size else 0
     return low, high
-
-
-def polyline_distance(points: Array, path: Array) -> Array:
-    """Distance from points to a polyline.
-
-    Args:
-        points: (n, 2) [m].
-        path: (P, 2) or (P, 3) vertices; only x and y count [m]. One vertex is a point.
-
-    Returns:
-        (n,) distance to the nearest point of the polyline [m].
-    """
-    begin = path[:, :2] if len(path) == 1 else path[:-1, :2]
-    span = np.zeros_like(begin) if len(path) == 1 else path[1:, :2] - begin
-    length_squared = np.maximum(np.sum(span**2, axis=1), 1e-18)
-    offset = points[:, None, :] - begin[None]
-    along = np.clip(np.sum(offset * span, axis=2) / length_squared, 0.0, 1.0)
-    distance: Array = np.linalg.norm(offset - along[:, :, None] * span, axis=2).min(axis=1)
-    return distance

@@ -6,35 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from unifg.lie import SO3
-from unifg.scenarios.worlds.bearing_range import Reading
+from unifg.scenarios.seeing.association import places
+from unifg.scenarios.seeing.readings import Reading
+from unifg.scenarios.seeing.tracks import Tracks
 from unifg.typing import Array
 
-__all__ = ["Movers", "Tracker", "TrackerSettings"]
-
-
-@dataclass(frozen=True)
-class Movers:
-    """Moving discs, as far as they are known.
-
-    Attributes:
-        centres: (K, 2) [m].
-        velocities: (K, 2) [m/s].
-        radii: (K,) [m].
-    """
-
-    centres: Array
-    velocities: Array
-    radii: Array
-
-    @staticmethod
-    def none() -> Movers:
-        """Nothing moves."""
-        return Movers(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
-
-    def __len__(self) -> int:
-        """How many move."""
-        return len(self.radii)
+__all__ = ["LineTracker", "TrackerSettings"]
 
 
 @dataclass(frozen=True)
@@ -71,7 +48,7 @@ class _Track:
         return expected
 
 
-class Tracker:
+class LineTracker:
     """Tracks of what the sensor flags as moving, in the frame of the belief."""
 
     def __init__(self, settings: TrackerSettings | None = None, association: str = "known") -> None:
@@ -81,13 +58,13 @@ class Tracker:
         self._tracks: list[_Track] = []
         self._count = 0
 
-    def update(self, reading: Reading, state: Array) -> Movers:
+    def update(self, reading: Reading, state: Array) -> Tracks:
         """Take in a reading made at the believed state (10,); where the discs are now and how they move."""
         s, now = self.settings, reading.time
         rows = np.flatnonzero(reading.moving)
-        places = _places(reading.bearings[rows], reading.ranges[rows], state)
+        seen = places(state, reading.bearings[rows], reading.ranges[rows])
         free = list(self._tracks)
-        for row, place in zip(rows.tolist(), places, strict=True):
+        for row, place in zip(rows.tolist(), seen, strict=True):
             track = self._match(int(reading.ids[row]), place, now, free)
             track.times.append(now)
             track.places.append(place)
@@ -95,11 +72,14 @@ class Tracker:
             self._fit(track, now)
         self._tracks = [track for track in self._tracks if now - track.times[-1] <= s.patience]
         if not self._tracks:
-            return Movers.none()
-        return Movers(
-            np.array([track.at(now) for track in self._tracks]),
-            np.array([track.line[1] for track in self._tracks]),
-            np.array([np.mean(track.radii) for track in self._tracks]),
+            return Tracks.none()
+        return Tracks(
+            centre=np.array([track.at(now) for track in self._tracks]),
+            velocity=np.array([track.line[1] for track in self._tracks]),
+            radius=np.array([np.mean(track.radii) for track in self._tracks]),
+            identity=np.array([track.name for track in self._tracks], dtype=np.intp),
+            unseen=np.array([now - track.times[-1] for track in self._tracks]),
+            mover=np.ones(len(self._tracks), dtype=bool),
         )
 
     def _match(self, name: int, place: Array, now: float, free: list[_Track]) -> _Track:
@@ -130,11 +110,3 @@ class Tracker:
         velocity = away @ (places - mean) / (away @ away)
         velocity *= min(1.0, s.speed_limit / max(float(np.hypot(*velocity)), 1e-9))
         track.line = mean + (now - middle) * velocity, velocity, now
-
-
-def _places(bearings: Array, ranges: Array, state: Array) -> Array:
-    """(K, 2) where sightings from a state (10,) put what was seen [m]."""
-    forward = SO3.matrix(state[None, 3:7])[0, :, 0]
-    angles = np.arctan2(forward[1], forward[0]) + bearings
-    places: Array = state[:2] + ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
-    return places

@@ -1,7 +1,8 @@
-"""Obstacles that the map does not show, placed where they matter: on and beside the planned path.
+"""Where discs that no map shows are: drawn by seed, on a building's map or in a corridor.
 
-They are drawn at random and redrawn until a disc of radius 0.25 m can still get from the start to every goal,
-so that an episode is hard but never impossible. Every third obstacle moves, along or across the path.
+In a building they matter: they stand on and beside the planned path. They are drawn at random and redrawn until a disc
+of radius 0.25 m can still get from the start to every goal, so that an episode is hard but never impossible. Every
+third obstacle moves, along or across the path. In a corridor all of them go to and fro where nothing else stands.
 """
 
 from __future__ import annotations
@@ -15,17 +16,20 @@ from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ways.grid import path_exists
-from unifg.scenarios.worlds.rectangles import polyline_distance
-from unifg.scenarios.worlds.unmapped import Obstacle
+from unifg.scenarios.ways.polyline import polyline_distance
+from unifg.scenarios.worlds.layouts import Layout
+from unifg.scenarios.worlds.space import Obstacle
 from unifg.typing import Array, ArrayLike
 
-__all__ = ["PlacementRules", "place_obstacles"]
+__all__ = ["PlacementRules", "place_obstacles", "random_movers"]
 
 _DRAWS = 300  # per obstacle, before everything is begun anew
 _RESTARTS = 4
 _SWEEP_STEP = 0.02  # [m]; spacing at which a sweep is held against the map
 _SHORTEST_SWEEP = 0.6  # [m]
 _JOINT_MOVERS = 4  # movers whose ends are tried in every combination
+_MOVER_FREE = 1.5  # of the whole path of a mover in a corridor around start and target [m]
+_MOVER_GAP = 0.1  # between its hull and what stands [m]
 _FRACTIONS = (0.25, 0.5, 0.75)  # places between the ends at which a way must remain as well
 
 
@@ -181,14 +185,14 @@ def _draw(site: _Site, moves: bool, rng: np.random.Generator) -> Obstacle | None
 
 def _keeps_distance(site: _Site, placed: list[Obstacle], obstacle: Obstacle) -> bool:
     """Whether the obstacle, all along its sweep, is far enough from start, goals and the other obstacles."""
-    sweep = _positions(obstacle, np.linspace(0.0, 1.0, 41))
+    sweep = obstacle.positions(np.linspace(0.0, 1.0, 41))
     rules = site.rules
     if np.linalg.norm(sweep - site.start, axis=1).min() < rules.start_distance:
         return False
     if np.linalg.norm(sweep[:, None] - site.goals[None], axis=2).min() < rules.goal_distance:
         return False
     ends = np.array([0.0, 1.0])
-    return all(polyline_distance(sweep, _positions(other, ends)).min() >= rules.spacing for other in placed)
+    return all(polyline_distance(sweep, other.positions(ends)).min() >= rules.spacing for other in placed)
 
 
 def _leaves_way(site: _Site, obstacles: list[Obstacle]) -> bool:
@@ -197,7 +201,7 @@ def _leaves_way(site: _Site, obstacles: list[Obstacle]) -> bool:
     movers = [o for o in obstacles if o.moving]
 
     def at(obstacle: Obstacle, fractions: Array) -> list[tuple[float, float, float]]:
-        return [(*place, obstacle.radius) for place in _positions(obstacle, fractions)]
+        return [(*place, obstacle.radius) for place in obstacle.positions(fractions)]
 
     # Discs everywhere along the sweeps at once: when that leaves a way, every single moment does.
     everywhere = np.linspace(0.0, 1.0, 9)
@@ -218,8 +222,46 @@ def _leaves_way(site: _Site, obstacles: list[Obstacle]) -> bool:
     )
 
 
-def _positions(obstacle: Obstacle, fractions: Array) -> Array:
-    """(n, 2) centres at fractions (n,) of the segment [m]; the same place for a fixed obstacle."""
-    end = obstacle.centre if obstacle.end is None else obstacle.end
-    positions: Array = obstacle.centre + fractions[:, None] * (end - obstacle.centre)
-    return positions
+def random_movers(layout: Layout, count: int, rng: np.random.Generator) -> tuple[Obstacle, ...]:
+    """Draw discs that move on straight segments between start and target.
+
+    Radii are uniform in 0.3 to 0.5 m, speeds in 0.3 to 0.8 m/s, lengths of the segments in 1.5 to 4 m; the middle of
+    a segment is uniform over the layout's ground between start and target, its direction uniform. A segment is drawn
+    again if on it the disc would come within 0.1 m of a cylinder or a wall, leave the ground, or come nearer than
+    1.5 m to start or target. Movers may cross each other.
+
+    Args:
+        layout: what stands.
+        count: number of movers.
+        rng: source of all numbers.
+
+    Raises:
+        ScenarioError: if ``count`` is negative or a thousand draws find no room for a mover.
+    """
+    if count < 0:
+        raise ScenarioError(f"the number of movers must not be negative, got {count}")
+    return tuple(_random_mover(layout, index, rng) for index in range(count))
+
+
+def _random_mover(layout: Layout, index: int, rng: np.random.Generator) -> Obstacle:
+    ends = np.stack([layout.start[:2], layout.target[:2]])
+    low, high = layout.size
+    left, right = np.sort(ends[:, 0])
+    for _ in range(1000):
+        radius, speed, length = rng.uniform(0.3, 0.5), rng.uniform(0.3, 0.8), rng.uniform(1.5, 4.0)
+        centre = np.array([rng.uniform(left, right), rng.uniform(low[1], high[1])])
+        angle = rng.uniform(0.0, 2.0 * np.pi)
+        half = 0.5 * length * np.array([np.cos(angle), np.sin(angle)])
+        path: Array = centre + np.linspace(-1.0, 1.0, 41)[:, None] * half
+        if (path < low + radius).any() or (path > high - radius).any():
+            continue
+        # Between samples, at most 0.1 m apart, the distance is at most 0.05 m smaller.
+        if layout.distance(path).min() < radius + _MOVER_GAP + 0.05:
+            continue
+        if np.linalg.norm(path[:, None, :] - ends[None], axis=2).min() < radius + _MOVER_FREE + 0.05:
+            continue
+        return Obstacle(centre=path[0], radius=float(radius), end=path[-1], speed=float(speed))
+    raise ScenarioError(
+        f"layout {layout.name!r} has no room for mover {index}: 1000 draws met a cylinder, a wall, start or target; "
+        "ask for fewer movers or place them yourself"
+    )

@@ -1,4 +1,4 @@
-"""Paths as rows of poses, and the moving reference that a controller follows along one."""
+"""The moving reference that a controller follows along a path of poses."""
 
 from __future__ import annotations
 
@@ -7,30 +7,8 @@ import math
 import numpy as np
 
 from unifg.errors import ScenarioError
+from unifg.scenarios.ways.polyline import arc_lengths, at_stations
 from unifg.typing import Array, ArrayLike
-
-
-def path_length(path: Array) -> float:
-    """Length [m] of the polyline through the positions of (P, 2) points or (P, 3) poses."""
-    return float(np.hypot(*np.diff(np.asarray(path, dtype=np.float64)[:, :2], axis=0).T).sum())
-
-
-def resample(points: Array, spacing: float) -> Array:
-    """Points (Q, 2) [m] about `spacing` [m] apart, evenly by arc length, on a polyline (P, 2)."""
-    arc = _arc_lengths(points)
-    count = max(1, round(arc[-1] / spacing))
-    stations = np.linspace(0.0, arc[-1], count + 1)
-    return np.column_stack([np.interp(stations, arc, points[:, 0]), np.interp(stations, arc, points[:, 1])])
-
-
-def headed(points: Array, goal_heading: float) -> Array:
-    """Poses (P, 3) [m, m, rad] whose headings run along the points; the last heading is the goal's."""
-    if path_length(points) < 1e-9:
-        return np.column_stack([points, np.full(len(points), goal_heading)])
-    along = np.gradient(points, axis=0)
-    headings = np.arctan2(along[:, 1], along[:, 0])
-    headings[-1] = goal_heading
-    return np.column_stack([points, headings])
 
 
 class PathFollower:
@@ -53,10 +31,10 @@ class PathFollower:
         if self.path.ndim != 2 or self.path.shape[1] != 3 or len(self.path) < 2:
             raise ScenarioError(f"path of shape {self.path.shape}: at least two poses (P, 3) are needed")
         self.window = window
-        self._arc = _arc_lengths(self.path[:, :2])
+        self._arc = arc_lengths(self.path[:, :2])
         self.length = float(self._arc[-1])
         # The goal's heading belongs to the goal alone: on the way there the heading stays that of the path.
-        self._headings = np.unwrap(np.append(self.path[:-1, 2], self.path[-2, 2]))
+        self._headings: Array = np.unwrap(np.append(self.path[:-1, 2], self.path[-2, 2]))
 
     def project(self, position: ArrayLike, start_arclength: float = 0.0) -> float:
         """Arc length [m] of the nearest point between `start_arclength` and the window's end.
@@ -95,26 +73,8 @@ class PathFollower:
             call.
         """
         reached = self.project(position, start_arclength)
-        stations = reached + spacing * np.arange(count)
-        poses = np.column_stack(
-            [
-                np.interp(stations, self._arc, self.path[:, 0]),
-                np.interp(stations, self._arc, self.path[:, 1]),
-                np.interp(stations, self._arc, self._headings),
-            ]
-        )
+        stations = reached + spacing * np.arange(count, dtype=np.float64)
+        poses = at_stations(np.column_stack([self.path[:, :2], self._headings]), self._arc, stations)
         poses[stations >= self.length - 1e-9] = self.path[-1]
         poses[:, 2] = (poses[:, 2] + math.pi) % (2.0 * math.pi) - math.pi
         return poses, reached
-
-
-def reference(
-    path: ArrayLike, position: ArrayLike, spacing: float, count: int, start_arclength: float = 0.0
-) -> tuple[Array, float]:
-    """`PathFollower.reference` for a path used once; see there."""
-    return PathFollower(path).reference(position, spacing, count, start_arclength)
-
-
-def _arc_lengths(points: Array) -> Array:
-    """Arc length (P,) [m] at every point of a polyline (P, 2)."""
-    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])

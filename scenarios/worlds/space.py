@@ -1,0 +1,237 @@
+"""The ground plane of both worlds: one vehicle's disc among walls and discs, its contacts, and time, by pymunk.
+
+Contacts count only once shapes overlap, so time passes in substeps of 5 ms. The engine moves bodies before it looks for
+contacts: a velocity that leads into something touched already must lose that part before a substep begins.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pymunk
+
+from unifg.errors import ScenarioError
+from unifg.typing import Array
+
+__all__ = ["COURTESY_GAP", "OTHERS", "Obstacle", "Space"]
+
+COURTESY_GAP = 0.1
+"""Gap a mover keeps between its hull and that of a resting robot [m]."""
+
+_SUBSTEP = 0.005  # [s]; at 1 m/s a first contact overlaps by at most 5 mm
+_EVENT_GAP = 0.5  # [s]; a contact renewed sooner belongs to the same event
+_VEHICLE_CATEGORY = 1
+_VEHICLE_TYPE, _THING_TYPE = 1, 2
+
+OTHERS = pymunk.ShapeFilter(mask=pymunk.ShapeFilter.ALL_MASKS() ^ _VEHICLE_CATEGORY)
+"""Filter of queries that pass the vehicle."""
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A disc that is not on the map; it rests, or moves to and fro between two points.
+
+    Attributes:
+        centre: (2,) where it is at time zero, world frame [m].
+        radius: [m].
+        end: (2,) far end of the segment it moves along, starting from ``centre`` [m]; None for a fixed
+            obstacle.
+        speed: speed along the segment [m/s]; 0 for a fixed obstacle.
+    """
+
+    centre: Array
+    radius: float
+    end: Array | None = None
+    speed: float = 0.0
+
+    @property
+    def moving(self) -> bool:
+        """True if the obstacle moves by design, even while it waits."""
+        return self.end is not None and self.speed > 0.0
+
+    def positions(self, fractions: Array) -> Array:
+        """(n, 2) centres at fractions (n,) of the segment [m]; the same place for a fixed obstacle."""
+        end = self.centre if self.end is None else self.end
+        positions: Array = self.centre + fractions[:, None] * (end - self.centre)
+        return positions
+
+
+class Space:
+    """One vehicle's disc and what it can run into, each thing with an owner's number.
+
+    Attributes:
+        engine: pymunk's space.
+        vehicle: body of the vehicle; a wall stops it, it does not turn it.
+        radius: of the vehicle's disc [m].
+        obstacles: discs that are not on the map.
+        time: since the start [s].
+        collisions: contact events so far; contacts with one owner less than 0.5 s apart are one.
+    """
+
+    def __init__(self, place: Array, radius: float) -> None:
+        """Stand at ``place`` (2,) or (3,), x, y and heading [m, m, rad], alone."""
+        self.engine = pymunk.Space()
+        self.engine.collision_slop = 1e-4  # the default lets shapes overlap by 0.1 m
+        self.engine.collision_bias = 1e-6
+        self.vehicle = pymunk.Body(mass=1.0, moment=float("inf"))
+        self.vehicle.position = (float(place[0]), float(place[1]))
+        self.vehicle.angle = float(place[2]) if len(place) > 2 else 0.0
+        self.radius = radius
+        self.obstacles: list[Obstacle] = []
+        self.time = 0.0
+        self.collisions = 0
+        self._owner: dict[pymunk.Shape, int] = {}
+        self._movers: dict[int, _Mover] = {}  # by place in obstacles
+        self._touching: dict[int, int] = {}
+        self._separated: dict[int, float] = {}
+
+    # ------------------------------------------------------------------ things
+
+    def add(self, shape: pymunk.Shape, owner: int) -> pymunk.Shape:
+        """Add a shape on a body of the engine's."""
+        shape.collision_type = _THING_TYPE
+        shape.filter = pymunk.ShapeFilter(categories=pymunk.ShapeFilter.ALL_MASKS() ^ _VEHICLE_CATEGORY)
+        self.engine.add(shape)
+        self._owner[shape] = owner
+        return shape
+
+    def add_disc(self, obstacle: Obstacle, owner: int) -> pymunk.Shape:
+        """Add a disc, on a body of its own if it moves."""
+        if obstacle.end is not None and obstacle.moving:
+            mover = _Mover(obstacle, obstacle.end)
+            self._movers[len(self.obstacles)] = mover
+            self.engine.add(mover.body)
+            shape = pymunk.Circle(mover.body, obstacle.radius)
+        else:
+            offset = (float(obstacle.centre[0]), float(obstacle.centre[1]))
+            shape = pymunk.Circle(self.engine.static_body, obstacle.radius, offset)
+        self.obstacles.append(obstacle)
+        return self.add(shape, owner)
+
+    def add_vehicle(self) -> None:
+        """Let the vehicle in, after everything else."""
+        shape = pymunk.Circle(self.vehicle, self.radius)
+        shape.collision_type = _VEHICLE_TYPE
+        shape.filter = pymunk.ShapeFilter(categories=_VEHICLE_CATEGORY)
+        self.engine.add(self.vehicle, shape)
+        self.engine.on_collision(_VEHICLE_TYPE, _THING_TYPE, begin=self._on_begin, separate=self._on_separate)
+
+    def discs(self) -> Array:
+        """(K, 4) x, y, radius [m] of the obstacles now, and 1 for those that move by design, else 0."""
+        states = np.zeros((len(self.obstacles), 4))
+        for index, obstacle in enumerate(self.obstacles):
+            mover = self._movers.get(index)
+            centre = obstacle.centre if mover is None else mover.body.position
+            states[index] = centre[0], centre[1], obstacle.radius, mover is not None
+        return states
+
+    # -------------------------------------------------------------------- time
+
+    def substeps(self, dt: float) -> Iterator[float]:
+        """Lengths [s] of the substeps of ``dt``, the clock set to the end of each.
+
+        Raises:
+            ScenarioError: if the duration is not usable.
+        """
+        if not (math.isfinite(dt) and dt > 0.0):
+            raise ScenarioError(f"the duration of a step must be positive and finite, got {dt}")
+        count, begin = max(1, math.ceil(dt / _SUBSTEP - 1e-9)), self.time
+        for k in range(count):
+            self.time = begin + (k + 1) * (dt / count)
+            yield dt / count
+
+    def step(self, pause: float, resting: bool = False) -> None:
+        """Move everything for a substep [s]; movers wait for a vehicle that is ``resting``."""
+        for mover in self._movers.values():
+            mover.advance(self.vehicle, self.radius, resting, pause)
+        self.engine.step(pause)
+
+    def without_contacts(self, velocity: pymunk.Vec2d, relative: bool = True) -> pymunk.Vec2d:
+        """A velocity of the vehicle without its parts into things touched, relative to their own motion if asked."""
+        contacts: list[tuple[pymunk.Vec2d, float]] = []
+
+        def note(arbiter: pymunk.Arbiter) -> None:
+            first, second = arbiter.shapes
+            normal, thing = arbiter.contact_point_set.normal, second
+            if first in self._owner:
+                normal, thing = -normal, first
+            assert thing.body is not None
+            contacts.append((normal, thing.body.velocity.dot(normal) if relative else 0.0))
+
+        self.vehicle.each_arbiter(note)
+        for _ in range(2 if contacts else 0):  # twice, for two things that are not square to one another
+            for normal, allowed in contacts:
+                velocity -= max(velocity.dot(normal) - allowed, 0.0) * normal
+        return velocity
+
+    # ---------------------------------------------------------------- contacts
+
+    def touches(self, owner: int) -> bool:
+        """Whether the vehicle is in contact with an owner's things."""
+        return self._touching.get(owner, 0) > 0
+
+    def begin(self, owner: int, counts: bool = True) -> None:
+        """Note a contact that begins; one that does not count is no collision."""
+        if counts and not self.touches(owner) and self.time - self._separated.get(owner, -math.inf) >= _EVENT_GAP:
+            self.collisions += 1
+        self._touching[owner] = self._touching.get(owner, 0) + 1
+
+    def separate(self, owner: int) -> None:
+        """Note a contact that ends."""
+        self._touching[owner] = self._touching.get(owner, 1) - 1
+        self._separated[owner] = self.time
+
+    def _on_begin(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
+        self.begin(self._thing(arbiter))
+
+    def _on_separate(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
+        self.separate(self._thing(arbiter))
+
+    def _thing(self, arbiter: pymunk.Arbiter) -> int:
+        first, second = arbiter.shapes
+        return self._owner[first] if first in self._owner else self._owner[second]
+
+
+class _Mover:
+    """A kinematic disc going to and fro along its segment."""
+
+    def __init__(self, obstacle: Obstacle, end: Array) -> None:
+        """Stand at the obstacle's centre, about to leave for ``end`` (2,) [m]."""
+        self.origin = pymunk.Vec2d(*map(float, obstacle.centre))
+        span = pymunk.Vec2d(*map(float, end)) - self.origin
+        self.length = span.length
+        self.direction = span.normalized()
+        self.radius = obstacle.radius
+        self.speed = obstacle.speed
+        self.along = 0.0
+        self.sense = 1.0
+        self.body = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+        self.body.position = self.origin
+
+    def advance(self, robot: pymunk.Body, robot_radius: float, resting: bool, dt: float) -> None:
+        """Choose the velocity of the next substep; wait when it would crowd a robot at rest.
+
+        Args:
+            robot: the robot's body.
+            robot_radius: [m].
+            resting: True while the robot stands still; turning on the spot is standing still.
+            dt: duration of the substep [s].
+        """
+        along, sense = self.along + self.sense * self.speed * dt, self.sense
+        if along > self.length:
+            along, sense = max(2.0 * self.length - along, 0.0), -1.0
+        elif along < 0.0:
+            along, sense = min(-along, self.length), 1.0
+        target = self.origin + along * self.direction
+        if resting:
+            hulls = robot_radius + self.radius
+            gap = target.get_distance(robot.position) - hulls
+            if gap < COURTESY_GAP and gap < self.body.position.get_distance(robot.position) - hulls:
+                self.body.velocity = (0.0, 0.0)
+                return
+        self.along, self.sense = along, sense
+        self.body.velocity = (target - self.body.position) / dt  # lands on the segment: no drift
