@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from unifg.errors import ScenarioError
+from unifg.errors import BackendError, ScenarioError
 from unifg.lie import SO3
 from unifg.scenarios import command
 from unifg.scenarios import flight as episode
@@ -262,7 +262,7 @@ def test_arrival_needs_belief_and_truth(monkeypatch: pytest.MonkeyPatch) -> None
     "change", [{"coupling": "loose"}, {"solver": "newton"}, {"seed": -1}, {"movers": -1}], ids=lambda c: next(iter(c))
 )
 def test_what_does_not_exist_is_refused(change: dict[str, object]) -> None:
-    with pytest.raises(ScenarioError):
+    with pytest.raises((ScenarioError, BackendError)):
         Flight(short(0.2, **change))
 
 
