@@ -89,6 +89,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "scenarios/ways/grid.py": ("planner", "route"),
     "scenarios/driving/route.py": ("route", "navigation"),
     "scenarios/show/drive_scene.py": ("scene",),
+    "scenarios/show/stage.py": ("scene", "quadrotor_scene"),
     "scenarios/worlds/placement.py": ("unforeseen",),
     "scenarios/driving/window.py": ("joint", "control_decisions"),
     "scenarios/flying/arrival.py": ("quadrotor_mpc", "quadrotor_flights"),

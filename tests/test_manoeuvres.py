@@ -25,7 +25,7 @@ from unifg.scenarios.manoeuvres import (
     table,
 )
 from unifg.scenarios.show import manoeuvre_plot as manoeuvre_plots
-from unifg.scenarios.show.palette import css
+from unifg.scenarios.show.style import css
 from unifg.solvers import SQP, names
 
 SOLVERS = ("alm", "sqp")

@@ -142,7 +142,8 @@ def test_wheel_holds_the_packages_and_nothing_else(source: Path, wheel: Path) ->
     expected = {f"{name}/{path.name}" for name, folder in folders.items() for path in folder.glob("*.py")}
     maps = [path for kind in ("*.pgm", "*.yaml") for path in (source / "scenarios" / "worlds").glob(kind)]
     assert {path.suffix for path in maps} == {".pgm", ".yaml"}, "no map is shipped"
-    expected |= {f"unifg/scenarios/worlds/{path.name}" for path in maps} | {"unifg/py.typed"}
+    expected |= {f"unifg/scenarios/worlds/{path.name}" for path in maps}
+    expected |= {"unifg/py.typed", "unifg/scenarios/show/page.html"}
     assert {name for name in names if ".dist-info/" not in name} == expected
 
 

@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -343,7 +344,8 @@ def only_a_moment(monkeypatch: pytest.MonkeyPatch, change: Callable[[FlightLog],
 
 def test_the_command_writes_its_results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     only_a_moment(monkeypatch, lambda log: log)
-    monkeypatch.setattr(results, "write_scene", lambda path, log: path)  # takes seconds, and has tests of its own
+    no_scene = SimpleNamespace(write=lambda path: path)
+    monkeypatch.setattr(results, "flight_scene", lambda log: no_scene)  # takes seconds, and has tests of its own
     assert command.main(["run", "quadrotor-mpc", "--seed", str(SEED), "--out", str(tmp_path)]) == 1  # not there yet
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["settings"]["seed"] == SEED

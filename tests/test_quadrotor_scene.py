@@ -6,6 +6,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,13 +18,14 @@ from unifg.scenarios.commands import flight_results as results
 from unifg.scenarios.commands.flight_results import summary, write_results
 from unifg.scenarios.log.flight_log import FlightLog, FlightRecorder
 from unifg.scenarios.log.flight_metrics import flight_metrics, landmark_errors
-from unifg.scenarios.show import drone
+from unifg.scenarios.show import drone, shapes
 from unifg.scenarios.show.control_plot import control
 from unifg.scenarios.show.estimates_plot import estimates
 from unifg.scenarios.show.flight_plot import moments, overview, plot_moment, write_overview
-from unifg.scenarios.show.flight_scene import first_sights, frame_ticks, record_scene, scene_html
-from unifg.scenarios.show.palette import css
+from unifg.scenarios.show.flight_scene import first_sights, flight_scene
 from unifg.scenarios.show.recorder import viewer_script
+from unifg.scenarios.show.stage import frame_ticks
+from unifg.scenarios.show.style import css
 from unifg.scenarios.worlds.layouts import Layout
 
 umsgpack = pytest.importorskip("umsgpack")
@@ -95,7 +97,7 @@ def log() -> FlightLog:
 
 @pytest.fixture(scope="module")
 def page(log: FlightLog) -> str:
-    return scene_html(log)
+    return flight_scene(log).html()
 
 
 def _around(page: str) -> str:
@@ -108,6 +110,14 @@ def _commands(page: str) -> list[dict[str, Any]]:
     found = re.search(r"^const COMMANDS = (\[.*?\]);$", page, re.DOTALL | re.MULTILINE)
     assert found
     return [umsgpack.unpackb(base64.b64decode(text)) for text in json.loads(found.group(1))]
+
+
+def page_data(page: str) -> dict[str, Any]:
+    """What the script of a page knows."""
+    found = re.search(r"^const DATA = (.*);$", page, re.MULTILINE)
+    assert found
+    data: dict[str, Any] = json.loads(found.group(1))
+    return data
 
 
 def _tracks(commands: list[dict[str, Any]]) -> Tracks:
@@ -142,26 +152,24 @@ def test_page_loads_nothing_from_outside_and_says_what_it_shows(page: str) -> No
     for word in (" src=", "href=", "@import", "url(", "fetch(", "import(", "WebSocket", ".connect("):
         assert word not in around
     assert "default-src 'none'" in around and "@@" not in around
-    text = re.sub(r"<[^>]+>", " ", around)
-    for words in (
-        "quadrotor-mpc, made up 7",
-        "target reached, no collision",
-        "ipm (sequential)",
-        "reach of the sensor",
-    ):
-        assert words in text
+    data = page_data(around)
+    assert data["title"] == "unifg: quadrotor-mpc, made up 7" and ["solver", "ipm (sequential)"] in data["facts"]
+    assert data["outcome"] == "target reached, no collision" and data["good"] is True
+    assert "reach of the sensor" in [key["text"] for key in data["legend"]]
+    assert [view["name"] for view in data["views"]] == ["overview", "follow", "top"]
 
 
 def test_failure_and_foreign_names_in_the_page(log: FlightLog) -> None:
     named = replace(log, layout=replace(log.layout, name="</script><b>x"), reached=False, collisions=2)
-    around = _around(scene_html(named))
-    assert "0.0 m short of the target, 2 collisions" in around and 'class="bad"' in around
-    assert "</script><b>" not in around and "&lt;/script&gt;&lt;b&gt;x" in around
+    around = _around(flight_scene(named).html())
+    data = page_data(around)
+    assert data["outcome"] == "0.0 m short of the target, 2 collisions" and data["good"] is False
+    assert "</script><b>" not in around and data["title"].endswith("</script><b>x")
 
 
 def test_same_log_same_page(page: str, log: FlightLog, tmp_path: Path) -> None:
     log.save(tmp_path / "flight.npz")
-    assert scene_html(FlightLog.load(tmp_path / "flight.npz")) == page
+    assert flight_scene(FlightLog.load(tmp_path / "flight.npz")).html() == page
 
 
 def test_animation_moves_things_that_exist_and_ends_together(page: str, log: FlightLog) -> None:
@@ -217,7 +225,7 @@ def test_a_landmark_that_stands_still_does_not_creep(log: FlightLog) -> None:
     still = [log.landmarks[0]] * 20
     moved = log.landmarks[0]._replace(means=log.landmarks[0].means + 0.5)
     jumping = replace(log, landmarks=still + [moved] * (log.ticks - 20))
-    commands = record_scene(jumping).commands
+    commands = flight_scene(jumping).recorder.commands
     assert commands[-1]["type"] == "set_animation"
     keys = dict(_tracks(commands)["landmarks/0"][".position"])
     assert sorted(keys) == [0, 19, 20] and keys[19] == keys[0] != keys[20]  # else it would drift there for 20 ticks
@@ -251,38 +259,50 @@ def test_the_flown_way_appears_piece_by_piece(page: str, log: FlightLog) -> None
 
 def test_a_flight_without_estimate_is_shown_without_it() -> None:
     plain = flight(estimated=False, movers=0)
-    page = scene_html(plain)
+    page = flight_scene(plain).html()
     objects, text = _objects(_commands(page)), _around(page)
     families = {path.split("/")[0] for path in objects}
     assert not families & {"sensor", "landmarks", "movers"}
     assert not any(path.endswith(("unseen", "past", "truth")) for path in objects)
     assert {f"cylinders/{k}/seen/body" for k in range(3)} <= objects and "frames/0/horizon" in objects
+    data = page_data(text)
     for words in ("reach of the sensor", "position error", "estimate + plan", "not seen yet"):
-        assert words not in re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)
-    data = json.loads(re.search(r"^const DATA = (.*);$", text, re.MULTILINE).group(1))  # type: ignore[union-attr]
-    assert data["rows"]["mass"] is None and data["rows"]["error"] is None and data["rows"]["planMs"] is None
+        assert words not in json.dumps([data["facts"], data["legend"], data["readouts"]])
+    assert [row["name"] for row in data["readouts"]] == ["speed", "height", "clearance", "thrust", "plan"]
+    assert "way flown" in [key["text"] for key in data["legend"]]
+
+
+def test_readouts_are_those_of_the_log(page: str, log: FlightLog) -> None:
+    rows = {row["name"]: row for row in page_data(page)["readouts"]}
+    assert {len(row["texts"]) for row in rows.values()} == {log.ticks}
+    assert rows["position error"]["texts"][0] == "5.0 cm" and rows["speed"]["texts"][0] == "2.00 m/s"
+    assert (
+        rows["mass \u00b1 \u03c3"]["texts"][0] == "1.050 \u00b1 0.020 kg"
+        and rows["true mass"]["texts"][0] == "1.000 kg"
+    )
+    assert rows["estimate, plan"]["texts"][0] == "5.0 ms, 7.0 ms" and rows["landmarks"]["texts"][-1] == "2"
+    assert rows["plan"]["texts"][5] == "converged: stored one flown" and rows["plan"]["alarms"][5] is True
 
 
 def test_long_flights_are_thinned_and_small() -> None:
     long = flight(400)
-    assert frame_ticks(long).tolist() == list(range(400))
-    assert len(scene_html(long)) < 6e6
-    ticks = frame_ticks(flight(1001))
-    assert ticks[:3].tolist() == [0, 3, 6] and ticks[-1] == 1000 and len(ticks) <= 401
+    assert frame_ticks(long.ticks).tolist() == list(range(400))
+    assert len(flight_scene(long).html()) < 6e6
+    assert flight_scene(flight(1001)).ticks.tolist() == [*range(0, 1000, 3), 1000]
 
 
 def test_odd_flights_are_drawn_too(log: FlightLog) -> None:
     single = flight(1)
-    assert _commands(scene_html(single))[-1]["type"] == "set_animation"
+    assert _commands(flight_scene(single).html())[-1]["type"] == "set_animation"
     overview(single)
     estimates(single)
     control(single)
     lost = replace(log, plans=np.full_like(log.plans, np.nan), clearance=np.full(log.ticks, np.inf))
-    assert not any("horizon" in path for path in _objects(_commands(scene_html(lost))))
+    assert not any("horizon" in path for path in _objects(_commands(flight_scene(lost).html())))
     overview(lost)
     control(lost)
     empty = flight(0)
-    for draw in (record_scene, overview, estimates, control, flight_metrics):
+    for draw in (flight_scene, overview, estimates, control, flight_metrics):
         with pytest.raises(ScenarioError, match="no tick"):
             draw(empty)
 
@@ -301,7 +321,7 @@ def test_drone_fits_its_radius() -> None:
 def test_tube_keeps_its_radius_in_every_direction(axis: int) -> None:
     line = np.zeros((5, 3))
     line[:, axis] = [0.0, 1.0, 1.0, 2.0, 3.0]  # two points coincide
-    vertices, faces = drone.tube(line, 0.1, sides=4)
+    vertices, faces = shapes.tube(line, 0.1, sides=4)
     apart = vertices.reshape(5, 4, 3) - line[:, None]
     np.testing.assert_allclose(np.linalg.norm(apart, axis=2), 0.1)
     np.testing.assert_allclose(apart[..., axis], 0.0, atol=1e-12)
@@ -309,7 +329,7 @@ def test_tube_keeps_its_radius_in_every_direction(axis: int) -> None:
 
 
 def test_box_looks_outwards() -> None:
-    vertices, faces = drone.box([1.0, 2.0, 3.0], [0.2, 0.4, 0.6])
+    vertices, faces = shapes.box([1.0, 2.0, 3.0], [0.2, 0.4, 0.6])
     np.testing.assert_allclose(np.ptp(vertices, axis=0), [0.2, 0.4, 0.6])
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -318,12 +338,12 @@ def test_box_looks_outwards() -> None:
 
 def test_ellipse_axes_and_thinning() -> None:
     turn = np.array([[math.cos(0.4), -math.sin(0.4)], [math.sin(0.4), math.cos(0.4)]])
-    long, short, direction = drone.ellipse_axes(turn @ np.diag([0.09, 0.01]) @ turn.T, 2.0)
+    long, short, direction = shapes.ellipse_axes(turn @ np.diag([0.09, 0.01]) @ turn.T, 2.0)
     assert (long, short) == pytest.approx((0.6, 0.2))
     assert math.tan(direction) == pytest.approx(math.tan(0.4))
     line = np.column_stack([np.arange(100.0), np.zeros(100), np.zeros(100)])
-    assert drone.thin(line, 4)[:, 0].tolist() == [0.0, 33.0, 66.0, 99.0]
-    assert len(drone.thin(np.zeros((50, 3)), 4)) == 1
+    assert shapes.thin(line, 4)[:, 0].tolist() == [0.0, 33.0, 66.0, 99.0]
+    assert len(shapes.thin(np.zeros((50, 3)), 4)) == 1
 
 
 def test_metrics_are_those_of_the_made_up_errors(log: FlightLog) -> None:
@@ -406,8 +426,9 @@ def test_results_leave_files_that_can_be_read_again(log: FlightLog, tmp_path: Pa
 
 
 def test_results_of_a_flight_without_estimate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("write_overview", "write_control", "write_scene"):
+    for name in ("write_overview", "write_control"):
         monkeypatch.setattr(results, name, lambda path, log: path)
+    monkeypatch.setattr(results, "flight_scene", lambda log: SimpleNamespace(write=lambda path: path))
     plain = flight(estimated=False)
     names = [path.name for path in write_results(tmp_path, plain, {"own": 1})]
     assert names == ["scene.html", "overview.png", "control.png", "metrics.json", "flight.npz"]

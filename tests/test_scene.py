@@ -25,9 +25,10 @@ from unifg.scenarios.show.drive_plot import (
     plot_solve_times,
     write_overview,
 )
-from unifg.scenarios.show.drive_scene import frame_ticks, record_scene, scan_points, scene_html, write_scene
+from unifg.scenarios.show.drive_scene import drive_scene, scan_points
 from unifg.scenarios.show.recorder import Recorder, viewer_script
 from unifg.scenarios.show.shapes import cover, extrude, flat, known_corners, ribbon
+from unifg.scenarios.show.stage import frame_ticks
 
 umsgpack = pytest.importorskip("umsgpack")
 
@@ -41,13 +42,21 @@ def log() -> EpisodeLog:
 
 @pytest.fixture(scope="module")
 def page(log: EpisodeLog) -> str:
-    return scene_html(log)
+    return drive_scene(log).html()
 
 
 def _commands(page: str) -> Commands:
     found = re.search(r"^const COMMANDS = (\[.*?\]);$", page, re.DOTALL | re.MULTILINE)
     assert found
     return [umsgpack.unpackb(base64.b64decode(text)) for text in json.loads(found.group(1))]
+
+
+def page_data(page: str) -> dict[str, Any]:
+    """What the script of a page knows."""
+    found = re.search(r"^const DATA = (.*);$", page, re.MULTILINE)
+    assert found
+    data: dict[str, Any] = json.loads(found.group(1))
+    return data
 
 
 def _tracks(commands: Commands) -> dict[str, dict[str, list[tuple[int, Any]]]]:
@@ -81,24 +90,37 @@ def test_page_loads_nothing_from_outside(page: str) -> None:
 def test_page_has_no_placeholder_left_and_says_what_it_shows(page: str, log: EpisodeLog) -> None:
     around = _strip_viewer(page)
     assert "@@" not in around
-    text = re.sub(r"<[^>]+>", " ", around)
-    for words in ("navigation on room", "1 of 1 goals reached, no collision", "alm (sequential)", "lidar hits"):
-        assert words in text
-    failed = scene_html(replace(log, collisions=2, reached=[False]))
-    assert "0 of 1 goals reached, 2 collisions" in failed and 'class="bad"' in failed
+    data = page_data(around)
+    assert data["title"] == "unifg: navigation on room" and ["solver", "alm (sequential)"] in data["facts"]
+    assert data["outcome"] == "1 of 1 goals reached, no collision" and data["good"] is True
+    assert any("lidar hits" in key["text"] for key in data["legend"])
+    failed = page_data(drive_scene(replace(log, collisions=2, reached=[False])).html())
+    assert failed["outcome"] == "0 of 1 goals reached, 2 collisions" and failed["good"] is False
+    assert 'DATA.good ? "good" : "bad"' in around
+
+
+def test_readouts_are_those_of_the_log(page: str, log: EpisodeLog) -> None:
+    readouts = {readout["name"]: readout for readout in page_data(page)["readouts"]}
+    assert {len(readout["texts"]) for readout in readouts.values()} == {log.ticks}
+    assert readouts["speed"]["texts"][3] == "0.50 m/s" and readouts["localisation error"]["texts"][0] == "5.0 cm"
+    assert readouts["clearance"]["texts"][0] == "0.60 m" and readouts["goal"]["texts"][0] == "1 of 1"
+    assert readouts["plan"]["texts"][-1] == "stalled: stored one driven"
+    assert readouts["plan"]["alarms"] == log.emergency.tolist()
 
 
 def test_names_from_outside_cannot_become_markup(log: EpisodeLog) -> None:
     named = replace(log.occupancy, name="</script><b>x")
-    page = _strip_viewer(scene_html(replace(log, occupancy=named)))
-    assert "</script><b>" not in page and "&lt;/script&gt;&lt;b&gt;x" in page
+    page = _strip_viewer(drive_scene(replace(log, occupancy=named)).html())
+    assert "</script><b>" not in page and page.count("</script>") == 3
+    assert page_data(page)["title"] == "unifg: navigation on </script><b>x"
+    assert "innerHTML" not in page  # what the script writes is text
 
 
 def test_same_log_same_bytes_in_two_processes(page: str, tmp_path: Path, log: EpisodeLog) -> None:
-    assert write_scene(tmp_path / "scene.html", log).read_bytes() == page.encode()
+    assert drive_scene(log).write(tmp_path / "scene.html").read_bytes() == page.encode()
     code = (
-        "import hashlib; from episodes import episode; from unifg.scenarios.show.drive_scene import scene_html;"
-        "print(hashlib.sha256(scene_html(episode(ticks=12, obstacles=4)).encode()).hexdigest())"
+        "import hashlib; from episodes import episode; from unifg.scenarios.show.drive_scene import drive_scene;"
+        "print(hashlib.sha256(drive_scene(episode(ticks=12, obstacles=4)).html().encode()).hexdigest())"
     )
     here = Path(__file__).parent
     printed = subprocess.run(
@@ -109,6 +131,17 @@ def test_same_log_same_bytes_in_two_processes(page: str, tmp_path: Path, log: Ep
         env={"PYTHONPATH": f"{here}:{here.parent}", "PYTHONHASHSEED": "7"},
     ).stdout.strip()
     assert printed == hashlib.sha256(page.encode()).hexdigest()
+
+
+@pytest.mark.parametrize("name", ["overview", "follow"])
+def test_views_follow_and_labels_name_what_there_is(page: str, name: str) -> None:
+    data = page_data(page)
+    view = next(view for view in data["views"] if view["name"] == name)
+    objects = {c["path"].split("/")[2] for c in _commands(page) if c["type"] == "set_object"}
+    followed = {entry["follows"] for entry in [view, *data["labels"]]} - {None}
+    assert followed <= objects and (view["follows"] is not None) == (name == "follow")
+    assert np.shape(data["corners"]) == (8, 3)
+    assert [label["text"] for label in data["labels"]] == ["start", "goal", "robot", "odometry alone"]
 
 
 def test_animation_comes_last_and_moves_things_that_exist(page: str) -> None:
@@ -214,23 +247,23 @@ def test_scan_points_skip_dropouts_and_misses(log: EpisodeLog) -> None:
 
 def test_long_episodes_are_thinned_and_small() -> None:
     log = episode(ticks=1001)
-    ticks = frame_ticks(log)
+    ticks = frame_ticks(log.ticks)
     assert ticks[:3].tolist() == [0, 3, 6] and ticks[-1] == 1000 and len(ticks) <= 501
     log.scan, log.scan_angles = np.full((1001, 360), 2.0), np.linspace(-np.pi, np.pi, 360)
     log.horizon = np.repeat(log.horizon[:, -1:], 31, axis=1) + np.linspace(0.0, 1.0, 31)[:, None]
-    assert len(scene_html(log)) < 6e6
-    assert frame_ticks(episode(ticks=500)).tolist() == list(range(500))
+    assert len(drive_scene(log).html()) < 6e6
+    assert frame_ticks(500).tolist() == list(range(500))
 
 
 def test_odd_episodes_are_drawn_too(log: EpisodeLog) -> None:
     single = episode(ticks=1, obstacles=0)
-    assert _commands(scene_html(single))[-1]["type"] == "set_animation"
+    assert _commands(drive_scene(single).html())[-1]["type"] == "set_animation"
     overview(single)
     lost = replace(log, horizon=np.full_like(log.horizon, np.nan), scan=np.full_like(log.scan, np.nan))
-    paths = {command.get("path") for command in _commands(scene_html(lost))}
+    paths = {command.get("path") for command in _commands(drive_scene(lost).html())}
     assert "/meshcat/frames/0/horizon" not in paths and "/meshcat/frames/0/scan" not in paths
     with pytest.raises(ScenarioError, match="no tick"):
-        record_scene(replace(log, time=log.time[:0]))
+        drive_scene(replace(log, time=log.time[:0]))
 
 
 def test_recorder_makes_numpy_and_identifiers_plain() -> None:

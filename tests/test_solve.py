@@ -181,17 +181,22 @@ def test_an_interrupt_keeps_what_there_is(city: Path) -> None:
 
 
 def test_the_scene_needs_nothing_else(city: Path, tmp_path: Path) -> None:
-    from unifg.scenarios.show.graph_scene import record_scene, strips
+    from unifg.scenarios.show.graph_scene import graph_scene, shown_steps
+    from unifg.scenarios.show.shapes import strips
 
     solved = solve_file(SolveSettings(city))
-    recorder, shown = record_scene(solved)
-    paths = {str(command["path"]) for command in recorder.commands if command["type"] == "set_object"}
+    scene, shown = graph_scene(solved), shown_steps(solved)
+    paths = {str(command["path"]) for command in scene.recorder.commands if command["type"] == "set_object"}
     assert shown == list(range(len(solved.steps)))
     assert {f"/meshcat/steps/{k}/{part}" for k in shown for part in ("trajectory", "closures")} <= paths
     assert {"/meshcat/start", "/meshcat/first"} <= paths
     assert command.main(["solve", str(city), "--out", str(tmp_path)]) == 0
     page = (tmp_path / "scene.html").read_text()
     assert "default-src 'none'" in page and "@@" not in page.split("<script>")[0]
+    assert scene.page.numbers == [0, *scene.page.numbers[1:-1], solved.solution.iterations]
+    assert len(scene.page.readouts[0].texts) == len(shown) == len(scene.ticks)
+    switched = {f"/meshcat/{part}" for key in scene.page.legend for part in key.parts}
+    assert switched == paths - {"/meshcat/first"}  # the legend names everything that can be switched off
     assert not re.search(r"(src|href)=\"http", page)
     lines = np.array([[[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]], [[1.0, 1.0, 0.0], [1.0, 1.0, 3.0]]])
     vertices, faces = strips(lines, 0.2, crossed=True)

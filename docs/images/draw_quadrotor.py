@@ -10,7 +10,7 @@ from draw import COST, HARD, beside, factor, frame, variable
 
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.show.flight_plot import write_overview
-from unifg.scenarios.show.palette import css
+from unifg.scenarios.show.style import css
 
 HERE = Path(__file__).resolve().parent
 SEED = 1003

@@ -11,7 +11,7 @@ from unifg.scenarios.course import Course
 from unifg.scenarios.log.drive_metrics import write_metrics
 from unifg.scenarios.show.course_log import course_log
 from unifg.scenarios.show.course_plot import write_iterates
-from unifg.scenarios.show.flight_scene import write_scene
+from unifg.scenarios.show.flight_scene import flight_scene
 
 __all__ = ["CourseMetrics", "course_metrics", "summary", "write_results"]
 
@@ -107,7 +107,7 @@ def write_results(folder: str | Path, course: Course) -> list[Path]:
     folder = Path(folder)
     numbers = write_metrics(folder / "metrics.json", course_metrics(course))
     picture = write_iterates(folder / "iterates.png", course)
-    return [write_scene(folder / "scene.html", course_log(course)), picture, numbers]
+    return [flight_scene(course_log(course)).write(folder / "scene.html"), picture, numbers]
 
 
 def summary(course: Course) -> str:

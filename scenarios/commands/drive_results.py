@@ -8,7 +8,7 @@ from unifg.files.tum import write_tum
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import Spread, Timing, episode_metrics, write_metrics
 from unifg.scenarios.show.drive_plot import write_overview
-from unifg.scenarios.show.drive_scene import write_scene
+from unifg.scenarios.show.drive_scene import drive_scene
 
 __all__ = ["summary", "write_results"]
 
@@ -32,7 +32,7 @@ def write_results(folder: Path, log: EpisodeLog) -> list[Path]:
     trajectory = write_tum(folder / "trajectory.tum", log.time, log.true_pose)
     estimate = write_tum(folder / "estimate.tum", log.time, log.estimate)
     overview = write_overview(folder / "overview.png", log)
-    scene = write_scene(folder / "scene.html", log)
+    scene = drive_scene(log).write(folder / "scene.html")
     return [scene, overview, metrics, trajectory, estimate]
 
 

@@ -11,7 +11,7 @@ from unifg.scenarios.log.flight_metrics import Errors, flight_metrics, has_estim
 from unifg.scenarios.show.control_plot import write_control
 from unifg.scenarios.show.estimates_plot import write_estimates
 from unifg.scenarios.show.flight_plot import write_overview
-from unifg.scenarios.show.flight_scene import write_scene
+from unifg.scenarios.show.flight_scene import flight_scene
 
 __all__ = ["summary", "write_results"]
 
@@ -40,7 +40,7 @@ def write_results(folder: str | Path, log: FlightLog, metrics: Mapping[str, obje
     if has_estimate(log):
         pictures.append(write_estimates(folder / "estimates.png", log))
     pictures.append(write_control(folder / "control.png", log))
-    return [write_scene(folder / "scene.html", log), *pictures, numbers, stored]
+    return [flight_scene(log).write(folder / "scene.html"), *pictures, numbers, stored]
 
 
 def summary(log: FlightLog) -> str:

@@ -12,7 +12,7 @@ from unifg.files.g2o import write_g2o
 from unifg.files.tum import write_tum
 from unifg.scenarios.pose_graph import SolvedGraph
 from unifg.scenarios.show.graph_plot import write_picture
-from unifg.scenarios.show.graph_scene import write_scene
+from unifg.scenarios.show.graph_scene import graph_scene
 
 __all__ = ["metrics", "summary", "write_results"]
 
@@ -34,7 +34,7 @@ def write_results(folder: Path, solved: SolvedGraph) -> list[Path]:
     numbers = folder / "metrics.json"
     numbers.write_text(json.dumps(metrics(solved), indent=2) + "\n", encoding="utf-8")
     picture = write_picture(folder / "graph.png", solved)
-    scene = write_scene(folder / "scene.html", solved)
+    scene = graph_scene(solved).write(folder / "scene.html")
     return [scene, picture, graph, trajectory, numbers]
 
 

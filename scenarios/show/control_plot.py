@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from unifg.scenarios.log.flight_log import FlightLog
-from unifg.scenarios.show.palette import css
-from unifg.scenarios.show.style import GREY, finish, heading, new_figure, over_time, write_figure
+from unifg.scenarios.show.style import GREY, css, finish, heading, new_figure, over_time, write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

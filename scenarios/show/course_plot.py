@@ -14,8 +14,7 @@ import numpy as np
 from unifg.lie import SO3
 from unifg.scenarios.course import Course
 from unifg.scenarios.show.course_log import course_log
-from unifg.scenarios.show.palette import css
-from unifg.scenarios.show.style import GREY, INK, new_figure, write_figure
+from unifg.scenarios.show.style import GREY, INK, css, new_figure, write_figure
 from unifg.scenarios.worlds.air import VEHICLE_RADIUS
 from unifg.typing import Array, BoolArray
 

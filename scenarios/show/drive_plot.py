@@ -14,8 +14,8 @@ import numpy as np
 from unifg.errors import ScenarioError
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import EpisodeMetrics, episode_metrics, pose_errors
-from unifg.scenarios.show.palette import css
 from unifg.scenarios.show.shapes import known_corners
+from unifg.scenarios.show.style import css
 from unifg.typing import Array
 
 if TYPE_CHECKING:

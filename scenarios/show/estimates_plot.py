@@ -14,8 +14,7 @@ import numpy as np
 from unifg.errors import ScenarioError
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import PARAMETERS, estimated_parameters, has_estimate, state_errors
-from unifg.scenarios.show.palette import css
-from unifg.scenarios.show.style import INK, finish, heading, new_figure, over_time, write_figure
+from unifg.scenarios.show.style import INK, css, finish, heading, new_figure, over_time, write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,10 +14,9 @@ import numpy as np
 
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import has_estimate
-from unifg.scenarios.show.drone import ellipse_axes
 from unifg.scenarios.show.flight_scene import SIGMAS, first_sights, sensor_reach
-from unifg.scenarios.show.palette import css
-from unifg.scenarios.show.style import GREY, INK, heading, new_figure, over_time, write_figure
+from unifg.scenarios.show.shapes import ellipse_axes
+from unifg.scenarios.show.style import GREY, INK, css, heading, new_figure, over_time, write_figure
 from unifg.scenarios.worlds.air import VEHICLE_RADIUS
 from unifg.typing import IntArray
 

@@ -1,8 +1,4 @@
-"""A flight as one HTML file: what stood there, what was believed of it, and where the vehicle flew and meant to fly.
-
-As in `unifg.scenarios.show.drive_scene` the file carries its viewer (meshcat) and needs neither a server nor a network.
-Frame k of the animation is tick k. Ways that change shape from frame to frame are one object per frame, shown in turn;
-what only moves, turns or changes its size is animated.
+"""A flight as a scene: what stood there, what was believed of it, and where the vehicle flew and meant to fly.
 
 A flight that nobody estimated, such as a plan flown as it is, has no sigmas, windows, landmarks or sightings; it is
 shown without them, and with all cylinders solid from the start.
@@ -11,72 +7,38 @@ shown without them, and with all cylinders solid from the start.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from unifg.errors import ScenarioError
 from unifg.scenarios.log.flight_log import FlightLog
-from unifg.scenarios.log.flight_metrics import has_estimate
+from unifg.scenarios.log.flight_metrics import estimated_parameters, flight_metrics, has_estimate
 from unifg.scenarios.show import drone, shapes
-from unifg.scenarios.show.flight_page import scene_page
-from unifg.scenarios.show.palette import COLOURS
-from unifg.scenarios.show.recorder import Recorder, load_meshcat, viewer_script
+from unifg.scenarios.show.stage import Key, Label, Page, Readout, Stage, View
 from unifg.scenarios.worlds.air import VEHICLE_RADIUS
 from unifg.scenarios.worlds.bearing_range import SensorModel
 from unifg.typing import Array, IntArray
 
-if TYPE_CHECKING:
-    from meshcat.animation import Animation
-    from meshcat.visualizer import Visualizer
-
-__all__ = ["first_sights", "frame_ticks", "record_scene", "scene_html", "sensor_reach", "write_scene"]
-
-MAX_FRAMES = 400
-"""Longer flights show every second tick, every third, ..."""
+__all__ = ["first_sights", "flight_scene", "sensor_reach"]
 
 SIGMAS = 2.0
 """Half axes of ellipses in standard deviations."""
 
 _HEIGHT = 2.0  # of walls, cylinders and movers [m]; there they have no top
 _FLOOR = -0.02  # drawn a little lower than it is, clear of what stands on it [m]
-_FAINT = 0.22  # opacity of cylinders not seen yet
 _NODES = 16  # of a way that changes from frame to frame
 _STILL = (0.002, 0.02)  # an ellipse that moved [m] or grew (share) by less is not told anew
-_PIECES = 150  # of the way flown
 
 
-def write_scene(path: str | Path, log: FlightLog) -> Path:
-    """Write the scene of a flight.
-
-    Args:
-        path: HTML file to write; an existing one is replaced.
-        log: a flight of at least one tick.
-
-    Returns:
-        The path written.
+def flight_scene(log: FlightLog) -> Stage:
+    """The scene of a flight.
 
     Raises:
         ScenarioError: the flight has no tick, or meshcat is not installed.
     """
-    path = Path(path)
-    path.write_text(scene_html(log), encoding="utf-8", newline="\n")
-    return path
-
-
-def scene_html(log: FlightLog) -> str:
-    """The scene of a flight as the text of an HTML page; see `write_scene`."""
-    script = viewer_script()
-    recorder = record_scene(log)
-    return scene_page(log, frame_ticks(log), recorder.packed_base64(), script)
-
-
-def frame_ticks(log: FlightLog) -> IntArray:
-    """Ticks shown, the last one among them; at most about `MAX_FRAMES`."""
-    stride = max(1, math.ceil(log.ticks / MAX_FRAMES))
-    return np.unique(np.append(np.arange(0, log.ticks, stride), log.ticks - 1))
+    stage = Stage(log.ticks, log.dt)
+    for layer in (_ground, _walls, _cylinders, _ends, _landmarks, _movers, _drone, _trail, _frames):
+        layer(stage, log)
+    return stage.finish(_page(log, stage.ticks))
 
 
 def first_sights(log: FlightLog) -> list[int | None]:
@@ -99,291 +61,269 @@ def sensor_reach(log: FlightLog) -> float | None:
     return float(log.settings.get("sensor_range", SensorModel().range_max))
 
 
-def record_scene(log: FlightLog) -> Recorder:
-    """Draw a flight into a recorder.
-
-    Args:
-        log: a flight of at least one tick.
-
-    Returns:
-        The recorded meshcat commands; frame k of the animation is tick k.
-
-    Raises:
-        ScenarioError: the flight has no tick, or meshcat is not installed.
-    """
-    if log.ticks == 0:
-        raise ScenarioError("the flight has no tick: there is nothing to show")
-    load_meshcat()
-    from meshcat.animation import Animation
-    from meshcat.visualizer import Visualizer
-
-    recorder = Recorder()
-    _Scene(log, Visualizer(window=recorder), Animation(default_framerate=1.0 / log.dt)).draw()
-    return recorder
+def _ground(stage: Stage, log: FlightLog) -> None:
+    """The floor, with lines every metre to judge distances by."""
+    (left, low), (right, high) = log.layout.size
+    floor = np.array([[[left, low, _FLOOR], [right, low, _FLOOR], [right, high, _FLOOR], [left, high, _FLOOR]]])
+    stage.mesh("ground/floor", shapes.quads(floor), "floor")
+    across = [[[x, low], [x, high]] for x in np.arange(math.ceil(left), right + 1e-9)]
+    along = [[[left, y], [right, y]] for y in np.arange(math.ceil(low), high + 1e-9)]
+    lines = [shapes.ribbon(np.array(line), 0.02, 0.0) for line in across + along]
+    stage.mesh("ground/metres", shapes.merge(lines), "metres")
 
 
-class _Scene:
-    """Everything drawn."""
+def _walls(stage: Stage, log: FlightLog) -> None:
+    for index, wall in enumerate(log.layout.walls):
+        low, high = (np.column_stack([wall, np.full(2, z)]) for z in (0.0, _HEIGHT))
+        sheet = np.concatenate([low, high[::-1]])[None]
+        stage.mesh(f"walls/{index}/sheet", shapes.quads(sheet), "wall", opacity=0.22)
+        frame = [shapes.tube(line, 0.03, 4) for line in (low, high)]
+        frame += [shapes.tube(np.stack([low[k], high[k]]), 0.03, 4) for k in range(2)]
+        stage.mesh(f"walls/{index}/frame", shapes.merge(frame), "wall", lit=True)
 
-    def __init__(self, log: FlightLog, viewer: Visualizer, animation: Animation) -> None:
-        self.log, self.viewer, self.animation = log, viewer, animation
-        self.ticks = frame_ticks(log)
-        self.last = int(self.ticks[-1])
 
-    def draw(self) -> None:
-        """Send every object, then the animation."""
-        self._surroundings()
-        self._ground()
-        self._walls()
-        self._cylinders()
-        self._ends()
-        self._landmarks()
-        self._movers()
-        self._drone()
-        self._trail()
-        self._frames()
-        self.viewer.set_animation(self.animation, play=True, repetitions=1)
-
-    def _surroundings(self) -> None:
-        for path in ("/Grid", "/Axes"):
-            self.viewer[path].set_property("visible", False)
-        self.viewer["/Background"].set_property("top_color", [0.97, 0.97, 0.98])
-        self.viewer["/Background"].set_property("bottom_color", [0.86, 0.88, 0.90])
-        # Only lights without a range: the default point lights fade within ten metres.
-        for name in ("PointLightNegativeX", "PointLightPositiveX"):
-            self.viewer[f"/Lights/{name}"].set_property("visible", False)
-        self.viewer["/Lights/AmbientLight/<object>"].set_property("intensity", 0.72)
-        self.viewer["/Lights/FillLight/<object>"].set_property("intensity", 0.4)
-        self.viewer["/Lights/FillLight/<object>"].set_property("position", [-0.5, -0.35, 1.0])
-
-    def _ground(self) -> None:
-        """The floor, with lines every metre to judge distances by."""
-        (left, low), (right, high) = self.log.layout.size
-        floor = np.array([[[left, low, _FLOOR], [right, low, _FLOOR], [right, high, _FLOOR], [left, high, _FLOOR]]])
-        self._mesh("ground/floor", drone.quads(floor), COLOURS["floor"], flat=True)
-        across = [[[x, low], [x, high]] for x in np.arange(math.ceil(left), right + 1e-9)]
-        along = [[[left, y], [right, y]] for y in np.arange(math.ceil(low), high + 1e-9)]
-        lines = [shapes.ribbon(np.array(line), 0.02, 0.0) for line in across + along]
-        self._mesh("ground/metres", shapes.merge(lines), 0xE2DFD6, flat=True)
-
-    def _walls(self) -> None:
-        for index, wall in enumerate(self.log.layout.walls):
-            low, high = (np.column_stack([wall, np.full(2, z)]) for z in (0.0, _HEIGHT))
-            sheet = np.concatenate([low, high[::-1]])[None]
-            self._mesh(f"walls/{index}/sheet", drone.quads(sheet), COLOURS["wall"], flat=True, opacity=0.22)
-            frame = [drone.tube(line, 0.03, 4) for line in (low, high)]
-            frame += [drone.tube(np.stack([low[k], high[k]]), 0.03, 4) for k in range(2)]
-            self._mesh(f"walls/{index}/frame", shapes.merge(frame), COLOURS["wall"])
-
-    def _cylinders(self) -> None:
-        for index, first in enumerate(first_sights(self.log)):
-            x, y, radius = self.log.layout.cylinders[index].tolist()
-            if first != 0:
-                path = f"cylinders/{index}/unseen"
-                self._cylinder(path, _HEIGHT, radius, COLOURS["wall"], (x, y), opacity=_FAINT)
-                if first is not None:
-                    self._show(path, 0, first)
+def _cylinders(stage: Stage, log: FlightLog) -> None:
+    """Faint until they are seen."""
+    for index, first in enumerate(first_sights(log)):
+        x, y, radius = log.layout.cylinders[index].tolist()
+        unseen, seen = f"cylinders/{index}/unseen", f"cylinders/{index}/seen"
+        if first != 0:
+            stage.cylinder(unseen, _HEIGHT, radius, "wall", (x, y), opacity=0.22)
             if first is not None:
-                path = f"cylinders/{index}/seen"
-                self._cylinder(f"{path}/body", _HEIGHT, radius, COLOURS["fixed"], (x, y))
-                self._rim(f"{path}/rim", np.array([x, y]), radius)
-                if first > 0:
-                    self._show(path, first, None)
+                stage.appear(unseen, 0, first)
+        if first is not None:
+            _pillar(stage, seen, radius, "fixed", (x, y))
+            if first > 0:
+                stage.appear(seen, first)
 
-    def _rim(self, path: str, place: Array, radius: float) -> None:
-        rim = shapes.ring(place, radius - 0.03, 0.03, _HEIGHT + 0.01, corners=32)
-        self._mesh(path, rim, COLOURS["start"], flat=True)
 
-    def _ends(self) -> None:
-        start, target = self.log.layout.start, self.log.layout.target
-        self._mesh("start", shapes.ring(start[:2], 0.18, 0.07, 0.012, corners=32), COLOURS["start"], flat=True)
-        rings = [shapes.ring(target[:2], r, 0.07, 0.012, corners=40) for r in (0.12, 0.4)]
-        self._mesh("target/rings", shapes.merge(rings), COLOURS["goal"], flat=True)
-        self._cylinder("target/pole", float(target[2]), 0.025, COLOURS["pole"], target[:2])
-        self._ball("target/ball", 0.16, COLOURS["goal"], target)
+def _pillar(stage: Stage, path: str, radius: float, colour: str, place: tuple[float, float] = (0.0, 0.0)) -> None:
+    stage.cylinder(f"{path}/body", _HEIGHT, radius, colour, place)
+    stage.mesh(f"{path}/rim", shapes.ring(np.array(place), radius - 0.03, 0.03, _HEIGHT + 0.01, corners=32), "start")
 
-    def _landmarks(self) -> None:
-        """One ellipse for each name a landmark was ever given, moved and stretched as it becomes better known."""
-        told: dict[int, dict[int, Array]] = {}
-        radii: dict[int, float] = {}
-        for tick in self.ticks.tolist():
-            row = self.log.landmarks[tick]
-            radii |= dict(zip(row.ids.tolist(), row.radii.tolist(), strict=True))
-            for name, mean, covariance in zip(row.ids.tolist(), row.means, row.covariances, strict=True):
-                long, short, direction = drone.ellipse_axes(covariance, SIGMAS)
-                earlier = told.setdefault(name, {})
-                if earlier:  # a direction and its opposite are the same: the nearer one, lest the ellipse spin
-                    last = float(next(reversed(earlier.values()))[4])
-                    direction = last + (direction - last + math.pi / 2.0) % math.pi - math.pi / 2.0
-                earlier[tick] = np.array([*mean, long, short, direction])
-        for name, ellipses in sorted(told.items()):
-            self._landmark(f"landmarks/{name}", ellipses, radii[name])
 
-    def _landmark(self, path: str, ellipses: dict[int, Array], radius: float) -> None:
-        """Its ellipse, on top of the cylinder it stands for, and the cylinder's outline as believed."""
-        height = _HEIGHT + 0.02 if radius > 0.0 else 0.03
-        disc, _ = ellipse = drone.unit_disc()
-        disc[:, 2] = height
-        self._mesh(f"{path}/ellipse/disc", ellipse, COLOURS["estimate"], flat=True, opacity=0.5)
-        edge = shapes.ring(np.zeros(2), 0.86, 0.14, height + 0.005, corners=32)
-        self._mesh(f"{path}/ellipse/edge", edge, COLOURS["estimate"], flat=True)
-        if radius > 0.0:
-            outline = shapes.ring(np.zeros(2), radius, 0.05, 0.02, corners=32)
-            self._mesh(f"{path}/outline", outline, COLOURS["estimate"], flat=True)
-        hidden = True
-        for tick in self.ticks.tolist():
-            if (tick not in ellipses) != hidden or tick in (0, self.last):
-                hidden = tick not in ellipses
-                self._key(path, tick)("visible", "boolean", not hidden)
-        told, previous = -1, -1
-        for tick, values in ellipses.items():
-            if told < 0 or _changed(ellipses[told], values):
-                if previous > told:
-                    self._place_ellipse(path, previous, ellipses[told])  # it has stood still until then
-                self._place_ellipse(path, tick, values)
-                told = tick
-            previous = tick
+def _ends(stage: Stage, log: FlightLog) -> None:
+    start, target = log.layout.start, log.layout.target
+    stage.mesh("start", shapes.ring(start[:2], 0.18, 0.07, 0.012, corners=32), "start")
+    rings = [shapes.ring(target[:2], r, 0.07, 0.012, corners=40) for r in (0.12, 0.4)]
+    stage.mesh("target/rings", shapes.merge(rings), "goal")
+    stage.cylinder("target/pole", float(target[2]), 0.025, "pole", target[:2])
+    stage.ball("target/ball", 0.16, "goal", target)
 
-    def _place_ellipse(self, path: str, tick: int, ellipse: Array) -> None:
-        x, y, long, short, direction = ellipse.tolist()
-        self._key(path, tick)("position", "vector3", [x, y, 0.0])
-        key = self._key(f"{path}/ellipse", tick)
-        key("scale", "vector3", [max(long, 1e-3), max(short, 1e-3), 1.0])
-        key("quaternion", "quaternion", [0.0, 0.0, math.sin(direction / 2.0), math.cos(direction / 2.0)])
 
-    def _movers(self) -> None:
-        for index in range(self.log.movers.shape[1]):
-            places = self.log.movers[:, index]
-            self._cylinder(f"movers/{index}/body", _HEIGHT, float(places[0, 2]), COLOURS["moving"])
-            self._rim(f"movers/{index}/rim", np.zeros(2), float(places[0, 2]))
-            self._travel(f"movers/{index}", np.column_stack([places[:, :2], np.zeros(self.log.ticks)]))
+def _landmarks(stage: Stage, log: FlightLog) -> None:
+    """One ellipse for each name a landmark was ever given, moved and stretched as it becomes better known."""
+    told: dict[int, dict[int, Array]] = {}
+    radii: dict[int, float] = {}
+    for tick in stage.ticks.tolist():
+        row = log.landmarks[tick]
+        radii |= dict(zip(row.ids.tolist(), row.radii.tolist(), strict=True))
+        for name, mean, covariance in zip(row.ids.tolist(), row.means, row.covariances, strict=True):
+            long, short, direction = shapes.ellipse_axes(covariance, SIGMAS)
+            earlier = told.setdefault(name, {})
+            if earlier:  # a direction and its opposite are the same: the nearer one, lest the ellipse spin
+                last = float(next(reversed(earlier.values()))[4])
+                direction = last + (direction - last + math.pi / 2.0) % math.pi - math.pi / 2.0
+            earlier[tick] = np.array([*mean, long, short, direction])
+    for name, ellipses in sorted(told.items()):
+        _landmark(stage, f"landmarks/{name}", ellipses, radii[name])
 
-    def _drone(self) -> None:
-        """The vehicle, its shadow with a plumb line, and the circle the sensor reaches."""
-        truth = self.log.truth
-        self._mesh("drone/body", drone.body(VEHICLE_RADIUS), COLOURS["robot"])
-        self._mesh("drone/nose", drone.nose(VEHICLE_RADIUS), COLOURS["goal"])
-        self._mesh("drone/arms", drone.arms(VEHICLE_RADIUS), 0x2B3340)
-        for name, front, colour in (("front", True, COLOURS["scan"]), ("back", False, 0x2B3340)):
-            self._mesh(f"drone/{name}/rotors", drone.rotors(VEHICLE_RADIUS, front=front), colour, flat=True)
-            swept = drone.swept(VEHICLE_RADIUS, front=front)
-            self._mesh(f"drone/{name}/swept", swept, colour, flat=True, opacity=0.4)
-        self._travel("drone", truth[:, :3], truth[:, 3:7])
 
-        below = np.column_stack([truth[:, :2], np.zeros(self.log.ticks)])
-        disc = shapes.ring(np.zeros(2), 0.0, VEHICLE_RADIUS, 0.016, corners=24)
-        self._mesh("shadow/disc", disc, COLOURS["start"], flat=True, opacity=0.4)
-        plumb = drone.tube(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), 0.012)
-        self._mesh("shadow/plumb", plumb, COLOURS["start"], flat=True, opacity=0.5)
-        for tick in self.ticks.tolist():
-            self._key("shadow/plumb", tick)("scale", "vector3", [1.0, 1.0, max(float(truth[tick, 2]), 1e-3)])
-        self._travel("shadow", below)
-        reach = sensor_reach(self.log)
-        if reach is not None:
-            self._mesh(
-                "sensor", shapes.ring(np.zeros(2), reach - 0.07, 0.07, 0.014, corners=96), COLOURS["scan"], flat=True
-            )
-            self._travel("sensor", below)
+def _landmark(stage: Stage, path: str, ellipses: dict[int, Array], radius: float) -> None:
+    """Its ellipse, on top of the cylinder it stands for, and the cylinder's outline as believed."""
+    height, middle = _HEIGHT + 0.02 if radius > 0.0 else 0.03, np.zeros(2)
+    stage.mesh(f"{path}/ellipse/disc", shapes.ring(middle, 0.0, 1.0, height, corners=32), "estimate", opacity=0.5)
+    stage.mesh(f"{path}/ellipse/edge", shapes.ring(middle, 0.86, 0.14, height + 0.005, corners=32), "estimate")
+    if radius > 0.0:
+        stage.mesh(f"{path}/outline", shapes.ring(middle, radius, 0.05, 0.02, corners=32), "estimate")
+    hidden = True
+    for tick in stage.ticks.tolist():
+        if (tick not in ellipses) != hidden or tick in (0, stage.last):
+            hidden = tick not in ellipses
+            stage.key(path, tick, visible=not hidden)
+    told, previous = -1, -1
+    for tick, values in ellipses.items():
+        if told < 0 or _changed(ellipses[told], values):
+            if previous > told:
+                _place_ellipse(stage, path, previous, ellipses[told])  # it has stood still until then
+            _place_ellipse(stage, path, tick, values)
+            told = tick
+        previous = tick
 
-    def _trail(self) -> None:
-        """The way flown so far, as believed and as it truly was, in pieces that appear as the vehicle passes."""
-        ways = [("believed", self.log.believed[:, :3], "trail", 0.03)]
-        if has_estimate(self.log):
-            ways.append(("truth", self.log.truth[:, :3], "odometry", 0.014))
-        stride = max(1, math.ceil(self.last / _PIECES))
-        for begin in range(0, self.last, stride):
-            end = min(begin + stride, self.last)
-            for name, way, colour, radius in ways:
-                points = drone.thin(way[begin : end + 1], 3)
-                if len(points) > 1:
-                    self._mesh(f"flown/{begin}/{name}", drone.tube(points, radius), COLOURS[colour], flat=True)
-            self._show(f"flown/{begin}", end, None)
 
-    def _frames(self) -> None:
-        """Predicted way and window of the estimator: one group per frame, shown in turn."""
-        endings = [*self.ticks[1:].tolist(), None]
-        for tick, ending in zip(self.ticks.tolist(), endings, strict=True):
-            path, drawn = f"frames/{tick}", False
-            for name, way, colour, radius in (
-                ("past", self.log.pasts[tick], "robot", 0.045),
-                ("horizon", self.log.plans[tick], "horizon", 0.05),
-            ):
-                points = drone.thin(way, _NODES) if len(way) > 1 and np.isfinite(way).all() else way[:0]
-                if len(points) > 1:
-                    drawn = True
-                    self._mesh(f"{path}/{name}", drone.tube(points, radius), COLOURS[colour], flat=True)
-                    if name == "horizon":
-                        below = shapes.ribbon(points, 0.06, 0.018)
-                        self._mesh(f"{path}/below", below, COLOURS["horizon"], flat=True, opacity=0.35)
-            if drawn:
-                self._show(path, tick, ending)
-
-    def _mesh(self, path: str, mesh: shapes.Mesh, colour: int, *, flat: bool = False, opacity: float = 1.0) -> None:
-        """Send a mesh; a flat one is drawn in its own colour whatever the light."""
-        from meshcat.geometry import MeshBasicMaterial, MeshLambertMaterial, TriangularMeshGeometry
-
-        material = MeshBasicMaterial if flat else MeshLambertMaterial
-        extra: dict[str, Any] = {"depthWrite": False} if opacity < 1.0 else {}  # what lies behind shows through
-        self.viewer[path].set_object(TriangularMeshGeometry(*mesh), material(color=colour, opacity=opacity, **extra))
-
-    def _ball(self, path: str, radius: float, colour: int, place: Array) -> None:
-        from meshcat.geometry import MeshLambertMaterial, Sphere
-
-        self.viewer[path].set_object(Sphere(radius), MeshLambertMaterial(color=colour))
-        transform = np.eye(4)
-        transform[:3, 3] = place
-        self.viewer[path].set_transform(transform)
-
-    def _cylinder(
-        self,
-        path: str,
-        height: float,
-        radius: float,
-        colour: int,
-        place: tuple[float, float] | Array = (0.0, 0.0),
-        *,
-        opacity: float = 1.0,
-    ) -> None:
-        """Send an upright cylinder that stands on the ground."""
-        from meshcat.geometry import Cylinder, MeshLambertMaterial
-
-        extra: dict[str, Any] = {"depthWrite": False} if opacity < 1.0 else {}
-        self.viewer[path].set_object(
-            Cylinder(height, radius), MeshLambertMaterial(color=colour, opacity=opacity, **extra)
-        )
-        x, y = place
-        # The cylinder's axis is y there: turned by a quarter about x, it is z.
-        upright = np.array([[1, 0, 0, x], [0, 0, -1, y], [0, 1, 0, height / 2.0], [0, 0, 0, 1]], dtype=np.float64)
-        self.viewer[path].set_transform(upright)
-
-    def _travel(self, path: str, places: Array, attitudes: Array | None = None) -> None:
-        """Animate an object through places (T, 3) [m] and attitudes (T, 4) (w, x, y, z)."""
-        for tick in self.ticks.tolist():
-            key = self._key(path, tick)
-            key("position", "vector3", places[tick].tolist())
-            if attitudes is not None:
-                w, x, y, z = attitudes[tick].tolist()
-                key("quaternion", "quaternion", [x, y, z, w])
-
-    def _show(self, path: str, begin: int, end: int | None) -> None:
-        """Show an object from one tick to another (or for good).
-
-        The track holds its first key backwards, hence the key at 0; the key at the very end makes all tracks equally
-        long, which lets the viewer stop and restart them together.
-        """
-        keys = {0: False, begin: True}
-        if end is not None:
-            keys[end] = False
-        keys.setdefault(self.last, end is None)
-        for tick, visible in keys.items():
-            self._key(path, tick)("visible", "boolean", visible)
-
-    def _key(self, path: str, tick: int) -> Callable[[str, str, object], None]:
-        set_property: Callable[[str, str, object], None] = self.animation.at_frame(self.viewer[path], tick).set_property
-        return set_property
+def _place_ellipse(stage: Stage, path: str, tick: int, ellipse: Array) -> None:
+    x, y, long, short, direction = ellipse.tolist()
+    stage.key(path, tick, position=(x, y, 0.0))
+    turn = (math.cos(direction / 2.0), 0.0, 0.0, math.sin(direction / 2.0))
+    stage.key(f"{path}/ellipse", tick, scale=(max(long, 1e-3), max(short, 1e-3), 1.0), quaternion=turn)
 
 
 def _changed(before: Array, now: Array) -> bool:
     distance, share = _STILL
     moved = float(np.abs(now[:2] - before[:2]).max()) > distance
     return moved or bool((np.abs(now[2:4] - before[2:4]) > share * np.maximum(before[2:4], distance)).any())
+
+
+def _movers(stage: Stage, log: FlightLog) -> None:
+    for index in range(log.movers.shape[1]):
+        places = log.movers[:, index]
+        _pillar(stage, f"movers/{index}", float(places[0, 2]), "moving")
+        stage.move(f"movers/{index}", _below(places))
+
+
+def _drone(stage: Stage, log: FlightLog) -> None:
+    """The vehicle, its shadow with a plumb line, and the circle the sensor reaches."""
+    truth, radius, middle = log.truth, VEHICLE_RADIUS, np.zeros(2)
+    stage.mesh("drone/body", drone.body(radius), "robot", lit=True)
+    stage.mesh("drone/nose", drone.nose(radius), "goal", lit=True)
+    stage.mesh("drone/arms", drone.arms(radius), "dark", lit=True)
+    for name, front, colour in (("front", True, "scan"), ("back", False, "dark")):
+        stage.mesh(f"drone/{name}/rotors", drone.rotors(radius, front=front), colour)
+        stage.mesh(f"drone/{name}/swept", drone.swept(radius, front=front), colour, opacity=0.4)
+    stage.move("drone", truth[:, :3], truth[:, 3:7])
+
+    stage.mesh("shadow/disc", shapes.ring(middle, 0.0, radius, 0.016, corners=24), "start", opacity=0.4)
+    plumb = shapes.tube(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), 0.012)
+    stage.mesh("shadow/plumb", plumb, "start", opacity=0.5)
+    for tick in stage.ticks.tolist():
+        stage.key("shadow/plumb", tick, scale=(1.0, 1.0, max(float(truth[tick, 2]), 1e-3)))
+    stage.move("shadow", _below(truth))
+    reach = sensor_reach(log)
+    if reach is not None:
+        stage.mesh("sensor", shapes.ring(middle, reach - 0.07, 0.07, 0.014, corners=96), "scan")
+        stage.move("sensor", _below(truth))
+
+
+def _below(rows: Array) -> Array:
+    """Places (T, 3) [m] on the ground of rows that begin with x and y."""
+    return np.column_stack([rows[:, :2], np.zeros(len(rows))])
+
+
+def _trail(stage: Stage, log: FlightLog) -> None:
+    """The way flown so far, as believed and as it truly was."""
+    ways = [("believed", log.believed[:, :3], "trail", 0.03)]
+    if has_estimate(log):
+        ways.append(("truth", log.truth[:, :3], "odometry", 0.014))
+    for begin, end in stage.pieces():
+        for name, way, colour, radius in ways:
+            points = shapes.thin(way[begin : end + 1], 3)
+            if len(points) > 1:
+                stage.mesh(f"flown/{begin}/{name}", shapes.tube(points, radius), colour)
+        stage.appear(f"flown/{begin}", end)
+
+
+def _frames(stage: Stage, log: FlightLog) -> None:
+    """Predicted way, with its shadow, and window of the estimator, of each frame."""
+    for tick, ending in stage.turns():
+        path, drawn = f"frames/{tick}", False
+        for name, way, colour, radius in (
+            ("past", log.pasts[tick], "robot", 0.045),
+            ("horizon", log.plans[tick], "horizon", 0.05),
+        ):
+            points = shapes.thin(way, _NODES) if len(way) > 1 and np.isfinite(way).all() else way[:0]
+            if len(points) > 1:
+                drawn = True
+                stage.mesh(f"{path}/{name}", shapes.tube(points, radius), colour)
+                if name == "horizon":
+                    stage.mesh(f"{path}/below", shapes.ribbon(points, 0.06, 0.018), "horizon", opacity=0.35)
+        if drawn:
+            stage.appear(path, tick, ending)
+
+
+def _page(log: FlightLog, ticks: IntArray) -> Page:
+    m = flight_metrics(log)
+    settings, error, tick, hits = m["settings"], m["position_error_m"], m["tick_ms"], m["collisions"]
+    name = str(settings.get("scenario", "quadrotor"))
+    reached = "target reached" if m["reached"] else f"{m['target_distance_m']:.1f} m short of the target"
+    collisions = "no collision" if hits == 0 else f"{hits} collision{'s' if hits > 1 else ''}"
+    stopped = ", interrupted by the user" if m["interrupted"] else ""
+    solver = str(settings.get("solver", ""))
+    if solver and settings.get("coupling"):
+        solver += f" ({settings['coupling']})"
+    (left, low), (right, high) = log.layout.size.tolist()
+    corners = [[x, y, z] for z in (0.0, _HEIGHT) for x in (left, right) for y in (low, high)]
+    return Page(
+        title=f"unifg: {name}" + (f", {log.layout.name}" if log.layout.name else ""),
+        outcome=f"{reached}, {collisions}{stopped}",
+        good=m["succeeded"],
+        facts={
+            "solver": solver,
+            "seed": "" if settings.get("seed") is None else str(settings["seed"]),
+            "flown": f"{m['path_length_m']:.1f} m in {m['duration_s']:.1f} s",
+            "closest approach": f"{max(0.0, m['min_clearance_m']):.2f} m",
+            "position error": "" if error is None else f"{100 * error['rms']:.1f} cm rms",
+            "estimate + plan": f"{tick['p50']:.1f} ms median" if tick["max"] > 0.0 else "",
+        },
+        corners=np.array(corners),
+        legend=_legend(log),
+        labels=[
+            Label("start", [*log.layout.start[:2].tolist(), 0.0]),
+            Label("target", log.layout.target.tolist()),
+            Label("drone", follows="drone", above=True),
+        ],
+        readouts=_readouts(log, ticks),
+        views=_views(log),
+        speeds=(0.25, 0.5, 1, 2, 4),
+    )
+
+
+def _legend(log: FlightLog) -> list[Key]:
+    sensed, estimated = sensor_reach(log) is not None, has_estimate(log)
+    window = any(len(past) > 1 for past in log.pasts)
+    believed = "estimated past before that" if window or estimated else "way flown"
+    marked = any(len(row.ids) for row in log.landmarks)
+    keys = (
+        (window, Key("robot", "line", "estimated past: the window that is smoothed")),
+        (True, Key("trail", "line", believed)),
+        (estimated, Key("odometry", "thin", "true way, where it differs")),
+        (True, Key("horizon", "line", "predicted future, and its shadow on the ground")),
+        (sensed, Key("scan", "ring", "reach of the sensor")),
+        (True, Key("fixed", "disc", "cylinder that has been seen" if sensed else "cylinder")),
+        (sensed, Key("wall", "ghost", "cylinder not seen yet")),
+        (marked, Key("estimate", "ghost", "landmark as believed: outline, and 2\u03c3 ellipse of its axis on top")),
+        (log.movers.shape[1] > 0, Key("moving", "disc", "cylinder that moves")),
+        (True, Key("goal", "disc", "target")),
+    )
+    return [key for here, key in keys if here]
+
+
+def _readouts(log: FlightLog, ticks: IntArray) -> list[Readout]:
+    def texts(values: Array, form: str) -> list[str]:
+        return [form.format(value) if np.isfinite(value) else "\u2013" for value in values[ticks].tolist()]
+
+    rows = [
+        Readout("speed", texts(np.linalg.norm(log.truth[:, 7:], axis=1), "{:.2f} m/s")),
+        Readout("height", texts(log.truth[:, 2], "{:.2f} m")),
+        Readout("clearance", texts(log.clearance, "{:.2f} m")),
+        Readout("thrust", texts(log.controls[:, 3], "{:.1f} N")),
+    ]
+    if has_estimate(log):
+        error = 100.0 * np.linalg.norm(log.believed[:, :3] - log.truth[:, :3], axis=1)
+        rows.append(Readout("position error", texts(error, "{:.1f} cm")))
+    if estimated_parameters(log)[0]:
+        mass, sigma = texts(log.parameters[:, 0], "{:.3f}"), texts(log.parameters_sigma[:, 0], "{:.3f} kg")
+        rows.append(Readout("mass \u00b1 \u03c3", [f"{m} \u00b1 {s}" for m, s in zip(mass, sigma, strict=True)]))
+        rows.append(Readout("true mass", [f"{log.parameters_true[0]:.3f} kg"] * len(ticks)))
+    if any(len(row.ids) for row in log.landmarks):
+        rows.append(Readout("landmarks", [str(len(log.landmarks[tick].ids)) for tick in ticks]))
+    if (log.estimate_ms + log.plan_ms).max() > 0.0:
+        spent = zip(texts(log.estimate_ms, "{:.1f} ms"), texts(log.plan_ms, "{:.1f} ms"), strict=True)
+        rows.append(Readout("estimate, plan", [f"{estimate}, {plan}" for estimate, plan in spent]))
+    plans = [log.statuses[k].lower() + (": stored one flown" if log.emergency[k] else "") for k in ticks]
+    return [*rows, Readout("plan", plans, log.emergency[ticks].tolist())]
+
+
+def _views(log: FlightLog) -> list[View]:
+    """Overview and follow look along and across the way to the target."""
+    way = (log.layout.target - log.layout.start)[:2]
+    way = way / max(float(np.linalg.norm(way)), 1e-9)
+
+    def away(back: float, side: float, up: float) -> list[float]:
+        return [*(-back * way + side * np.array([way[1], -way[0]])).tolist(), up]
+
+    ahead = [*(2.5 * way).tolist(), 0.0]
+    return [
+        View("overview", "Overview", away(0.55, 0.75, 0.8), 24.0),
+        View("follow", "Follow drone", away(1.0, 0.45, 0.7), 30.0, follows="drone", distance=13.0, ahead=ahead),
+        View("top", "From above", away(0.0, 0.001, 1.0), 10.0),
+    ]

@@ -14,7 +14,7 @@ import numpy as np
 
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.scenarios.pose_graph import SolvedGraph
-from unifg.scenarios.show.palette import css
+from unifg.scenarios.show.style import css
 from unifg.typing import Array, BoolArray
 
 if TYPE_CHECKING:

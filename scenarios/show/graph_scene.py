@@ -1,173 +1,129 @@
-"""A solved pose graph as one HTML file: look around in it, and step through the iterations, offline.
-
-As in `unifg.scenarios.show.drive_scene` the file carries its viewer (meshcat) and needs neither a server nor a network.
-"""
+"""A solved pose graph as a scene: look around in it, and step through the iterations."""
 
 from __future__ import annotations
-
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.scenarios.pose_graph import SolvedGraph
-from unifg.scenarios.show.graph_page import solve_page
 from unifg.scenarios.show.graph_plot import segments
-from unifg.scenarios.show.palette import COLOURS
-from unifg.scenarios.show.recorder import Recorder, load_meshcat, viewer_script
-from unifg.scenarios.show.shapes import Mesh
+from unifg.scenarios.show.shapes import strips
+from unifg.scenarios.show.stage import Key, Page, Readout, Stage, View
 from unifg.typing import Array
 
-if TYPE_CHECKING:
-    from meshcat.visualizer import Visualizer
-
-__all__ = ["record_scene", "strips", "write_scene"]
+__all__ = ["graph_scene", "shown_steps"]
 
 _MOST = 60_000  # edges drawn over all iterations; beyond, only the first guess and the solution are shown
 _MOST_STRIPS = 30_000  # odometry edges drawn with a width; beyond, as hair-thin lines
+_STEP = 0.5  # seconds an iterate is shown when they are played; sums of it are exact, as seeking one needs
+_MARGIN = 0.3  # of the size of the solution: how far around it the camera looks for the start
+_DIRECTIONS = {2: (0.0, -1e-4, 1.0), 3: (0.55, -0.67, 0.5)}  # to the camera, for poses in the plane and in space
 
 
-def write_scene(path: str | Path, solved: SolvedGraph) -> Path:
-    """Write the scene of a solved pose graph.
-
-    Args:
-        path: HTML file to write; an existing one is replaced.
-        solved: a solved pose graph.
-
-    Returns:
-        The path written.
+def graph_scene(solved: SolvedGraph) -> Stage:
+    """The scene of a solved pose graph: ``start``, and one group ``steps/k`` for each iterate shown.
 
     Raises:
         ScenarioError: meshcat is not installed.
     """
-    path = Path(path)
-    script = viewer_script()
-    recorder, shown = record_scene(solved)
-    page = solve_page(solved, shown, recorder.packed_base64(), script)
-    path.write_text(page, encoding="utf-8", newline="\n")
-    return path
+    graph, shown = solved.after, shown_steps(solved)
+    stage = Stage(len(shown), _STEP)
+    size, odometry = graph.group.point_dim, graph.edges.odometry
+    extent = float(np.ptp(graph.poses[:, :size], axis=0).max())
+    width = (0.0022 if size == 2 else 0.004) * extent  # strips in space are seen from the side
+    closures = {
+        "closures": (~odometry & ~solved.outliers, "closure", -1.0),
+        "outliers": (solved.outliers, "outlier", 1),
+    }
 
-
-def record_scene(solved: SolvedGraph) -> tuple[Recorder, list[int]]:
-    """Draw into a recorder: ``start``, and one group ``steps/k`` for each iterate shown.
-
-    Returns:
-        The recorded meshcat commands, and which of ``solved.steps`` are shown.
-
-    Raises:
-        ScenarioError: meshcat is not installed.
-    """
-    load_meshcat()
-    from meshcat.visualizer import Visualizer
-
-    recorder = Recorder()
-    scene = _Scene(solved, Visualizer(window=recorder))
-    return recorder, scene.draw()
-
-
-class _Scene:
-    """Everything drawn, with the sizes that follow from the extent of the solution."""
-
-    def __init__(self, solved: SolvedGraph, viewer: Visualizer) -> None:
-        self.solved, self.viewer = solved, viewer
-        graph = solved.after
-        self.size = graph.group.point_dim
-        extent = float(np.ptp(graph.poses[:, : self.size], axis=0).max())
-        self.width = (0.0022 if self.size == 2 else 0.004) * extent  # strips in space are seen from the side
-        odometry = graph.edges.odometry
-        self.parts = {
-            "trajectory": odometry,
-            "closures": ~odometry & ~solved.outliers,
-            "outliers": solved.outliers,
-        }
-        self.ribbons = int(odometry.sum()) <= _MOST_STRIPS
-
-    def draw(self) -> list[int]:
-        """Send every object; return which iterates were drawn."""
-        self._surroundings()
-        solved, graph = self.solved, self.solved.after
-        self._path("start", solved.before, "odometry", 0.6, -2.0)
-        last = len(solved.steps) - 1
-        count = len(graph.edges)
-        shown = list(range(last + 1)) if count * (last + 1) <= _MOST else sorted({0, last})
-        for k in shown:
-            iterate = graph.with_poses(solved.steps[k])
-            for name, colour, height in (("closures", "closure", -1.0), ("outliers", "outlier", 1.0)):
-                lines = segments(iterate, self.parts[name])
-                if len(lines):
-                    self._thin(f"steps/{k}/{name}", self._lift(lines, height), COLOURS[colour])
-            self._path(f"steps/{k}/trajectory", iterate, "robot", 1.0, 0.0)
-        if len(graph.landmarks):
-            self._points("landmarks", self._lift(graph.landmarks, 2.0), COLOURS["landmark"], 7.0)
-        first = graph.poses[:1, : self.size]
-        self._points("first", self._lift(first, 3.0), 0x1D2430, 9.0)
-        return shown
-
-    def _surroundings(self) -> None:
-        for path in ("/Grid", "/Axes"):
-            self.viewer[path].set_property("visible", False)
-        self.viewer["/Background"].set_property("top_color", [0.98, 0.98, 0.985])
-        self.viewer["/Background"].set_property("bottom_color", [0.93, 0.94, 0.95])
-
-    def _path(self, path: str, graph: PoseGraph, colour: str, width: float, height: float) -> None:
-        """The odometry edges of a graph as strips, or as lines where there are very many."""
-        lines = self._lift(segments(graph, self.parts["trajectory"]), height)
-        if not len(lines):
-            self._points(path, self._lift(graph.poses[:, : self.size], height), COLOURS[colour], 3.0)
-        elif self.ribbons:
-            self._mesh(path, strips(lines, width * self.width, self.size == 3), COLOURS[colour])
-        else:
-            self._thin(path, lines, COLOURS[colour])
-
-    def _lift(self, points: Array, height: float) -> Array:
-        """Planar points (..., 2) as points in space; a few widths up or down keep layers apart."""
-        if points.shape[-1] == 3:
+    def lift(points: Array, height: float) -> Array:
+        """Planar points (..., 2) as points in space; half widths up or down keep layers apart."""
+        if size == 3:
             return points
-        level = np.full((*points.shape[:-1], 1), 0.5 * height * self.width)
-        return np.concatenate([points, level], axis=-1)
+        return np.concatenate([points, np.full((*points.shape[:-1], 1), 0.5 * height * width)], axis=-1)
 
-    def _mesh(self, path: str, mesh: Mesh, colour: int) -> None:
-        from meshcat.geometry import MeshBasicMaterial, TriangularMeshGeometry
+    def trajectory(path: str, poses: PoseGraph, colour: str, share: float, height: float) -> None:
+        """The odometry edges as strips, or as lines where there are very many."""
+        lines = lift(segments(poses, odometry), height)
+        if not len(lines):
+            stage.points(path, lift(poses.poses[:, :size], height), colour, 3.0)
+        elif len(lines) <= _MOST_STRIPS:
+            stage.mesh(path, strips(lines, share * width, size == 3), colour)
+        else:
+            stage.lines(path, lines, colour)
 
-        self.viewer[path].set_object(TriangularMeshGeometry(*mesh), MeshBasicMaterial(color=colour))
+    trajectory("start", solved.before, "odometry", 0.6, -2.0)
+    parts: dict[str, list[str]] = {"trajectory": [], "closures": [], "outliers": []}
+    for tick, k in enumerate(shown):
+        iterate = graph.with_poses(solved.steps[k])
+        for name, (edges, colour, height) in closures.items():
+            if edges.any():
+                parts[name].append(f"steps/{k}/{name}")
+                stage.lines(parts[name][-1], lift(segments(iterate, edges), height), colour)
+        parts["trajectory"].append(f"steps/{k}/trajectory")
+        trajectory(parts["trajectory"][-1], iterate, "robot", 1.0, 0.0)
+        stage.appear(f"steps/{k}", tick, tick + 1 if tick < stage.last else None)
+    if len(graph.landmarks):
+        stage.points("landmarks", lift(graph.landmarks, 2.0), "landmark", 7.0)
+    stage.points("first", lift(graph.poses[:1, :size], 3.0), "ink", 9.0)
+    return stage.finish(_page(solved, shown, parts))
 
-    def _thin(self, path: str, lines: Array, colour: int) -> None:
-        from meshcat.geometry import LineBasicMaterial, LineSegments, PointsGeometry
 
-        points = lines.reshape(-1, 3).T.astype(np.float32)
-        material = LineBasicMaterial(color=colour, transparent=True, opacity=0.55)
-        self.viewer[path].set_object(LineSegments(PointsGeometry(points), material))
-
-    def _points(self, path: str, points: Array, colour: int, pixels: float) -> None:
-        from meshcat.geometry import GenericMaterial, Points, PointsGeometry
-
-        material = GenericMaterial(color=colour, size=pixels, sizeAttenuation=False)
-        material._type = "PointsMaterial"  # meshcat's own insists on a colour per point
-        self.viewer[path].set_object(Points(PointsGeometry(points.T.astype(np.float32)), material))
+def shown_steps(solved: SolvedGraph) -> list[int]:
+    """Which of ``solved.steps`` are drawn: all, or of a large graph the first and the last."""
+    last = len(solved.steps) - 1
+    return list(range(last + 1)) if len(solved.after.edges) * (last + 1) <= _MOST else sorted({0, last})
 
 
-def strips(lines: Array, width: float, crossed: bool) -> Mesh:
-    """Straight lines (k, 2, 3) as level strips of that width [m]; crossed with upright ones to be seen from all sides.
+def _page(solved: SolvedGraph, shown: list[int], parts: dict[str, list[str]]) -> Page:
+    graph, settings, solution = solved.after, solved.settings, solved.solution
+    legend = [
+        Key("odometry", "line", "trajectory at the start", ["start"]),
+        Key("robot", "line", "trajectory: poses joined by odometry", parts["trajectory"]),
+        Key("closure", "line", "loop closures: the same place seen again", parts["closures"]),
+    ]
+    if solved.outliers.any():
+        legend.append(Key("outlier", "line", "loop closures taken for outliers", parts["outliers"]))
+    if len(graph.landmarks):
+        legend.append(Key("landmark", "line", "landmarks", ["landmarks"]))
+    costs = {row.number: row.cost for row in solution.history}
+    numbers = [int(solved.step_numbers[k]) for k in shown]
+    return Page(
+        title=f"unifg: {solved.name}",
+        outcome=solution.status.value,
+        good=solution.converged,
+        facts={
+            "poses": f"{len(graph.poses)} in {graph.group.point_dim}D",
+            "edges": f"{len(graph.edges)}, {len(graph.closures)} close loops",
+            "landmarks": f"{len(graph.landmarks)}" if len(graph.landmarks) else "",
+            "first guess": settings.init,
+            "solver": settings.solver,
+            "residual": settings.residual,
+            "robust loss": settings.robust or "",
+            "outliers": f"{int(solved.outliers.sum())}" if solved.loss else "",
+            "\u03c7\u00b2 before": f"{solved.chi2[1]:.7g}",
+            "\u03c7\u00b2 after": f"{solved.chi2[2]:.7g}",
+            "without outliers": f"{solved.chi2_inliers:.7g}" if solved.outliers.any() else "",
+            "solved in": f"{solution.iterations} iterations, {1e3 * solved.seconds['solve']:.0f} ms",
+        },
+        corners=_corners(solved),
+        legend=legend,
+        labels=[],
+        readouts=[Readout("cost", [f"{costs.get(number, solution.cost):.7g}" for number in numbers])],
+        views=[View("overview", "Whole graph", _DIRECTIONS[graph.group.point_dim], 20.0)],
+        counts="iteration",
+        numbers=numbers,
+    )
 
-    Returns:
-        Vertices (4 k or 8 k, 3) and faces.
-    """
-    along = lines[:, 1] - lines[:, 0]
-    level = np.cross(along, [0.0, 0.0, 1.0])
-    vertical = np.linalg.norm(level, axis=1, keepdims=True) < 1e-9 * np.linalg.norm(along, axis=1, keepdims=True)
-    level = np.where(vertical, np.array([1.0, 0.0, 0.0]), level)
-    sides = [level]
-    if crossed:
-        sides.append(np.cross(level, along))
-    corners = []
-    for side in sides:
-        arm = 0.5 * width * side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-300)
-        # A little longer than the line: the joints of a bent path close.
-        end = 0.5 * width * along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
-        low, high = lines[:, 0] - end, lines[:, 1] + end
-        corners.append(np.stack([low - arm, low + arm, high + arm, high - arm], axis=1))
-    vertices = np.concatenate(corners).reshape(-1, 3)
-    begin = 4 * np.arange(len(vertices) // 4, dtype=np.intp)[:, None, None]
-    faces = (begin + np.array([[0, 1, 2], [0, 2, 3]], dtype=np.intp)).reshape(-1, 3)
-    return vertices, faces
+
+def _corners(solved: SolvedGraph) -> Array:
+    """(8, 3) corners of the solution and, unless it strays far from it, of the start."""
+    size = solved.after.group.point_dim
+    points, start = solved.after.poses[:, :size], solved.before.poses[:, :size]
+    low, high = points.min(axis=0), points.max(axis=0)
+    reach = _MARGIN * float((high - low).max())
+    low = np.maximum(np.minimum(low, start.min(axis=0)), low - reach)
+    high = np.minimum(np.maximum(high, start.max(axis=0)), high + reach)
+    box = np.zeros((2, 3))
+    box[:, :size] = low, high
+    return np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)

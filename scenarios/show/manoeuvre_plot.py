@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from unifg.scenarios.manoeuvres import Manoeuvre
-from unifg.scenarios.show.palette import css
+from unifg.scenarios.show.style import css
 from unifg.typing import Array
 
 if TYPE_CHECKING:

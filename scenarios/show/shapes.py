@@ -1,20 +1,40 @@
-"""Meshes for scenes: a map extruded into walls, and flat ribbons where a browser draws hair-thin lines.
+"""Meshes for scenes: a map extruded into walls, ribbons and tubes where a browser draws hair-thin lines, boxes, rings.
 
-A mesh is a pair (vertices (n, 3) [m], faces (m, 3)). Walls share no vertices, so that shading keeps edges sharp.
+A mesh is a pair (vertices (n, 3) [m], faces (m, 3)). Walls and boxes share no vertices, so that shading keeps edges
+sharp.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from unifg.files.ros_map import OccupancyMap
-from unifg.typing import Array, BoolArray, IntArray
+from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
-__all__ = ["Mesh", "cover", "extrude", "flat", "known_corners", "merge", "ribbon", "ring", "wedge"]
+__all__ = [
+    "Mesh",
+    "box",
+    "cover",
+    "ellipse_axes",
+    "extrude",
+    "flat",
+    "known_corners",
+    "merge",
+    "quads",
+    "ribbon",
+    "ring",
+    "strips",
+    "thin",
+    "tube",
+    "wedge",
+]
 
 Mesh = tuple[Array, IntArray]
 
 _WALLS_AROUND = 0.5  # [m]; thickness of outer walls that is still shown
+_APART = 1e-4  # neighbours nearer than this are one point [m]
 
 
 def cover(mask: BoolArray) -> IntArray:
@@ -75,7 +95,7 @@ def flat(occupancy: OccupancyMap, mask: BoolArray, z: float) -> Mesh:
         axis=1,
     )
     points = occupancy.grid_to_world(corners.astype(np.float64))
-    return _quads(np.concatenate([points, np.full((*points.shape[:2], 1), z)], axis=-1))
+    return quads(np.concatenate([points, np.full((*points.shape[:2], 1), z)], axis=-1))
 
 
 def extrude(occupancy: OccupancyMap, height: float) -> Mesh:
@@ -94,7 +114,7 @@ def extrude(occupancy: OccupancyMap, height: float) -> Mesh:
     ends = occupancy.grid_to_world(np.concatenate(sides + turned).astype(np.float64))
     low = np.concatenate([ends, np.zeros((len(ends), 2, 1))], axis=-1)
     high = np.concatenate([ends, np.full((len(ends), 2, 1), height)], axis=-1)
-    walls = _quads(np.concatenate([low, high[:, ::-1]], axis=1))
+    walls = quads(np.concatenate([low, high[:, ::-1]], axis=1))
     return merge([flat(occupancy, occupied, height), walls])
 
 
@@ -140,6 +160,89 @@ def merge(meshes: list[Mesh]) -> Mesh:
     return np.concatenate([vertices for vertices, _ in meshes]), np.concatenate(faces)
 
 
+def strips(lines: Array, width: float, crossed: bool) -> Mesh:
+    """Straight lines (k, 2, 3) as level strips of that width [m]; crossed with upright ones to be seen from all sides.
+
+    Returns:
+        4 k or 8 k vertices, and faces.
+    """
+    along = lines[:, 1] - lines[:, 0]
+    level = np.cross(along, [0.0, 0.0, 1.0])
+    vertical = np.linalg.norm(level, axis=1, keepdims=True) < 1e-9 * np.linalg.norm(along, axis=1, keepdims=True)
+    level = np.where(vertical, np.array([1.0, 0.0, 0.0]), level)
+    sides = [level]
+    if crossed:
+        sides.append(np.cross(level, along))
+    corners = []
+    for side in sides:
+        arm = 0.5 * width * side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-300)
+        # A little longer than the line: the joints of a bent path close.
+        end = 0.5 * width * along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
+        low, high = lines[:, 0] - end, lines[:, 1] + end
+        corners.append(np.stack([low - arm, low + arm, high + arm, high - arm], axis=1))
+    return quads(np.concatenate(corners))
+
+
+def tube(points: Array, radius: float, sides: int = 3) -> Mesh:
+    """A tube of few sides along a polyline, open at its ends.
+
+    Args:
+        points: (n, 3) [m], n >= 2; neighbours may coincide.
+        radius: [m].
+        sides: of the cross section.
+
+    Returns:
+        ``sides`` n vertices and 2 ``sides`` (n - 1) faces.
+    """
+    tangent = np.gradient(points, axis=0)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
+    # Any two directions across the tangent do, as long as they turn little from point to point.
+    away = np.array([0.0, 0.0, 1.0]) if np.abs(tangent[:, 2]).max() < 0.9 else np.array([0.31, 0.95, 0.0])
+    first = np.cross(away, tangent)
+    norm = np.linalg.norm(first, axis=1, keepdims=True)
+    first = np.where(norm > 1e-6, first / np.maximum(norm, 1e-9), [0.0, 1.0, 0.0])
+    second = np.cross(tangent, first)
+    angles = np.pi / 2.0 + 2.0 * np.pi / sides * np.arange(sides)
+    around = np.cos(angles)[:, None] * first[:, None] + np.sin(angles)[:, None] * second[:, None]
+    vertices = (points[:, None] + radius * around).reshape(-1, 3)
+    faces = []
+    for k in range(sides):
+        after = (k + 1) % sides
+        faces += [[k, after, sides + k], [after, sides + after, sides + k]]
+    return vertices, _repeat(faces, sides, len(points) - 1)
+
+
+def box(centre: ArrayLike, size: ArrayLike) -> Mesh:
+    """A box (3,) [m] around a centre (3,) [m], its faces apart, so that shading keeps edges sharp."""
+    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=np.float64)
+    sides = []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            side = np.full((4, 3), sign)
+            side[:, [(axis + 1) % 3, (axis + 2) % 3]] = signs if sign > 0.0 else signs[::-1]
+            sides.append(side)
+    return quads(np.asarray(centre) + 0.5 * np.asarray(size) * np.stack(sides))
+
+
+def thin(points: Array, most: int) -> Array:
+    """At most that many of the points of a polyline, its ends among them, after repeated neighbours are left out."""
+    apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > _APART
+    kept: Array = points[np.concatenate([[True], apart])]
+    return kept[np.unique(np.linspace(0, len(kept) - 1, most).round().astype(np.intp))]
+
+
+def ellipse_axes(covariance: Array, sigmas: float) -> tuple[float, float, float]:
+    """Half axes [m] and direction of the longer one [rad] of a covariance (2, 2) [m^2] at some standard deviations."""
+    variances, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    short, long = sigmas * np.sqrt(np.maximum(variances, 0.0))
+    return float(long), float(short), math.atan2(vectors[1, 1], vectors[0, 1])
+
+
+def quads(corners: Array) -> Mesh:
+    """Quadrilaterals (n, 4, 3) as two triangles each."""
+    return corners.reshape(-1, 3), _repeat([[0, 1, 2], [0, 2, 3]], 4, len(corners))
+
+
 def _edges(solid: BoolArray, forward: bool) -> IntArray:
     """Edges (n, 2, 2), ends as (column, row), of solid runs that border the next or the previous row."""
     beyond = np.zeros_like(solid)
@@ -154,11 +257,6 @@ def _edges(solid: BoolArray, forward: bool) -> IntArray:
     _, ends = np.nonzero(steps == -1)
     rows = rows + int(forward)
     return np.stack([np.stack([begins, rows], axis=-1), np.stack([ends, rows], axis=-1)], axis=1)
-
-
-def _quads(corners: Array) -> Mesh:
-    """Quadrilaterals (n, 4, 3) as two triangles each."""
-    return corners.reshape(-1, 3), _repeat([[0, 1, 2], [0, 2, 3]], 4, len(corners))
 
 
 def _repeat(faces: list[list[int]], stride: int, count: int) -> IntArray:

@@ -1,5 +1,6 @@
-"""What all plots of flights share: style, new figures and axes over time, and the file they become.
+"""What all pictures share: colours, style, new figures and axes over time, and the file they become.
 
+One colour stands for one thing, in scenes and plots alike; chosen from colour-blind-safe sets (Okabe and Ito 2008).
 Figures are made without matplotlib's global state (no ``pyplot``), so drawing works in threads and on machines without
 a screen.
 """
@@ -20,7 +21,33 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["GREY", "INK", "finish", "heading", "new_figure", "over_time", "write_figure"]
+__all__ = ["COLOURS", "GREY", "INK", "css", "finish", "heading", "new_figure", "over_time", "write_figure"]
+
+COLOURS = {
+    "floor": 0xF6F4EF,
+    "metres": 0xE2DFD6,
+    "wall": 0x9AA3AE,
+    "ink": 0x1D2430,
+    "dark": 0x2B3340,
+    "plan": 0x4D4D4D,
+    "start": 0x4D4D4D,
+    "goal": 0xF0C000,
+    "pole": 0x4D4D4D,
+    "robot": 0x0A56A8,
+    "heading": 0xFFFFFF,
+    "trail": 0x3D95E0,
+    "estimate": 0x8A3FD0,
+    "odometry": 0x7F7F7F,
+    "horizon": 0x009E4F,
+    "scan": 0xE6007E,
+    "fixed": 0xF09000,
+    "moving": 0xD62718,
+    "detected": 0x000000,
+    "closure": 0x009E4F,
+    "outlier": 0xD62718,
+    "landmark": 0xF09000,
+}
+"""Name to 0xRRGGBB."""
 
 INK, GREY = "#1d2430", "#6b7280"
 _STYLE: dict[Any, Any] = {
@@ -40,6 +67,11 @@ _STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "legend.fontsize": 8.5,
 }
+
+
+def css(name: str) -> str:
+    """The colour as ``#rrggbb``."""
+    return f"#{COLOURS[name]:06x}"
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from unifg.scenarios.show.palette import css
+from unifg.scenarios.show.style import css
 from unifg.scenarios.velocity_tracking import Drive, metrics
 
 if TYPE_CHECKING:

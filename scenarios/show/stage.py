@@ -1,0 +1,312 @@
+"""A scene as one HTML file: objects, what becomes of them from frame to frame, and the words around the picture.
+
+The file carries its viewer (meshcat) and needs neither a server nor a network; the same log gives the same bytes,
+provided that the same version of meshcat wrote them. A kind of scene is a function that puts layers on a `Stage` and
+fills in its `Page`. What only moves, turns or stretches is animated; what changes shape from frame to frame is one
+object per frame, shown in turn.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unifg.errors import ScenarioError
+from unifg.scenarios.show.recorder import Recorder, load_meshcat, viewer_script
+from unifg.scenarios.show.shapes import Mesh
+from unifg.scenarios.show.style import COLOURS, css
+from unifg.typing import Array, ArrayLike, IntArray
+
+__all__ = ["Key", "Label", "Page", "Readout", "Stage", "View", "frame_ticks"]
+
+MAX_FRAMES = 500
+"""Longer runs show every second tick, every third, ..."""
+
+_PIECES = 200  # of a way that appears bit by bit
+_WATCHED = 40.0  # [s]; a scene starts at the lowest speed that shows it within this time
+_KINDS = {"position": "vector3", "scale": "vector3", "quaternion": "quaternion", "visible": "boolean"}
+
+
+@dataclass
+class Key:
+    """One line of the legend: a swatch (disc, ghost, ring, line, thin, dots, block, flag) in a colour of the palette.
+
+    Objects named as parts can be switched off there.
+    """
+
+    colour: str
+    shape: str
+    text: str
+    parts: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Label:
+    """A word at a place (x, y, z) [m] or with a moving object; a minor one yields to those before it."""
+
+    text: str
+    at: list[float] | None = None
+    follows: str | None = None
+    above: bool = False
+    minor: bool = False
+
+
+@dataclass
+class Readout:
+    """A number that changes: one text per frame, those of alarms in red."""
+
+    name: str
+    texts: list[str]
+    alarms: list[bool] = field(default_factory=list)
+
+
+@dataclass
+class View:
+    """Where the camera stands, with a button: it looks from ``direction`` at everything, or at something that moves.
+
+    Attributes:
+        name: in the address of a picture, ``#t=12.5&view=NAME``.
+        text: of the button.
+        direction: from what is looked at to the camera, in the world.
+        fov: vertical angle of view [deg].
+        follows: the object to go along with; None to see everything.
+        distance: from that object [m].
+        ahead: of that object, the place in the middle of the picture [m].
+    """
+
+    name: str
+    text: str
+    direction: Sequence[float]
+    fov: float
+    follows: str | None = None
+    distance: float = 0.0
+    ahead: Sequence[float] = (0.0, 0.0, 0.0)
+
+
+@dataclass
+class Page:
+    """The words and numbers around the picture, and what the camera must see.
+
+    Attributes:
+        title: what this is.
+        outcome: how it ended.
+        good: whether that is what was asked for.
+        facts: names and values; empty values are left out.
+        corners: (n, 3) [m] that a view of everything must hold.
+        legend: what is drawn, from top to bottom.
+        labels: words in the picture.
+        readouts: numbers of the moment.
+        views: of the camera, the first one at the start.
+        speeds: to choose from; none leaves out the choice.
+        counts: what the slider counts; "time" in seconds, anything else by ``numbers``.
+        numbers: what is counted, one per frame.
+    """
+
+    title: str
+    outcome: str
+    good: bool
+    facts: dict[str, str]
+    corners: Array
+    legend: list[Key]
+    labels: list[Label]
+    readouts: list[Readout]
+    views: list[View]
+    speeds: tuple[float, ...] = ()
+    counts: str = "time"
+    numbers: list[int] = field(default_factory=list)
+
+
+def frame_ticks(count: int) -> IntArray:
+    """Of so many ticks those shown, the last one among them; at most about `MAX_FRAMES`."""
+    stride = max(1, math.ceil(count / MAX_FRAMES))
+    return np.unique(np.append(np.arange(0, count, stride), count - 1))
+
+
+class Stage:
+    """A scene in the making; frame k of its animation is tick k.
+
+    Attributes:
+        ticks: (F,) ticks shown.
+        last: the last of them.
+        dt: seconds per tick.
+        recorder: everything sent.
+        page: around it; set by :meth:`finish`.
+    """
+
+    def __init__(self, ticks: int, dt: float) -> None:
+        """Set an empty stage of so many ticks.
+
+        Raises:
+            ScenarioError: there is no tick, or meshcat is not installed.
+        """
+        if ticks == 0:
+            raise ScenarioError("there is no tick, and nothing to show")
+        load_meshcat()
+        from meshcat.animation import Animation
+        from meshcat.visualizer import Visualizer
+
+        self.recorder = Recorder()
+        self.ticks, self.last, self.dt = frame_ticks(ticks), ticks - 1, dt
+        self._viewer, self._animation = Visualizer(window=self.recorder), Animation(default_framerate=1.0 / dt)
+        for path in ("/Grid", "/Axes"):
+            self._viewer[path].set_property("visible", False)
+        self._viewer["/Background"].set_property("top_color", [0.97, 0.97, 0.98])
+        self._viewer["/Background"].set_property("bottom_color", [0.86, 0.88, 0.90])
+        # Only lights without a range: the default point lights fade within ten metres.
+        for name in ("PointLightNegativeX", "PointLightPositiveX"):
+            self._viewer[f"/Lights/{name}"].set_property("visible", False)
+        self._viewer["/Lights/AmbientLight/<object>"].set_property("intensity", 0.72)
+        self._viewer["/Lights/FillLight/<object>"].set_property("intensity", 0.4)
+        self._viewer["/Lights/FillLight/<object>"].set_property("position", [-0.5, -0.35, 1.0])
+
+    # ------------------------------------------------------------------- objects
+
+    def mesh(self, path: str, mesh: Mesh, colour: str, *, lit: bool = False, opacity: float = 1.0) -> None:
+        """Send a mesh, drawn in its own colour whatever the light unless it is lit."""
+        from meshcat.geometry import MeshBasicMaterial, MeshLambertMaterial, TriangularMeshGeometry
+
+        material = MeshLambertMaterial if lit else MeshBasicMaterial
+        self._send(path, TriangularMeshGeometry(*mesh), material, colour, opacity)
+
+    def cylinder(
+        self,
+        path: str,
+        height: float,
+        radius: float,
+        colour: str,
+        place: ArrayLike = (0.0, 0.0),
+        *,
+        z: float = 0.0,
+        top: float | None = None,
+        opacity: float = 1.0,
+    ) -> None:
+        """Send an upright cylinder, or a cone where the radius at its top differs, that stands on height z [m]."""
+        from meshcat.geometry import Cylinder, MeshLambertMaterial
+
+        shape = Cylinder(height, radiusBottom=radius, radiusTop=radius if top is None else top)
+        self._send(path, shape, MeshLambertMaterial, colour, opacity)
+        # The cylinder's axis is y there: turned by a quarter about x, it is z.
+        upright = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, z + height / 2.0], [0, 0, 0, 1]], dtype=np.float64)
+        upright[:2, 3] = place
+        self._viewer[path].set_transform(upright)
+
+    def ball(self, path: str, radius: float, colour: str, place: Array) -> None:
+        """Send a ball around a place (3,) [m]."""
+        from meshcat.geometry import MeshLambertMaterial, Sphere
+
+        self._send(path, Sphere(radius), MeshLambertMaterial, colour)
+        transform = np.eye(4)
+        transform[:3, 3] = place
+        self._viewer[path].set_transform(transform)
+
+    def points(self, path: str, points: Array, colour: str, pixels: float) -> None:
+        """Send points (n, 3) [m] of a size on the screen."""
+        from meshcat.geometry import GenericMaterial, Points, PointsGeometry
+
+        material = GenericMaterial(color=COLOURS[colour], size=pixels, sizeAttenuation=False)
+        material._type = "PointsMaterial"  # meshcat's own insists on a colour per point
+        self._viewer[path].set_object(Points(PointsGeometry(points.T.astype(np.float32)), material))
+
+    def lines(self, path: str, lines: Array, colour: str) -> None:
+        """Send straight lines (n, 2, 3) [m], hair-thin."""
+        from meshcat.geometry import LineBasicMaterial, LineSegments, PointsGeometry
+
+        points = lines.reshape(-1, 3).T.astype(np.float32)
+        material = LineBasicMaterial(color=COLOURS[colour], transparent=True, opacity=0.55)
+        self._viewer[path].set_object(LineSegments(PointsGeometry(points), material))
+
+    def _send(self, path: str, shape: Any, material: Any, colour: str, opacity: float = 1.0) -> None:
+        extra = {"depthWrite": False} if opacity < 1.0 else {}  # what lies behind shows through
+        self._viewer[path].set_object(shape, material(color=COLOURS[colour], opacity=opacity, **extra))
+
+    # ------------------------------------------------------------------- time
+
+    def key(self, path: str, tick: int, **properties: ArrayLike | bool) -> None:
+        """Animate an object: at a tick its position [m], its quaternion (w, x, y, z), its scale, or whether visible."""
+        target = self._animation.at_frame(self._viewer[path], tick)
+        for name, value in properties.items():
+            plain: Any = value if isinstance(value, bool) else np.asarray(value).tolist()
+            if name == "quaternion":
+                plain = [*plain[1:], plain[0]]  # three.js puts w last
+            target.set_property(name, _KINDS[name], plain)
+
+    def move(self, path: str, places: Array, attitudes: Array | None = None) -> None:
+        """Animate an object through places (T, 3) [m] and attitudes, (T,) headings [rad] or (T, 4) (w, x, y, z)."""
+        if attitudes is not None and attitudes.ndim == 1:
+            half, zero = attitudes / 2.0, np.zeros(len(attitudes))
+            attitudes = np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1)
+        for tick in self.ticks.tolist():
+            self.key(path, tick, position=places[tick])
+            if attitudes is not None:
+                self.key(path, tick, quaternion=attitudes[tick])
+
+    def appear(self, path: str, begin: int, end: int | None = None) -> None:
+        """Show an object from one tick to another (or for good).
+
+        The track holds its first key backwards, hence the key at 0; the key at the very end makes all tracks equally
+        long, which lets the viewer stop and restart them together.
+        """
+        keys = {0: False, begin: True}
+        if end is not None:
+            keys[end] = False
+        keys.setdefault(self.last, end is None)
+        for tick, visible in keys.items():
+            self.key(path, tick, visible=visible)
+
+    def turns(self) -> Iterator[tuple[int, int | None]]:
+        """Ticks shown, each with the one that follows; None after the last."""
+        return zip(self.ticks.tolist(), [*self.ticks[1:].tolist(), None], strict=True)
+
+    def pieces(self) -> Iterator[tuple[int, int]]:
+        """First and last tick of the pieces of a way that is to appear bit by bit."""
+        stride = max(1, math.ceil(self.last / _PIECES))
+        for begin in range(0, self.last, stride):
+            yield begin, min(begin + stride, self.last)
+
+    # ------------------------------------------------------------------- the page
+
+    def finish(self, page: Page) -> Stage:
+        """Send the animation, put the page around it, and return the scene."""
+        self._viewer.set_animation(self._animation, play=True, repetitions=1)
+        self.page = page
+        return self
+
+    def write(self, path: str | Path) -> Path:
+        """Write the page of a finished scene and return its path; an existing file is replaced."""
+        path = Path(path)
+        path.write_text(self.html(), encoding="utf-8", newline="\n")
+        return path
+
+    def html(self) -> str:
+        """The page of a finished scene, which refers to no other file."""
+        page, duration = self.page, float(self.dt * self.last)
+        fitting = [speed for speed in page.speeds if speed >= 1.0 and duration / speed <= _WATCHED]
+        data: dict[str, Any] = asdict(page)
+        data |= {
+            "facts": [[name, text] for name, text in page.facts.items() if text],
+            "corners": page.corners.round(4).tolist(),
+            "legend": [asdict(key) | {"colour": css(key.colour)} for key in page.legend],
+            "dt": self.dt,
+            "duration": duration,
+            "ticks": self.ticks.tolist(),
+            "speed": fitting[0] if fitting else page.speeds[-1] if page.speeds else 1.0,
+            "step": 0.01 if page.counts == "time" else self.dt,
+            "play": page.counts == "time",
+        }
+        parts = {
+            # Names from outside cannot end the script: no "<" is left in it.
+            "DATA": json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
+            "COMMANDS": json.dumps(self.recorder.packed_base64(), indent=0),
+            "VIEWER": viewer_script(),
+        }
+        text = resources.files("unifg.scenarios.show").joinpath("page.html").read_text(encoding="utf-8")
+        for name, part in parts.items():  # the viewer last: it is code in which no placeholder may be looked for
+            text = text.replace(f"@@{name}@@", part)
+        return text
