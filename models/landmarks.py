@@ -13,9 +13,8 @@ import numpy as np
 
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import residual
-from unifg.lie import SO3, Rn
-from unifg.lie.scalar import so3
-from unifg.lie.scalar.so2 import wrap
+from unifg.lie import SO3, Rn, so3
+from unifg.lie.so2 import wrap
 from unifg.machine.calls import local_matrix
 from unifg.machine.jit import compiled
 from unifg.models.quadrotor import STATE

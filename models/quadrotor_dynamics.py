@@ -13,8 +13,8 @@ Every entry that can differ from zero is written by name: a step touches 90 of t
 
 from __future__ import annotations
 
-from unifg.lie.scalar import so3
-from unifg.lie.scalar.series import k_value
+from unifg.lie import so3
+from unifg.lie.series import k_value
 from unifg.machine.calls import local_matrix
 from unifg.machine.jit import compiled
 from unifg.typing import Array

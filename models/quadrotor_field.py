@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from unifg.lie.scalar import so3
+from unifg.lie import so3
 from unifg.machine.calls import local_matrix
 from unifg.machine.jit import compiled
 from unifg.models.compiled_field import CompiledField

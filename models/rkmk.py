@@ -36,8 +36,7 @@ from unifg.errors import ModelError, UnifgError
 from unifg.kernels.kernel import Argument, Kernel
 from unifg.kernels.residuals import Residual, residual
 from unifg.lie import LieGroup, Rn
-from unifg.lie.lookup import bend_of, functions_of
-from unifg.lie.scalar import rn as scalar_rn
+from unifg.lie.functions import functions_of
 from unifg.machine.jit import compiled
 from unifg.models.compiled_field import CompiledField
 from unifg.models.rkmk_batch import Field, FieldJacobian, StepDefect
@@ -88,9 +87,9 @@ def integrator(
     if isinstance(field, CompiledField):
         if field.dim != group.dim:
             raise ModelError(f"{tableau.name}: the field has {field.dim} velocities, {group.name} takes {group.dim}")
-        functions, bend = scalar_rn if isinstance(group, Rn) else functions_of(group), bend_of(group)
-        if functions is not None and bend is not None and jacobian in (None, field.jacobian):
-            kernel = step_kernel(functions, bend, field, group, ROOM * -(-tableau.stages // ROOM))
+        functions = functions_of(group)
+        if functions is not None and hasattr(functions, "bend") and jacobian in (None, field.jacobian):
+            kernel = step_kernel(functions, field, group, ROOM * -(-tableau.stages // ROOM))
             arguments: tuple[Argument, ...] = (group, *(Rn(length) for length in field.lengths), group, 0)
             differenced = field.derivative is None
             return residual(Kernel(kernel, arguments, group.dim, tableau.rows, tableau.name, differenced=differenced))
@@ -183,7 +182,7 @@ def rollout(
     parts = [np.broadcast_to(part, (count, part.shape[1])) for part in parts]
     states = np.empty((count + 1, group.storage))
     states[0] = start
-    functions = scalar_rn if isinstance(group, Rn) else functions_of(group)
+    functions = functions_of(group)
     if isinstance(field, CompiledField) and tableau.explicit and functions is not None and defect.kernel is not None:
         u = np.concatenate([*parts, np.empty((count, 0))], axis=1)
         if u.shape[1] != field.controls:

@@ -12,12 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from types import ModuleType
 
 import numpy as np
 
-from unifg.lie import LieGroup
-from unifg.lie.scalar import rn
+from unifg.lie import LieGroup, rn
+from unifg.lie.functions import Functions
 from unifg.machine.calls import local_matrix, local_vector, vector
 from unifg.machine.jit import compiled
 from unifg.models.compiled_field import CompiledField, differences
@@ -69,7 +68,7 @@ def place_derivative(row: Array, h: float, by_xi: Array, by_k: Array, stage: int
 
 
 @cache
-def difference_of(functions: ModuleType, storage: int, dim: int, inputs: int) -> Callable[..., None]:
+def difference_of(functions: Functions, storage: int, dim: int, inputs: int) -> Callable[..., None]:
     """``difference(x, x_next, out)``: xi' in the columns (x, inputs, x_next)."""
     local, between, adjoint = functions.local, functions.between, functions.adjoint
     inverse_jacobian = functions.right_jacobian_inverse
@@ -92,7 +91,7 @@ def difference_of(functions: ModuleType, storage: int, dim: int, inputs: int) ->
 
 
 @cache
-def move_of(functions: ModuleType, storage: int, dim: int) -> Callable[..., None]:
+def move_of(functions: Functions, storage: int, dim: int) -> Callable[..., None]:
     """``move(sigma, by_x, by_sigma, columns, out)``: add F_x (Ad(Exp(-sigma)) x' + Jr(sigma) sigma') to F'."""
     exp, adjoint, jacobian = functions.exp, functions.adjoint, functions.right_jacobian
 
@@ -114,24 +113,21 @@ def move_of(functions: ModuleType, storage: int, dim: int) -> Callable[..., None
 
 
 @cache
-def step_kernel(
-    functions: ModuleType, bend: Callable[..., None], field: CompiledField, group: LieGroup, room: int
-) -> Callable[..., None]:
+def step_kernel(functions: Functions, field: CompiledField, group: LieGroup, room: int) -> Callable[..., None]:
     """The defect xi - h Phi of a step, and its derivatives, for all methods of so many stages or fewer.
 
     The kernel takes x, the inputs and x_next as variables, h as parameter and the rows of a
     :class:`~unifg.models.tableau.Tableau` as table.
 
     Args:
-        functions: of the group, from :mod:`unifg.lie.scalar`.
-        bend: of the group, from :func:`unifg.lie.lookup.bend_of`.
+        functions: of the group, from :func:`unifg.lie.functions.functions_of`.
         field: F.
         group: of the states.
         room: for stages; one compiled function then serves many methods.
     """
     velocity, dim, inputs, storage = field.function, field.dim, field.controls, group.storage
     local, retract, unit = functions.local, functions.retract, rn.unit
-    inverse_jacobian = functions.right_jacobian_inverse
+    inverse_jacobian, bend = functions.right_jacobian_inverse, functions.bend
     derivative = field.derivative or differences(field, group)
     difference, move = difference_of(functions, storage, dim, inputs), move_of(functions, storage, dim)
     width, all_rows = 2 * dim + inputs, room * dim
@@ -170,7 +166,7 @@ def step_kernel(
             velocity(point, u, speed)
             flat = flat or where == AT_START
             if flat:
-                unit(weight)
+                unit(sigma, weight)
             else:
                 inverse_jacobian(sigma, weight)
             for i in range(dim):
@@ -210,7 +206,7 @@ def step_kernel(
 
 
 @cache
-def rollout_kernel(kernel: Callable[..., None], functions: ModuleType, storage: int, dim: int) -> Callable[..., None]:
+def rollout_kernel(kernel: Callable[..., None], functions: Functions, storage: int, dim: int) -> Callable[..., None]:
     """``rollout(v, p, table, u, states)``: take explicit steps, several for every row of the inputs.
 
     From x to itself the defect is -h Phi, so the step is x Exp(-defect).

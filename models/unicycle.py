@@ -15,8 +15,8 @@ from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import residual
 from unifg.language.factors import difference
 from unifg.lie import SE2, Rn
-from unifg.lie.scalar.rn import minus
-from unifg.lie.scalar.so2 import wrap
+from unifg.lie.rn import minus
+from unifg.lie.so2 import wrap
 from unifg.machine.calls import vector
 from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike

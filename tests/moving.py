@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 
 import unifg as fg
-from unifg.lie.lookup import functions_of
+from unifg.lie.functions import functions_of
 from unifg.machine.calls import local_matrix, local_vector
 from unifg.machine.jit import compiled
 from unifg.models.compiled_field import CompiledField

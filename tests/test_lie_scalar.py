@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable
 from fractions import Fraction
 from math import comb, factorial
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -15,22 +14,21 @@ from numpy.random import Generator
 
 from groups import PI
 from unifg.errors import UnifgError
-from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Product, Rn
-from unifg.lie.batch import over_one, over_two
-from unifg.lie.lookup import bend_of, functions_of
-from unifg.lie.scalar import bend, rn, se2, se3, series, so2, so3
-from unifg.typing import Array
+from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Product, Rn, rn, se3, series, so2
+from unifg.lie.elementwise import over_one, over_two
+from unifg.lie.functions import Functions, functions_of
+from unifg.typing import Array, ArrayLike
 
-PAIRS: list[tuple[LieGroup, ModuleType]] = [(Rn(3), rn), (SO2, so2), (SE2, se2), (SO3, so3), (SE3, se3)]
 PARTS: list[LieGroup] = [
     Product(p=Rn(3), R=SO3, v=Rn(3)),
     Product(turn=SO2),
     Product(inner=Product(x=SE2, y=Rn(1)), outer=Product(deep=Product(z=SE3), r=SO2)),
 ]
-for composite in PARTS:
-    found = functions_of(composite)
+PAIRS: list[tuple[LieGroup, Functions]] = []
+for member in (Rn(3), SO2, SE2, SO3, SE3, *PARTS):
+    found = functions_of(member)
     assert found is not None
-    PAIRS.append((composite, found))
+    PAIRS.append((member, found))
 EVERY = pytest.mark.parametrize(("group", "functions"), PAIRS, ids=[str(group) for group, _ in PAIRS])
 ROUNDING = 4e-16  # a call of its own and one inside a loop may fuse products and sums differently
 
@@ -54,7 +52,7 @@ NAMES += ["right_jacobian", "right_jacobian_inverse", "left_jacobian", "left_jac
 
 @EVERY
 @pytest.mark.parametrize("name", NAMES)
-def test_one_element_and_a_batch_agree(group: LieGroup, functions: ModuleType, name: str, rng: Generator) -> None:
+def test_one_element_and_a_batch_agree(group: LieGroup, functions: Functions, name: str, rng: Generator) -> None:
     if isinstance(group, Product) and name in ("act", "matrix") and len(group.components) > 1:
         assert not hasattr(functions, name)  # nothing compiled moves points by a product
         return
@@ -73,7 +71,7 @@ def test_one_element_and_a_batch_agree(group: LieGroup, functions: ModuleType, n
 @EVERY
 @pytest.mark.parametrize("name", ["exp", "log", "compose", "inverse", "between", "retract", "local", "act"])
 def test_a_result_may_take_the_place_of_an_argument(
-    group: LieGroup, functions: ModuleType, name: str, rng: Generator
+    group: LieGroup, functions: Functions, name: str, rng: Generator
 ) -> None:
     if isinstance(group, Product) and name == "act":
         return
@@ -88,16 +86,30 @@ def test_a_result_may_take_the_place_of_an_argument(
             np.testing.assert_array_equal(one[position], out)
 
 
+class Inheriting(type(SO2)):  # type: ignore[misc]
+    """A group that states nothing of its own."""
+
+
 class Unknown(type(SO2)):  # type: ignore[misc]
-    """A group that has batched methods only."""
+    """A group that moves by NumPy."""
+
+    def retract(self, x: ArrayLike, d: ArrayLike, /) -> Array:
+        return SO2.retract(x, d)
 
 
 def test_functions_of_products() -> None:
     assert functions_of(Product(a=SE2, b=Rn(2))) is functions_of(Product(a=SE2, b=Rn(2)))
     assert functions_of(Product(a=SO2, b=Rn(1))) is not functions_of(Product(a=Rn(1), b=SO2))
     assert functions_of(Unknown()) is None and functions_of(Product(a=SE2, b=Product(c=Unknown()))) is None
-    assert functions_of(SE3) is se3 and functions_of(Rn(2)) is None
-    assert bend_of(Product(a=SE2, b=Unknown())) is None and bend_of(SE3) is bend.se3 and bend_of(Rn(2)) is bend.none
+
+
+def test_functions_are_those_of_the_methods() -> None:
+    functions, of_vectors, inherited = functions_of(SE3), functions_of(Rn(2)), functions_of(Inheriting())
+    assert functions is not None and of_vectors is not None and inherited is not None
+    assert functions.exp is se3.exp and functions.bend is se3.bend and of_vectors.retract is rn.add
+    assert inherited.retract is so2.compose
+    with pytest.raises(AttributeError, match="SO2_1_Rn_1__1 has no compiled act"):
+        _ = functions_of(Product(a=SO2, b=Rn(1))).act  # type: ignore[union-attr]
 
 
 def test_products_of_the_same_parts_in_another_order_are_not_confused() -> None:
@@ -141,8 +153,8 @@ def test_any_layout_will_do(rng: Generator) -> None:
 
 def test_a_group_of_your_own(rng: Generator) -> None:
     """The helpers take any compiled function of the right form."""
-    double = over_one(rn.inverse, 2, 2)
-    plus = over_two(rn.compose, 2, 2, 2)
+    double = over_one(rn.negate, 2, 2)
+    plus = over_two(rn.add, 2, 2, 2)
     x, y = rng.standard_normal((3, 1, 2)), rng.standard_normal((5, 2))
     np.testing.assert_array_equal(double(x), -x)
     np.testing.assert_array_equal(plus(x, y), x + y)
@@ -206,7 +218,7 @@ def test_functions_of_an_angle(theta: float) -> None:
         assert abs(value - desired) * weight < 1e-15
         if t < series.SERIES_BELOW:
             assert value == pytest.approx(desired, rel=1e-15, abs=0.0)
-    value, desired = bend.k_curve(t, g, series.k_slope(t, g)), total(slope(slope(K)), square)
+    value, desired = series.k_curve(t, g, series.k_slope(t, g)), total(slope(slope(K)), square)
     assert abs(value - desired) * (1.0 if t < series.SERIES_BELOW else theta**4) < 1e-14
     if t < series.SERIES_BELOW:
         assert value == pytest.approx(desired, rel=2e-14, abs=0.0)

@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from groups import PI, assert_close, assert_same
 from unifg.errors import UnifgError
 from unifg.lie import SE3, SO3
-from unifg.lie.scalar.so3 import DRIFT
 from unifg.lie.se3 import SE3Group
-from unifg.lie.so3 import SO3Group
+from unifg.lie.so3 import DRIFT, SO3Group
 from unifg.typing import Array
 
 Spatial = SO3Group | SE3Group

@@ -12,7 +12,7 @@ import pytest
 
 import unifg as fg
 from moving import Carried, compiled_carried
-from unifg.lie.lookup import functions_of
+from unifg.lie.functions import functions_of
 from unifg.machine.jit import compiled
 from unifg.models import rkmk
 from unifg.models.compiled_field import CompiledField

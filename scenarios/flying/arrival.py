@@ -17,7 +17,7 @@ import numpy as np
 import unifg as fg
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import Residual
-from unifg.lie.scalar import so3
+from unifg.lie import so3
 from unifg.machine.calls import local_matrix
 from unifg.machine.jit import compiled
 from unifg.models import quadrotor

@@ -10,7 +10,7 @@ from unifg.errors import GraphError
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import Residual, residual
 from unifg.lie import LieGroup, Manifold, Rn
-from unifg.lie.lookup import functions_of
+from unifg.lie.functions import functions_of
 from unifg.machine.jit import compiled
 from unifg.typing import Array
 

@@ -25,10 +25,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from unifg.lie import SE2, SE3, SO2, SO3, Manifold, Rn
+from unifg.lie import SE2, SE3, SO2, SO3, Manifold, Rn, so3
 from unifg.lie.product import leaves
-from unifg.lie.scalar import so3
-from unifg.lie.scalar.so2 import wrap
+from unifg.lie.so2 import wrap
 from unifg.machine.calls import vector
 from unifg.machine.jit import compiled
 from unifg.typing import Array, IntArray

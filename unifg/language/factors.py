@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import cache
-from types import ModuleType
 from typing import Any, cast
 
 import numpy as np
@@ -18,9 +17,8 @@ import numpy as np
 from unifg.errors import GraphError
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import Residual, residual
-from unifg.lie import LieGroup, Manifold, Rn
-from unifg.lie.lookup import functions_of
-from unifg.lie.scalar import rn
+from unifg.lie import LieGroup, Manifold, Rn, rn
+from unifg.lie.functions import Functions, functions_of
 from unifg.machine.calls import local_matrix, local_vector, vector
 from unifg.machine.jit import compiled
 from unifg.typing import Array
@@ -50,7 +48,7 @@ class ManifoldResidual:
 # ---------------------------------------------------------------- groups with compiled functions
 
 
-def _relative(group: LieGroup, functions: ModuleType) -> Callable[..., None]:
+def _relative(group: LieGroup, functions: Functions) -> Callable[..., None]:
     """Write Log(p^-1 x^-1 y) and its derivatives, with p a measured element or nothing."""
     storage, dim = group.storage, group.dim
     between, log, adjoint = functions.between, functions.log, functions.adjoint
@@ -82,7 +80,7 @@ def _relative(group: LieGroup, functions: ModuleType) -> Callable[..., None]:
     return kernel
 
 
-def _deviation(group: LieGroup, functions: ModuleType) -> Callable[..., None]:
+def _deviation(group: LieGroup, functions: Functions) -> Callable[..., None]:
     """Write Log(p^-1 x) and its derivative."""
     local, inverse_jacobian = functions.local, functions.right_jacobian_inverse
 

@@ -15,15 +15,14 @@ import numpy as np
 from unifg.errors import GraphError
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import Residual, residual
-from unifg.lie import LieGroup, Manifold, Rn
+from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Manifold, Rn, se2, se3, so2, so3
 from unifg.lie.product import leaves
-from unifg.lie.scalar import se2, se3, so2, so3
 from unifg.machine.calls import local_matrix, vector
 from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 VECTOR = 0  # how a leaf is compared; groups by their numbers in GROUPS
-GROUPS = {"SO2": 1, "SE2": 2, "SO3": 3, "SE3": 4}
+GROUPS: dict[Manifold, int] = {SO2: 1, SE2: 2, SO3: 3, SE3: 4}
 
 
 def joint_prior(*manifolds: Manifold) -> Residual:
@@ -72,7 +71,7 @@ def _kind(leaf: Manifold) -> int | None:
     """How the kernel compares elements of ``leaf``; None when it cannot."""
     if isinstance(leaf, Rn):
         return VECTOR
-    return GROUPS.get(leaf.name) if type(leaf).__module__.startswith("unifg.lie.") else None
+    return GROUPS.get(leaf)
 
 
 @compiled
@@ -94,8 +93,8 @@ def _stacked(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
             here, reference, out = vector(v, at, storage), vector(p, at, storage), vector(r, row, dim)
             square = block.reshape(-1)[: dim * dim].reshape(dim, dim)
             if kind == 1:
-                so2.local(reference, here, out)
-                so2.right_jacobian_inverse(out, square)
+                so2.between(reference, here, out)
+                square[0, 0] = 1.0
             elif kind == 2:
                 se2.local(reference, here, out)
                 se2.right_jacobian_inverse(out, square)

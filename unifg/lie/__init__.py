@@ -1,12 +1,13 @@
 """Manifolds and Lie groups: batched, in float64, right perturbation, translation before rotation.
 
 ``SO2``, ``SE2``, ``SO3`` and ``SE3`` are ready-made objects, ``Rn(n)`` and ``Product(name=manifold, ...)`` make
-equal objects from equal arguments. A new group is a file of its own that derives from :class:`LieGroup`. The
-formulas are compiled functions of one element, in :mod:`unifg.lie.scalar`. Conventions are collected in
-``docs/conventions.md``.
+equal objects from equal arguments. Each group is one file: its formulas as compiled functions of one element, and the
+class that states them (:func:`elementwise`). A manifold of one's own derives from :class:`ManifoldBase`, a group from
+:class:`LieGroup`. Conventions are collected in ``docs/conventions.md``.
 """
 
-from unifg.lie.manifold import LieGroup, Manifold
+from unifg.lie.elementwise import elementwise
+from unifg.lie.manifold import LieGroup, Manifold, ManifoldBase
 from unifg.lie.product import Component, Product, ProductGroup
 from unifg.lie.rn import Rn
 from unifg.lie.se2 import SE2
@@ -22,8 +23,10 @@ __all__ = [
     "Component",
     "LieGroup",
     "Manifold",
+    "ManifoldBase",
     "Product",
     "ProductGroup",
     "Rn",
+    "elementwise",
     "wrap_angle",
 ]

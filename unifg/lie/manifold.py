@@ -6,11 +6,15 @@ arXiv:1812.01537.
 
 from __future__ import annotations
 
+import sys
 from abc import ABC, abstractmethod
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from unifg.errors import UnifgError
+from unifg.lie.derive import RULES, STEP
+from unifg.lie.elementwise import method, stated
 from unifg.typing import Array, ArrayLike, BoolArray
 
 
@@ -59,34 +63,99 @@ class Manifold(Protocol):
         ...
 
 
-class LieGroup(ABC):
+class ManifoldBase(ABC):
+    """What manifolds share that are written as classes: values, equal by kind and size, hashable, picklable, stateless.
+
+    A manifold of one's own states ``retract`` and ``local`` by compiled functions
+    (:func:`unifg.lie.elementwise.elementwise`) or as ordinary methods for batches; where they are compiled, solvers and
+    smoothers run them like those of the groups here.
+
+    Attributes:
+        name: short name for tables and messages.
+        storage: length of the vector that stores a point.
+        dim: dimension of the tangent space.
+    """
+
+    name: str
+    storage: int
+    dim: int
+
+    @abstractmethod
+    def identity(self) -> Array:
+        """Return the (storage,) point to start from when nothing better is known; of a group, the identity."""
+
+    @abstractmethod
+    def retract(self, x: ArrayLike, d: ArrayLike, /) -> Array:
+        """Move (..., storage) points by (..., dim) steps: ``x [+] d``, (..., storage)."""
+
+    @abstractmethod
+    def local(self, x: ArrayLike, y: ArrayLike, /) -> Array:
+        """Return the (..., dim) step ``d`` with ``x [+] d = y``."""
+
+    @abstractmethod
+    def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
+        """Draw (*shape, storage) points that reach every part; of a group, uniform rotations, normal translations."""
+
+    def is_valid(self, x: ArrayLike, /) -> BoolArray:
+        """Tell for each of (..., storage) vectors whether it is a point: here, whether it is finite."""
+        return np.asarray(np.isfinite(x).all(axis=-1))
+
+    def __eq__(self, other: object) -> bool:
+        """Compare by kind and size."""
+        return self is other or (type(self) is type(other) and self.__dict__ == other.__dict__)
+
+    def __hash__(self) -> int:
+        """Hash by kind and size."""
+        return hash((type(self), self.name, self.storage, self.dim))
+
+    def __repr__(self) -> str:
+        """Return the name."""
+        return self.name
+
+    def __reduce__(self) -> Any:
+        """Pickle by name what its module knows by name, such as ``SE2``."""
+        known = getattr(sys.modules.get(type(self).__module__), self.name, None)
+        return self.name if known is self else super().__reduce__()
+
+
+class LieGroup(ManifoldBase):
     """A manifold whose points can be composed; satisfies :class:`Manifold`.
 
     The retraction is the group's own: ``x [+] d = x Exp(d)`` (Sola eq. 25) and ``local(x, y) = Log(x^-1 y)``
     (eq. 26). Jacobians are named for the side of the perturbation:
     ``Exp(d + e) = Exp(d) Exp(Jr(d) e) = Exp(Jl(d) e) Exp(d)`` to first order in e.
 
-    Groups are values: equal by kind (and size), hashable, picklable, without state.
+    A subclass states ``identity``, ``random`` and, by compiled functions, ``exp``, ``log``, ``compose`` and
+    ``inverse``: all else follows (:mod:`unifg.lie.derive`), and is stated only where a closed form is quicker. What is
+    stated as an ordinary method is run by NumPy, and so is what follows from it; adjoint and Jacobians then have to be
+    stated.
 
     Attributes:
         name: short name for tables and messages.
         storage: length of the vector that stores an element.
         dim: dimension of the tangent space.
-        point_dim: dimension of the points that :meth:`act` moves.
-        matrix_dim: size of :meth:`matrix`.
+        point_dim: dimension of the points that :meth:`act` moves; 0 where it moves none.
+        matrix_dim: size of :meth:`matrix`; 0 where there is none.
     """
 
-    name: str
-    storage: int
-    dim: int
-    point_dim: int
-    matrix_dim: int
+    point_dim: int = 0
+    matrix_dim: int = 0
 
-    # Every group defines these.
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Make what follows from the compiled functions that the class states or inherits."""
+        super().__init_subclass__(**options)
+        for name, (needs, make) in RULES.items():
+            if not getattr(getattr(cls, name), "follows", getattr(cls, name) is getattr(LieGroup, name)):
+                continue
+            parts = [stated(cls, need) for need in needs]
+            if all(parts) and isinstance(getattr(cls, "storage", None), int):
+                made = method(cls, name, make(cls.storage, cls.dim, *parts))
+                made.follows = True  # type: ignore[attr-defined]
+            else:
+                made = getattr(LieGroup, name)
+            setattr(cls, name, made)
 
-    @abstractmethod
-    def identity(self) -> Array:
-        """Return the (storage,) identity element."""
+    # Every group states these.
 
     @abstractmethod
     def exp(self, d: ArrayLike, /) -> Array:
@@ -104,25 +173,11 @@ class LieGroup(ABC):
     def inverse(self, x: ArrayLike, /) -> Array:
         """Invert (..., storage) elements."""
 
-    @abstractmethod
-    def act(self, x: ArrayLike, points: ArrayLike, /) -> Array:
-        """Move (..., point_dim) points; leading axes of elements and points broadcast."""
-
-    @abstractmethod
-    def matrix(self, x: ArrayLike, /) -> Array:
-        """Represent elements by (..., matrix_dim, matrix_dim) matrices: products go to products."""
-
-    @abstractmethod
-    def hat(self, d: ArrayLike, /) -> Array:
-        """Return (..., matrix_dim, matrix_dim) algebra matrices: ``matrix(Exp(d)) = expm(hat(d))``."""
+    # These follow where those are compiled.
 
     @abstractmethod
     def adjoint(self, x: ArrayLike, /) -> Array:
         """Return the (..., dim, dim) adjoints: ``x Exp(d) x^-1 = Exp(Ad(x) d)``."""
-
-    @abstractmethod
-    def ad(self, d: ArrayLike, /) -> Array:
-        """Return (..., dim, dim) small adjoints: ``Ad(Exp(d)) = expm(ad(d))``, ``ad(a) b = [a, b]``."""
 
     @abstractmethod
     def right_jacobian(self, d: ArrayLike, /) -> Array:
@@ -132,15 +187,7 @@ class LieGroup(ABC):
     def right_jacobian_inverse(self, d: ArrayLike, /) -> Array:
         """Return (..., dim, dim) ``Jr(d)^-1 = I + ad/2 + ad^2/12 - ...`` in closed form."""
 
-    @abstractmethod
-    def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
-        """Draw (*shape, storage) elements: rotations uniform, translations standard normal."""
-
-    # These follow; a group overrides them where it can do the same with fewer calls.
-
-    def is_valid(self, x: ArrayLike, /) -> BoolArray:
-        """Tell for each of (..., storage) vectors whether it is an element: here, whether it is finite."""
-        return np.asarray(np.isfinite(x).all(axis=-1))
+    # These follow in any case; a group states them where it can do the same with fewer calls.
 
     def between(self, x: ArrayLike, y: ArrayLike, /) -> Array:
         """Return ``x^-1 y``, (..., storage): y seen from x."""
@@ -162,25 +209,40 @@ class LieGroup(ABC):
         """Return (..., dim, dim) ``Jl(d)^-1 = I - ad/2 + ad^2/12 - ...`` in closed form."""
         return self.right_jacobian_inverse(np.negative(d))
 
-    # Value semantics.
+    def bend(self, d: ArrayLike, v: ArrayLike, /) -> Array:
+        """Return (..., dim, dim) derivatives of ``Jr^-1(d) v`` along d, at a fixed v, by differences."""
+        d, v = np.broadcast_arrays(np.asarray(d, dtype=np.float64), np.asarray(v, dtype=np.float64))
+        steps = STEP * np.eye(self.dim)
 
-    def _key(self) -> tuple[object, ...]:
-        """Return what, besides the class, tells two groups apart."""
-        return ()
+        def slope(times: float) -> Array:
+            ahead, behind = (self.right_jacobian_inverse(d[..., None, :] + s * times * steps) for s in (1.0, -1.0))
+            along: Array = ((ahead - behind) @ v[..., None, :, None])[..., 0]
+            return along / (2.0 * times * STEP)
 
-    def __eq__(self, other: object) -> bool:
-        """Compare by kind and size."""
-        if self is other:
-            return True
-        return isinstance(other, LieGroup) and type(self) is type(other) and self._key() == other._key()
+        return np.swapaxes((4.0 * slope(1.0) - slope(2.0)) / 3.0, -1, -2)
 
-    def __hash__(self) -> int:
-        """Hash by kind and size."""
-        return hash((type(self), self._key()))
+    def ad(self, d: ArrayLike, /) -> Array:
+        """Return (..., dim, dim) small adjoints: ``Ad(Exp(d)) = expm(ad(d))``, ``ad(a) b = [a, b]``."""
+        unit = np.eye(self.dim)
+        forward = self.adjoint(self.exp(0.25 * unit))
+        z = np.linalg.solve(forward + unit, forward - unit)  # log A = 2 artanh((A + I)^-1 (A - I))
+        basis = sum(np.linalg.matrix_power(z, k) / k for k in range(1, 25, 2)) * 8.0
+        found: Array = np.einsum("...k,kij->...ij", np.asarray(d, dtype=np.float64), basis)
+        return found
 
-    def __repr__(self) -> str:
-        """Return the name."""
-        return self.name
+    # A group that moves points, or has matrices, states these.
+
+    def act(self, x: ArrayLike, points: ArrayLike, /) -> Array:
+        """Move (..., point_dim) points; leading axes of elements and points broadcast."""
+        raise UnifgError(f"{self.name} moves no points: it states no act")
+
+    def matrix(self, x: ArrayLike, /) -> Array:
+        """Represent elements by (..., matrix_dim, matrix_dim) matrices: products go to products."""
+        raise UnifgError(f"{self.name} states no matrix")
+
+    def hat(self, d: ArrayLike, /) -> Array:
+        """Return (..., matrix_dim, matrix_dim) algebra matrices: ``matrix(Exp(d)) = expm(hat(d))``."""
+        raise UnifgError(f"{self.name} states no hat")
 
 
 def identities(like: Array, dim: int) -> Array:

@@ -10,6 +10,7 @@ from typing import Any, overload
 import numpy as np
 
 from unifg.errors import UnifgError
+from unifg.lie.elementwise import DIM, LAYOUTS, MATRIX, POINT, STORAGE, OneMethod, TwoMethod
 from unifg.lie.manifold import LieGroup, Manifold
 from unifg.typing import Array, ArrayLike, BoolArray
 
@@ -160,6 +161,30 @@ class Product:
         return _rebuild, ({name: part.manifold for name, part in self.components.items()},)
 
 
+def _one_by_one(name: str) -> OneMethod:
+    """The method of a product that does the same to every component."""
+    square = len(LAYOUTS[name][1]) == 2
+
+    def each(self: Any, x: ArrayLike, /) -> Array:
+        x = np.asarray(x, dtype=np.float64)
+        found = [of(x[..., at]) for of, at in self._of(name)]
+        return self._diagonal(name, found) if square else np.concatenate(found, axis=-1)  # type: ignore[no-any-return]
+
+    return each
+
+
+def _two_by_two(name: str) -> TwoMethod:
+    """The same with two arguments."""
+    square = len(LAYOUTS[name][1]) == 2
+
+    def each(self: Any, x: ArrayLike, y: ArrayLike, /) -> Array:
+        x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+        found = [of(x[..., at], y[..., beside]) for of, at, beside in self._of(name)]
+        return self._diagonal(name, found) if square else np.concatenate(found, axis=-1)  # type: ignore[no-any-return]
+
+    return each
+
+
 class ProductGroup(Product, LieGroup):
     """A product whose components are all groups; ``Product(...)`` makes it.
 
@@ -167,81 +192,49 @@ class ProductGroup(Product, LieGroup):
     own.
     """
 
-    _groups: tuple[tuple[LieGroup, slice, slice, slice, slice], ...]
+    _places: tuple[tuple[LieGroup, dict[str, slice]], ...]
+    _methods: dict[str, list[tuple[Any, ...]]]
 
     def _place_actions(self) -> None:
         """Lay out the points and matrices of the components."""
-        groups = []
+        places = []
         self.point_dim = self.matrix_dim = 0
         for part in self.components.values():
             group = part.manifold
             assert isinstance(group, LieGroup)
             points = slice(self.point_dim, self.point_dim + group.point_dim)
             rows = slice(self.matrix_dim, self.matrix_dim + group.matrix_dim)
-            groups.append((group, part.storage, part.tangent, points, rows))
+            places.append((group, {STORAGE: part.storage, DIM: part.tangent, POINT: points, MATRIX: rows}))
             self.point_dim, self.matrix_dim = points.stop, rows.stop
-        self._groups = tuple(groups)
+        self._places, self._methods = tuple(places), {}
 
-    def exp(self, d: ArrayLike, /) -> Array:
-        """Map (..., dim) tangent vectors to elements."""
-        d = np.asarray(d, dtype=np.float64)
-        return np.concatenate([g.exp(d[..., t]) for g, _, t, _, _ in self._groups], axis=-1)
+    def _of(self, name: str) -> list[tuple[Any, ...]]:
+        """A method of every component, and where its arguments stand."""
+        if name not in self._methods:
+            given, _ = LAYOUTS[name]
+            self._methods[name] = [(getattr(group, name), *(at[size] for size in given)) for group, at in self._places]
+        return self._methods[name]
 
-    def log(self, x: ArrayLike, /) -> Array:
-        """Map (..., storage) elements to tangent vectors."""
-        x = np.asarray(x, dtype=np.float64)
-        return np.concatenate([g.log(x[..., s]) for g, s, _, _, _ in self._groups], axis=-1)
+    def _diagonal(self, name: str, blocks: list[Array]) -> Array:
+        """Square blocks on the diagonal of (..., n, n) zeros."""
+        size = LAYOUTS[name][1][0]
+        result = np.zeros((*blocks[0].shape[:-2], getattr(self, size), getattr(self, size)))
+        for (_, at), block in zip(self._places, blocks, strict=True):
+            result[..., at[size], at[size]] = block
+        return result
 
-    def compose(self, x: ArrayLike, y: ArrayLike, /) -> Array:
-        """Multiply component by component."""
-        x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-        return np.concatenate([g.compose(x[..., s], y[..., s]) for g, s, _, _, _ in self._groups], axis=-1)
-
-    def inverse(self, x: ArrayLike, /) -> Array:
-        """Invert component by component."""
-        x = np.asarray(x, dtype=np.float64)
-        return np.concatenate([g.inverse(x[..., s]) for g, s, _, _, _ in self._groups], axis=-1)
-
-    def act(self, x: ArrayLike, points: ArrayLike, /) -> Array:
-        """Move (..., point_dim) concatenated points."""
-        x, points = np.asarray(x, dtype=np.float64), np.asarray(points, dtype=np.float64)
-        return np.concatenate([g.act(x[..., s], points[..., p]) for g, s, _, p, _ in self._groups], axis=-1)
-
-    def matrix(self, x: ArrayLike, /) -> Array:
-        """Return block-diagonal (..., matrix_dim, matrix_dim) matrices."""
-        x = np.asarray(x, dtype=np.float64)
-        blocks = [(rows, g.matrix(x[..., s])) for g, s, _, _, rows in self._groups]
-        return _block_diagonal(x.shape[:-1], self.matrix_dim, blocks)
-
-    def hat(self, d: ArrayLike, /) -> Array:
-        """Return block-diagonal (..., matrix_dim, matrix_dim) Lie algebra matrices."""
-        d = np.asarray(d, dtype=np.float64)
-        blocks = [(rows, g.hat(d[..., t])) for g, _, t, _, rows in self._groups]
-        return _block_diagonal(d.shape[:-1], self.matrix_dim, blocks)
-
-    def adjoint(self, x: ArrayLike, /) -> Array:
-        """Return block-diagonal (..., dim, dim) adjoints."""
-        x = np.asarray(x, dtype=np.float64)
-        blocks = [(t, g.adjoint(x[..., s])) for g, s, t, _, _ in self._groups]
-        return _block_diagonal(x.shape[:-1], self.dim, blocks)
-
-    def ad(self, d: ArrayLike, /) -> Array:
-        """Return block-diagonal (..., dim, dim) small adjoints."""
-        d = np.asarray(d, dtype=np.float64)
-        blocks = [(t, g.ad(d[..., t])) for g, _, t, _, _ in self._groups]
-        return _block_diagonal(d.shape[:-1], self.dim, blocks)
-
-    def right_jacobian(self, d: ArrayLike, /) -> Array:
-        """Return block-diagonal (..., dim, dim) right Jacobians."""
-        d = np.asarray(d, dtype=np.float64)
-        blocks = [(t, g.right_jacobian(d[..., t])) for g, _, t, _, _ in self._groups]
-        return _block_diagonal(d.shape[:-1], self.dim, blocks)
-
-    def right_jacobian_inverse(self, d: ArrayLike, /) -> Array:
-        """Return block-diagonal (..., dim, dim) inverse right Jacobians."""
-        d = np.asarray(d, dtype=np.float64)
-        blocks = [(t, g.right_jacobian_inverse(d[..., t])) for g, _, t, _, _ in self._groups]
-        return _block_diagonal(d.shape[:-1], self.dim, blocks)
+    exp = _one_by_one("exp")
+    log = _one_by_one("log")
+    compose = _two_by_two("compose")
+    inverse = _one_by_one("inverse")
+    act = _two_by_two("act")
+    matrix = _one_by_one("matrix")
+    hat = _one_by_one("hat")
+    adjoint = _one_by_one("adjoint")
+    ad = _one_by_one("ad")
+    right_jacobian = _one_by_one("right_jacobian")
+    right_jacobian_inverse = _one_by_one("right_jacobian_inverse")
+    bend = _two_by_two("bend")
 
 
 def leaves(manifold: Manifold, storage: int = 0, tangent: int = 0) -> Iterator[tuple[Manifold, int, int]]:
@@ -251,14 +244,6 @@ def leaves(manifold: Manifold, storage: int = 0, tangent: int = 0) -> Iterator[t
         return
     for part in manifold.components.values():
         yield from leaves(part.manifold, storage + part.storage.start, tangent + part.tangent.start)
-
-
-def _block_diagonal(batch: tuple[int, ...], size: int, blocks: list[tuple[slice, Array]]) -> Array:
-    """Place square blocks on the diagonal of (*batch, size, size) zeros."""
-    result = np.zeros((*batch, size, size))
-    for place, block in blocks:
-        result[..., place, place] = block
-    return result
 
 
 def _check(components: Mapping[str, Manifold]) -> None:

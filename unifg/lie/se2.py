@@ -1,30 +1,187 @@
-"""Rigid motions of the plane, stored as (x, y, theta); Sola 2018, appendix C.
+"""Rigid motions of the plane: storage ``(x, y, theta)``, tangent ``(vx, vy, omega)``; Sola 2018, appendix C.
 
-The formulas stand in :mod:`unifg.lie.scalar.se2`.
+Everything is written with half angles h = theta / 2, because the matrix V of the exponential (eq. 158) is a scaled
+rotation, ``V(theta) = (sin h / h) R(h)``, and ``V^-1 = (h cot h) I - h [1]x``. Neither form cancels near zero, so a
+floor under |h| takes the place of the Taylor branch that (1 - cos theta) / theta needs.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from unifg.lie.batch import over_one, over_two
+from unifg.lie.elementwise import elementwise
 from unifg.lie.manifold import LieGroup
-from unifg.lie.scalar import se2
-from unifg.lie.scalar.so2 import PI
+from unifg.lie.series import c_value, k_slope, k_value, sinc, sinc_and_cos, x_cot_x
+from unifg.lie.so2 import PI, wrap
+from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike
 
-_exp = over_one(se2.exp, 3, 3)
-_log = over_one(se2.log, 3, 3)
-_compose = over_two(se2.compose, 3, 3, 3)
-_inverse = over_one(se2.inverse, 3, 3)
-_between = over_two(se2.between, 3, 3, 3)
-_retract = over_two(se2.retract, 3, 3, 3)
-_local = over_two(se2.local, 3, 3, 3)
-_act = over_two(se2.act, 3, 2, 2)
-_matrix = over_one(se2.matrix, 3, 3, 3)
-_adjoint = over_one(se2.adjoint, 3, 3, 3)
-_right_jacobian = over_one(se2.right_jacobian, 3, 3, 3)
-_right_jacobian_inverse = over_one(se2.right_jacobian_inverse, 3, 3, 3)
+
+@compiled
+def exp(d: Array, out: Array) -> None:
+    """Exponential; Sola eq. 156 and 158."""
+    vx, vy, omega = d[0], d[1], d[2]
+    half = 0.5 * omega
+    scale, cosine = sinc_and_cos(half)
+    c, s = scale * cosine, scale * scale * half
+    out[0] = c * vx - s * vy
+    out[1] = s * vx + c * vy
+    out[2] = wrap(omega)
+
+
+@compiled
+def log(x: Array, out: Array) -> None:
+    """Logarithm with omega in [-pi, pi); Sola eq. 157 and 158."""
+    px, py, omega = x[0], x[1], wrap(x[2])
+    half = 0.5 * omega
+    g = x_cot_x(half)
+    out[0] = g * px + half * py
+    out[1] = g * py - half * px
+    out[2] = omega
+
+
+@compiled
+def compose(x: Array, y: Array, out: Array) -> None:
+    """``x y``; Sola eq. 155."""
+    px, py, theta = x[0], x[1], x[2]
+    qx, qy, turn = y[0], y[1], y[2]
+    c, s = math.cos(theta), math.sin(theta)
+    out[0] = px + (c * qx - s * qy)
+    out[1] = py + (s * qx + c * qy)
+    out[2] = wrap(theta + turn)
+
+
+@compiled
+def inverse(x: Array, out: Array) -> None:
+    """``x^-1``; Sola eq. 154."""
+    px, py, theta = x[0], x[1], x[2]
+    c, s = math.cos(theta), math.sin(theta)
+    out[0] = -c * px - s * py
+    out[1] = s * px - c * py
+    out[2] = wrap(-theta)
+
+
+@compiled
+def between(x: Array, y: Array, out: Array) -> None:
+    """``x^-1 y``."""
+    theta = x[2]
+    dx, dy, turn = y[0] - x[0], y[1] - x[1], y[2] - theta
+    c, s = math.cos(theta), math.sin(theta)
+    out[0] = c * dx + s * dy
+    out[1] = c * dy - s * dx
+    out[2] = wrap(turn)
+
+
+@compiled
+def retract(x: Array, d: Array, out: Array) -> None:
+    """``x Exp(d)``: the chord of the arc has length |v| sin(h)/h and direction theta + h."""
+    px, py, theta = x[0], x[1], x[2]
+    vx, vy, omega = d[0], d[1], d[2]
+    half = 0.5 * omega
+    scale = sinc(half)
+    middle = theta + half
+    c, s = scale * math.cos(middle), scale * math.sin(middle)
+    out[0] = px + (c * vx - s * vy)
+    out[1] = py + (s * vx + c * vy)
+    out[2] = wrap(theta + omega)
+
+
+@compiled
+def local(x: Array, y: Array, out: Array) -> None:
+    """``Log(x^-1 y)``: the chord turned back by theta + h, stretched by h / sin(h)."""
+    theta = x[2]
+    dx, dy, omega = y[0] - x[0], y[1] - x[1], wrap(y[2] - theta)
+    half = 0.5 * omega
+    stretch = 1.0 / sinc(half)
+    middle = theta + half
+    c, s = stretch * math.cos(middle), stretch * math.sin(middle)
+    out[0] = c * dx + s * dy
+    out[1] = c * dy - s * dx
+    out[2] = omega
+
+
+@compiled
+def act(x: Array, p: Array, out: Array) -> None:
+    """Bring a (2,) point from the body frame to the frame of the pose; Sola eq. 165."""
+    tx, ty, theta = x[0], x[1], x[2]
+    px, py = p[0], p[1]
+    c, s = math.cos(theta), math.sin(theta)
+    out[0] = tx + (c * px - s * py)
+    out[1] = ty + (s * px + c * py)
+
+
+@compiled
+def with_column(c: float, s: float, first: float, second: float, out: Array) -> None:
+    """Write ``[c, -s, first; s, c, second; 0, 0, 1]``."""
+    out[0, 0] = c
+    out[0, 1] = -s
+    out[0, 2] = first
+    out[1, 0] = s
+    out[1, 1] = c
+    out[1, 2] = second
+    out[2, 0] = 0.0
+    out[2, 1] = 0.0
+    out[2, 2] = 1.0
+
+
+@compiled
+def matrix(x: Array, out: Array) -> None:
+    """Write the (3, 3) homogeneous matrix; Sola eq. 152."""
+    with_column(math.cos(x[2]), math.sin(x[2]), x[0], x[1], out)
+
+
+@compiled
+def adjoint(x: Array, out: Array) -> None:
+    """Write ``[R, -[1]x t; 0, 1]``, (3, 3); Sola eq. 159."""
+    with_column(math.cos(x[2]), math.sin(x[2]), x[1], -x[0], out)
+
+
+@compiled
+def right_jacobian(d: Array, out: Array) -> None:
+    """Write Jr, (3, 3); Sola eq. 163."""
+    vx, vy, omega = d[0], d[1], d[2]
+    half = 0.5 * omega
+    s, cosine = sinc_and_cos(half)
+    a = s * cosine  # sin omega / omega
+    e = 0.5 * s * s  # (1 - cos omega) / omega^2
+    f = omega * c_value(omega, a * omega)
+    with_column(a, -omega * e, f * vx - e * vy, f * vy + e * vx, out)
+
+
+@compiled
+def right_jacobian_inverse(d: Array, out: Array) -> None:
+    """Write Jr^-1, (3, 3), the map that RK-MK integrators call dexp^-1.
+
+    ``[g, -h, k vx + vy/2; h, g, k vy - vx/2; 0, 0, 1]`` with h = omega / 2, g = h cot h and k = (1 - g) / omega,
+    found by inverting Sola eq. 163. Singular at omega = +-2 pi, where Jr loses rank; ``log`` and ``local`` stay
+    within pi.
+    """
+    vx, vy, omega = d[0], d[1], d[2]
+    half = 0.5 * omega
+    g = x_cot_x(half)
+    k = omega * k_value(omega * omega, g)
+    with_column(g, half, k * vx + 0.5 * vy, k * vy - 0.5 * vx, out)
+
+
+@compiled
+def bend(d: Array, v: Array, out: Array) -> None:
+    """Write the (3, 3) derivative of ``Jr^-1(d) v`` along d = (vx, vy, omega)."""
+    vx, vy, omega = d[0], d[1], d[2]
+    a, b, turn = v[0], v[1], v[2]
+    t = omega * omega
+    g = x_cot_x(0.5 * omega)
+    value, slope = k_value(t, g), k_slope(t, g)
+    k, k_rate = omega * value, value + t * slope  # of omega k
+    g_rate = -omega * (2.0 * value + t * slope)  # g = 1 - t k
+    out[0, 0] = k * turn
+    out[0, 1] = 0.5 * turn
+    out[0, 2] = g_rate * a - 0.5 * b + k_rate * vx * turn
+    out[1, 0] = -0.5 * turn
+    out[1, 1] = k * turn
+    out[1, 2] = 0.5 * a + g_rate * b + k_rate * vy * turn
+    out[2, 0] = out[2, 1] = out[2, 2] = 0.0
 
 
 class SE2Group(LieGroup):
@@ -41,45 +198,23 @@ class SE2Group(LieGroup):
     point_dim = 2
     matrix_dim = 3
 
+    exp = elementwise(exp)
+    log = elementwise(log)
+    compose = elementwise(compose)
+    inverse = elementwise(inverse)
+    between = elementwise(between)
+    retract = elementwise(retract)
+    local = elementwise(local)
+    act = elementwise(act)
+    matrix = elementwise(matrix)
+    adjoint = elementwise(adjoint)
+    right_jacobian = elementwise(right_jacobian)
+    right_jacobian_inverse = elementwise(right_jacobian_inverse)
+    bend = elementwise(bend)
+
     def identity(self) -> Array:
         """Return the (3,) zero pose."""
         return np.zeros(3)
-
-    def exp(self, d: ArrayLike, /) -> Array:
-        """Map (..., 3) tangent vectors to poses; Sola eq. 156 and 158."""
-        return _exp(d)
-
-    def log(self, x: ArrayLike, /) -> Array:
-        """Map (..., 3) poses to tangent vectors with omega in [-pi, pi); Sola eq. 157 and 158."""
-        return _log(x)
-
-    def compose(self, x: ArrayLike, y: ArrayLike, /) -> Array:
-        """Chain: ``world_T_a`` and ``a_T_b`` give ``world_T_b``; Sola eq. 155."""
-        return _compose(x, y)
-
-    def inverse(self, x: ArrayLike, /) -> Array:
-        """Invert: ``a_T_b`` gives ``b_T_a``; Sola eq. 154."""
-        return _inverse(x)
-
-    def between(self, x: ArrayLike, y: ArrayLike, /) -> Array:
-        """Return ``x^-1 y``: y seen from x."""
-        return _between(x, y)
-
-    def retract(self, x: ArrayLike, d: ArrayLike, /) -> Array:
-        """Return ``x Exp(d)``: the chord of the arc has length |v| sin(h)/h and direction theta + h, h = omega/2."""
-        return _retract(x, d)
-
-    def local(self, x: ArrayLike, y: ArrayLike, /) -> Array:
-        """Return ``Log(x^-1 y)``: the chord turned back by theta + h, stretched by h / sin(h)."""
-        return _local(x, y)
-
-    def act(self, x: ArrayLike, points: ArrayLike, /) -> Array:
-        """Bring (..., 2) points [m] from the body frame to the frame of the pose; Sola eq. 165."""
-        return _act(x, points)
-
-    def matrix(self, x: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) homogeneous matrices; Sola eq. 152."""
-        return _matrix(x)
 
     def hat(self, d: ArrayLike, /) -> Array:
         """Return (..., 3, 3) Lie algebra matrices; Sola eq. 153."""
@@ -89,10 +224,6 @@ class SE2Group(LieGroup):
         result[..., 0, 1] = -d[..., 2]
         result[..., :2, 2] = d[..., :2]
         return result
-
-    def adjoint(self, x: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) adjoints ``[R, -[1]x t; 0, 1]``; Sola eq. 159."""
-        return _adjoint(x)
 
     def ad(self, d: ArrayLike, /) -> Array:
         """Return (..., 3, 3) small adjoints ``[omega [1]x, -[1]x v; 0, 0]``."""
@@ -104,28 +235,11 @@ class SE2Group(LieGroup):
         result[..., 1, 2] = -d[..., 0]
         return result
 
-    def right_jacobian(self, d: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) right Jacobians; Sola eq. 163."""
-        return _right_jacobian(d)
-
-    def right_jacobian_inverse(self, d: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) inverse right Jacobians, the map that RK-MK integrators call dexp^-1.
-
-        ``[g, -h, k vx + vy/2; h, g, k vy - vx/2; 0, 0, 1]`` with h = omega / 2, g = h cot h and
-        k = (1 - g) / omega, found by inverting Sola eq. 163. Singular at omega = +-2 pi, where Jr loses rank;
-        ``log`` and ``local`` stay within pi.
-        """
-        return _right_jacobian_inverse(d)
-
     def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
         """Draw (*shape, 3) poses: standard normal positions, uniform headings."""
         result = rng.standard_normal((*shape, 3))
         result[..., 2] = rng.uniform(-PI, PI, shape)
         return result
-
-    def __reduce__(self) -> str:
-        """Pickle by name: there is one SE2."""
-        return "SE2"
 
 
 SE2 = SE2Group()

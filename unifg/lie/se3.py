@@ -1,33 +1,258 @@
-"""Rigid motions of space, stored as (px, py, pz, qw, qx, qy, qz); Sola 2018, appendix D.
+"""Rigid motions of space; Sola 2018, appendix D.
 
-The formulas stand in :mod:`unifg.lie.scalar.se3`.
+Storage ``(px, py, pz, qw, qx, qy, qz)``, tangent ``(vx, vy, vz, wx, wy, wz)``.
+
+The algebra of SE(3) is that of SO(3) over the dual numbers ``omega + epsilon v``, with ``epsilon^2 = 0``: its small
+adjoint is ``[W, V; 0, W]``, V = [v]x. A power series of it therefore has the block ``f(W)`` twice on the diagonal, and
+above it the derivative of f at W in the direction V. So the blocks Q of Barfoot, *State Estimation for Robotics*,
+eq. 7.86, and Sola eq. 180 are, with t = |omega|^2 and s = omega . v,
+
+    Jr:     -b V + c (W V + V W) - b' s W + c' s W^2
+    Jr^-1:   V/2 + k (W V + V W) + k' s W^2
+
+where ' is d/dtheta over theta, in :mod:`unifg.lie.series`; W V + V W = omega v' + v omega' - 2 s I.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from unifg.errors import UnifgError
-from unifg.lie.batch import over_one, over_two
+from unifg.lie.elementwise import elementwise
 from unifg.lie.manifold import LieGroup
-from unifg.lie.scalar import se3
-from unifg.lie.so3 import SO3
+from unifg.lie.series import b_slope, c_slope, c_value, k_curve, k_slope, k_value, x_cot_x
+from unifg.lie.so3 import (
+    SO3,
+    coefficients,
+    half_log,
+    half_turn,
+    rotate,
+    write,
+    write_matrix,
+    write_polynomial,
+    write_product,
+    write_turn,
+)
+from unifg.machine.calls import vector
+from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike, BoolArray
 
-_exp = over_one(se3.exp, 6, 7)
-_log = over_one(se3.log, 7, 6)
-_compose = over_two(se3.compose, 7, 7, 7)
-_inverse = over_one(se3.inverse, 7, 7)
-_between = over_two(se3.between, 7, 7, 7)
-_retract = over_two(se3.retract, 7, 6, 7)
-_local = over_two(se3.local, 7, 7, 6)
-_act = over_two(se3.act, 7, 3, 3)
-_matrix = over_one(se3.matrix, 7, 4, 4)
-_adjoint = over_one(se3.adjoint, 7, 6, 6)
-_right_jacobian = over_one(se3.right_jacobian, 6, 6, 6)
-_right_jacobian_inverse = over_one(se3.right_jacobian_inverse, 6, 6, 6)
-_left_jacobian = over_one(se3.left_jacobian, 6, 6, 6)
-_left_jacobian_inverse = over_one(se3.left_jacobian_inverse, 6, 6, 6)
+
+@compiled
+def turned(
+    b: float, c: float, wx: float, wy: float, wz: float, x: float, y: float, z: float
+) -> tuple[float, float, float]:
+    """Return ``(I + b W + c W^2) (x, y, z)``."""
+    ax, ay, az = wy * z - wz * y, wz * x - wx * z, wx * y - wy * x
+    return (
+        x + b * ax + c * (wy * az - wz * ay),
+        y + b * ay + c * (wz * ax - wx * az),
+        z + b * az + c * (wx * ay - wy * ax),
+    )
+
+
+@compiled
+def exp(d: Array, out: Array) -> None:
+    """Exponential ``(Jl(omega) v, Exp(omega))``; Sola eq. 172 and 174."""
+    wx, wy, wz = d[3], d[4], d[5]
+    theta, cosine, s = half_turn(wx, wy, wz)
+    c = c_value(theta, 2.0 * s * cosine * theta)
+    px, py, pz = turned(2.0 * s * s, c, wx, wy, wz, d[0], d[1], d[2])
+    out[0] = px
+    out[1] = py
+    out[2] = pz
+    write(cosine, s * wx, s * wy, s * wz, out, 3)
+
+
+@compiled
+def write_log(w: float, x: float, y: float, z: float, px: float, py: float, pz: float, out: Array) -> None:
+    """Write the logarithm of the pose with this quaternion and position, ``(Jl(omega)^-1 p, omega)``."""
+    factor, half, g = half_log(w, x, y, z)
+    wx, wy, wz = factor * x, factor * y, factor * z
+    vx, vy, vz = turned(-0.5, k_value(4.0 * half * half, g), wx, wy, wz, px, py, pz)
+    out[0] = vx
+    out[1] = vy
+    out[2] = vz
+    out[3] = wx
+    out[4] = wy
+    out[5] = wz
+
+
+@compiled
+def log(x: Array, out: Array) -> None:
+    """Logarithm with a rotation of at most pi; Sola eq. 173."""
+    write_log(x[3], x[4], x[5], x[6], x[0], x[1], x[2], out)
+
+
+@compiled
+def compose(x: Array, y: Array, out: Array) -> None:
+    """``x y``; Sola eq. 171."""
+    tx, ty, tz, w, a, b, c = x[0], x[1], x[2], x[3], x[4], x[5], x[6]
+    v, e, f, g = y[3], y[4], y[5], y[6]
+    px, py, pz = rotate(w, a, b, c, y[0], y[1], y[2])
+    out[0] = tx + px
+    out[1] = ty + py
+    out[2] = tz + pz
+    write_product(w, a, b, c, v, e, f, g, out, 3)
+
+
+@compiled
+def inverse(x: Array, out: Array) -> None:
+    """``x^-1``; Sola eq. 170."""
+    w, a, b, c = x[3], -x[4], -x[5], -x[6]
+    px, py, pz = rotate(w, a, b, c, x[0], x[1], x[2])
+    out[0] = -px
+    out[1] = -py
+    out[2] = -pz
+    write(w, a, b, c, out, 3)
+
+
+@compiled
+def between(x: Array, y: Array, out: Array) -> None:
+    """``x^-1 y``."""
+    w, a, b, c = x[3], -x[4], -x[5], -x[6]
+    v, e, f, g = y[3], y[4], y[5], y[6]
+    px, py, pz = rotate(w, a, b, c, y[0] - x[0], y[1] - x[1], y[2] - x[2])
+    out[0] = px
+    out[1] = py
+    out[2] = pz
+    write_product(w, a, b, c, v, e, f, g, out, 3)
+
+
+@compiled
+def retract(x: Array, d: Array, out: Array) -> None:
+    """``x Exp(d)``."""
+    tx, ty, tz, w, a, b, c = x[0], x[1], x[2], x[3], x[4], x[5], x[6]
+    wx, wy, wz = d[3], d[4], d[5]
+    theta, cosine, s = half_turn(wx, wy, wz)
+    third = c_value(theta, 2.0 * s * cosine * theta)
+    vx, vy, vz = turned(2.0 * s * s, third, wx, wy, wz, d[0], d[1], d[2])
+    px, py, pz = rotate(w, a, b, c, vx, vy, vz)
+    out[0] = tx + px
+    out[1] = ty + py
+    out[2] = tz + pz
+    write_product(w, a, b, c, cosine, s * wx, s * wy, s * wz, out, 3)
+
+
+@compiled
+def local(x: Array, y: Array, out: Array) -> None:
+    """``Log(x^-1 y)``, the short way round."""
+    w, a, b, c = x[3], -x[4], -x[5], -x[6]
+    v, e, f, g = y[3], y[4], y[5], y[6]
+    px, py, pz = rotate(w, a, b, c, y[0] - x[0], y[1] - x[1], y[2] - x[2])
+    qw = w * v - a * e - b * f - c * g
+    qx = w * e + a * v + (b * g - c * f)
+    qy = w * f + b * v + (c * e - a * g)
+    qz = w * g + c * v + (a * f - b * e)
+    write_log(qw, qx, qy, qz, px, py, pz, out)
+
+
+@compiled
+def act(x: Array, p: Array, out: Array) -> None:
+    """Bring a (3,) point from the body frame to the frame of the pose."""
+    tx, ty, tz = x[0], x[1], x[2]
+    px, py, pz = rotate(x[3], x[4], x[5], x[6], p[0], p[1], p[2])
+    out[0] = tx + px
+    out[1] = ty + py
+    out[2] = tz + pz
+
+
+@compiled
+def matrix(x: Array, out: Array) -> None:
+    """Write the (4, 4) homogeneous matrix; Sola eq. 168."""
+    write_matrix(x[3], x[4], x[5], x[6], out, 0)
+    for i in range(3):
+        out[i, 3] = x[i]
+        out[3, i] = 0.0
+    out[3, 3] = 1.0
+
+
+@compiled
+def adjoint(x: Array, out: Array) -> None:
+    """Write ``[R, [p]x R; 0, R]``, (6, 6); Sola eq. 175."""
+    px, py, pz = x[0], x[1], x[2]
+    write_matrix(x[3], x[4], x[5], x[6], out, 0)
+    for j in range(3):
+        rx, ry, rz = out[0, j], out[1, j], out[2, j]
+        out[3, j + 3] = rx
+        out[4, j + 3] = ry
+        out[5, j + 3] = rz
+        out[0, j + 3] = py * rz - pz * ry
+        out[1, j + 3] = pz * rx - px * rz
+        out[2, j + 3] = px * ry - py * rx
+        out[3, j] = 0.0
+        out[4, j] = 0.0
+        out[5, j] = 0.0
+
+
+@compiled
+def write_dual(b: float, c: float, b_rate: float, c_rate: float, d: Array, out: Array) -> None:
+    """Write ``f(ad(d))`` for ``f(W) = I + b W + c W^2``, whose coefficients have the slopes given (over theta)."""
+    vx, vy, vz, wx, wy, wz = d[0], d[1], d[2], d[3], d[4], d[5]
+    write_polynomial(b, c, wx, wy, wz, out, 0)
+    for i in range(3):
+        for j in range(3):
+            out[i + 3, j + 3] = out[i, j]
+            out[i + 3, j] = 0.0
+    s = wx * vx + wy * vy + wz * vz
+    second, first = c_rate * s, b_rate * s
+    xx, yy, zz = second * wx * wx, second * wy * wy, second * wz * wz
+    xy = second * wx * wy + c * (wx * vy + wy * vx)
+    xz = second * wx * wz + c * (wx * vz + wz * vx)
+    yz = second * wy * wz + c * (wy * vz + wz * vy)
+    ox, oy, oz = b * vx + first * wx, b * vy + first * wy, b * vz + first * wz
+    twice = 2.0 * c
+    out[0, 3] = -twice * (wy * vy + wz * vz) - (yy + zz)
+    out[0, 4] = xy - oz
+    out[0, 5] = xz + oy
+    out[1, 3] = xy + oz
+    out[1, 4] = -twice * (wx * vx + wz * vz) - (xx + zz)
+    out[1, 5] = yz - ox
+    out[2, 3] = xz - oy
+    out[2, 4] = yz + ox
+    out[2, 5] = -twice * (wx * vx + wy * vy) - (xx + yy)
+
+
+@compiled
+def right_jacobian(d: Array, out: Array) -> None:
+    """Write Jr, (6, 6); Sola eq. 179 at -d, with the block of eq. 180 in fewer terms."""
+    a, b, c = coefficients(d[3], d[4], d[5])
+    t = d[3] * d[3] + d[4] * d[4] + d[5] * d[5]
+    write_dual(-b, c, -b_slope(t, a, b), c_slope(t, b, c), d, out)
+
+
+@compiled
+def right_jacobian_inverse(d: Array, out: Array) -> None:
+    """Write Jr^-1, (6, 6); singular at a rotation of 2 pi."""
+    t = d[3] * d[3] + d[4] * d[4] + d[5] * d[5]
+    g = x_cot_x(0.5 * math.sqrt(t))
+    write_dual(0.5, k_value(t, g), 0.0, k_slope(t, g), d, out)
+
+
+@compiled
+def bend(d: Array, v: Array, out: Array) -> None:
+    """Write the (6, 6) derivative of ``Jr^-1(d) v`` along d = (v, omega), for a vector (y, z)."""
+    p, w, y, z = vector(d, 0, 3), vector(d, 3, 3), vector(v, 0, 3), vector(v, 3, 3)
+    t = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    g = x_cot_x(0.5 * math.sqrt(t))
+    k, slope = k_value(t, g), k_slope(t, g)
+    curve = k_curve(t, g, slope)
+    write_turn(k, slope, w, z, out, 0, 0)
+    write_turn(k, slope, w, y, out, 0, 3)
+    write_turn(k, slope, w, z, out, 3, 3)
+    wz = w[0] * z[0] + w[1] * z[1] + w[2] * z[2]
+    wp = w[0] * p[0] + w[1] * p[1] + w[2] * p[2]
+    pz = p[0] * z[0] + p[1] * z[1] + p[2] * z[2]
+    for i in range(3):
+        square = w[i] * wz - t * z[i]  # W^2 z
+        first = slope * (p[i] * wz + w[i] * pz - 2.0 * z[i] * wp) + curve * wp * square
+        for j in range(3):
+            out[3 + i, j] = 0.0
+            out[i, 3 + j] += k * (p[i] * z[j] - 2.0 * z[i] * p[j]) + first * w[j] + slope * square * p[j]
+            out[i, 3 + j] += slope * wp * (w[i] * z[j] - 2.0 * z[i] * w[j])
+        out[i, 3 + i] += k * pz + slope * wp * wz
 
 
 class SE3Group(LieGroup):
@@ -44,6 +269,20 @@ class SE3Group(LieGroup):
     dim = 6
     point_dim = 3
     matrix_dim = 4
+
+    exp = elementwise(exp)
+    log = elementwise(log)
+    compose = elementwise(compose)
+    inverse = elementwise(inverse)
+    between = elementwise(between)
+    retract = elementwise(retract)
+    local = elementwise(local)
+    act = elementwise(act)
+    matrix = elementwise(matrix)
+    adjoint = elementwise(adjoint)
+    right_jacobian = elementwise(right_jacobian)
+    right_jacobian_inverse = elementwise(right_jacobian_inverse)
+    bend = elementwise(bend)
 
     # Constructors, and back.
 
@@ -78,7 +317,7 @@ class SE3Group(LieGroup):
 
     def to_matrix(self, x: ArrayLike, /) -> Array:
         """Return (..., 4, 4) homogeneous matrices; the same as :meth:`matrix`."""
-        return _matrix(x)
+        return self.matrix(x)
 
     def position(self, x: ArrayLike, /) -> Array:
         """Return the (..., 3) positions [m], as a view of an array."""
@@ -94,42 +333,6 @@ class SE3Group(LieGroup):
         """Return (0, 0, 0, 1, 0, 0, 0)."""
         return np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
-    def exp(self, d: ArrayLike, /) -> Array:
-        """Map (..., 6) tangent vectors to poses; Sola eq. 172 and 174."""
-        return _exp(d)
-
-    def log(self, x: ArrayLike, /) -> Array:
-        """Map (..., 7) poses to tangent vectors whose rotation is at most pi long; Sola eq. 173."""
-        return _log(x)
-
-    def compose(self, x: ArrayLike, y: ArrayLike, /) -> Array:
-        """Chain: ``world_T_a`` and ``a_T_b`` give ``world_T_b``; Sola eq. 171."""
-        return _compose(x, y)
-
-    def inverse(self, x: ArrayLike, /) -> Array:
-        """Invert: ``a_T_b`` gives ``b_T_a``; Sola eq. 170."""
-        return _inverse(x)
-
-    def between(self, x: ArrayLike, y: ArrayLike, /) -> Array:
-        """Return ``x^-1 y``: y seen from x."""
-        return _between(x, y)
-
-    def retract(self, x: ArrayLike, d: ArrayLike, /) -> Array:
-        """Return ``x Exp(d)``."""
-        return _retract(x, d)
-
-    def local(self, x: ArrayLike, y: ArrayLike, /) -> Array:
-        """Return ``Log(x^-1 y)``, the short way round."""
-        return _local(x, y)
-
-    def act(self, x: ArrayLike, points: ArrayLike, /) -> Array:
-        """Bring (..., 3) points [m] from the body frame to the frame of the pose."""
-        return _act(x, points)
-
-    def matrix(self, x: ArrayLike, /) -> Array:
-        """Return (..., 4, 4) homogeneous matrices; Sola eq. 168."""
-        return _matrix(x)
-
     def hat(self, d: ArrayLike, /) -> Array:
         """Return (..., 4, 4) Lie algebra matrices ``[[omega]x, v; 0, 0]``; Sola eq. 169."""
         d = np.asarray(d, dtype=np.float64)
@@ -137,10 +340,6 @@ class SE3Group(LieGroup):
         result[..., :3, :3] = SO3.hat(d[..., 3:])
         result[..., :3, 3] = d[..., :3]
         return result
-
-    def adjoint(self, x: ArrayLike, /) -> Array:
-        """Return (..., 6, 6) adjoints ``[R, [p]x R; 0, R]``; Sola eq. 175."""
-        return _adjoint(x)
 
     def ad(self, d: ArrayLike, /) -> Array:
         """Return (..., 6, 6) small adjoints ``[[omega]x, [v]x; 0, [omega]x]``."""
@@ -150,22 +349,6 @@ class SE3Group(LieGroup):
         result[..., :3, 3:] = SO3.hat(d[..., :3])
         return result
 
-    def right_jacobian(self, d: ArrayLike, /) -> Array:
-        """Return (..., 6, 6) right Jacobians; Sola eq. 179 at -d, with the block of eq. 180 in fewer terms."""
-        return _right_jacobian(d)
-
-    def right_jacobian_inverse(self, d: ArrayLike, /) -> Array:
-        """Return (..., 6, 6) inverse right Jacobians, in closed form; singular at a rotation of 2 pi."""
-        return _right_jacobian_inverse(d)
-
-    def left_jacobian(self, d: ArrayLike, /) -> Array:
-        """Return (..., 6, 6) left Jacobians; Sola eq. 179 and 180."""
-        return _left_jacobian(d)
-
-    def left_jacobian_inverse(self, d: ArrayLike, /) -> Array:
-        """Return (..., 6, 6) inverse left Jacobians; Sola eq. 179; singular at a rotation of 2 pi."""
-        return _left_jacobian_inverse(d)
-
     def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
         """Draw (*shape, 7) poses: standard normal positions, uniform rotations."""
         return self.from_parts(rng.standard_normal((*shape, 3)), SO3.random(rng, shape))
@@ -174,10 +357,6 @@ class SE3Group(LieGroup):
         """Tell for each of (..., 7) vectors whether it is finite and its quaternion of unit norm to within 1e-9."""
         x = np.asarray(x, dtype=np.float64)
         return np.asarray(np.isfinite(x[..., :3]).all(axis=-1) & SO3.is_valid(x[..., 3:]))
-
-    def __reduce__(self) -> str:
-        """Pickle by name: there is one SE3."""
-        return "SE3"
 
 
 SE3 = SE3Group()

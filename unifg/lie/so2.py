@@ -1,27 +1,105 @@
-"""Rotations of the plane, stored as one angle; Sola 2018, appendix A."""
+"""Rotations of the plane: storage ``(theta,)``, tangent ``(omega,)``; Sola 2018, appendix A."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from unifg.lie.batch import over_one, over_two
-from unifg.lie.manifold import LieGroup, identities
-from unifg.lie.scalar import so2
-from unifg.lie.scalar.so2 import PI
+from unifg.lie.elementwise import elementwise, over_one
+from unifg.lie.manifold import LieGroup
+from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike
 
-_wrap = over_one(so2.exp, 1, 1)
-_inverse = over_one(so2.inverse, 1, 1)
-_add = over_two(so2.compose, 1, 1, 1)
-_subtract = over_two(so2.between, 1, 1, 1)
-_act = over_two(so2.act, 1, 2, 2)
-_matrix = over_one(so2.matrix, 1, 2, 2)
+PI = math.pi
+TWO_PI = 2.0 * math.pi
 
 
-def wrap_angle(theta: ArrayLike, /) -> Array:
-    """Bring angles of any shape [rad] into [-pi, pi), exactly: see :func:`unifg.lie.scalar.so2.wrap`."""
-    wrapped: Array = _wrap(np.asarray(theta, dtype=np.float64)[..., None])[..., 0][()]
-    return wrapped
+@compiled
+def wrap(theta: float) -> float:
+    """Bring an angle [rad] into [-pi, pi), exactly.
+
+    Angles already there come back bit for bit, and the result never leaves the interval: each step is a difference of
+    two doubles within a factor two of each other, which is exact (Sterbenz). The usual shortcuts are not:
+    ``remainder(theta + pi, 2 pi) - pi`` loses digits near zero, ``rint(theta / 2 pi)`` leaves the interval near pi.
+    """
+    rest = theta if abs(theta) < TWO_PI else without_turns(theta)
+    turns = (1.0 if rest >= PI else 0.0) - (1.0 if rest < -PI else 0.0)  # selected, not branched on
+    return rest - TWO_PI * turns
+
+
+@compiled
+def without_turns(theta: float) -> float:
+    """Return what whole turns leave of an angle, in (-2 pi, 2 pi) and exact; NaN for what is not finite.
+
+    This is ``fmod(theta, 2 pi)``, which the compiler would compute for every angle, needed or not.
+    """
+    rest = abs(theta)
+    if not rest < math.inf:
+        return math.nan
+    turns = TWO_PI
+    while turns <= 0.5 * rest:
+        turns *= 2.0
+    while turns >= TWO_PI:
+        if rest >= turns:
+            rest -= turns
+        turns *= 0.5
+    return -rest if theta < 0.0 else rest
+
+
+@compiled
+def exp(d: Array, out: Array) -> None:
+    """Wrap; Sola eq. 114 to 116."""
+    out[0] = wrap(d[0])
+
+
+@compiled
+def compose(x: Array, y: Array, out: Array) -> None:
+    """Add and wrap."""
+    out[0] = wrap(x[0] + y[0])
+
+
+@compiled
+def inverse(x: Array, out: Array) -> None:
+    """Negate and wrap; Sola eq. 118."""
+    out[0] = wrap(-x[0])
+
+
+@compiled
+def between(x: Array, y: Array, out: Array) -> None:
+    """Subtract and wrap."""
+    out[0] = wrap(y[0] - x[0])
+
+
+@compiled
+def act(x: Array, p: Array, out: Array) -> None:
+    """Rotate a (2,) point."""
+    c, s = math.cos(x[0]), math.sin(x[0])
+    px, py = p[0], p[1]
+    out[0] = c * px - s * py
+    out[1] = s * px + c * py
+
+
+@compiled
+def matrix(x: Array, out: Array) -> None:
+    """Write the (2, 2) rotation matrix."""
+    c, s = math.cos(x[0]), math.sin(x[0])
+    out[0, 0] = c
+    out[0, 1] = -s
+    out[1, 0] = s
+    out[1, 1] = c
+
+
+@compiled
+def unit(x: Array, out: Array) -> None:
+    """Write 1; Sola eq. 123 and 126."""
+    out[0, 0] = 1.0
+
+
+@compiled
+def straight(d: Array, v: Array, out: Array) -> None:
+    """Write zeros, (n, n): Jr^-1 = I does not change."""
+    out[:] = 0.0
 
 
 class SO2Group(LieGroup):
@@ -37,45 +115,18 @@ class SO2Group(LieGroup):
     point_dim = 2
     matrix_dim = 2
 
+    exp = log = elementwise(exp)
+    compose = retract = elementwise(compose)
+    inverse = elementwise(inverse)
+    between = local = elementwise(between)
+    act = elementwise(act)
+    matrix = elementwise(matrix)
+    adjoint = right_jacobian = right_jacobian_inverse = elementwise(unit)
+    bend = elementwise(straight)
+
     def identity(self) -> Array:
         """Return the zero angle, (1,)."""
         return np.zeros(1)
-
-    def exp(self, d: ArrayLike, /) -> Array:
-        """Wrap (..., 1) angles; Sola eq. 114 and 116."""
-        return _wrap(d)
-
-    def log(self, x: ArrayLike, /) -> Array:
-        """Wrap (..., 1) angles; Sola eq. 115."""
-        return _wrap(x)
-
-    def compose(self, x: ArrayLike, y: ArrayLike, /) -> Array:
-        """Add angles and wrap."""
-        return _add(x, y)
-
-    def inverse(self, x: ArrayLike, /) -> Array:
-        """Negate angles and wrap: -pi is its own inverse; Sola eq. 118."""
-        return _inverse(x)
-
-    def between(self, x: ArrayLike, y: ArrayLike, /) -> Array:
-        """Subtract angles and wrap."""
-        return _subtract(x, y)
-
-    def retract(self, x: ArrayLike, d: ArrayLike, /) -> Array:
-        """Add angles and wrap."""
-        return _add(x, d)
-
-    def local(self, x: ArrayLike, y: ArrayLike, /) -> Array:
-        """Subtract angles and wrap."""
-        return _subtract(x, y)
-
-    def act(self, x: ArrayLike, points: ArrayLike, /) -> Array:
-        """Rotate (..., 2) points [m]."""
-        return _act(x, points)
-
-    def matrix(self, x: ArrayLike, /) -> Array:
-        """Return (..., 2, 2) rotation matrices."""
-        return _matrix(x)
 
     def hat(self, d: ArrayLike, /) -> Array:
         """Return (..., 2, 2) skew-symmetric matrices."""
@@ -85,29 +136,19 @@ class SO2Group(LieGroup):
         result[..., 0, 1] = -omega
         return result
 
-    def adjoint(self, x: ArrayLike, /) -> Array:
-        """Return (..., 1, 1) ones; Sola eq. 123."""
-        return identities(np.asarray(x), 1)
-
     def ad(self, d: ArrayLike, /) -> Array:
         """Return (..., 1, 1) zeros; the group commutes."""
         return np.zeros((*np.shape(d)[:-1], 1, 1))
-
-    def right_jacobian(self, d: ArrayLike, /) -> Array:
-        """Return (..., 1, 1) ones; Sola eq. 126."""
-        return identities(np.asarray(d), 1)
-
-    def right_jacobian_inverse(self, d: ArrayLike, /) -> Array:
-        """Return (..., 1, 1) ones; Sola eq. 126."""
-        return identities(np.asarray(d), 1)
 
     def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
         """Draw (*shape, 1) uniform angles in [-pi, pi)."""
         return rng.uniform(-PI, PI, (*shape, 1))
 
-    def __reduce__(self) -> str:
-        """Pickle by name: there is one SO2."""
-        return "SO2"
-
 
 SO2 = SO2Group()
+
+
+def wrap_angle(theta: ArrayLike, /) -> Array:
+    """Bring angles of any shape [rad] into [-pi, pi), exactly: see :func:`wrap`."""
+    wrapped: Array = over_one(exp, 1, 1)(np.asarray(theta, dtype=np.float64)[..., None])[..., 0][()]
+    return wrapped

@@ -1,38 +1,311 @@
-"""Rotations of space, stored as unit quaternions (w, x, y, z); Sola 2018, appendix B.
+"""Rotations of space; Sola 2018, appendix B.
 
-The formulas stand in :mod:`unifg.lie.scalar.so3`.
+Storage is the unit quaternion ``(w, x, y, z)``, tangent the rotation vector ``(wx, wy, wz)``.
+
+A quaternion and its negative are one rotation: results have w >= 0, arguments may have either sign. Results have unit
+norm to within ``DRIFT / 2`` and rounding. With W = [omega]x and the angle theta = |omega|,
+
+    Jr = I - b W + c W^2,        Jr^-1 = I + W / 2 + k W^2,
+
+where b, c and k are the functions of the angle in :mod:`unifg.lie.series`. ``Jl`` has the other sign at W. The
+logarithm reads the half angle from ``atan2(|v|, w)``, which is accurate at every angle, pi among them.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from unifg.errors import UnifgError
-from unifg.lie.batch import over_one, over_two
+from unifg.lie.elementwise import elementwise, over_one
 from unifg.lie.manifold import LieGroup
-from unifg.lie.scalar import so3
+from unifg.lie.series import TINY, c_value, k_slope, k_value, x_cot_x
+from unifg.lie.so2 import wrap
+from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike, BoolArray
 
 UNIT = 1e-9  # how far the norm of a valid quaternion may be from 1
 AMBIGUOUS = 1e-14  # gap, over the largest singular value, below which the nearest rotation is anyone's guess
+DRIFT = 4e-15  # of |q|^2; below it a product keeps its digits, so that a zero step changes none
 
-_exp = over_one(so3.exp, 3, 4)
-_log = over_one(so3.log, 4, 3)
-_compose = over_two(so3.compose, 4, 4, 4)
-_inverse = over_one(so3.inverse, 4, 4)
-_between = over_two(so3.between, 4, 4, 4)
-_retract = over_two(so3.retract, 4, 3, 4)
-_local = over_two(so3.local, 4, 4, 3)
-_act = over_two(so3.act, 4, 3, 3)
-_matrix = over_one(so3.matrix, 4, 3, 3)
-_right_jacobian = over_one(so3.right_jacobian, 3, 3, 3)
-_right_jacobian_inverse = over_one(so3.right_jacobian_inverse, 3, 3, 3)
-_left_jacobian = over_one(so3.left_jacobian, 3, 3, 3)
-_left_jacobian_inverse = over_one(so3.left_jacobian_inverse, 3, 3, 3)
-_normalise = over_one(so3.normalise, 4, 4)
-_from_matrix = over_one(so3.from_matrix, 9, 4)
-_from_rpy = over_one(so3.from_rpy, 3, 4)
-_to_rpy = over_one(so3.to_rpy, 4, 3)
+
+@compiled
+def write(w: float, x: float, y: float, z: float, out: Array, at: int) -> None:
+    """Store a quaternion at ``out[at:at + 4]``, unit norm and w >= 0."""
+    square = w * w + x * x + y * y + z * z
+    scale = 1.0
+    if abs(square - 1.0) > DRIFT:
+        scale = 1.0 / math.sqrt(square)
+    if w < 0.0:
+        scale = -scale
+    out[at] = scale * w
+    out[at + 1] = scale * x
+    out[at + 2] = scale * y
+    out[at + 3] = scale * z
+
+
+@compiled
+def write_product(
+    w: float, x: float, y: float, z: float, v: float, a: float, b: float, c: float, out: Array, at: int
+) -> None:
+    """Store the product of the quaternions ``(w, x, y, z)`` and ``(v, a, b, c)``."""
+    write(
+        w * v - x * a - y * b - z * c,
+        w * a + x * v + y * c - z * b,
+        w * b - x * c + y * v + z * a,
+        w * c + x * b - y * a + z * v,
+        out,
+        at,
+    )
+
+
+@compiled
+def rotate(w: float, x: float, y: float, z: float, px: float, py: float, pz: float) -> tuple[float, float, float]:
+    """Turn a vector: ``p + 2 w (u x p) + 2 u x (u x p)`` with u = (x, y, z)."""
+    cx, cy, cz = 2.0 * (y * pz - z * py), 2.0 * (z * px - x * pz), 2.0 * (x * py - y * px)
+    return (
+        px + (w * cx + (y * cz - z * cy)),
+        py + (w * cy + (z * cx - x * cz)),
+        pz + (w * cz + (x * cy - y * cx)),
+    )
+
+
+@compiled
+def half_turn(wx: float, wy: float, wz: float) -> tuple[float, float, float]:
+    """Return the angle, ``cos(theta / 2)`` and ``sin(theta / 2) / theta`` of a rotation vector."""
+    theta = max(math.sqrt(wx * wx + wy * wy + wz * wz), TINY)
+    half = 0.5 * theta
+    return theta, math.cos(half), math.sin(half) / theta
+
+
+@compiled
+def half_log(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return what makes (x, y, z) the rotation vector, half the angle h <= pi / 2, and h cot(h).
+
+    The factor has the sign of w: the short way round. The quaternion need not be of unit norm.
+    """
+    length = max(math.sqrt(x * x + y * y + z * z), TINY)
+    cosine = abs(w)
+    half = math.atan2(length, cosine)
+    factor = 2.0 * half / length
+    return (-factor if w < 0.0 else factor), half, half * cosine / length
+
+
+@compiled
+def coefficients(wx: float, wy: float, wz: float) -> tuple[float, float, float]:
+    """Return a = sin(theta) / theta, b and c of a rotation vector."""
+    theta, cosine, s = half_turn(wx, wy, wz)
+    a = 2.0 * s * cosine
+    return a, 2.0 * s * s, c_value(theta, a * theta)
+
+
+@compiled
+def write_polynomial(b: float, c: float, wx: float, wy: float, wz: float, out: Array, at: int) -> None:
+    """Write ``I + b W + c W^2`` as the 3 by 3 block of ``out`` whose first entry is ``out[at, at]``."""
+    xx, yy, zz = c * wx * wx, c * wy * wy, c * wz * wz
+    xy, xz, yz = c * wx * wy, c * wx * wz, c * wy * wz
+    bx, by, bz = b * wx, b * wy, b * wz
+    out[at, at] = 1.0 - (yy + zz)
+    out[at, at + 1] = xy - bz
+    out[at, at + 2] = xz + by
+    out[at + 1, at] = xy + bz
+    out[at + 1, at + 1] = 1.0 - (xx + zz)
+    out[at + 1, at + 2] = yz - bx
+    out[at + 2, at] = xz - by
+    out[at + 2, at + 1] = yz + bx
+    out[at + 2, at + 2] = 1.0 - (xx + yy)
+
+
+@compiled
+def write_matrix(w: float, x: float, y: float, z: float, out: Array, at: int) -> None:
+    """Write the rotation matrix ``I + 2 w U + 2 U^2``, U = [(x, y, z)]x, as a block of ``out``."""
+    write_polynomial(2.0 * w, 2.0, x, y, z, out, at)
+
+
+@compiled
+def exp(d: Array, out: Array) -> None:
+    """Exponential at any angle; Sola eq. 101 and 132."""
+    wx, wy, wz = d[0], d[1], d[2]
+    _, cosine, s = half_turn(wx, wy, wz)
+    write(cosine, s * wx, s * wy, s * wz, out, 0)
+
+
+@compiled
+def log(x: Array, out: Array) -> None:
+    """Logarithm of length at most pi; Sola eq. 133."""
+    w, a, b, c = x[0], x[1], x[2], x[3]
+    factor, _, _ = half_log(w, a, b, c)
+    out[0] = factor * a
+    out[1] = factor * b
+    out[2] = factor * c
+
+
+@compiled
+def compose(x: Array, y: Array, out: Array) -> None:
+    """``x y``: the product of the quaternions."""
+    write_product(x[0], x[1], x[2], x[3], y[0], y[1], y[2], y[3], out, 0)
+
+
+@compiled
+def inverse(x: Array, out: Array) -> None:
+    """``x^-1``: the conjugate."""
+    write(x[0], -x[1], -x[2], -x[3], out, 0)
+
+
+@compiled
+def between(x: Array, y: Array, out: Array) -> None:
+    """``x^-1 y``."""
+    write_product(x[0], -x[1], -x[2], -x[3], y[0], y[1], y[2], y[3], out, 0)
+
+
+@compiled
+def retract(x: Array, d: Array, out: Array) -> None:
+    """``x Exp(d)``."""
+    wx, wy, wz = d[0], d[1], d[2]
+    _, cosine, s = half_turn(wx, wy, wz)
+    write_product(x[0], x[1], x[2], x[3], cosine, s * wx, s * wy, s * wz, out, 0)
+
+
+@compiled
+def local(x: Array, y: Array, out: Array) -> None:
+    """``Log(x^-1 y)``, the short way round."""
+    w, a, b, c = x[0], -x[1], -x[2], -x[3]
+    v, e, f, g = y[0], y[1], y[2], y[3]
+    qx = w * e + a * v + (b * g - c * f)
+    qy = w * f + b * v + (c * e - a * g)
+    qz = w * g + c * v + (a * f - b * e)
+    factor, _, _ = half_log(w * v - a * e - b * f - c * g, qx, qy, qz)
+    out[0] = factor * qx
+    out[1] = factor * qy
+    out[2] = factor * qz
+
+
+@compiled
+def act(x: Array, p: Array, out: Array) -> None:
+    """Rotate a (3,) point."""
+    px, py, pz = rotate(x[0], x[1], x[2], x[3], p[0], p[1], p[2])
+    out[0] = px
+    out[1] = py
+    out[2] = pz
+
+
+@compiled
+def matrix(x: Array, out: Array) -> None:
+    """Write the (3, 3) rotation matrix, which is the adjoint too; Sola eq. 139."""
+    write_matrix(x[0], x[1], x[2], x[3], out, 0)
+
+
+@compiled
+def right_jacobian(d: Array, out: Array) -> None:
+    """Write Jr, (3, 3); Sola eq. 143."""
+    _, b, c = coefficients(d[0], d[1], d[2])
+    write_polynomial(-b, c, d[0], d[1], d[2], out, 0)
+
+
+@compiled
+def inverse_coefficient(wx: float, wy: float, wz: float) -> float:
+    """Return k of a rotation vector."""
+    t = wx * wx + wy * wy + wz * wz
+    return k_value(t, x_cot_x(0.5 * math.sqrt(t)))
+
+
+@compiled
+def right_jacobian_inverse(d: Array, out: Array) -> None:
+    """Write Jr^-1, (3, 3); Sola eq. 144; singular at an angle of 2 pi."""
+    write_polynomial(0.5, inverse_coefficient(d[0], d[1], d[2]), d[0], d[1], d[2], out, 0)
+
+
+@compiled
+def write_turn(k: float, slope: float, w: Array, y: Array, out: Array, row: int, column: int) -> None:
+    """Write D(w, y), (3, 3), as a block of ``out``."""
+    along = w[0] * y[0] + w[1] * y[1] + w[2] * y[2]
+    t = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    for i in range(3):
+        second = slope * (w[i] * along - t * y[i])
+        for j in range(3):
+            out[row + i, column + j] = k * (w[i] * y[j] - 2.0 * y[i] * w[j]) + second * w[j]
+        out[row + i, column + i] += k * along
+    x0, x1, x2 = 0.5 * y[0], 0.5 * y[1], 0.5 * y[2]
+    out[row, column + 1] += x2
+    out[row, column + 2] -= x1
+    out[row + 1, column] -= x2
+    out[row + 1, column + 2] += x0
+    out[row + 2, column] += x1
+    out[row + 2, column + 1] -= x0
+
+
+@compiled
+def bend(d: Array, v: Array, out: Array) -> None:
+    """Write the (3, 3) derivative of ``Jr^-1(d) v`` along d: D(d, v)."""
+    t = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+    g = x_cot_x(0.5 * math.sqrt(t))
+    write_turn(k_value(t, g), k_slope(t, g), d, v, out, 0, 0)
+
+
+@compiled
+def normalise(x: Array, out: Array) -> None:
+    """Bring a quaternion of any length to unit norm and w >= 0; one without direction gives NaN."""
+    write(x[0], x[1], x[2], x[3], out, 0)
+
+
+@compiled
+def from_matrix(m: Array, out: Array) -> None:
+    """Store the quaternion of a rotation matrix, given as (9,) numbers row by row.
+
+    The four products 4 q_i q_j of the largest component with all others are sums of entries; dividing by the largest
+    loses no digits (Shepperd 1978, *Quaternion from rotation matrix*).
+    """
+    r00, r11, r22 = m[0], m[4], m[8]
+    wx, wy, wz = m[7] - m[5], m[2] - m[6], m[3] - m[1]
+    xy, xz, yz = m[3] + m[1], m[2] + m[6], m[7] + m[5]
+    trace = r00 + r11 + r22
+    if trace >= r00 and trace >= r11 and trace >= r22:
+        a, b, c, d = 1.0 + trace, wx, wy, wz
+    elif r00 >= r11 and r00 >= r22:
+        a, b, c, d = wx, 1.0 + r00 - r11 - r22, xy, xz
+    elif r11 >= r22:
+        a, b, c, d = wy, xy, 1.0 + r11 - r00 - r22, yz
+    else:
+        a, b, c, d = wz, xz, yz, 1.0 + r22 - r00 - r11
+    scale = 1.0 / math.sqrt(a * a + b * b + c * c + d * d)
+    write(scale * a, scale * b, scale * c, scale * d, out, 0)
+
+
+@compiled
+def from_rpy(angles: Array, out: Array) -> None:
+    """Store ``Rz(yaw) Ry(pitch) Rx(roll)`` for angles (roll, pitch, yaw) [rad]."""
+    roll, pitch, yaw = 0.5 * angles[0], 0.5 * angles[1], 0.5 * angles[2]
+    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
+    cy, sy = math.cos(yaw), math.sin(yaw)
+    write(
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        out,
+        0,
+    )
+
+
+@compiled
+def to_rpy(x: Array, out: Array) -> None:
+    """Write (roll, pitch, yaw) [rad], pitch in [-pi/2, pi/2], the others in [-pi, pi).
+
+    With half angles, ``(w - y, x + z) = (cos p - sin p) (cos, sin)(roll/2 + yaw/2)`` and ``(w + y, x - z) =
+    (cos p + sin p) (cos, sin)(roll/2 - yaw/2)``, p = pitch / 2; the product of the lengths is cos(pitch). This keeps
+    all digits up to the pole, where one of the two pairs is noise that does not change the rotation.
+    """
+    w, a, b, c = x[0], x[1], x[2], x[3]
+    plus, minus = math.atan2(a + c, w - b), math.atan2(a - c, w + b)
+    cosine = math.hypot(w - b, a + c) * math.hypot(w + b, a - c)
+    out[0] = wrap(plus + minus)
+    out[1] = math.atan2(2.0 * (w * b - a * c), cosine)
+    out[2] = wrap(plus - minus)
+
+
+_normalise, _from_matrix = over_one(normalise, 4, 4), over_one(from_matrix, 9, 4)
+_from_rpy, _to_rpy = over_one(from_rpy, 3, 4), over_one(to_rpy, 4, 3)
 
 
 class SO3Group(LieGroup):
@@ -50,6 +323,19 @@ class SO3Group(LieGroup):
     dim = 3
     point_dim = 3
     matrix_dim = 3
+
+    exp = elementwise(exp)
+    log = elementwise(log)
+    compose = elementwise(compose)
+    inverse = elementwise(inverse)
+    between = elementwise(between)
+    retract = elementwise(retract)
+    local = elementwise(local)
+    act = elementwise(act)
+    matrix = adjoint = elementwise(matrix)
+    right_jacobian = elementwise(right_jacobian)
+    right_jacobian_inverse = elementwise(right_jacobian_inverse)
+    bend = elementwise(bend)
 
     # Constructors, and back.
 
@@ -121,7 +407,7 @@ class SO3Group(LieGroup):
 
     def to_matrix(self, x: ArrayLike, /) -> Array:
         """Return (..., 3, 3) rotation matrices; the same as :meth:`matrix`."""
-        return _matrix(x)
+        return self.matrix(x)
 
     def to_rpy(self, x: ArrayLike, /) -> tuple[Array, Array, Array]:
         """Return roll, pitch and yaw [rad], (...) each: the arguments that :meth:`from_rpy` turns into ``x``.
@@ -138,42 +424,6 @@ class SO3Group(LieGroup):
         """Return (1, 0, 0, 0)."""
         return np.array([1.0, 0.0, 0.0, 0.0])
 
-    def exp(self, d: ArrayLike, /) -> Array:
-        """Map (..., 3) rotation vectors of any length; Sola eq. 101 and 132."""
-        return _exp(d)
-
-    def log(self, x: ArrayLike, /) -> Array:
-        """Map to (..., 3) rotation vectors of length at most pi; Sola eq. 133, with the short way round."""
-        return _log(x)
-
-    def compose(self, x: ArrayLike, y: ArrayLike, /) -> Array:
-        """Chain: ``world_R_a`` and ``a_R_b`` give ``world_R_b``."""
-        return _compose(x, y)
-
-    def inverse(self, x: ArrayLike, /) -> Array:
-        """Invert: the conjugate quaternion."""
-        return _inverse(x)
-
-    def between(self, x: ArrayLike, y: ArrayLike, /) -> Array:
-        """Return ``x^-1 y``: y seen from x."""
-        return _between(x, y)
-
-    def retract(self, x: ArrayLike, d: ArrayLike, /) -> Array:
-        """Return ``x Exp(d)``."""
-        return _retract(x, d)
-
-    def local(self, x: ArrayLike, y: ArrayLike, /) -> Array:
-        """Return ``Log(x^-1 y)``, the short way round."""
-        return _local(x, y)
-
-    def act(self, x: ArrayLike, points: ArrayLike, /) -> Array:
-        """Rotate (..., 3) points [m]."""
-        return _act(x, points)
-
-    def matrix(self, x: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) rotation matrices."""
-        return _matrix(x)
-
     def hat(self, d: ArrayLike, /) -> Array:
         """Return (..., 3, 3) skew-symmetric matrices: ``hat(a) b`` is the cross product."""
         d = np.asarray(d, dtype=np.float64)
@@ -182,29 +432,9 @@ class SO3Group(LieGroup):
         result[..., (1, 2, 0), (2, 0, 1)] = -d
         return result
 
-    def adjoint(self, x: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) adjoints: the rotation matrices; Sola eq. 139."""
-        return _matrix(x)
-
     def ad(self, d: ArrayLike, /) -> Array:
         """Return (..., 3, 3) small adjoints: the same as :meth:`hat`."""
         return self.hat(d)
-
-    def right_jacobian(self, d: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) right Jacobians; Sola eq. 143."""
-        return _right_jacobian(d)
-
-    def right_jacobian_inverse(self, d: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) inverse right Jacobians; Sola eq. 144; singular at an angle of 2 pi."""
-        return _right_jacobian_inverse(d)
-
-    def left_jacobian(self, d: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) left Jacobians; Sola eq. 145."""
-        return _left_jacobian(d)
-
-    def left_jacobian_inverse(self, d: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) inverse left Jacobians; Sola eq. 146; singular at an angle of 2 pi."""
-        return _left_jacobian_inverse(d)
 
     def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
         """Draw (*shape, 4) rotations, uniform: the direction of four normal numbers."""
@@ -213,10 +443,6 @@ class SO3Group(LieGroup):
     def is_valid(self, x: ArrayLike, /) -> BoolArray:
         """Tell for each of (..., 4) vectors whether its norm is 1 to within 1e-9; either sign is valid."""
         return np.asarray(np.abs(np.linalg.norm(x, axis=-1) - 1.0) < UNIT)
-
-    def __reduce__(self) -> str:
-        """Pickle by name: there is one SO3."""
-        return "SO3"
 
 
 SO3 = SO3Group()

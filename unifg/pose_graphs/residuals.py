@@ -8,15 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import cache
-from types import ModuleType
 
 from unifg.errors import GraphError
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import Residual, residual
 from unifg.language.factors import ManifoldResidual
 from unifg.lie import SE2, SE3, LieGroup, Manifold, Rn
-from unifg.lie.lookup import functions_of
-from unifg.lie.scalar.so2 import wrap
+from unifg.lie.functions import Functions, functions_of
+from unifg.lie.so2 import wrap
 from unifg.machine.calls import local_matrix, local_vector, vector
 from unifg.machine.jit import compiled
 from unifg.typing import Array
@@ -39,7 +38,7 @@ def _planar_chart(error: Array, r: Array, after: Array) -> None:
         after[2, 2] = 1.0
 
 
-def _spatial_chart_of(functions: ModuleType) -> Callable[..., None]:
+def _spatial_chart_of(functions: Functions) -> Callable[..., None]:
     """Translation and vector part of the quaternion, scalar part positive, of E, and its derivative along E Exp(d)."""
     homogeneous = functions.matrix
 
@@ -65,7 +64,7 @@ def _spatial_chart_of(functions: ModuleType) -> Callable[..., None]:
     return chart
 
 
-def _relative(group: LieGroup, functions: ModuleType, chart: Callable[..., None]) -> Callable[..., None]:
+def _relative(group: LieGroup, functions: Functions, chart: Callable[..., None]) -> Callable[..., None]:
     """A chart of measured^-1 x^-1 y."""
     storage, dim = group.storage, group.dim
     between, adjoint = functions.between, functions.adjoint
@@ -141,7 +140,7 @@ def _planar_sighting(v: Array, p: Array, table: Array, r: Array, J: Array) -> No
     r[1] -= p[1]
 
 
-def _spatial_sighting(functions: ModuleType) -> Callable[..., None]:
+def _spatial_sighting(functions: Functions) -> Callable[..., None]:
     """The same in space; derivatives [-I, [p]x] and R'."""
     homogeneous = functions.matrix
 

@@ -12,7 +12,7 @@ import numpy as np
 from unifg.kernels.steps import ANGLE, ONE_SIDED, TURN, VECTOR, largest, move, rotation, step_for, step_of, to_body
 from unifg.kernels.steps import SECOND as TWICE
 from unifg.kernels.whitening import DIAGONAL, FULL
-from unifg.lie.scalar.so2 import wrap
+from unifg.lie.so2 import wrap
 from unifg.machine.calls import call_residual, matrix, vector, vector_at
 from unifg.machine.jit import compiled, in_order, inlined
 from unifg.program.passes import gather_variables

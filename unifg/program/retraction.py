@@ -8,7 +8,7 @@ import numpy as np
 
 from unifg.language.terms import Fix
 from unifg.lie import Manifold, Rn
-from unifg.lie.lookup import functions_of
+from unifg.lie.functions import functions_of
 from unifg.lie.product import leaves
 from unifg.machine.calls import RETRACTION, address, call_retraction, vector
 from unifg.machine.jit import compiled

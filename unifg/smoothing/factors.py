@@ -18,7 +18,7 @@ from unifg.language.factors import prior
 from unifg.language.graph import AnyResidual, complete
 from unifg.language.variables import as_selection, is_variable
 from unifg.lie import Manifold, Rn
-from unifg.lie.lookup import functions_of
+from unifg.lie.functions import functions_of
 from unifg.lie.product import leaves
 from unifg.machine.calls import RETRACTION, address
 from unifg.machine.jit import compiled, is_compiled
