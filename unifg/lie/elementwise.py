@@ -112,7 +112,8 @@ def method(owner: type, name: str, function: Scalar, over: Callable[..., Array] 
 
 def stated(owner: type, name: str) -> Scalar | None:
     """The compiled function behind a method of a class, if there is one."""
-    return cast("Scalar | None", getattr(getattr(owner, name, None), "compiled", None))
+    found = getattr(owner, name, None)
+    return found.compiled if isinstance(found, FunctionType) and hasattr(found, "compiled") else None
 
 
 @cache

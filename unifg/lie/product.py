@@ -168,7 +168,7 @@ def _one_by_one(name: str) -> OneMethod:
     def each(self: Any, x: ArrayLike, /) -> Array:
         x = np.asarray(x, dtype=np.float64)
         found = [of(x[..., at]) for of, at in self._of(name)]
-        return self._diagonal(name, found) if square else np.concatenate(found, axis=-1)  # type: ignore[no-any-return]
+        return self._diagonal(name, found) if square else np.concatenate(found, axis=-1)
 
     return each
 
@@ -180,7 +180,7 @@ def _two_by_two(name: str) -> TwoMethod:
     def each(self: Any, x: ArrayLike, y: ArrayLike, /) -> Array:
         x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
         found = [of(x[..., at], y[..., beside]) for of, at, beside in self._of(name)]
-        return self._diagonal(name, found) if square else np.concatenate(found, axis=-1)  # type: ignore[no-any-return]
+        return self._diagonal(name, found) if square else np.concatenate(found, axis=-1)
 
     return each
 
