@@ -185,6 +185,15 @@ def where(rows: Iterable[Row], **wanted: Any) -> list[Row]:
     return [row for row in rows if "error" not in row and all(row[name] == value for name, value in wanted.items())]
 
 
+def crossed(rows: Iterable[Row], *names: str) -> dict[Key, list[Row]]:
+    """Rows by their values of some fields, in the order of seeds; a seed counts when all groups have it."""
+    groups: dict[Key, dict[int, Row]] = {}
+    for row in where(rows):
+        groups.setdefault(tuple(row[name] for name in names), {})[row["seed"]] = row
+    common = sorted(set[int].intersection(*map(set, groups.values()))) if groups else []
+    return {key: [found[seed] for seed in common] for key, found in groups.items()}
+
+
 def paired(mine: Iterable[Row], base: Iterable[Row], read: Read) -> tuple[Array, Array]:
     """(n,) values of two variants for the seeds of which both have one."""
     a, b = ({row["seed"]: read(row) for row in rows} for rows in (mine, base))

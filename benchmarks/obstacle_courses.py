@@ -1,6 +1,6 @@
 """Two hundred obstacle courses: which backend finds a way past three walls and a cylinder, and where it gets stuck.
 
-    python -m benchmarks.obstacle_courses [--layouts K] [--tuning] [--again]
+    python -m benchmarks.obstacle_courses [--layouts K] [--tuning] [--fresh] [--report]
 
 Ta et al. 2014, section V-A, vary the positions of the obstacles: "the drone often manages to get to the target", and
 sometimes ends in a local minimum. Here this is counted, on the layouts of ``COURSE_SEEDS``, for every backend with the
@@ -11,21 +11,19 @@ the start, the straight line to the target, and a shortest way. Weights were cho
 
 from __future__ import annotations
 
-import argparse
-import json
-import math
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cache
 from itertools import pairwise, product
-from pathlib import Path
 
 import numpy as np
 from scipy.stats import binomtest
-from tqdm import tqdm
 
-from benchmarks.report import CHECKOUT, OUT, machine, put_results, table
+from benchmarks import campaign
+from benchmarks.campaign import Row, share
+from benchmarks.report import command, listing, machine, publish, table, words
 from benchmarks.timing import pin
 from unifg.scenarios.course import (
     AVOIDANCES,
@@ -58,11 +56,6 @@ class Method:
     hessian: Hessian
 
     @property
-    def settings(self) -> CourseSettings:
-        """The numbers of the scenario, unchanged."""
-        return CourseSettings(avoidance=self.avoidance, guess=self.guess, solver=self.solver, hessian=self.hessian)
-
-    @property
     def words(self) -> tuple[str, str, str]:
         """For tables."""
         return self.avoidance, self.guess, f"{self.solver}, {self.hessian}"
@@ -76,11 +69,22 @@ METHODS = tuple(
 
 
 @dataclass(frozen=True)
+class Attempt(Method):
+    """A method and the layout it is tried on."""
+
+    seed: int
+
+    @property
+    def method(self) -> Method:
+        """The method alone."""
+        return Method(self.avoidance, self.guess, self.solver, self.hessian)
+
+
+@dataclass(frozen=True)
 class Outcome:
     """What became of one layout.
 
     Attributes:
-        seed: of the layout.
         status: of the solver.
         converged: whether the KKT test passed.
         arrived: whether the end is near the target.
@@ -93,7 +97,6 @@ class Outcome:
         milliseconds: of the processor, for the solve.
     """
 
-    seed: int
     status: str
     converged: bool
     arrived: bool
@@ -119,9 +122,11 @@ class Outcome:
 Results = dict[Method, list[Outcome]]
 
 
-def attempt(method: Method, layout: Layout, seed: int) -> Outcome:
+def attempt(method: Method, layout: Layout) -> Outcome:
     """Solve one layout cold; the processor's time is counted, without that of building the graph."""
-    settings = method.settings
+    settings = CourseSettings(
+        avoidance=method.avoidance, guess=method.guess, solver=method.solver, hessian=method.hessian
+    )
     graph, x, u = state_problem(settings, layout)
     run = backend(settings).prepare(graph)
     states, controls = course_guess(settings, layout)
@@ -130,8 +135,7 @@ def attempt(method: Method, layout: Layout, seed: int) -> Outcome:
     elapsed = time.process_time() - begin
     course = Course(settings, layout, solution, solution[x], solution[u], iterates=np.zeros((0, *states.shape)))
     return Outcome(
-        seed,
-        solution.status.name.lower().replace("_", " "),
+        words(solution.status),
         solution.converged,
         course.arrived,
         course.clear,
@@ -144,14 +148,24 @@ def attempt(method: Method, layout: Layout, seed: int) -> Outcome:
     )
 
 
-def wilson(hits: int, of: int, z: float = 1.96) -> tuple[float, float]:
-    """Confidence interval of a rate (Wilson 1927), 95 % by default."""
-    if of == 0:
-        return 0.0, 1.0
-    rate, share = hits / of, z * z / of
-    middle = (rate + 0.5 * share) / (1.0 + share)
-    half = z * math.sqrt(rate * (1.0 - rate) / of + 0.25 * share / of) / (1.0 + share)
-    return max(0.0, middle - half), min(1.0, middle + half)
+def attempted(job: Attempt) -> Row:
+    """The same, as a row."""
+    _compiled(job.method)
+    return vars(attempt(job.method, obstacle_course(job.seed)))
+
+
+@cache
+def _compiled(method: Method) -> None:
+    """The first solve of a method in a process compiles: the nominal course, which is no result."""
+    attempt(method, obstacle_course())
+
+
+def results_of(rows: Iterable[Row]) -> Results:
+    """Outcomes of every method, on the layouts that all have tried."""
+    names = [field.name for field in fields(Outcome)]
+    groups = campaign.crossed(rows, *(field.name for field in fields(Method)))
+    found = {Method(*key): [Outcome(*(row[name] for name in names)) for row in some] for key, some in groups.items()}
+    return {method: found[method] for method in METHODS}
 
 
 def lowest(results: Results, avoidance: Avoidance) -> list[Outcome | None]:
@@ -171,99 +185,90 @@ def distinct(costs: Iterable[float]) -> int:
 def rates(results: Results) -> str:
     """Success and its opposite, per method."""
     best = {avoidance: lowest(results, avoidance) for avoidance in AVOIDANCES}
-    lines = []
-    for method, outcomes in results.items():
-        safe, count = sum(o.safe for o in outcomes), len(outcomes)
-        low, high = wilson(safe, count)
-        stuck = [o for o in outcomes if o.minimum and not o.safe]
-        found = sum(
-            o.minimum and b is not None and o.cost <= b.cost * (1.0 + SAME)
-            for o, b in zip(outcomes, best[method.avoidance], strict=True)
-        )
-        lines.append(
-            (
-                *method.words, str(safe), f"{100 * low:.0f} to {100 * high:.0f} %",
-                str(sum(o.converged for o in outcomes)), str(sum(not o.arrived for o in stuck)),
-                str(sum(o.arrived for o in stuck)), str(found),
-                _middle([o.iterations for o in outcomes]), _middle([o.milliseconds for o in outcomes]),
-            )
-        )  # fmt: skip
-    head = (
-        "avoidance", "guess", "backend", "success", "95 % interval", "converged", "minimum short of target",
-        "minimum through an obstacle", "cheapest found", "iterations", "ms",
-    )  # fmt: skip
-    return table(head, lines, text=3)
+    groups = {m.words: [*zip(some, best[m.avoidance], strict=True)] for m, some in results.items()}
+    columns: dict[str, Callable[[list[tuple[Outcome, Outcome | None]]], str]] = {
+        "success": lambda some: str(sum(o.safe for o, _ in some)),
+        "95 % interval": lambda some: "{:.0f} to {:.0f} %".format(
+            *(100 * end for end in share(sum(o.safe for o, _ in some), len(some)))
+        ),
+        "converged": lambda some: str(sum(o.converged for o, _ in some)),
+        "minimum short of target": lambda some: str(sum(o.minimum and not o.safe and not o.arrived for o, _ in some)),
+        "minimum through an obstacle": lambda some: str(sum(o.minimum and not o.safe and o.arrived for o, _ in some)),
+        "cheapest found": lambda some: str(
+            sum(o.minimum and b is not None and o.cost <= b.cost * (1.0 + SAME) for o, b in some)
+        ),
+        "iterations": lambda some: _middle([o.iterations for o, _ in some]),
+        "ms": lambda some: _middle([o.milliseconds for o, _ in some]),
+    }
+    return listing(("avoidance", "guess", "backend"), groups, columns)
 
 
-def words(results: Results) -> str:
+def endings(results: Results) -> str:
     """How solves ended, per method."""
-    names = [name for name, _ in Counter(o.status for outcomes in results.values() for o in outcomes).most_common()]
-    lines = []
-    for method, outcomes in results.items():
-        counts = Counter(o.status for o in outcomes)
-        lines.append((*method.words, *(str(counts[name] or "") for name in names)))
+    counts = {method: Counter(o.status for o in outcomes) for method, outcomes in results.items()}
+    names = [name for name, _ in sum(counts.values(), Counter()).most_common()]
+    lines = [(*method.words, *(str(found[name] or "") for name in names)) for method, found in counts.items()]
     return table(("avoidance", "guess", "backend", *names), lines, text=3)
+
+
+Pairs = list[tuple[Outcome, Outcome]]
 
 
 def hessians(results: Results) -> str:
     """Exact against Gauss-Newton from the same guess, pair by pair."""
-    lines = []
+
+    def same(pairs: Pairs) -> Pairs:
+        return [(e, g) for e, g in pairs if e.minimum and g.minimum and abs(e.cost - g.cost) <= SAME * abs(e.cost)]
+
+    def middles(pairs: Pairs, name: str) -> str:
+        return " : ".join(_middle([getattr(pair[k], name) for pair in same(pairs)]) for k in range(2))
+
+    groups: dict[tuple[str, str], Pairs] = {}
     for avoidance, solver in product(AVOIDANCES, ("sqp", "ipm")):
-        exact, rough = (results[Method(avoidance, EVERYWHERE, solver, h)] for h in ("exact", "gauss-newton"))
-        pairs = list(zip(exact, rough, strict=True))
-        same = [(e, g) for e, g in pairs if e.minimum and g.minimum and abs(e.cost - g.cost) <= SAME * abs(e.cost)]
-        both = sum(e.minimum and g.minimum for e, g in pairs)
-        lines.append(
-            (
-                avoidance, solver, str(sum(e.converged and not g.converged for e, g in pairs)),
-                str(sum(g.converged and not e.converged for e, g in pairs)),
-                f"{len(same)} of {both}",
-                f"{_middle([e.iterations for e, _ in same])} : {_middle([g.iterations for _, g in same])}",
-                f"{_middle([e.milliseconds for e, _ in same])} : {_middle([g.milliseconds for _, g in same])}",
-            )
-        )  # fmt: skip
-    head = (
-        "avoidance", "solver", "converged: exact only", "Gauss-Newton only", "same minimum",
-        "iterations there, exact : GN", "ms there, exact : GN",
-    )  # fmt: skip
-    return table(head, lines, text=2)
+        exact = Method(avoidance, EVERYWHERE, solver, "exact")
+        rough = replace(exact, hessian="gauss-newton")
+        groups[avoidance, solver] = list(zip(results[exact], results[rough], strict=True))
+    columns: dict[str, Callable[[Pairs], str]] = {
+        "converged: exact only": lambda pairs: str(sum(e.converged and not g.converged for e, g in pairs)),
+        "Gauss-Newton only": lambda pairs: str(sum(g.converged and not e.converged for e, g in pairs)),
+        "same minimum": lambda pairs: f"{len(same(pairs))} of {sum(e.minimum and g.minimum for e, g in pairs)}",
+        "iterations there, exact : GN": lambda pairs: middles(pairs, "iterations"),
+        "ms there, exact : GN": lambda pairs: middles(pairs, "milliseconds"),
+    }
+    return listing(("avoidance", "solver"), groups, columns)
 
 
 def duels(results: Results) -> str:
     """Success of two methods on the same layouts, and how likely a difference as large is by chance (McNemar)."""
-    lines = []
+    groups: dict[tuple[str, str, str], tuple[int, int]] = {}
     for avoidance in AVOIDANCES:
-        sqp, ipm, line = (
-            Method(avoidance, EVERYWHERE, "sqp", "exact"),
-            Method(avoidance, EVERYWHERE, "ipm", "exact"),
-            Method(avoidance, "line", "sqp", "exact"),
-        )
+        sqp, ipm = (Method(avoidance, EVERYWHERE, solver, "exact") for solver in ("sqp", "ipm"))
         rough = [replace(method, hessian="gauss-newton") for method in (sqp, ipm)]
-        for first, second in ((sqp, rough[0]), (ipm, rough[1]), (sqp, ipm), (sqp, line)):
-            pairs = [(a.safe, b.safe) for a, b in zip(results[first], results[second], strict=True)]
-            only = pairs.count((True, False)), pairs.count((False, True))
-            chance = binomtest(only[0], sum(only)).pvalue if sum(only) else 1.0
-            words = [f"{method.guess}, {method.solver}, {method.hessian}" for method in (first, second)]
-            lines.append((avoidance, *words, str(only[0]), str(only[1]), f"{chance:.3f}"))
-    return table(("avoidance", "first", "second", "only first", "only second", "p"), lines, text=3)
+        for duel in ((sqp, rough[0]), (ipm, rough[1]), (sqp, ipm), (sqp, replace(sqp, guess="line"))):
+            pairs = [(a.safe, b.safe) for a, b in zip(*(results[method] for method in duel), strict=True)]
+            first, second = (f"{method.guess}, {method.solver}, {method.hessian}" for method in duel)
+            groups[avoidance, first, second] = pairs.count((True, False)), pairs.count((False, True))
+    columns: dict[str, Callable[[tuple[int, int]], str]] = {
+        "only first": lambda only: str(only[0]),
+        "only second": lambda only: str(only[1]),
+        "p": lambda only: f"{binomtest(only[0], sum(only)).pvalue if sum(only) else 1.0:.3f}",
+    }
+    return listing(("avoidance", "first", "second"), groups, columns)
 
 
 def minima(results: Results) -> str:
     """How many local minima all methods together found on each layout."""
     lines = []
     for avoidance in AVOIDANCES:
-        rows = [outcomes for method, outcomes in results.items() if method.avoidance == avoidance]
-        columns = list(zip(*rows, strict=True))
+        columns = list(zip(*(some for method, some in results.items() if method.avoidance == avoidance), strict=True))
         counts = [distinct(o.cost for o in column if o.minimum) for column in columns]
-        best = lowest(results, avoidance)
-        lines.append(
-            (
-                avoidance, *(str(sum(c == k for c in counts)) for k in range(1, 4)), str(sum(c > 3 for c in counts)),
-                str(max(counts)), str(sum(any(o.safe for o in column) for column in columns)),
-                str(sum(b is not None and not b.clear for b in best)),
-                str(sum(b is not None and not b.arrived for b in best)),
-            )
+        best = [b for b in lowest(results, avoidance) if b is not None]
+        numbers = (
+            *(counts.count(k) for k in range(1, 4)), sum(c > 3 for c in counts), max(counts),
+            sum(any(o.safe for o in column) for column in columns),
+            sum(not b.clear for b in best), sum(not b.arrived for b in best),
         )  # fmt: skip
+        lines.append((avoidance, *map(str, numbers)))
     head = (
         "avoidance", "layouts with 1 minimum", "2", "3", "more", "most", "success by any method",
         "cheapest hits something", "cheapest stops short",
@@ -296,31 +301,11 @@ def render(results: Results, layouts: Sequence[Layout]) -> str:
             "Local minima that all methods together found (costs apart by more than 0.1 %):",
             minima(results),
             "How solves ended:",
-            words(results),
+            endings(results),
             "Iterations and times are medians, times are the processor's. `python -m benchmarks.obstacle_courses`. "
             + machine("numpy", "scipy", "osqp", "piqp"),
         )
     )
-
-
-def measured(seeds: Sequence[int], layouts: Sequence[Layout]) -> Results:
-    """Solve every layout by every method."""
-    for method in METHODS:  # compiles
-        attempt(method, obstacle_course(), -1)
-    results: Results = {method: [] for method in METHODS}
-    for seed, layout in tqdm(list(zip(seeds, layouts, strict=True)), unit="layout"):
-        for method in METHODS:
-            results[method].append(attempt(method, layout, seed))
-    return results
-
-
-def recorded(path: Path) -> Results:
-    """What an earlier run has written."""
-    results: Results = {}
-    for entry in json.loads(path.read_text(encoding="utf-8")):
-        outcomes = [Outcome(**outcome) for outcome in entry.pop("outcomes")]
-        results[Method(**entry)] = outcomes
-    return results
 
 
 def _middle(values: Sequence[float]) -> str:
@@ -329,30 +314,22 @@ def _middle(values: Sequence[float]) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Solve every layout by every method and write the tables."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.obstacle_courses", description=__doc__.split("\n")[0])
+    parser = command(__doc__)
+    campaign.options(parser)
     parser.add_argument("--layouts", type=int, default=len(COURSE_SEEDS), help="number of layouts")
     parser.add_argument("--tuning", action="store_true", help="the layouts settings were chosen on; writes no page")
-    parser.add_argument("--again", action="store_true", help="make tables of the outcomes recorded last")
     options = parser.parse_args(arguments)
-    seeds = (TUNING_SEEDS if options.tuning else COURSE_SEEDS)[: options.layouts]
     if options.layouts < 1:
         parser.error(f"--layouts must be positive, found {options.layouts}")
-    name = "obstacle-courses" + ("-tuning" if options.tuning else "")
-    layouts = [obstacle_course(seed) for seed in seeds]
-    if options.again:
-        results = recorded(OUT / f"{name}.json")
-        layouts = layouts[: len(results[METHODS[0]])]
-    else:
+    if options.workers == 1:
         pin()
-        results = measured(seeds, layouts)
-        OUT.mkdir(parents=True, exist_ok=True)
-        record = [{**asdict(method), "outcomes": [asdict(o) for o in outcomes]} for method, outcomes in results.items()]
-        (OUT / f"{name}.json").write_text(json.dumps(record) + "\n", encoding="utf-8", newline="\n")
-    text = render(results, layouts)
-    print(text)
-    (OUT / f"{name}.md").write_text(text + "\n", encoding="utf-8", newline="\n")
-    if not options.tuning:
-        put_results(CHECKOUT / "docs" / "quadrotor-obstacles.md", "Scenario: quadrotor-obstacles", text)
+    seeds = (TUNING_SEEDS if options.tuning else COURSE_SEEDS)[: options.layouts]
+    jobs = [Attempt(**vars(method), seed=seed) for seed in seeds for method in METHODS]
+    rows = [row for row in campaign.episodes("obstacle_courses", attempted, jobs, options) if row["seed"] in seeds]
+    flown = sorted({row["seed"] for row in rows})
+    text = render(results_of(rows), [obstacle_course(seed) for seed in flown])
+    name = "obstacle-courses-tuning" if options.tuning else "quadrotor-obstacles"
+    publish(name, text, {row["code"] for row in rows})
     return 0
 
 

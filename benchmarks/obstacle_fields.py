@@ -13,7 +13,6 @@ the true gradient (a vortex of weight 1e-9). Writes docs/models.md.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ import numpy as np
 from tqdm import tqdm
 
 import unifg as fg
-from benchmarks.report import CHECKOUT, OUT, machine, put_results, table
+from benchmarks.report import command, machine, publish, table
 from benchmarks.unicycle_problems import DT, EFFORT, LIMIT, STAGE, TERMINAL
 from unifg.models import obstacles, unicycle
 from unifg.models.potential import Sense, potential
@@ -192,58 +191,55 @@ def attempt(method: Method, solver: fg.Solver, field: Scene) -> Outcome:
 Results = dict[tuple[str, str], list[Outcome]]
 
 
+FACTS: dict[str, Callable[[Outcome], bool]] = {
+    "solved": lambda o: o.solved,
+    "free": lambda o: o.free,
+    "reached": lambda o: o.reached,
+    "passed": lambda o: o.passed,
+    "passed and solved": lambda o: o.passed and o.solved,
+}
+
+
 def render(results: Results, fields: int) -> str:
     """Both tables as Markdown."""
-    lines = []
+    lines, moves = [], []
     for (name, backend), outcomes in results.items():
-        hard = results["hard clearance", backend]
+        hard, plain = (results[base, backend] for base in ("hard clearance", "potential"))
         ratios = [o.cost / h.cost for o, h in zip(outcomes, hard, strict=True) if o.passed and h.passed]
-        lines.append(
-            (
-                name, backend,
-                *(str(sum(getattr(o, what) for o in outcomes)) for what in ("solved", "free", "reached")),
-                str(sum(o.passed for o in outcomes)), str(sum(o.passed and o.solved for o in outcomes)),
-                f"{np.median(ratios):.2f}" if ratios else "-",
-                f"{np.median([o.iterations for o in outcomes]):.0f}",
-                f"{np.median([o.milliseconds for o in outcomes]):.0f}",
-            )
-        )  # fmt: skip
-    head = ("method", "solver", "solved", "free", "reached", "passed", "passed and solved", "cost", "iterations", "ms")
-    parts = [table(head, lines, text=2)]
-    moves = []
-    for (name, backend), outcomes in results.items():
-        before = results["potential", backend]
+        counts = (sum(map(what, outcomes)) for what in FACTS.values())
+        medians = (np.median([getattr(o, what) for o in outcomes]) for what in ("iterations", "milliseconds"))
+        ratio = f"{np.median(ratios):.2f}" if ratios else "-"
+        lines.append((name, backend, *map(str, counts), ratio, *(f"{value:.0f}" for value in medians)))
         if name != "potential":
-            pairs = [(b.passed, o.passed) for b, o in zip(before, outcomes, strict=True)]
-            strict = [(b.passed and b.solved, o.passed and o.solved) for b, o in zip(before, outcomes, strict=True)]
-            counts = [str(group.count(kind)) for group in (pairs, strict) for kind in ((False, True), (True, False))]
-            moves.append((f"potential -> {name}", backend, *counts))
-    changes = ("change", "solver", "passed: rescued", "broken", "passed and solved: rescued", "broken")
-    parts.append(table(changes, moves, text=2))
-    parts.append(
+            changes = (
+                str(moved(plain, outcomes, FACTS[what], before))
+                for what in ("passed", "passed and solved") for before in (False, True)
+            )  # fmt: skip
+            moves.append((f"potential -> {name}", backend, *changes))
+    parts = [
+        table(("method", "solver", *FACTS, "cost", "iterations", "ms"), lines, text=2),
+        table(("change", "solver", "passed: rescued", "broken", "passed and solved: rescued", "broken"), moves, text=2),
         f"{fields} fields, seeds 0 to {fields - 1}; tolerance {TOLERANCE:g}; `python -m benchmarks.obstacle_fields`. "
-        f"Iterations and processor times are medians. {machine('numpy', 'scipy', 'osqp', 'piqp')}"
-    )
-    return "\n\n".join([*parts, sayings(results)])
+        f"Iterations and processor times are medians. {machine('numpy', 'scipy', 'osqp', 'piqp')}",
+        sayings(results),
+    ]
+    return "\n\n".join(parts)
+
+
+def moved(plain: list[Outcome], outcomes: list[Outcome], what: Callable[[Outcome], bool], before: bool) -> int:
+    """In how many fields something that was so, or was not, is the other way round."""
+    return sum(what(was) is before and what(now) is not before for was, now in zip(plain, outcomes, strict=True))
 
 
 def sayings(results: Results) -> str:
     """What the tables say, in sentences that are computed from them."""
 
-    def count(name: str, backend: str, what: Callable[[Outcome], bool]) -> int:
-        return sum(map(what, results[name, backend]))
-
     def each(name: str, what: Callable[[Outcome], bool]) -> str:
-        return " and ".join(f"{count(name, backend, what)} ({backend})" for backend in BACKENDS)
+        return " and ".join(f"{sum(map(what, results[name, backend]))} ({backend})" for backend in BACKENDS)
 
-    def moved(name: str, before: bool, base: str = "potential") -> str:
-        pairs = {b: zip(results[base, b], results[name, b], strict=True) for b in BACKENDS}
-        return " and ".join(
-            f"{sum(was.passed == before and now.passed != before for was, now in pairs[b])} ({b})" for b in BACKENDS
-        )
-
-    def deceived(o: Outcome) -> bool:
-        return o.solved and not o.free
+    def changed(name: str, before: bool) -> str:
+        pairs = ((b, results["potential", b], results[name, b]) for b in BACKENDS)
+        return " and ".join(f"{moved(plain, some, FACTS['passed'], before)} ({b})" for b, plain, some in pairs)
 
     total = len(results["potential", BACKENDS[0]])
     lines = [
@@ -251,13 +247,14 @@ def sayings(results: Results) -> str:
         f"{each('hard clearance', lambda o: o.solved)}.",
         f"- **Potential.** {each('potential', lambda o: o.passed)} passed. "
         f"{each('potential', lambda o: not o.free)} plans collide, of which "
-        f"{each('potential', deceived)} pass the KKT test: they are answers, with poses in the flat part inside a "
-        f"disc. {each('potential', lambda o: not o.solved)} do not meet the KKT test within the iterations.",
+        f"{each('potential', lambda o: o.solved and not o.free)} pass the KKT test: they are answers, with poses in "
+        f"the flat part inside a disc. {each('potential', lambda o: not o.solved)} do not meet the KKT test within the "
+        "iterations.",
     ]
     for method in METHODS[2:]:
         lines.append(
             f"- **{method.name.partition(', ')[2].capitalize()}.** Against the plain potential it rescues "
-            f"{moved(method.name, False)} fields and breaks {moved(method.name, True)}; "
+            f"{changed(method.name, False)} fields and breaks {changed(method.name, True)}; "
             f"{each(method.name, lambda o: o.reached)} reach the end of the line, with the plain potential "
             f"{each('potential', lambda o: o.reached)}."
         )
@@ -266,7 +263,7 @@ def sayings(results: Results) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Solve every field by every method and write the tables; 0 only if hard clearance passes everywhere."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.obstacle_fields", description=__doc__.split("\n")[0])
+    parser = command(__doc__)
     parser.add_argument("--fields", type=int, default=100, help="number of random fields")
     options = parser.parse_args(arguments)
     if options.fields < 1:
@@ -277,11 +274,7 @@ def main(arguments: list[str] | None = None) -> int:
         for method in METHODS:
             for backend, solver in solvers(method.search).items():
                 results.setdefault((method.name, backend), []).append(attempt(method, solver, field))
-    text = render(results, options.fields)
-    OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "obstacle-fields.md").write_text(text + "\n", encoding="utf-8", newline="\n")
-    print(text)
-    put_results(CHECKOUT / "docs" / "models.md", "Models", text)
+    publish("models", render(results, options.fields))
     hard = (outcome for (name, _), outcomes in results.items() if name == "hard clearance" for outcome in outcomes)
     return 0 if all(outcome.passed for outcome in hard) else 1
 

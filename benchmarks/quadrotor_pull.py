@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 from benchmarks import campaign
 from benchmarks.campaign import Row, against, digits, where
 from benchmarks.quadrotor_flights import SOLVERS
-from benchmarks.report import command, machine, publish, table
+from benchmarks.report import command, listing, machine, publish
 from unifg.models import quadrotor
 from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.flying.joint import JointSettings
@@ -175,26 +176,23 @@ Groups = Mapping[tuple[str, ...], Sequence[Row]]
 def pull_table(groups: Groups, head: Sequence[str]) -> str:
     """Mean over all ticks and greatest of any tick."""
 
-    def cell(rows: Sequence[Row], name: str, scale: float) -> str:
+    def cell(rows: Sequence[Row], what: tuple[str, float]) -> str:
+        name, scale = what
         mean = scale * float(np.mean([row["mean"][name] for row in rows]))
         return f"{digits(mean)} ({digits(scale * max(row['max'][name] for row in rows))})"
 
-    lines = [[*words, *(cell(rows, *what) for what in PULLED.values())] for words, rows in groups.items()]
-    return table([*head, *PULLED], lines, len(head))
+    return listing(head, groups, {name: partial(cell, what=what) for name, what in PULLED.items()})
 
 
 def error_table(groups: Groups, head: Sequence[str]) -> str:
     """Errors, the first row's as they are, the others' with their paired difference to it."""
 
-    def cell(rows: Sequence[Row], name: str, scale: float) -> str:
+    def cell(rows: Sequence[Row], what: tuple[str, float]) -> str:
+        name, scale = what
         return against(rows, base, lambda row: scale * row["mean"][name] if name in row["mean"] else None)
 
     base = next(iter(groups.values()))
-    lines = [
-        [*words, *(cell(rows, *what) for what in ERRORS.values()), *(tell(rows) for tell in FLOWN.values())]
-        for words, rows in groups.items()
-    ]
-    return table([*head, *ERRORS, *FLOWN], lines, len(head))
+    return listing(head, groups, {**{name: partial(cell, what=what) for name, what in ERRORS.items()}, **FLOWN})
 
 
 def bound(pull: float) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from benchmarks.campaign import Read, Row, comparison, share, where
-from benchmarks.report import table
+from benchmarks.report import listing, table
 from unifg.typing import Array
 
 MEDIAN_MS, P99_MS, LEAST_TICKS = 15.0, 40.0, 5000  # limits of a tick
@@ -118,11 +118,8 @@ SUCCESS: dict[str, Callable[[list[Row]], str]] = {
 
 def success(rows: Sequence[Row]) -> str:
     """Share of flights that reach the target without a collision, with Wilson's interval."""
-    lines = []
-    for words, chosen in _groups(rows).items():
-        flights = [row["metrics"] for row in chosen]
-        lines.append([*words, *(tell(flights) for tell in SUCCESS.values())])
-    return _section("### Does it arrive?", ["study", "solver", "coupling", *SUCCESS], lines, 3)
+    groups = {names: [row["metrics"] for row in chosen] for names, chosen in _groups(rows).items()}
+    return "### Does it arrive?\n\n" + listing(["study", "solver", "coupling"], groups, SUCCESS) if groups else ""
 
 
 def _good(flights: list[Row]) -> int:

@@ -6,14 +6,18 @@ import argparse
 import os
 import platform
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import TypeVar
 
 import unifg
 from benchmarks.pages import DIGEST_LINE, PAGES
 from benchmarks.sources import CHECKOUT as CHECKOUT
 from benchmarks.sources import digest
+
+T = TypeVar("T")
+Words = TypeVar("Words", bound=tuple[str, ...])
 
 OUT = CHECKOUT / "out" / "benchmarks"
 BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
@@ -41,6 +45,12 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], text: int = 1) -> 
     """A Markdown table whose first ``text`` columns are words and the others numbers."""
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * text + "---:|" * (len(head) - text)]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+
+
+def listing(head: Sequence[str], groups: Mapping[Words, T], columns: Mapping[str, Callable[[T], str]]) -> str:
+    """A table with a line for each group: the words that name it, then what each column tells of it."""
+    lines = ([*names, *(tell(group) for tell in columns.values())] for names, group in groups.items())
+    return table([*head, *columns], lines, len(head))
 
 
 def machine(*packages: str) -> str:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from benchmarks.obstacle_courses import METHODS, Method, Outcome, distinct, lowest, render, wilson
+from benchmarks.campaign import share
+from benchmarks.obstacle_courses import METHODS, Method, Outcome, distinct, lowest, render
 from judge import judge
 from unifg.errors import BackendError, ScenarioError
 from unifg.models import avoidance, quadrotor
@@ -207,11 +208,11 @@ def test_the_command_line_offers_what_the_scenario_has() -> None:
 
 def test_statistics_of_the_study() -> None:
     # Newcombe (1998), table I: 81 of 263, 15 of 148, 0 of 20.
-    assert wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
-    assert wilson(15, 148) == pytest.approx((0.0624, 0.1605), abs=1e-4)
-    assert wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
+    assert share(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
+    assert share(15, 148) == pytest.approx((0.0624, 0.1605), abs=1e-4)
+    assert share(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
     assert distinct([]) == 0 and distinct([1.0, 1.0 + 1e-6, 1.01, 5.0]) == 3
-    good = Outcome(0, "converged", True, True, True, True, 2.0, 0.0, 0.1, 5, 1.0)
+    good = Outcome("converged", True, True, True, True, 2.0, 0.0, 0.1, 5, 1.0)
     results = {method: [good] for method in METHODS}
     cheap = Method("potential", "way", "ipm", "exact")
     results[cheap] = [replace(good, cost=1.0, clear=False)]
