@@ -10,9 +10,9 @@ from unittest import mock
 import numpy as np
 
 import unifg as fg
-from benchmarks.report import table
+from benchmarks.report import table, words
 from benchmarks.timing import Stopwatch, interleave, milliseconds, number, shown
-from benchmarks.unicycle_problems import Problem
+from problems.control import Unicycle
 from unifg.answers import solver
 from unifg.elimination import fronts, substitution
 from unifg.machine.jit import compiled
@@ -46,21 +46,21 @@ def chain(kind: str, horizon: int) -> tuple[fg.Solver, fg.Graph, fg.Guess]:
         kind: "soft", "hard" or "bounded" (hard, with limits on the controls).
         horizon: steps.
     """
-    problem = Problem("straight", False, horizon)
-    weights, effort = problem.weights
+    problem = Unicycle("straight", False, horizon)
+    weights = np.vstack([np.tile(problem.stage, (horizon, 1)), problem.terminal])
     reference, cruise = problem.reference()
     graph = fg.Graph()
     x = graph.variables("pose", fg.SE2, horizon + 1)
     u = graph.variables("control", fg.Rn(2), horizon)
     graph.fix(x[0], problem.start)
     graph.minimize(unicycle.tracking, x, reference, sigma=weights**-0.5, name="tracking")
-    graph.minimize(fg.prior, u, cruise, sigma=effort**-0.5, name="effort")
+    graph.minimize(fg.prior, u, cruise, sigma=problem.effort**-0.5, name="effort")
     if kind == "soft":
         graph.minimize(unicycle.dynamics, x[:-1], u, x[1:], problem.dt, sigma=SOFT, name="dynamics")
     else:
         graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], problem.dt, lower=0.0, upper=0.0, name="dynamics")
     if kind == "bounded":
-        graph.bound(u, lower=-problem.limit, upper=problem.limit, name="limits")
+        graph.bound(u, lower=problem.lower, upper=problem.upper, name="limits")
     states, controls = problem.guess()
     backend = GaussNewton() if kind == "soft" else AugmentedLagrangian()
     return backend, graph, fg.Guess({x: states, u: controls})
@@ -92,7 +92,7 @@ def measure(rounds: int, small: bool = False) -> Result:
                 "horizon": horizon,
                 "unknowns": run.program.size,
                 "iterations": first.iterations,
-                "status": first.status.name.lower().replace("_", " "),
+                "status": words(first.status),
                 "eliminations": eliminations(run, guess) / first.iterations,
                 **_compiled_parts(run.program, guess, repeats, rounds),
             }

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from importlib.util import find_spec
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
-import unifg as fg
-from benchmarks import compiled_peers
-from benchmarks.closed_loop import WARM_IPOPT, Driver, Loop
-from benchmarks.control_problems import Problem, Quadrotor, Unicycle
+from benchmarks.cold import PEERS, runnable
 from benchmarks.report import table
-from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
+from problems.control import Driver, Problem, Quadrotor, Tick, Unicycle
+from unifg.solvers.names import backend
 from unifg.typing import Array
 
 STEPS = 100
@@ -36,46 +34,7 @@ ACADOS = {
 }
 WORSE = 0.01  # cost of one iteration a step above the converged one by which a loop is named
 CONTACT = 1e-4  # and depth in an obstacle [m]
-
-
-class Ours:
-    """A backend of ours, warm-started with its own shifted answers."""
-
-    def __init__(self, solver: fg.Solver, problem: Problem, penalties: bool = True) -> None:
-        """Prepare the graph; the first answer of a one-iteration driver is a converged one, as of every other.
-
-        Args:
-            solver: ours.
-            problem: one of :func:`cases`.
-            penalties: whether those of an augmented Lagrangian go from step to step, as multipliers do.
-        """
-        self._stated = problem.formulation()
-        self._first = type(solver)(tolerance=TOLERANCE).prepare(self._stated.graph)
-        self._run = solver.prepare(self._stated.graph)
-        self._last: fg.Solution | None = None
-        self._penalties = penalties
-
-    def control(self, pose: Array, index: int) -> tuple[Array, float, int, str]:
-        """First control, processor time of the solve [ms], iterations, and the status in words."""
-        x, u = self._stated.x, self._stated.u
-        start = self._stated.guess if self._last is None else self._last.shifted(x, u, by=1)
-        if not self._penalties:
-            start = replace(start, penalties={})
-        data = self._stated.data(pose, index)
-        run = self._first if self._last is None else self._run
-        begin = time.thread_time()
-        solution = run.solve(start, data=data)
-        elapsed = 1e3 * (time.thread_time() - begin)
-        self._last = solution
-        self._call = run, start, data
-        return solution[u][0], elapsed, solution.iterations, solution.status.name.lower().replace("_", " ")
-
-    def again(self) -> float:
-        """Processor time of the same solve, when everything it needs is in the caches [ms]."""
-        run, start, data = self._call
-        begin = time.thread_time()
-        run.solve(start, data=data)
-        return 1e3 * (time.thread_time() - begin)
+OURS = ("ipm", SINGLE[0], "sqp", SINGLE[1], "alm", "alm, new penalties")
 
 
 def cases() -> list[Problem]:
@@ -89,89 +48,97 @@ def cases() -> list[Problem]:
 
 
 @dataclass
-class Drive(Loop):
-    """What one solver made of one drive, and the times of every solve repeated at once.
+class Drive:
+    """What one solver made of one drive.
 
     Attributes:
-        repeated: [ms].
+        times: of the solves after the first [ms].
+        repeated: of the same solves repeated at once [ms].
+        iterations: of the same.
+        failures: solves that did not converge, by status, the first included.
+        cost: sum of the stage costs.
+        penetration: deepest of the states in an obstacle [m]; negative is a clearance.
     """
 
+    times: list[float] = field(default_factory=list)
     repeated: list[float] = field(default_factory=list)
+    iterations: list[int] = field(default_factory=list)
+    failures: Counter[str] = field(default_factory=Counter)
+    cost: float = 0.0
+    penetration: float = -np.inf
 
 
-def drivers(problem: Problem) -> dict[str, tuple[Driver, Callable[[], float]]]:
-    """Ours, and casadi's where it is installed; each with what repeats its last solve."""
-    ours = {
-        "ipm": Ours(InteriorPoint(tolerance=TOLERANCE), problem),
-        "ipm, 1 iteration": Ours(InteriorPoint(tolerance=TOLERANCE, max_iterations=1), problem),
-        "sqp": Ours(SQP(tolerance=TOLERANCE), problem),
-        "sqp, 1 iteration": Ours(SQP(tolerance=TOLERANCE, max_iterations=1), problem),
-        "alm": Ours(AugmentedLagrangian(tolerance=TOLERANCE), problem),
-        "alm, new penalties": Ours(AugmentedLagrangian(tolerance=TOLERANCE), problem, penalties=False),
-    }
-    found: dict[str, tuple[Driver, Callable[[], float]]] = {name: (o, o.again) for name, o in ours.items()}
-    if find_spec("casadi") is not None:
-        from benchmarks.control_peers import warm
+class Contestant(Protocol):
+    """Who drives: a backend of ours or a solver of casadi."""
 
-        found["ipopt"] = warm(problem, "ipopt", tol=TOLERANCE, mu_init=1e-3, **WARM_IPOPT)
-        found["fatrop"] = warm(problem, "fatrop", tol=TOLERANCE, mu_init=1e-3)
-        if compiled_peers.COMPILER:
-            found["fatrop, compiled"] = warm(problem, "fatrop", compiled=True, tol=TOLERANCE, mu_init=1e-3)
-    return found
+    def control(self, state: Array, index: int) -> Tick:
+        """Solve for one step, from what the last one ended with."""
+        ...
+
+    def again(self) -> float:
+        """Processor time of the same solve, when everything it needs is in the caches [ms]."""
+        ...
 
 
-def drive(problem: Problem) -> dict[str, Drive]:
+def contestant(problem: Problem, name: str) -> Contestant:
+    """By the name of the tables."""
+    short, _, how = name.partition(", ")
+    if name in PEERS:
+        from benchmarks.control_peers import WARM, ControlPeer
+
+        return ControlPeer(problem, short, how == "compiled", tol=TOLERANCE, **WARM[short])
+    solver = backend(short, tolerance=TOLERANCE, **({"max_iterations": 1} if name in SINGLE else {}))
+    return Driver(problem, solver, penalties=how != "new penalties")
+
+
+def drive(problem: Problem, ours: Sequence[str] = OURS, peers: tuple[str, ...] = PEERS) -> dict[str, Drive]:
     """Drive every robot one step in turn: a slow moment of the machine meets all of them."""
-    who = drivers(problem)
-    loops, states = {name: Drive() for name in who}, dict.fromkeys(who, problem.start)
+    who = {name: contestant(problem, name) for name in (*ours, *runnable(peers))}
+    drives, states = {name: Drive() for name in who}, dict.fromkeys(who, problem.start)
     controls: dict[str, Array] = {}
     for index in range(STEPS + 1):
-        for name, (driver, again) in who.items():
-            loop = loops[name]
+        for name, driver in who.items():
+            found = drives[name]
             if index:
-                loop.cost += problem.stage_cost(states[name], controls[name], index - 1)
+                found.cost += problem.stage_cost(states[name], controls[name], index - 1)
                 states[name] = problem.plant(states[name], controls[name], index - 1)
-                for *centre, radius in problem.discs:
-                    distance = float(np.linalg.norm(states[name][: len(centre)] - centre))
-                    loop.penetration = max(loop.penetration, radius - distance)
-            controls[name], elapsed, iterations, status = driver.control(states[name], index)
-            if status != "converged" and name not in SINGLE:
-                loop.failures[status] += 1
+                found.penetration = max(found.penetration, problem.penetration(states[name]))
+            tick = driver.control(states[name], index)
+            controls[name] = tick.control
+            if tick.status != "converged" and name not in SINGLE:
+                found.failures[tick.status] += 1
             if index:  # the cold solve is no step of the loop
-                loop.times.append(elapsed)
-                loop.iterations.append(iterations)
-                loop.repeated.append(again())
-    return loops
+                found.times.append(tick.milliseconds)
+                found.iterations.append(tick.iterations)
+                found.repeated.append(driver.again())
+    return drives
 
 
 def render(results: Mapping[Problem, Mapping[str, Drive]]) -> str:
     """A table and what it means."""
     head = (
         "closed loop", "solver", "median [ms]", "p99 [ms]", "iterations, median", "mean", "most", "failures",
-        "cost", "penetration [mm]", "times ipopt", "times fatrop", "times fatrop, compiled", "repeated [ms]",
-        "times fatrop, repeated",
+        "cost", "penetration [mm]", *(f"times {peer}" for peer in PEERS), "repeated [ms]", "times fatrop, repeated",
     )  # fmt: skip
     lines = []
     for problem, loops in results.items():
+
+        def ratio(name: str, peer: str, times: str = "times", loops: Mapping[str, Drive] = loops) -> str:
+            if peer not in loops or name in (peer, *PEERS[:-1]):
+                return "-"
+            mine, other = (float(np.median(getattr(loops[who], times))) for who in (name, peer))
+            return f"{mine / other:.2f}"
+
         for name, loop in loops.items():
-            median = float(np.median(loop.times))
-            ratios = [
-                f"{median / float(np.median(loops[peer].times)):.2f}"
-                if peer in loops and name not in (peer, "ipopt", "fatrop")
-                else "-"
-                for peer in ("ipopt", "fatrop", "fatrop, compiled")
-            ]
-            repeated = float(np.median(loop.repeated))
-            peer = "fatrop" in loops and name not in ("ipopt", "fatrop")
-            again = f"{repeated / float(np.median(loops['fatrop'].repeated)):.2f}" if peer else "-"
             failures = ", ".join(f"{count} {status}" for status, count in loop.failures.items())
             depth = f"{1e3 * loop.penetration:.4f}" if np.isfinite(loop.penetration) else "-"
             lines.append(
                 (
-                    f"{problem.robot} {problem.name}", name, f"{median:.3f}", f"{np.percentile(loop.times, 99):.3f}",
+                    problem.title, name, f"{np.median(loop.times):.3f}", f"{np.percentile(loop.times, 99):.3f}",
                     f"{np.median(loop.iterations):.0f}", f"{np.mean(loop.iterations):.1f}",
-                    str(max(loop.iterations)), failures or "0",
-                    f"{loop.cost:.4f}", depth, *ratios, f"{repeated:.3f}", again,
+                    str(max(loop.iterations)), failures or "0", f"{loop.cost:.4f}", depth,
+                    *(ratio(name, peer) for peer in PEERS), f"{np.median(loop.repeated):.3f}",
+                    ratio(name, "fatrop", "repeated"),
                 )
             )  # fmt: skip
     notes = (
@@ -190,7 +157,7 @@ def render_single(results: Mapping[Problem, Mapping[str, Drive]]) -> str:
     """One iteration a step, beside acados: a table and sentences computed from it."""
     lines, slower, named = [], {robot: 0.0 for robot in ("unicycle", "quadrotor")}, []
     for problem, loops in results.items():
-        name = f"{problem.robot} {problem.name}"
+        name = problem.title
         if "ipopt" not in loops or name not in ACADOS:
             continue
         yardstick, converged = float(np.median(loops["ipopt"].times)), loops["ipm"].cost

@@ -8,8 +8,8 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.control_problems import Problem, Quadrotor, Unicycle
 from benchmarks.report import table
+from problems.control import Problem, Quadrotor, Unicycle
 from unifg.elimination.fronts import factor
 from unifg.elimination.substitution import solve
 from unifg.machine.jit import compiled
@@ -84,7 +84,7 @@ def render() -> str:
     """A table and what it means."""
     cases: list[Problem] = [Unicycle("straight", False, 50), Unicycle("straight", True, 50)]
     cases += [Quadrotor("figure8", False, 20), Quadrotor("figure8", True, 20)]
-    found = {f"{problem.robot} {problem.name}": measure(problem) for problem in cases}
+    found = {problem.title: measure(problem) for problem in cases}
     rows = [[name, *(f"{pieces[name]:.1f}" for pieces in found.values())] for name in next(iter(found.values()))]
     notes = (
         "Microseconds of processor time, least of several rounds. Pieces marked * are called from Python here, which "

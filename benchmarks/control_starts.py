@@ -3,39 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
-import unifg as fg
-from benchmarks.control_problems import Problem, problems
-from benchmarks.report import table
-from unifg.lie import wrap_angle
-from unifg.models import quadrotor
+from benchmarks.report import table, words
+from problems.control import Problem
 from unifg.solvers.names import backends
-from unifg.typing import Array
 
 STARTS = 30
-SEED = 7
-SPREAD = {  # standard deviations of states (tangent) and controls
-    "unicycle": (np.array([0.3, 0.3, 0.5]), np.array([0.3, 0.3])),
-    "quadrotor": (np.repeat([0.3, 0.3, 0.5], 3), np.array([0.5, 0.5, 0.5, 1.0])),
-}
 SOLVERS = backends("ipm", "sqp", "alm", tolerance=1e-4)
-
-
-def starts(problem: Problem, count: int = STARTS) -> Iterator[tuple[Array, Array]]:
-    """Perturbed cold guesses: states and controls, every one by itself."""
-    rng = np.random.default_rng(SEED)
-    states, controls = problem.guess()
-    manifold: fg.Manifold = quadrotor.STATE if problem.robot == "quadrotor" else fg.SE2
-    if problem.robot == "unicycle":
-        states[:, 2] = wrap_angle(states[:, 2])
-    of_states, of_controls = SPREAD[problem.robot]
-    for _ in range(count):
-        moved = manifold.retract(states, of_states * rng.standard_normal((len(states), len(of_states))))
-        yield moved, controls + of_controls * rng.standard_normal(controls.shape)
 
 
 @dataclass
@@ -58,20 +35,15 @@ def measure(problem: Problem, count: int = STARTS) -> dict[str, Tally]:
     stated = problem.formulation()
     runs = {name: solver.prepare(stated.graph) for name, solver in SOLVERS.items()}
     tallies = {name: Tally() for name in runs}
-    for states, controls in starts(problem, count):
+    for states, controls in problem.starts(count):
         for name, run in runs.items():
             solution = run.solve({stated.x: states, stated.u: controls})
             tally = tallies[name]
-            tally.statuses[solution.status.name.lower().replace("_", " ")] += 1
+            tally.statuses[words(solution.status)] += 1
             tally.iterations.append(solution.iterations)
             if solution.converged:
                 tally.costs.append(solution.cost / problem.optima[0])
     return tallies
-
-
-def blocked() -> list[Problem]:
-    """The twelve cases with obstacles."""
-    return [problem for problem in problems() if problem.blocked]
 
 
 def render(results: dict[Problem, dict[str, Tally]], count: int) -> str:
@@ -86,15 +58,15 @@ def render(results: dict[Problem, dict[str, Tally]], count: int) -> str:
             best = f"{min(tally.costs):.3f} to {max(tally.costs):.3f}" if tally.costs else "-"
             lines.append(
                 (
-                    name, f"{problem.robot} {problem.name}", f"{tally.statuses['converged']} / {count}", others or "-",
+                    name, problem.title, f"{tally.statuses['converged']} / {count}", others or "-",
                     f"{np.median(tally.iterations):.0f}, {max(tally.iterations)}", best,
                 )
             )  # fmt: skip
     head = ("solver", "case", "converged", "other endings", "iterations, median and most", "cost / listed optimum")
     notes = (
         f"{count} guesses for each case: the cold guess with every state moved by a normal tangent step (unicycle "
-        f"0.3 m, 0.5 rad; quadrotor 0.3 m, 0.3 rad, 0.5 m/s) and every control by 0.3, or 0.5 rad/s and 1 m/s^2; seed "
-        f"{SEED}. Tolerance 1e-4. A cost above the listed optimum is another local optimum: it passes some obstacle on "
+        f"0.3 m, 0.5 rad; quadrotor 0.3 m, 0.3 rad, 0.5 m/s) and every control by 0.3, or 0.5 rad/s and 1 m/s^2. "
+        "Tolerance 1e-4. A cost above the listed optimum is another local optimum: it passes some obstacle on "
         "the other side."
     )
     return "\n\n".join([table(head, lines, text=2), notes])

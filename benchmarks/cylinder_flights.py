@@ -2,89 +2,24 @@
 
     python -m benchmarks.cylinder_flights [--layouts K] [--no-peer]
 
-The quadrotor of :mod:`benchmarks.control_problems` follows a straight line at 6 m/s for 2.5 s; ten cylinders stand at
-random on it and beside it. Every backend begins with that line, through the cylinders. What a solver calls solved is
-judged by its own KKT test at 1e-6; IPOPT has the same problem in CasADi's expressions.
+The flights are stated in tests/problems/cylinders.py. What a solver calls solved is judged by its own KKT test at 1e-6;
+IPOPT has the same problem in CasADi's expressions.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
 import unifg as fg
-from benchmarks.control_peers import QuadrotorPeer
-from benchmarks.control_problems import Quadrotor, QuadrotorGraph
-from benchmarks.report import table
-from unifg.models import avoidance, quadrotor
+from benchmarks.report import command, table, words
+from problems.cylinders import Flight, flight
 from unifg.solvers.names import backends
-from unifg.typing import Array
 
-SPEED = 6.0  # [m/s]
-CYLINDERS = 10
 SEEDS = range(20)
-FREE = 1.5  # of cylinders, around the start [m]
 SOLVERS = backends("ipm", "sqp", "alm")
-
-
-@dataclass(frozen=True)
-class Flight(Quadrotor):
-    """One layout.
-
-    Attributes:
-        seed: of the cylinders.
-    """
-
-    upright: ClassVar[bool] = True
-
-    seed: int = 0
-
-    @property
-    def name(self) -> str:
-        """For the tables."""
-        return f"layout {self.seed}"
-
-    @property
-    def discs(self) -> Array:
-        """(M, 4) x, y, nothing, radius of the cylinders [m]."""
-        rng = np.random.default_rng([61, self.seed])
-        length = SPEED * self.dt * self.horizon
-        found: list[tuple[float, float, float, float]] = []
-        while len(found) < CYLINDERS:
-            x, y, radius = rng.uniform(0.0, length), rng.uniform(-1.5, 1.5), rng.uniform(0.25, 0.5)
-            if np.hypot(x, y) >= FREE + radius:
-                found.append((x, y, 0.0, radius))
-        return np.array(found)
-
-    @property
-    def start(self) -> Array:
-        """(10,) level flight at the speed of the reference."""
-        return np.array([0.0, 0.0, 1.5, 1.0, 0.0, 0.0, 0.0, SPEED, 0.0, 0.0])
-
-    def reference(self, first: int = 0) -> tuple[Array, Array]:
-        """Reference states (N + 1, 10) from step ``first`` on, and controls (N, 4)."""
-        t = self.dt * np.arange(first, first + self.horizon + 1)
-        states = np.tile(self.start, (len(t), 1))
-        states[:, 0] = SPEED * t
-        return states, np.tile([0.0, 0.0, 0.0, quadrotor.GRAVITY], (self.horizon, 1))
-
-    def formulation(self) -> FlightGraph:
-        """As a factor graph."""
-        return FlightGraph(self)
-
-
-class FlightGraph(QuadrotorGraph):
-    """The flight as a factor graph."""
-
-    def keep_off(self) -> None:
-        """Add the clearance from every cylinder at every node."""
-        discs = self.problem.discs
-        away = self.x[1:].p, discs[:, :2], discs[:, 3]
-        self.graph.constrain(avoidance.cylinder_clearance, *away, lower=0.0, name="cylinders")
 
 
 @dataclass(frozen=True)
@@ -97,22 +32,18 @@ class Outcome:
     cost: float
 
 
-def flight(seed: int, horizon: int = 50) -> Flight:
-    """One layout of the study."""
-    return Flight("flight", True, horizon, seed)
-
-
 def attempt(problem: Flight, solver: fg.Solver) -> Outcome:
     """Solve from the straight line."""
     stated = problem.formulation()
     solution = solver.solve(stated.graph, stated.guess)
-    status = solution.status.name.lower().replace("_", " ")
-    return Outcome(solution.converged, status, solution.iterations, float(solution.cost))
+    return Outcome(solution.converged, words(solution.status), solution.iterations, float(solution.cost))
 
 
 def attempt_peer(problem: Flight) -> Outcome:
     """The same by IPOPT."""
-    peer = QuadrotorPeer(problem, "ipopt")
+    from benchmarks.control_peers import ControlPeer
+
+    peer = ControlPeer(problem, "ipopt")
     peer.solve(*problem.guess())
     return Outcome(peer.status == "converged", peer.status.replace("_", " "), peer.iterations, peer.cost)
 
@@ -150,15 +81,16 @@ def render(results: dict[str, list[Outcome]], seeds: Sequence[int]) -> str:
     return table(head, lines) + "\n\n" + table(("layout", *results), rows)
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description="Flights at 6 m/s among ten cylinders.", allow_abbrev=False)
+    parser = command(__doc__)
     parser.add_argument("--layouts", type=int, default=len(SEEDS), help="how many (default: %(default)s)")
     parser.add_argument("--no-peer", action="store_true", help="without IPOPT")
-    chosen = parser.parse_args()
+    chosen = parser.parse_args(arguments)
     seeds = range(chosen.layouts)
     print(render(study(seeds, ipopt=not chosen.no_peer), seeds))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

@@ -28,9 +28,11 @@ import numpy as np
 from tqdm import tqdm
 
 import unifg as fg
-from benchmarks import collection, control_problems, control_starts, ecg2o, incremental, pose_graphs
+from benchmarks import control_starts, ecg2o, incremental, pose_graphs
 from benchmarks.navigation import CASES, Drive
 from benchmarks.report import OUT
+from problems import collection
+from problems.control import Problem, blocked, problems
 from problems.known import STARTS
 from problems.known import ecg2o as small
 from unifg.errors import UnifgError
@@ -102,7 +104,7 @@ def solved(solver: Solving, graph: fg.Graph, guess: Start) -> Row:
         return Row(type(error).__name__, 0, 0.0, digest(np.frombuffer(str(error).encode(), np.uint8)))
 
 
-def cold(problem: control_problems.Problem, solver: fg.Solver) -> Row:
+def cold(problem: Problem, solver: fg.Solver) -> Row:
     """A control case from its listed guess."""
     stated = problem.formulation()
     return solved(solver, stated.graph, stated.guess)
@@ -154,20 +156,20 @@ def flown(settings: FlightSettings) -> Row:
 
 def of_control() -> Rows:
     """The control cases, cold."""
-    for problem in control_problems.problems():
+    for problem in problems():
         for name, solver in CONTROL.items():
-            yield f"{problem.robot} {problem.name}, {name}", partial(cold, problem, solver)
+            yield f"{problem.title}, {name}", partial(cold, problem, solver)
 
 
 def of_starts() -> Rows:
     """The control cases with obstacles, from random starts."""
-    for problem in control_starts.blocked():
+    for problem in blocked():
         stated = problem.formulation()
         runs = {name: solver.prepare(stated.graph) for name, solver in control_starts.SOLVERS.items()}
-        for k, (states, controls) in enumerate(control_starts.starts(problem)):
+        for k, (states, controls) in enumerate(problem.starts(control_starts.STARTS)):
             guess = fg.Guess({stated.x: states, stated.u: controls})
             for name, run in runs.items():
-                yield f"{problem.robot} {problem.name}, {name}, start {k}", partial(started, run, guess)
+                yield f"{problem.title}, {name}, start {k}", partial(started, run, guess)
 
 
 def of_collection() -> Rows:

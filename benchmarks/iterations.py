@@ -9,15 +9,15 @@ The problems are those every backend is tested on (``tests/problems/known.py``),
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
 
 import unifg as fg
 from benchmarks import control_loops, cylinder_flights
-from benchmarks.control_problems import Problem
 from benchmarks.report import command, machine, publish, table, words
+from problems.control import Driver, Problem
+from problems.cylinders import SPEED
 from problems.known import PROBLEMS, Guess
 from unifg.solvers import (
     KKT,
@@ -84,26 +84,19 @@ def cylinders(seeds: Iterable[int] = cylinder_flights.SEEDS) -> str:
 
 def carried(problem: Problem, multipliers: bool, penalties: bool, steps: int = control_loops.STEPS) -> float:
     """Mean iterations of the augmented Lagrangian's warm steps in closed loop, by what a tick hands to the next."""
-    stated = problem.formulation()
-    run = AugmentedLagrangian(tolerance=control_loops.TOLERANCE).prepare(stated.graph)
+    driver = Driver(problem, AugmentedLagrangian(tolerance=control_loops.TOLERANCE), multipliers, penalties)
     state, counts = problem.start, []
-    start = stated.guess
     for index in range(steps + 1):
-        solution = run.solve(start, data=stated.data(state, index))
-        counts.append(solution.iterations)
-        state = problem.plant(state, solution[stated.u][0], index)
-        start = solution.shifted(stated.x, stated.u, by=1)
-        if not multipliers:
-            start = replace(start, multipliers={})
-        if not penalties:
-            start = replace(start, penalties={})
+        tick = driver.control(state, index)
+        counts.append(tick.iterations)
+        state = problem.plant(state, tick.control, index)
     return float(np.mean(counts[1:]))  # the first is no step of the loop
 
 
 def loops() -> str:
     """What the next tick saves by what it is given."""
     rows = [
-        (f"{problem.robot} {problem.name}", *(f"{carried(problem, *what):.1f}" for what in CARRIED.values()))
+        (problem.title, *(f"{carried(problem, *what):.1f}" for what in CARRIED.values()))
         for problem in control_loops.cases()
     ]
     return table(("closed loop", *CARRIED), rows)
@@ -119,7 +112,7 @@ def main(arguments: list[str] | None = None) -> int:
             "the problem.",
             known_answers(),
             "### Among cylinders",
-            f"A quadrotor at {cylinder_flights.SPEED:g} m/s among ten upright cylinders, 20 layouts at random, from a "
+            f"A quadrotor at {SPEED:g} m/s among ten upright cylinders, 20 layouts at random, from a "
             "straight line through the cylinders.",
             cylinders(),
             "### From tick to tick",

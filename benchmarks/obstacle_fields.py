@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 import unifg as fg
 from benchmarks.report import command, machine, publish, table
-from benchmarks.unicycle_problems import DT, EFFORT, LIMIT, STAGE, TERMINAL
+from problems.control import Unicycle
 from unifg.models import obstacles, unicycle
 from unifg.models.potential import Sense, potential
 from unifg.solvers.names import backends
@@ -56,7 +56,7 @@ class Scene:
     def reference(self) -> Array:
         """(N + 1, 3) poses along the x axis."""
         states = np.zeros((HORIZON + 1, 3))
-        states[:, 0] = SPEED * DT * np.arange(HORIZON + 1)
+        states[:, 0] = SPEED * Unicycle.dt * np.arange(HORIZON + 1)
         return states
 
     def clearance(self, states: Array) -> float:
@@ -69,7 +69,7 @@ def scene(seed: int) -> Scene:
     """Draw a field: the first disc stands in the way, the others anywhere around it."""
     rng = np.random.default_rng(seed)
     start = np.array([0.0, rng.uniform(-0.1, 0.1), rng.uniform(-0.2, 0.2)])
-    count, length = int(rng.integers(3, 7)), SPEED * DT * HORIZON
+    count, length = int(rng.integers(3, 7)), SPEED * Unicycle.dt * HORIZON
     ends = np.array([[0.0, 0.0], [length, 0.0]])
     while True:
         discs = np.zeros((0, 3))
@@ -112,11 +112,11 @@ class Method:
         x = graph.variables("pose", fg.SE2, HORIZON + 1)
         u = graph.variables("control", fg.Rn(2), HORIZON)
         graph.fix(x[0], field.start)
-        graph.minimize(unicycle.tracking, x[1:-1], reference[1:-1], sigma=STAGE**-0.5, name="tracking")
-        graph.minimize(unicycle.tracking, x[-1], reference[-1:], sigma=TERMINAL**-0.5, name="terminal")
-        graph.minimize(fg.prior, u, cruise, sigma=EFFORT**-0.5, name="effort")
-        graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], DT, lower=0.0, upper=0.0, name="dynamics")
-        graph.bound(u, lower=-LIMIT, upper=LIMIT, name="limits")
+        graph.minimize(unicycle.tracking, x[1:-1], reference[1:-1], sigma=Unicycle.stage**-0.5, name="tracking")
+        graph.minimize(unicycle.tracking, x[-1], reference[-1:], sigma=Unicycle.terminal**-0.5, name="terminal")
+        graph.minimize(fg.prior, u, cruise, sigma=Unicycle.effort**-0.5, name="effort")
+        graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], Unicycle.dt, lower=0.0, upper=0.0, name="dynamics")
+        graph.bound(u, lower=Unicycle.lower, upper=Unicycle.upper, name="limits")
         centres, radii = field.discs[:, :2], field.discs[:, 2] + ROBOT
         if self.hard:
             graph.constrain(obstacles.disc_clearance, x[1:], centres, radii, lower=0.0, name="discs")

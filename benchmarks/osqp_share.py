@@ -9,80 +9,28 @@ the elastic problem. Writes docs/osqp.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from unittest.mock import patch
+from collections.abc import Callable
 
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks import closed_loop, control_problems, control_starts, unicycle_problems
 from benchmarks.report import command, machine, publish, table
+from counts import Count, counting
+from problems.control import Problem, blocked, problems, sixteen
 from unifg.scenarios.course import CourseSettings, run_course
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.manoeuvres import CASES, run_manoeuvre
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
 from unifg.solvers import SQP
-from unifg.solvers.qp import QP, QPAnswer
-from unifg.solvers.qp_osqp import OsqpRoute
-from unifg.solvers.sqp import Subproblems
-from unifg.typing import Array
-
-
-@dataclass
-class Count:
-    """What became of the subproblems of one row.
-
-    Attributes:
-        routes: name of the route that solved each.
-        asked: iterations of OSQP whenever it was asked.
-        limits: its limit then.
-    """
-
-    routes: list[str] = field(default_factory=list)
-    asked: list[int] = field(default_factory=list)
-    limits: list[int] = field(default_factory=list)
-
-    def by(self, route: str) -> int:
-        """Subproblems that a route solved."""
-        return self.routes.count(route)
-
-    @property
-    def share(self) -> float:
-        """Of OSQP."""
-        return self.by("osqp") / max(len(self.routes), 1)
-
-
-@contextmanager
-def counting() -> Iterator[Count]:
-    """Count all subproblems with inequalities that are solved inside."""
-    count = Count()
-    solve, ask = Subproblems.solve, OsqpRoute.solve
-
-    def counted(self: Subproblems, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
-        answer = solve(self, qp, multipliers, accuracy)
-        if isinstance(self.first, OsqpRoute):
-            count.routes.append(answer.route if np.isfinite(answer.error) else "none")
-        return answer
-
-    def asked(self: OsqpRoute, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
-        answer = ask(self, qp, multipliers, accuracy)
-        count.asked.append(answer.iterations)
-        count.limits.append(self.max_iterations)
-        return answer
-
-    with patch.object(Subproblems, "solve", counted), patch.object(OsqpRoute, "solve", asked):
-        yield count
 
 
 def cases(quick: bool) -> dict[str, Callable[[], object]]:
     """Everything that is counted, by name."""
     found: dict[str, Callable[[], object]] = {}
-    for problem in unicycle_problems.problems()[:: 8 if quick else 1]:
-        found[f"reference problem: {problem.name}"] = _cold(closed_loop.Formulation(problem), 1e-6)
-    for case in control_problems.problems()[:: 12 if quick else 1]:
-        found[f"control case: {case.robot} {case.name}"] = _cold(case.formulation(), 1e-4)
+    for unicycle in sixteen()[:: 8 if quick else 1]:
+        found[f"reference problem: {unicycle.name}"] = _cold(unicycle, 1e-6)
+    for problem in problems()[:: 12 if quick else 1]:
+        found[f"control case: {problem.title}"] = _cold(problem, 1e-4)
     if quick:
         return found
     found["random starts of the control cases with obstacles, 5 each"] = _starts
@@ -99,17 +47,18 @@ def cases(quick: bool) -> dict[str, Callable[[], object]]:
     return found
 
 
-def _cold(stated: closed_loop.Formulation | control_problems.QuadrotorGraph, tolerance: float) -> Callable[[], object]:
+def _cold(problem: Problem, tolerance: float) -> Callable[[], object]:
     """A solve of a problem from its guess."""
+    stated = problem.formulation()
     return lambda: SQP(tolerance=tolerance).prepare(stated.graph).solve(stated.guess)
 
 
 def _starts() -> None:
     """From five random guesses each."""
-    for problem in control_starts.blocked():
+    for problem in blocked():
         stated = problem.formulation()
         run = SQP(tolerance=1e-4).prepare(stated.graph)
-        for states, controls in control_starts.starts(problem, 5):
+        for states, controls in problem.starts(5):
             run.solve({stated.x: states, stated.u: controls})
 
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from benchmarks import chains, elimination, gtsam_peer, marginals, own_residuals, pose_graphs
+from benchmarks import chains, collection, elimination, gtsam_peer, marginals, own_residuals, pose_graphs
 from benchmarks.timing import Stopwatch, interleave, number, shown, spread
+from problems.collection import BACKENDS, CASES, attempt
 from unifg.pose_graphs import manhattan
 from unifg.program.program import Program
 from unifg.solvers import GaussNewton
@@ -130,3 +131,16 @@ def test_the_peer_solves_the_same_problem(group: str) -> None:
     solution = GaussNewton().solve(graph, guess)
     assert isinstance(solution, fg.Solution)
     assert peer.solve("COLAMD")[2] == pytest.approx(pose_graph.with_poses(solution[x]).chi2(), rel=1e-6)
+
+
+def test_the_page_of_the_collection_counts_what_was_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collection, "CASES", {name: CASES[name] for name in ("HS21", "Beale", "no real root")})
+    monkeypatch.setattr(collection, "BACKENDS", {name: BACKENDS[name] for name in ("SQP", "GaussNewton")})
+    monkeypatch.setattr(collection, "find_spec", lambda name: None)
+    results = collection.measure()
+    assert results["GaussNewton"].keys() == {"Beale"}
+    text = collection.render(results)
+    assert "| SQP | 3 | 2 | 0 | 1 | 0 | 100.0 % |" in text
+    assert "| GaussNewton | singular | Beale |" in text
+    outcome = attempt("HS21", BACKENDS["SQP"])
+    assert outcome is not None and f"| HS21 | {outcome.iterations} |" in text

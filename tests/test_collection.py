@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from benchmarks import collection
-from benchmarks.collection import BACKENDS, CASES, GROUPS, OPTIMUM, RIGHT, attempt, ipopt, verdict
 from judge import judge
+from problems.collection import BACKENDS, CASES, GROUPS, OPTIMUM, RIGHT, ipopt, verdict
 from problems.hock_schittkowski import Case
 from problems.known import short_drive
 from problems.lie import LieCase
@@ -244,16 +243,3 @@ def test_a_claim_without_multipliers_is_still_a_kkt_point(name: str) -> None:
         if takes(name, graph):
             solution = BACKENDS[name].solve(graph, guess)
             assert not solution.converged or judge(graph, solution).worst() < case.judged
-
-
-def test_the_page_counts_what_was_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collection, "CASES", {name: CASES[name] for name in ("HS21", "Beale", "no real root")})
-    monkeypatch.setattr(collection, "BACKENDS", {name: BACKENDS[name] for name in ("SQP", "GaussNewton")})
-    monkeypatch.setattr(collection, "find_spec", lambda name: None)
-    results = collection.measure()
-    assert results["GaussNewton"].keys() == {"Beale"}
-    text = collection.render(results)
-    assert "| SQP | 3 | 2 | 0 | 1 | 0 | 100.0 % |" in text
-    assert "| GaussNewton | singular | Beale |" in text
-    outcome = attempt("HS21", BACKENDS["SQP"])
-    assert outcome is not None and f"| HS21 | {outcome.iterations} |" in text

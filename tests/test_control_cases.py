@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from benchmarks import control_loops, control_starts
-from benchmarks.control_problems import Problem, Quadrotor, Unicycle, problems
 from judge import judge
+from problems.control import Driver, Problem, Quadrotor, Unicycle, blocked, problems
 from unifg.models import quadrotor
 from unifg.solvers import InteriorPoint
 from unifg.solvers.names import backends
@@ -22,7 +21,7 @@ CONFIRMED = {
 SOLVERS = backends("ipm", "sqp", "alm", tolerance=1e-4)
 
 
-@pytest.mark.parametrize("problem", problems(), ids=lambda p: f"{p.robot} {p.name}")
+@pytest.mark.parametrize("problem", problems(), ids=lambda p: p.title)
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_control_case(solver: str, problem: Problem) -> None:
     stated = problem.formulation()
@@ -55,31 +54,30 @@ def test_convergence_on_rotations_is_quadratic() -> None:
     assert again.iterations <= 4, again.table()
 
 
-@pytest.mark.parametrize("problem", control_starts.blocked(), ids=lambda p: f"{p.robot} {p.name}")
+@pytest.mark.parametrize("problem", blocked(), ids=lambda p: p.title)
 def test_random_starts(problem: Problem) -> None:
     stated = problem.formulation()
     run = InteriorPoint(tolerance=1e-4).prepare(stated.graph)
-    for states, controls in control_starts.starts(problem, 3):
+    for states, controls in problem.starts(3):
         assert run.solve({stated.x: states, stated.u: controls}).converged
 
 
 @pytest.mark.parametrize("problem", [Unicycle("straight", True, 50), Quadrotor("figure8", True, 20)])
 def test_closed_loop_is_cheap_and_safe(problem: Problem) -> None:
-    driver = control_loops.Ours(InteriorPoint(tolerance=1e-4), problem)
+    driver = Driver(problem, InteriorPoint(tolerance=1e-4))
     state, iterations = problem.start, []
     for index in range(31):
         control, _, count, status = driver.control(state, index)
         assert status == "converged"
         iterations.append(count)
         state = problem.plant(state, control, index)
-        for *centre, radius in problem.discs:
-            assert np.linalg.norm(state[: len(centre)] - centre) > radius - 1e-4
+        assert problem.penetration(state) < 1e-4
     assert np.median(iterations[1:]) <= 6
 
 
 def test_one_iteration_a_step_is_an_option() -> None:
     problem = Quadrotor("goto", False, 20)
-    driver = control_loops.Ours(InteriorPoint(tolerance=1e-4, max_iterations=1), problem)
+    driver = Driver(problem, InteriorPoint(tolerance=1e-4, max_iterations=1))
     state, cost = problem.start, 0.0
     for index in range(101):
         control, _, count, _ = driver.control(state, index)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from benchmarks.control_problems import Quadrotor, Unicycle
+from problems.control import Quadrotor, Unicycle
 from problems.known import short_drive
 from unifg.solvers import SQP, InteriorPoint
 from unifg.solvers.interior_point import Workspace

@@ -11,8 +11,8 @@ import pytest
 
 from benchmarks import control_loops, coupling, obstacle_fields
 from benchmarks.control_loops import Drive
-from benchmarks.control_problems import Problem, Quadrotor, Unicycle
 from benchmarks.obstacle_fields import BACKENDS, METHODS, Outcome
+from problems.control import Problem, Quadrotor, Unicycle
 
 
 def test_obstacle_fields_count_what_they_say() -> None:

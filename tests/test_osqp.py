@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from benchmarks.control_problems import problems
-from benchmarks.osqp_share import Count, counting
+from counts import Count, counting
+from problems.control import problems
 from problems.known import active_bounds, short_drive
 from unifg.program.program import Program
 from unifg.solvers import SQP
@@ -18,7 +18,7 @@ from unifg.solvers.qp_graph import GraphRoute
 from unifg.solvers.qp_osqp import OsqpRoute, counted_iterations
 from units import drive
 
-CASES = {f"{problem.robot} {problem.name}": problem for problem in problems()}
+CASES = {problem.title: problem for problem in problems()}
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.closed_loop import Formulation
-from benchmarks.unicycle_problems import Problem, problems
 from judge import judge
+from problems.control import Unicycle, sixteen
 from unifg.solvers.names import backends
 
 # Minima that are not listed, at which IPOPT stays when it is started there (docs/reference-problems.md).
@@ -15,10 +14,10 @@ CONFIRMED = {("ahead", True, 20): (586.14768,), ("ahead", True, 50): (580.25905,
 SOLVERS = backends("alm", "sqp", "ipm", tolerance=1e-5)
 
 
-@pytest.mark.parametrize("problem", problems(), ids=lambda p: p.name)
+@pytest.mark.parametrize("problem", sixteen(), ids=lambda p: p.name)
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_reference_problem(solver: str, problem: Problem) -> None:
-    stated = Formulation(problem)
+def test_reference_problem(solver: str, problem: Unicycle) -> None:
+    stated = problem.formulation()
     solution = SOLVERS[solver].solve(stated.graph, stated.guess)
     assert solution.converged, solution.report()
     known = np.array([*problem.optima, *CONFIRMED.get((problem.instance, problem.blocked, problem.horizon), ())])

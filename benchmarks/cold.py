@@ -1,0 +1,200 @@
+"""Cold solves of control problems: from the listed guess, every solver in turn, beside IPOPT and fatrop."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TypeAlias
+
+import numpy as np
+
+import unifg as fg
+from benchmarks import compiled_peers
+from benchmarks.casadi_peer import available
+from benchmarks.report import table, words
+from benchmarks.timing import interleave, number
+from problems.control import Problem
+from unifg.typing import Array
+
+PEERS = ("ipopt", "fatrop", "fatrop, compiled")
+"""The last one with its functions in machine code, the others in the virtual machine of casadi."""
+
+
+def runnable(peers: tuple[str, ...] = PEERS) -> tuple[str, ...]:
+    """Those this machine can run."""
+    return tuple(name for name in peers if available() and (compiled_peers.COMPILER or "compiled" not in name))
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How a page measures and judges.
+
+    Attributes:
+        tolerance: of every solver.
+        same: relative difference below which two costs are one optimum.
+        good: KKT numbers below which an answer counts though its solver has not converged.
+        slow: a solve that takes longer is not repeated [ms].
+        prepared: whether ours are prepared once for all rounds; else every solve allocates its workspaces.
+        peers: beside ours, of :data:`PEERS`.
+    """
+
+    tolerance: float
+    same: float
+    good: float
+    slow: float
+    prepared: bool
+    peers: tuple[str, ...]
+
+
+@dataclass
+class Outcome:
+    """What one solver made of one problem.
+
+    Attributes:
+        status: in words.
+        iterations: of the solver.
+        cost: with its 1/2.
+        times: one per round [ms].
+        kkt: largest KKT number, not a number for a peer.
+        routes: how many subproblems each QP route of SQP solved.
+        states, controls: where it ended.
+        refined: what IPOPT does when it is started there; a dash where it was not asked.
+    """
+
+    status: str = ""
+    iterations: int = 0
+    cost: float = np.nan
+    times: list[float] = field(default_factory=list)
+    kkt: float = np.nan
+    routes: Counter[str] = field(default_factory=Counter)
+    states: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    controls: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    refined: str = "-"
+
+    @property
+    def median(self) -> float:
+        """[ms]."""
+        return float(np.median(self.times))
+
+    def good(self, rules: Rules) -> bool:
+        """Whether it is a KKT point to what counts as one."""
+        return self.status == "converged" or self.kkt <= rules.good
+
+    def verdict(self, problem: Problem, rules: Rules) -> str:
+        """How the cost compares with the known optima."""
+        if not self.good(rules):
+            return self.status
+        relative = [self.cost / known - 1.0 for known in problem.optima]
+        if abs(relative[0]) < rules.same:
+            return "listed"
+        if min(map(abs, relative)) < rules.same:
+            return "listed alternative"
+        return f"{'lower' if relative[0] < 0.0 else 'other'}, {100.0 * relative[0]:+.2g} %"
+
+
+Outcomes: TypeAlias = dict[str, Outcome]
+Results: TypeAlias = Mapping[Problem, Outcomes]
+Column: TypeAlias = Callable[[str, Outcome], str]
+"""What a table shows of the outcome of a solver."""
+
+
+def attempt(solver: fg.Solver, problem: Problem, prepared: bool) -> Callable[[Outcome], float]:
+    """A cold solve by one of ours, the graph compiled before; its processor time [ms]."""
+    stated = problem.formulation()
+    kept = solver.prepare(stated.graph)
+
+    def solve(outcome: Outcome) -> float:
+        run = kept if prepared else solver.prepare(stated.graph)
+        begin = time.thread_time()
+        solution = run.solve(stated.guess)
+        elapsed = 1e3 * (time.thread_time() - begin)
+        outcome.status = words(solution.status)
+        outcome.iterations, outcome.cost = solution.iterations, solution.cost
+        outcome.kkt = max(solution.stationarity, solution.violation, solution.complementarity)
+        outcome.states, outcome.controls = solution[stated.x], solution[stated.u]
+        routes = (str(row.details.get("qp", "")).partition(":")[0] for row in solution.history)
+        outcome.routes = Counter(route for route in routes if route not in ("", "none"))
+        return elapsed
+
+    return solve
+
+
+def attempt_peer(name: str, problem: Problem, tolerance: float) -> Callable[[Outcome], float]:
+    """A cold solve through casadi: expressions built, differentiated and, if so named, compiled before."""
+    from benchmarks.control_peers import ControlPeer
+
+    plugin, _, compiled = name.partition(", ")
+    peer = ControlPeer(problem, plugin, bool(compiled), tol=tolerance)
+    guess = problem.guess()
+
+    def solve(outcome: Outcome) -> float:
+        elapsed = peer.solve(*guess)
+        outcome.status, outcome.iterations, outcome.cost = peer.status, peer.iterations, peer.cost
+        return elapsed
+
+    return solve
+
+
+def measure(problem: Problem, solvers: Mapping[str, fg.Solver], rules: Rules, rounds: int) -> Outcomes:
+    """Solve a problem with every solver, ``rounds`` times after one that is not counted."""
+    attempts = {name: attempt(solver, problem, rules.prepared) for name, solver in solvers.items()}
+    attempts |= {name: attempt_peer(name, problem, rules.tolerance) for name in runnable(rules.peers)}
+    outcomes = {name: Outcome() for name in attempts}
+    times = interleave(
+        {name: partial(solve, outcomes[name]) for name, solve in attempts.items()}, rounds, slow=rules.slow
+    )
+    for name, outcome in outcomes.items():
+        outcome.times = times[name].tolist()
+    return outcomes
+
+
+def ratio(outcomes: Outcomes, name: str, peer: str) -> float:
+    """Time over that of a peer, where both converged; plain peers are not compared with others."""
+    if peer not in outcomes or name in (peer, *PEERS[:-1]):
+        return np.nan
+    both = outcomes[name].status == outcomes[peer].status == "converged"
+    return outcomes[name].median / outcomes[peer].median if both else np.nan
+
+
+def summary(results: Results, rules: Rules, counted: Mapping[str, Callable[[Problem, Outcome], bool]]) -> str:
+    """One row per solver: how often it did what is counted, its iterations and times."""
+    lines = []
+    for name in dict.fromkeys(name for outcomes in results.values() for name in outcomes):
+        mine = [(problem, outcomes[name]) for problem, outcomes in results.items()]
+        times = [outcome.median for _, outcome in mine]
+        means = []
+        for peer in runnable(rules.peers):
+            ratios = np.array([ratio(outcomes, name, peer) for outcomes in results.values()])
+            ratios = ratios[~np.isnan(ratios)]
+            means.append(f"{np.exp(np.mean(np.log(ratios))):.2f}" if len(ratios) else "-")
+        lines.append(
+            (
+                name, *(f"{sum(right(*pair) for pair in mine)} / {len(mine)}" for right in counted.values()),
+                str(sum(outcome.iterations for _, outcome in mine)), number(float(np.median(times))),
+                number(max(times)), *means,
+            )
+        )  # fmt: skip
+    means_of = (f"times {peer} (geometric mean)" for peer in runnable(rules.peers))
+    return table(("solver", *counted, "iterations in all", "median [ms]", "slowest [ms]", *means_of), lines)
+
+
+def every(results: Results, rules: Rules, more: Mapping[str, Column]) -> str:
+    """One row per problem and solver; ``more`` are columns a page adds."""
+    peers = runnable(rules.peers)
+    head = ("case", "solver", "optimum", "cost", "listed", "iterations", "ms", *(f"times {p}" for p in peers), *more)
+    lines = []
+    for problem, outcomes in results.items():
+        for name, outcome in outcomes.items():
+            ratios = [ratio(outcomes, name, peer) for peer in peers]
+            lines.append(
+                (
+                    problem.title, name, outcome.verdict(problem, rules), f"{outcome.cost:.5f}",
+                    f"{problem.optima[0]:.5f}", str(outcome.iterations), number(outcome.median),
+                    *("-" if np.isnan(value) else f"{value:.2f}" for value in ratios),
+                    *(column(name, outcome) for column in more.values()),
+                )
+            )  # fmt: skip
+    return table(head, lines, text=3)
