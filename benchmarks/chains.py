@@ -19,7 +19,7 @@ from unifg.machine.jit import compiled
 from unifg.models import unicycle
 from unifg.program import passes
 from unifg.program.program import Program
-from unifg.solvers import AugmentedLagrangian, GaussNewton, model
+from unifg.solvers import AugmentedLagrangian, GaussNewton, augmented_step
 from unifg.typing import Array
 
 Result: TypeAlias = dict[str, Any]
@@ -31,7 +31,7 @@ REPEATS = 20  # of a compiled pass inside one timed call
 WATCHED: dict[str, tuple[Any, str]] = {
     "linearise": (passes, "linearize"),
     "evaluate": (passes, "evaluate"),
-    "primal step": (model, "_minimize"),
+    "primal step": (augmented_step, "_minimize"),
     "eliminate": (fronts, "factor"),
     "substitute": (substitution, "solve"),
     "KKT test": (solver, "optimality"),
@@ -149,10 +149,10 @@ def eliminations(run: fg.Prepared, guess: fg.Guess) -> float:
         count += 1
         return real(*arguments)
 
-    interpreted = getattr(model._minimize, "py_func")  # noqa: B009 - an attribute of the compiled function
+    interpreted = getattr(augmented_step._minimize, "py_func")  # noqa: B009 - an attribute of the compiled function
     with (
-        mock.patch.object(model, "_minimize", interpreted),
-        mock.patch.object(model, "factor", counting),
+        mock.patch.object(augmented_step, "_minimize", interpreted),
+        mock.patch.object(augmented_step, "factor", counting),
         mock.patch.object(fronts, "factor", counting),
     ):
         run.solve(guess)

@@ -28,10 +28,11 @@ from unifg.errors import BackendError
 from unifg.machine.jit import compiled
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
-from unifg.solvers.damping import Damping, damped_step, largest, norm
-from unifg.solvers.least_violation import leave, settle
-from unifg.solvers.model import STRAIGHT, model_step
-from unifg.solvers.primal import Primal
+from unifg.solvers.augmented_objective import Primal
+from unifg.solvers.augmented_step import STRAIGHT, damped_step, model_step
+from unifg.solvers.globalize.damping import Damping
+from unifg.solvers.globalize.least_violation import leave, settle
+from unifg.solvers.globalize.sizes import largest, norm
 from unifg.typing import Array, IntArray
 
 LARGEST_PENALTY = 1e10

@@ -43,8 +43,7 @@ from unifg.language.terms import Cost
 from unifg.language.variables import Data
 from unifg.program.term import CompiledTerm
 from unifg.solvers.gating import Innovations, Scatter
-from unifg.solvers.gauss_newton import GaussNewton
-from unifg.solvers.levenberg_marquardt import LevenbergMarquardt
+from unifg.solvers.least_squares import GaussNewton, LevenbergMarquardt
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 logger = logging.getLogger("unifg")

@@ -25,7 +25,7 @@ from unifg.program.table import CONSTRAINT, COUNT, KIND, ROW, ROWS
 from unifg.solvers import barrier_state as state
 from unifg.solvers.barrier_loop import addresses, call
 from unifg.solvers.barrier_state import Problem, Work, empty_work
-from unifg.solvers.least_violation import nearest
+from unifg.solvers.globalize.least_violation import nearest
 from unifg.typing import Array
 
 ENDINGS = {

@@ -30,19 +30,19 @@ from unifg.answers.requirements import require
 from unifg.answers.solver import Run, Solver
 from unifg.answers.status import Status
 from unifg.errors import BackendError
-from unifg.program.linearization import Evaluation, Linearization
+from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.program.systems import aim, fill
-from unifg.solvers.damping import LARGEST, SUFFICIENT, Damping, largest, norm
-from unifg.solvers.least_violation import leave, settle
-from unifg.solvers.primal import DIAGONAL_FLOOR
+from unifg.solvers.augmented_objective import DIAGONAL_FLOOR
+from unifg.solvers.globalize.damping import LARGEST, Damping, gain
+from unifg.solvers.globalize.least_violation import leave, settle
+from unifg.solvers.globalize.line_search import search
+from unifg.solvers.globalize.merit import OnePrice
+from unifg.solvers.globalize.sizes import largest, norm
 from unifg.typing import Array
 
 RESIDUAL = 1e-8  # relative, in the equilibrated system, of one that counts as solved
-ARMIJO = 1e-4
 ROUNDING = 1e-13
-SHORTEST = 1e-6
-MARGIN = 0.3  # share of the violation's price that every step must earn (Nocedal and Wright, eq. 18.36)
 FAILURES = 5  # attempts with growing damping at one step
 FIRST_DAMPING, DAMPING_GROWTH, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-2, 10.0, 1e-9, 1e12
 DAMPING_DECAY = 0.9  # faster forgetting cycles between overshooting and shortened steps
@@ -95,7 +95,7 @@ class KKT(Solver):
         workspace.begin(self.name)
         if self.globalization == "levenberg-marquardt":
             return self._damped(run, workspace)
-        merit = Merit(run.program)
+        merit = OnePrice(run.program)
         damping = slackness = 0.0
         failures = 0
         while run.status is None:
@@ -136,7 +136,7 @@ class KKT(Solver):
 
     def _damped(self, run: Run, workspace: Newton) -> Status | None:
         """Levenberg and Marquardt's iteration."""
-        merit, damping = Merit(run.program), Damping(FIRST_LEVENBERG)
+        merit, damping = OnePrice(run.program), Damping(FIRST_LEVENBERG)
         rejected, slackness = 0, 0.0
         while run.status is None:
             lin = run.lin
@@ -151,8 +151,9 @@ class KKT(Solver):
                 values = run.program.retract(lin.values, found[0])
                 trial = run.program.evaluate(values, lin.weights)
                 actual = here - merit.value(trial)
-                if np.isfinite(predicted) and trial.finite and actual >= SUFFICIENT * predicted - slack:
-                    damping.accept(1.0 if predicted <= slack else min(actual / predicted, 1.0))
+                gained = gain(actual, predicted, slack) if np.isfinite(predicted) and trial.finite else None
+                if gained is not None:
+                    damping.accept(min(gained, 1.0))
                     reached = run.program.linearize(values)
             if found is None or reached is None:
                 if found is None:
@@ -177,7 +178,7 @@ class KKT(Solver):
         return None
 
     def _search(
-        self, run: Run, workspace: Newton, merit: Merit, step: Array, change: Array
+        self, run: Run, workspace: Newton, merit: OnePrice, step: Array, change: Array
     ) -> tuple[Linearization, Array, Array, float, bool] | None:
         """New linearisation, step and change of multipliers as taken, length, whether corrected; None for no step."""
         program, lin = run.program, run.lin
@@ -189,24 +190,16 @@ class KKT(Solver):
         slack = ROUNDING * max(1.0, abs(here)) + merit.rounding(lin)
         if not slope <= slack:
             return None
-        values = program.retract(lin.values, step)
-        trial = program.evaluate(values, lin.weights)
-        if merit.accepts(trial, here, slope, 1.0, slack):
-            return program.linearize(values), step, change, 1.0, False
-        if self.second_order_correction and trial.finite and program.constraints.count:
-            bend = trial.constraints - lin.constraints - linear
-            again = workspace.resolve(lin, run.multipliers, bend)
-            if again is not None:
-                values = program.retract(lin.values, again[0])
-                if merit.accepts(program.evaluate(values, lin.weights), here, slope, 1.0, slack):
-                    return program.linearize(values), *again, 1.0, True
-        length = 0.5
-        while length >= SHORTEST:
-            values = program.retract(lin.values, length * step)
-            if merit.accepts(program.evaluate(values, lin.weights), here, slope, length, slack):
-                return program.linearize(values), length * step, length * change, length, False
-            length *= 0.5
-        return None
+
+        def correct(bend: Array) -> tuple[Array, Array] | None:
+            return workspace.resolve(lin, run.multipliers, bend)
+
+        wanted = correct if self.second_order_correction else None
+        found = search(lin, step, merit, here, slope, slack, linear, wanted)
+        if found is None:
+            return None
+        change = found.length * change if found.dual is None else found.dual
+        return found.reached, found.step, change, found.length, found.dual is not None
 
 
 class Newton:
@@ -288,58 +281,6 @@ class Newton:
     def _structure(self, program: Program) -> None:
         self.system = program.systems.kkt(program.equality)
         self._data, self._begun = np.zeros(self.system.pattern.nnz), False
-
-
-class Merit:
-    """l1 merit: the cost plus a price per unit of violation."""
-
-    def __init__(self, program: Program) -> None:
-        """Start without a price: the first step that needs one raises it."""
-        self.program = program
-        self.price = 0.0
-
-    def value(self, point: Linearization | Evaluation) -> float:
-        """Merit at a point."""
-        return point.cost + self.price * self._violation(point.constraints)
-
-    def rounding(self, lin: Linearization) -> float:
-        """What the merit owes to coordinates that are rounded where they are stored, by half a spacing in every row."""
-        largest = float(np.abs(self.program.columns.values(lin.values).flat).max(initial=0.0))
-        return self.price * 0.5 * float(np.spacing(largest)) * len(lin.constraints)
-
-    def slope(self, lin: Linearization, step: Array, linear: Array) -> float:
-        """Bound of the merit's derivative along a step, after the price was raised to make it one of descent.
-
-        Args:
-            lin: where.
-            step: (n,).
-            linear: (M,) A times the step.
-        """
-        program = self.program
-        descent = float(lin.gradient[program.columns.free] @ step)
-        gain = self._violation(lin.constraints) - self._violation(lin.constraints + linear)
-        if gain > 0.0:
-            curved = self._curved(lin, step)
-            needed = (descent + 0.5 * curved) / ((1.0 - MARGIN) * gain)
-            if needed > self.price:
-                self.price = 1.5 * needed
-        return descent - self.price * gain
-
-    def predicted(self, lin: Linearization, step: Array, linear: Array) -> float:
-        """Decrease by the model, quadratic in the cost and linear in the constraints; arguments as for `slope`."""
-        return -self.slope(lin, step, linear) - 0.5 * self._curved(lin, step)
-
-    def accepts(self, trial: Evaluation, here: float, slope: float, length: float, slack: float) -> bool:
-        """Armijo's condition."""
-        return trial.finite and self.value(trial) <= here + ARMIJO * length * slope + slack
-
-    def _curved(self, lin: Linearization, step: Array) -> float:
-        """Curvature of the cost along a step, which may be too long for the range of numbers."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            return float(step @ self.program.hessian.times(self.program.hessian_entries(lin), step))
-
-    def _violation(self, constraints: Array) -> float:
-        return float(np.abs(self.program.violation(constraints)).sum())
 
 
 def _next_damping(damping: float, length: float) -> float:

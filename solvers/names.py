@@ -12,12 +12,10 @@ from typing import Any
 from unifg.answers.solver import Backend, Solver
 from unifg.errors import BackendError
 from unifg.solvers.augmented_lagrangian import AugmentedLagrangian
-from unifg.solvers.dog_leg import DogLeg
-from unifg.solvers.gauss_newton import GaussNewton
 from unifg.solvers.graduated_non_convexity import GraduatedNonConvexity
 from unifg.solvers.interior_point import InteriorPoint
 from unifg.solvers.kkt import KKT
-from unifg.solvers.levenberg_marquardt import LevenbergMarquardt
+from unifg.solvers.least_squares import DogLeg, GaussNewton, LevenbergMarquardt
 from unifg.solvers.penalty import Penalty
 from unifg.solvers.sqp import SQP
 

@@ -17,11 +17,11 @@ from unifg.answers.status import Status
 from unifg.errors import BackendError
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
-from unifg.solvers.damping import Damping, damped_step, norm
-from unifg.solvers.least_violation import settle
-from unifg.solvers.model import model_step
-from unifg.solvers.phr import update
-from unifg.solvers.primal import Primal
+from unifg.solvers.augmented_objective import Primal, update
+from unifg.solvers.augmented_step import damped_step, model_step
+from unifg.solvers.globalize.damping import Damping
+from unifg.solvers.globalize.least_violation import settle
+from unifg.solvers.globalize.sizes import norm
 from unifg.typing import Array
 
 ROUNDING = 1e-15  # relative decrease of the objective that is noise

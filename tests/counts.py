@@ -9,8 +9,8 @@ from unittest.mock import patch
 
 import numpy as np
 
-from unifg.solvers.qp import QP, QPAnswer
-from unifg.solvers.qp_osqp import OsqpRoute
+from unifg.solvers.quadratic_programs.osqp_route import OsqpRoute
+from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer
 from unifg.solvers.sqp import Subproblems
 from unifg.typing import Array
 

@@ -354,7 +354,7 @@ def test_a_history_gives_the_length_of_the_step_that_was_taken(name: str) -> Non
     graph = fg.Graph()
     x = graph.variables("x", fg.Rn(1), 1)
     graph.minimize(lambda p: np.arctan(p - 1.0), x, name="bend")
-    if name not in ("gn", "lm", "dog-leg"):
+    if name not in LEAST_SQUARES:
         y = graph.variables("y", fg.Rn(1), 1)
         graph.minimize(fg.prior, y, [0.0], sigma=100.0)
         graph.constrain(lambda p, q: p - q, x, y, lower=0.0, upper=0.0, name="same")

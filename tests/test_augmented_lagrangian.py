@@ -18,8 +18,8 @@ from problems.known import STARTS, ecg2o, ecg2o_inequality, pose_beside_disc, sh
 from unifg.models import obstacles, unicycle
 from unifg.scenarios.manoeuvres import CASES, ManoeuvreSettings, state_problem
 from unifg.solvers import SQP, AugmentedLagrangian
-from unifg.solvers.model import model_step
-from unifg.solvers.primal import Primal
+from unifg.solvers.augmented_objective import Primal
+from unifg.solvers.augmented_step import model_step
 from unifg.typing import Array
 from units import drive
 

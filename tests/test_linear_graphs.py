@@ -13,15 +13,12 @@ from test_sqp_exact import two_rotations
 from unifg.models import unicycle
 from unifg.program.program import Program
 from unifg.solvers import SQP
-from unifg.solvers.constrained_elimination import Contradiction, Undetermined
-from unifg.solvers.linear_factors import LinearFactor, QuadraticFactor
-from unifg.solvers.linear_graphs import LinearGraph, dual_graph
-from unifg.solvers.linearized_graph import LinearGraphs, primal_graph
-from unifg.solvers.qp import subproblem
-from unifg.solvers.qp_elimination import EliminationRoute
-from unifg.solvers.qp_exact import ExactHessian
-from unifg.solvers.qp_graph import GraphRoute
-from unifg.solvers.scaling import Scaling
+from unifg.solvers.quadratic_programs.exact_hessian import ExactHessian
+from unifg.solvers.quadratic_programs.graph_route import GraphRoute
+from unifg.solvers.quadratic_programs.scaling import Scaling
+from unifg.solvers.quadratic_programs.subproblem import subproblem
+from unifg.solvers.ta.elimination import Contradiction, LinearFactor, QuadraticFactor, Undetermined
+from unifg.solvers.ta.linear_graphs import EliminationRoute, LinearGraph, LinearGraphs, dual_graph, primal_graph
 
 DAMPING = 1e-6
 

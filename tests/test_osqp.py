@@ -13,9 +13,9 @@ from problems.control import problems
 from problems.known import active_bounds, short_drive
 from unifg.program.program import Program
 from unifg.solvers import SQP
-from unifg.solvers.qp import QP, qp_error, subproblem
-from unifg.solvers.qp_graph import GraphRoute
-from unifg.solvers.qp_osqp import OsqpRoute, counted_iterations
+from unifg.solvers.quadratic_programs.graph_route import GraphRoute
+from unifg.solvers.quadratic_programs.osqp_route import OsqpRoute, counted_iterations
+from unifg.solvers.quadratic_programs.subproblem import QP, qp_error, subproblem
 from units import drive
 
 CASES = {problem.title: problem for problem in problems()}

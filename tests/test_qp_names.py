@@ -9,9 +9,9 @@ import unifg as fg
 from judge import judge
 from problems.known import PROBLEMS, Problem, active_bounds, short_drive
 from unifg.solvers import SQP
-from unifg.solvers.qp import qp_error, subproblem
-from unifg.solvers.qp_graph import GraphRoute
-from unifg.solvers.qp_qpsolvers import QpsolversRoute
+from unifg.solvers.quadratic_programs.graph_route import GraphRoute
+from unifg.solvers.quadratic_programs.qpsolvers_route import QpsolversRoute
+from unifg.solvers.quadratic_programs.subproblem import qp_error, subproblem
 
 NAMES = ["quadprog", "clarabel"]  # a dense active-set method, and a sparse interior point
 CONSTRAINED = [problem for problem in PROBLEMS if problem.constrained]

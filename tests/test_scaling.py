@@ -11,9 +11,9 @@ import pytest
 import unifg as fg
 from judge import judge
 from unifg.solvers import SQP
-from unifg.solvers.qp import qp_error, subproblem
-from unifg.solvers.qp_graph import GraphRoute
-from unifg.solvers.scaling import MODEST, Scaling
+from unifg.solvers.quadratic_programs.graph_route import GraphRoute
+from unifg.solvers.quadratic_programs.scaling import MODEST, Scaling
+from unifg.solvers.quadratic_programs.subproblem import qp_error, subproblem
 from units import COST, OTHER_COST, drive
 
 UNITS: list[dict[str, float]] = [

@@ -11,8 +11,10 @@ import pytest
 import unifg as fg
 from problems.known import short_drive
 from unifg.solvers import SQP
-from unifg.solvers.qp import QPAnswer, subproblem
-from unifg.solvers.sqp import FALLING, LEFT, PATIENCE, RESTING, Merit, Subproblems, Watch
+from unifg.solvers.globalize.least_violation import FALLING, PATIENCE, Watch
+from unifg.solvers.globalize.merit import RowPrices
+from unifg.solvers.quadratic_programs.routes import LEFT, RESTING
+from unifg.solvers.quadratic_programs.subproblem import QPAnswer, subproblem
 from unifg.typing import Array
 
 
@@ -59,20 +61,17 @@ def test_the_highest_price_is_that_of_scaled_rows_and_at_least_one() -> None:
     program = graph.compile()
     lin = program.linearize(program.values_from({x: np.zeros((1, 1))}))
     for multiplier, row, price in ((6.0, 2.0, 3.0), (6.0, 0.5, 12.0), (0.1, 1.0, 1.0)):
-        scaling: Any = SimpleNamespace(program=program, rows=np.array([row]))
-        assert Merit(scaling, np.array([-multiplier]), lin).price == pytest.approx(price)
+        assert RowPrices(program, np.array([row]), np.array([-multiplier]), lin).price == pytest.approx(price)
 
 
 def test_prices_stay_above_their_multipliers_and_come_down_slowly() -> None:
     graph, x = line()
     program = graph.compile()
     lin = program.linearize(program.values_from({x: np.zeros((1, 1))}))
-    scaling: Any = SimpleNamespace(program=program, rows=np.ones(1))
-    merit = Merit(scaling, np.array([2.0]), lin)
-    answer = QPAnswer(np.zeros(1), np.array([-4.0]), "by hand", 1, 0.0)
-    merit.raise_prices(answer)
+    merit = RowPrices(program, np.ones(1), np.array([2.0]), lin)
+    merit.raise_above(np.array([-4.0]))
     np.testing.assert_allclose(merit.prices, [4.4])
-    merit.raise_prices(QPAnswer(np.zeros(1), np.array([1.0]), "by hand", 1, 0.0))
+    merit.raise_above(np.array([1.0]))
     np.testing.assert_allclose(merit.prices, [2.7])
 
 
@@ -84,7 +83,7 @@ def test_an_answer_contradicts_when_it_leaves_most_of_the_violation(
     limit: float, left: float, contradicts: bool
 ) -> None:
     graph, _ = line(limit)
-    work = Subproblems(SQP(), graph.compile())
+    work = SQP().workspace(graph.compile())
     qp: Any = SimpleNamespace(lower=np.array([-np.inf]), upper=np.array([limit]), linear=lambda step: step)
     step: Array = np.array([limit + left])
     assert work._contradicts(qp, QPAnswer(step, np.zeros(1), "by hand", 1, 1e-3)) == contradicts
@@ -95,7 +94,7 @@ def test_the_first_route_rests_after_a_step_that_led_nowhere() -> None:
     """It is asked, not asked for a while when its step was distrusted, and asked again."""
     graph, guess = short_drive()
     program = graph.compile()
-    work, lin = Subproblems(SQP(), program), program.linearize(program.values_from(guess))
+    work, lin = SQP().workspace(program), program.linearize(program.values_from(guess))
     work.start(lin)
     assert not work.distrust(), "it has given no step yet"
     qp = subproblem(program, lin, np.full(program.size, 1e-6), work.pattern)

@@ -15,14 +15,14 @@ from problems.hock_schittkowski import SMALL
 from problems.known import PROBLEMS, Guess, Problem, ecg2o, ecg2o_inequality, hs6, pose_beside_disc, short_drive
 from unifg.program.program import Program
 from unifg.solvers import SQP
-from unifg.solvers.qp import QP, Route, qp_error, solve_convex, subproblem
-from unifg.solvers.qp_elimination import EliminationRoute
-from unifg.solvers.qp_exact import ExactHessian, holds
-from unifg.solvers.qp_graph import GraphRoute
-from unifg.solvers.qp_osqp import OsqpRoute
-from unifg.solvers.qp_piqp import ElasticRoute, PiqpRoute
-from unifg.solvers.qp_qpsolvers import QpsolversRoute
-from unifg.solvers.scaling import Scaling
+from unifg.solvers.quadratic_programs.exact_hessian import ExactHessian, holds
+from unifg.solvers.quadratic_programs.graph_route import GraphRoute
+from unifg.solvers.quadratic_programs.osqp_route import OsqpRoute
+from unifg.solvers.quadratic_programs.piqp_route import ElasticRoute, PiqpRoute
+from unifg.solvers.quadratic_programs.qpsolvers_route import QpsolversRoute
+from unifg.solvers.quadratic_programs.scaling import Scaling
+from unifg.solvers.quadratic_programs.subproblem import QP, Route, qp_error, solve_convex, subproblem
+from unifg.solvers.ta.linear_graphs import EliminationRoute
 from unifg.typing import Array
 
 CASES = {case.name: case for case in SMALL}

@@ -8,8 +8,8 @@ import pytest
 import unifg as fg
 from problems.hock_schittkowski import SMALL
 from unifg.solvers import SQP
-from unifg.solvers.qp import subproblem
-from unifg.solvers.scaling import Scaling
+from unifg.solvers.quadratic_programs.scaling import Scaling
+from unifg.solvers.quadratic_programs.subproblem import subproblem
 from unifg.solvers.sqp import missing_curvature
 
 CASES = {case.name: case for case in SMALL}

@@ -13,7 +13,7 @@ import scipy.sparse as sp
 
 from unifg.elimination.symmetric import Symmetric
 from unifg.program.program import Program
-from unifg.solvers.qp import QP, QPAnswer, qp_error
+from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, qp_error
 from unifg.typing import Array, BoolArray, IntArray
 
 INFINITY = 1e30  # PIQP treats larger limits as absent

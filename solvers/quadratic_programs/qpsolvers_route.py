@@ -11,7 +11,7 @@ import scipy.sparse as sp
 
 from unifg.errors import BackendError
 from unifg.program.program import Program
-from unifg.solvers.qp import QP, QPAnswer, qp_error
+from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, qp_error
 from unifg.typing import Array
 
 SETTINGS: dict[str, dict[str, Any]] = {

@@ -1,18 +1,18 @@
 """OSQP, called directly: one workspace per structure, updated and warm-started in primal and dual.
 
 OSQP's first-order iterations find the active set soon and digits slowly, so it is asked for the former: two digits of a
-problem brought to one scale (:mod:`unifg.solvers.scaling`), then a polish, which solves the linear system of the limits
-found active. An answer that misses its accuracy is taken up where it is with one digit more, until the iterations have
-cost what a few of an interior point would. Equalities weigh three times as much as in OSQP's own choice, which is
-1000 times the rho of inequalities.
+problem brought to one scale (:mod:`unifg.solvers.quadratic_programs.scaling`), then a polish, which solves the linear
+system of the limits found active. An answer that misses its accuracy is taken up where it is with one digit more, until
+the iterations have cost what a few of an interior point would. Equalities weigh three times as much as in OSQP's own
+choice, which is 1000 times the rho of inequalities.
 
 Equal calls give equal answers: rho adapts at fixed iterations, never by the clock, and begins anew with every solve;
 OSQP's own scaling, which would carry digits of one problem into the next, is off. Its test of the duality gap is off
 too: complementarity is measured here, and a gap says little where limits are far.
 
 OSQP accepts wrong sizes, crossed limits and NaN without raising and fills x with numbers near 1e9 when a problem
-is infeasible, so nothing it returns is used before :func:`unifg.solvers.qp.qp_error` has measured it. Polishing is
-left off without equalities: it would print to the terminal whenever no limit is active.
+is infeasible, so nothing it returns is used before :func:`unifg.solvers.quadratic_programs.subproblem.qp_error` has
+measured it. Polishing is left off without equalities: it would print to the terminal whenever no limit is active.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ import numpy as np
 import osqp
 
 from unifg.program.program import Program
-from unifg.solvers.qp import QP, QPAnswer, qp_error
-from unifg.solvers.scaling import Scaling
+from unifg.solvers.quadratic_programs.scaling import Scaling
+from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, qp_error
 from unifg.typing import Array
 
 INFINITY = 1e20  # OSQP treats larger limits as absent

@@ -18,8 +18,8 @@ from unifg.program.linearization import Linearization
 from unifg.program.passes import add_constraints
 from unifg.program.program import Program
 from unifg.program.systems import KktSystem, fill
-from unifg.solvers.qp import QP, QPAnswer, subproblem
-from unifg.solvers.scaling import Scaling
+from unifg.solvers.quadratic_programs.scaling import Scaling
+from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, subproblem
 from unifg.typing import Array, BoolArray
 
 SHIFT = 1e-10  # on the diagonal of the scaled KKT matrix, so that no order of elimination meets a vanishing pivot

@@ -1,4 +1,4 @@
-"""The subproblem of a primal step, solved to its end.
+"""One step on the augmented objective: its model is minimised, and a step that does not lower it is damped.
 
 With residuals and constraints linearised, the augmented objective is convex and piecewise quadratic: a row of an
 inequality joins or leaves as the step grows. Newton steps that update the active rows, with a line search, find
@@ -18,18 +18,93 @@ from unifg.elimination.plan import NEGATIVE, Plan
 from unifg.elimination.substitution import solve
 from unifg.elimination.symmetric import add_times
 from unifg.machine.jit import compiled
+from unifg.program.columns import Values
 from unifg.program.linearization import Linearization
 from unifg.program.passes import add_constraints, times, transposed_times
 from unifg.program.table import Terms
-from unifg.solvers.phr import barrier, update
-from unifg.solvers.primal import DIAGONAL_FLOOR, Primal
+from unifg.solvers.augmented_objective import DIAGONAL_FLOOR, Primal, barrier, update
+from unifg.solvers.globalize.damping import LARGEST, SUFFICIENT, Damping, gain
 from unifg.typing import Array, BoolArray, IntArray
 
 NEWTON_STEPS = 12
 SHORTEST = 1e-3
 ARMIJO = 0.1
 ROUNDING = 1e-14
+LEAST_SHARE = 0.125  # of the second derivatives, before they are left out
+WELL = 0.75  # of the predicted decrease: a step that brings less is corrected
+CORRECTIONS = 3  # at most, of one trial
 STRAIGHT: Array = np.zeros(0)
+
+
+def damped_step(
+    primal: Primal,
+    lin: Linearization,
+    multipliers: Array,
+    penalty: Array,
+    damping: Damping,
+    bend: Array = STRAIGHT,
+) -> tuple[Values, Array, int] | None:
+    """One accepted step on the augmented objective.
+
+    A step of length d along curved constraints leaves them by some d^2, which costs rho d^4: the larger rho, the
+    shorter the steps that damping allows. So where second derivatives are in the model, a trial that brings much less
+    than predicted is followed by second-order corrections (Nocedal and Wright, section 18.3): the same model, with the
+    values of the constraints found there.
+
+    Args:
+        primal: the augmented objective and its factorisation.
+        lin: where.
+        multipliers: (M,) of the augmented objective.
+        penalty: (M,) rho of every row.
+        damping: what it begins with, and what it learns.
+        bend: (nnz,) second derivatives for the model; a share of them, or none, where they leave it indefinite.
+
+    Returns:
+        The new values, the tangent step and the number of rejected trials; None when no damping helps.
+    """
+    merit = primal.merit(lin, multipliers, penalty)
+    # Least squares has no unit: what is rounding depends on the cost alone.
+    slack = ROUNDING * (merit if primal.program.least_squares else max(1.0, abs(merit)))
+    rows = primal.program.constraints
+    rejected, rounded = 0, False
+    damping.share = share = min(4.0 * damping.share, 1.0)
+    while damping.value <= LARGEST:
+        curved = len(bend) > 0 and share > 0.0
+        chosen = (bend if share == 1.0 else share * bend) if curved else STRAIGHT
+        found = model_step(primal, lin, multipliers, penalty, damping.value, chosen)
+        if found is None and curved:
+            damping.share = max(0.5 * share, LEAST_SHARE)
+            share = 0.5 * share if share > LEAST_SHARE else 0.0
+            continue
+        if found is not None:
+            step, predicted = found
+            values, evaluation = primal.trial(lin, step)
+            actual = merit - primal.merit(evaluation, multipliers, penalty)
+            if not rounded and not actual >= SUFFICIENT * predicted - slack:
+                slack, rounded = max(slack, primal.rounding(lin, multipliers, penalty)), True
+            base = lin.constraints
+            for _ in range(CORRECTIONS if len(bend) > 0 else 0):
+                if not evaluation.finite or actual >= WELL * predicted - slack:
+                    break
+                # What the rows are at the trial, continued along their tangents back to no step.
+                curved_base = evaluation.constraints - rows.times(lin.constraint_jacobian, step)
+                again = model_step(primal, lin, multipliers, penalty, damping.value, chosen, curved_base)
+                if again is None:
+                    break
+                moved, there = primal.trial(lin, again[0])
+                better = merit - primal.merit(there, multipliers, penalty)
+                if not (there.finite and better > actual):
+                    break
+                base, step, values, evaluation, actual = curved_base, again[0], moved, there, better
+            gained = gain(actual, predicted, slack) if evaluation.finite else None
+            if gained is not None:
+                damping.accept(min(gained, 1.0))
+                damping.base = base
+                return values, step, rejected
+        rejected += 1
+        damping.reject()
+    damping.value = LARGEST
+    return None
 
 
 def model_step(

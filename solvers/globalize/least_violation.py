@@ -18,13 +18,15 @@ from unifg.answers.status import Status
 from unifg.answers.violation import ViolationModel, descent
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
-from unifg.solvers.damping import norm
+from unifg.solvers.globalize.sizes import norm
 
 STEPS = 200
 FIRST_DAMPING, LARGEST_DAMPING, GROWTH, SHRINK = 1e-3, 1e10, 4.0, 0.2
 PROGRESS = 1e-12  # smallest relative decrease that counts; below it, the gradient has to halve
 ROUNDING = 1e-14
 ASIDE = 1e-3  # standard deviation of the step off a point that may be a saddle
+PATIENCE = 20  # iterations whose violation has not fallen
+FALLING = 0.9
 LESS = 1e-4  # relative decrease that tells a saddle from a minimum in a flat valley
 
 
@@ -132,3 +134,28 @@ def least_violation(
         lin = program.linearize(values)
         damping *= SHRINK
     return lin
+
+
+class Watch:
+    """Calls for a look at the violation alone when it has not fallen for long.
+
+    Where constraints miss each other by little, every linearisation may have a solution, while steps only get shorter
+    and multipliers longer. Whether there is a feasible point, a descent on the violation tells.
+    """
+
+    def __init__(self) -> None:
+        """Begin to count."""
+        self._patience, self._waited = PATIENCE, 0
+        self._least = np.inf
+
+    def calls(self, run: Run) -> bool:
+        """Whether it is time; asked once an iteration, and after every call half as often."""
+        violation = run.optimality.violation
+        if violation <= run.tolerance or violation < FALLING * self._least:
+            self._least, self._waited = min(violation, self._least), 0
+            return False
+        self._waited += 1
+        if self._waited < self._patience:
+            return False
+        self._patience, self._waited = 2 * self._patience, 0
+        return True

@@ -18,7 +18,7 @@ from unifg.elimination.symmetric import Symmetric
 from unifg.machine.jit import compiled
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
-from unifg.solvers.qp import QP, QPAnswer
+from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer
 from unifg.typing import Array, BoolArray, IntArray
 
 PASSES, NEAR = 12, 1.5  # each pass halves what is left in the exponents; factors are rounded anyway

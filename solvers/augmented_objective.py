@@ -1,7 +1,9 @@
-"""What least-squares and augmented-Lagrangian backends share: merit, gradient and damped Gauss-Newton direction.
+"""The objective of the augmented Lagrangian, its gradient, and a Gauss-Newton direction.
 
-Both descend on f(x) + sum of Powell-Hestenes-Rockafellar terms (:mod:`unifg.solvers.phr`); without constraints that
-is f itself.
+The Powell-Hestenes-Rockafellar term of a row with multiplier lambda and penalty rho is (lambda+^2 - lambda^2) /
+(2 rho), where lambda+ is the multiplier the dual step would produce. An inactive inequality contributes nothing
+(Bazzana's eq. 19 read literally would keep penalising it). Without constraints the objective is f itself: the
+least-squares backends descend on the same.
 """
 
 from __future__ import annotations
@@ -17,7 +19,6 @@ from unifg.program.passes import transposed_times
 from unifg.program.program import Program
 from unifg.program.second_order import lagrangian_hessian
 from unifg.program.table import Terms
-from unifg.solvers.phr import barrier, update
 from unifg.typing import Array, IntArray
 
 DIAGONAL_FLOOR = 1e-9  # of the largest diagonal entry: damping must act on unknowns with little curvature too
@@ -143,3 +144,28 @@ def _slope(terms: Terms, free: IntArray, gradient: Array, entries: Array, multip
             return np.nan
         largest = max(largest, size)
     return largest
+
+
+@compiled
+def update(constraints: Array, lower: Array, upper: Array, multipliers: Array, penalty: Array, out: Array) -> None:
+    """Write lambda+: the first-order dual update, zero for inactive rows."""
+    for row in range(len(out)):
+        above = multipliers[row] + penalty[row] * (constraints[row] - upper[row])
+        below = multipliers[row] + penalty[row] * (constraints[row] - lower[row])
+        out[row] = (above if above > 0.0 else 0.0) + (below if below < 0.0 else 0.0)
+        if constraints[row] != constraints[row]:
+            out[row] = constraints[row]  # NaN stays visible
+
+
+@compiled
+def barrier(constraints: Array, lower: Array, upper: Array, multipliers: Array, penalty: Array) -> float:
+    """Sum of the terms."""
+    total = 0.0
+    for row in range(len(constraints)):
+        above = multipliers[row] + penalty[row] * (constraints[row] - upper[row])
+        below = multipliers[row] + penalty[row] * (constraints[row] - lower[row])
+        after = (above if above > 0.0 else 0.0) + (below if below < 0.0 else 0.0)
+        if constraints[row] != constraints[row]:
+            after = constraints[row]
+        total += (after * after - multipliers[row] * multipliers[row]) / (2.0 * penalty[row])
+    return total

@@ -1,0 +1,142 @@
+"""Merit functions: what a step has to lower, and how the price of violation is set."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+
+from unifg.program.linearization import Evaluation, Linearization
+from unifg.program.program import Program
+from unifg.typing import Array
+
+Point: TypeAlias = Linearization | Evaluation
+
+ARMIJO = 1e-4
+FARTHEST = 1e4  # violation that a step may lead to, relative to the start's (Waechter and Biegler 2006, eq. 21)
+MARGIN = 0.3  # share of the violation's price that every step must earn (Nocedal and Wright, eq. 18.36)
+
+
+class Merit:
+    """The cost alone, for graphs without constraints.
+
+    Attributes:
+        program: the compiled graph.
+    """
+
+    def __init__(self, program: Program) -> None:
+        """Remember the program."""
+        self.program = program
+
+    def value(self, point: Point) -> float:
+        """Merit at a point."""
+        return point.cost
+
+    def accepts(self, trial: Point, here: float, slope: float, length: float, slack: float) -> bool:
+        """Armijo's condition."""
+        return trial.finite and self.value(trial) <= here + ARMIJO * length * slope + slack
+
+    def outside(self, constraints: Array) -> Array:
+        """(M,) by how much each row is violated."""
+        return np.abs(self.program.violation(constraints))
+
+
+class RowPrices(Merit):
+    """l1 merit: the cost plus a price per unit of violation for every row (Powell 1978).
+
+    Attributes:
+        prices: (M,).
+    """
+
+    def __init__(self, program: Program, units: Array, multipliers: Array, start: Linearization) -> None:
+        """Start with the prices the multipliers suggest.
+
+        Args:
+            program: the compiled graph.
+            units: (M,) factors in which rows are compared with each other.
+            multipliers: (M,).
+            start: where the solve begins.
+        """
+        super().__init__(program)
+        self._units = units
+        self.prices = np.abs(multipliers)
+        self._worst = FARTHEST * max(1.0, self._size(start.constraints))
+
+    @property
+    def price(self) -> float:
+        """The highest price in scaled units, at least one."""
+        return float((self.prices / self._units).max(initial=1.0))
+
+    def raise_above(self, multipliers: Array) -> None:
+        """Keep every price above its multiplier."""
+        size = np.abs(multipliers)
+        self.prices = np.maximum(1.1 * size, 0.5 * (self.prices + size))
+
+    def value(self, point: Point) -> float:
+        """Merit at a point."""
+        return point.cost + float(self.prices @ self.outside(point.constraints))
+
+    def slope(self, descent: float, lin: Linearization, linear: Array) -> float:
+        """Upper bound of the merit's derivative along a step.
+
+        Args:
+            descent: derivative of the cost.
+            lin: where.
+            linear: (M,) A times the step.
+        """
+        change = self.outside(lin.constraints + linear) - self.outside(lin.constraints)
+        return descent + float(self.prices @ change)
+
+    def accepts(self, trial: Point, here: float, slope: float, length: float, slack: float) -> bool:
+        """Armijo's condition, not too far from the constraints: the merit may be unbounded out there."""
+        if not trial.finite or self._size(trial.constraints) > self._worst:
+            return False
+        return super().accepts(trial, here, slope, length, slack)
+
+    def _size(self, constraints: Array) -> float:
+        return float((self._units * self.outside(constraints)).sum())
+
+
+class OnePrice(Merit):
+    """l1 merit with one price, which rises until every step is one of descent (Nocedal and Wright, chapter 18).
+
+    Attributes:
+        price: per unit of violation of any row; the first step that needs one raises it.
+    """
+
+    price = 0.0
+
+    def value(self, point: Point) -> float:
+        """Merit at a point."""
+        return point.cost + self.price * float(self.outside(point.constraints).sum())
+
+    def rounding(self, lin: Linearization) -> float:
+        """What the merit owes to coordinates that are rounded where they are stored, by half a spacing in every row."""
+        largest = float(np.abs(self.program.columns.values(lin.values).flat).max(initial=0.0))
+        return self.price * 0.5 * float(np.spacing(largest)) * len(lin.constraints)
+
+    def slope(self, lin: Linearization, step: Array, linear: Array) -> float:
+        """Bound of the merit's derivative along a step, after the price was raised to make it one of descent.
+
+        Args:
+            lin: where.
+            step: (n,).
+            linear: (M,) A times the step.
+        """
+        descent = float(lin.gradient[self.program.columns.free] @ step)
+        gain = float(self.outside(lin.constraints).sum()) - float(self.outside(lin.constraints + linear).sum())
+        if gain > 0.0:
+            curved = self._curved(lin, step)
+            needed = (descent + 0.5 * curved) / ((1.0 - MARGIN) * gain)
+            if needed > self.price:
+                self.price = 1.5 * needed
+        return descent - self.price * gain
+
+    def predicted(self, lin: Linearization, step: Array, linear: Array) -> float:
+        """Decrease by the model, quadratic in the cost and linear in the constraints; arguments as for `slope`."""
+        return -self.slope(lin, step, linear) - 0.5 * self._curved(lin, step)
+
+    def _curved(self, lin: Linearization, step: Array) -> float:
+        """Curvature of the cost along a step, which may be too long for the range of numbers."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return float(step @ self.program.hessian.times(self.program.hessian_entries(lin), step))

@@ -1,0 +1,168 @@
+"""Which route solves a subproblem: the one asked for, a fallback where it misses, the elastic one where rows clash."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from unifg.answers.requirements import require
+from unifg.program.linearization import Linearization
+from unifg.program.program import Program
+from unifg.solvers.globalize.sizes import largest
+from unifg.solvers.quadratic_programs.exact_hessian import ExactHessian, holds
+from unifg.solvers.quadratic_programs.graph_route import GraphRoute, Polish
+from unifg.solvers.quadratic_programs.osqp_route import FINER, OsqpRoute
+from unifg.solvers.quadratic_programs.piqp_route import ElasticRoute, PiqpRoute
+from unifg.solvers.quadratic_programs.qpsolvers_route import QpsolversRoute
+from unifg.solvers.quadratic_programs.scaling import Scaling
+from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, Route, solve_convex, subproblem
+from unifg.solvers.ta.linear_graphs import EliminationRoute
+from unifg.typing import Array
+
+GOOD_ENOUGH = 1e-5  # QP error that is always accepted from the fallback
+USABLE = 1e-3  # QP error below which a step may still be tried
+MISSES = 2  # in a row, after which the first route is left out: once, then twice as often with each further miss
+LEFT = 0.3  # share of the violation that a step may leave in the linear model
+RESTING = 4  # subproblems that go straight to the fallback after a step of the first route that led nowhere
+
+
+class Subproblems:
+    """The QP routes of one prepared graph and the order they are tried in.
+
+    Attributes:
+        program: the compiled graph.
+        pattern: of the Hessians.
+        scaling: units in which subproblems are solved, found at the start of each solve.
+        elastic_asked: whether the last subproblem went to the elastic route.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        *,
+        hessian: str,
+        qp: str,
+        fallback: str | None,
+        qp_iterations: int | None,
+        scaling: bool,
+        tolerance: float,
+    ) -> None:
+        """Open the chosen route and its fallback; arguments as for :class:`unifg.solvers.SQP`.
+
+        Raises:
+            BackendError: when a named solver is not installed.
+        """
+        self.program = program
+        self.elastic_asked = False
+        self._tolerance = tolerance
+        self._exact = ExactHessian(program) if hessian == "exact" else None
+        self.pattern = program.hessian if self._exact is None else program.normal
+        linear = bool(program.equality.all()) and qp != "elimination"
+        self.fallback = None if fallback is None else _route(program, fallback, qp_iterations)
+        self.first = _route(program, "graph" if linear else qp, qp_iterations)
+        self.elastic = None if fallback is None else ElasticRoute(program, self.pattern)
+        self._polish = Polish(program)
+        self._scaled = scaling and not isinstance(self.first, EliminationRoute)
+        self.scaling = self._neutral = Scaling.none(program)
+        self._misses = self._resting = 0
+        self._first_answered = False
+
+    def start(self, lin: Linearization) -> None:
+        """Begin a new solve at ``lin``: the first route is trusted again, and nothing of the last one is left.
+
+        Raises:
+            BackendError: when new data made inequalities that the first route cannot take.
+        """
+        self._misses = self._resting = 0
+        for route in (self.first, self.fallback, self.elastic):
+            if isinstance(route, (OsqpRoute, PiqpRoute, ElasticRoute)):
+                route.begin()
+        if self._scaled:
+            self.scaling = Scaling.of(self.program, lin, self._neutral)
+        if isinstance(self.first, EliminationRoute):
+            require(self.program, "SQP(qp='elimination')", "equalities")
+
+    def subproblem(self, lin: Linearization, multipliers: Array, damping: float) -> QP:
+        """The quadratic model at an iterate."""
+        if self._exact is None:
+            return subproblem(self.program, lin, damping * self.scaling.metric, self.pattern)
+        return self._exact.subproblem(lin, multipliers, damping * self.scaling.metric, self.scaling)
+
+    def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
+        """Try the first route, then the fallback, then the elastic problem."""
+        scaling = self.scaling
+        if scaling.neutral:
+            return self._solve(qp, qp.gauss_newton, multipliers, accuracy)
+        scaled, multipliers = scaling.scaled(qp), multipliers / scaling.rows
+        answer = self._solve(scaled, lambda: scaling.scaled(qp.gauss_newton()), multipliers, accuracy)
+        if FINER * accuracy < answer.error <= USABLE and not self.elastic_asked:
+            answer = self._polish(scaled, answer)
+        return scaling.unscaled(answer)
+
+    def _solve(self, qp: QP, elastic: Callable[[], QP], multipliers: Array, accuracy: float) -> QPAnswer:
+        self.elastic_asked = self._first_answered = False
+        enough = max(10.0 * accuracy, GOOD_ENOUGH)
+        if self.fallback is None or self.elastic is None:
+            answer = solve_convex(self.first, qp, multipliers, accuracy)
+            return answer if holds(qp, answer, enough) else replace(answer, error=np.inf)
+        answers = []
+        if self._resting:
+            self._resting -= 1
+        else:
+            answers.append(solve_convex(self.first, qp, multipliers, accuracy))
+            if not holds(qp, answers[-1], enough):
+                return replace(answers[-1], error=np.inf)
+            if answers[-1].error <= 10.0 * accuracy and not self._contradicts(qp, answers[-1]):
+                self._misses, self._first_answered = 0, True
+                return answers[-1]
+            self._misses += 1
+            if self._misses >= MISSES:
+                self._resting = 2 ** (self._misses - MISSES)
+        if not any(answer.infeasible for answer in answers):
+            answers.append(solve_convex(self.fallback, qp, multipliers, accuracy))
+            if not holds(qp, answers[-1], enough):
+                return replace(answers[-1], error=np.inf)
+        best = min(answers, key=lambda answer: answer.error)
+        if best.error <= USABLE and not self._contradicts(qp, best):
+            return best
+        # Where no step satisfies the rows, nothing says along which steps the curvature of constraints should count.
+        self.elastic_asked = True
+        return self.elastic.solve(elastic(), max(10.0 * float(np.abs(multipliers).max(initial=0.0)), 1e3))
+
+    def _contradicts(self, qp: QP, answer: QPAnswer) -> bool:
+        """Whether an answer leaves most of the violation, as the least error of contradicting rows does."""
+        if answer.error <= 0.1 * self._tolerance:  # which is no less than what is left
+            return False
+        linear = qp.linear(answer.step)
+        left = largest(np.maximum(linear - qp.upper, 0.0) + np.maximum(qp.lower - linear, 0.0))
+        return left > max(LEFT * largest(np.maximum(-qp.upper, 0.0) + np.maximum(qp.lower, 0.0)), 0.1 * self._tolerance)
+
+    def distrust(self) -> bool:
+        """Leave the first route out for a while, after a step of it that led nowhere; whether it gave the last step."""
+        if not self._first_answered:
+            return False
+        self._resting = RESTING
+        return True
+
+    def correct(self, qp: QP, answer: QPAnswer, bend: Array, accuracy: float) -> QPAnswer | None:
+        """Second-order correction: aim at the constraints as found after the full step, which bend by (M,)."""
+        for route in (self.first, self.fallback):
+            if route is not None and route.name == answer.route:
+                corrected = solve_convex(
+                    route, self.scaling.scaled(qp.shifted(-bend)), answer.multipliers / self.scaling.rows, accuracy
+                )
+                return self.scaling.unscaled(corrected) if corrected.error <= USABLE else None
+        return None
+
+
+def _route(program: Program, name: str, osqp_iterations: int | None) -> Route:
+    """The engine, OSQP and PIQP are called directly, everything else through qpsolvers."""
+    if name == "graph":
+        return GraphRoute(program)
+    if name == "elimination":
+        return EliminationRoute(program)
+    if name == "osqp":
+        return OsqpRoute(program, osqp_iterations)
+    return PiqpRoute(program) if name == "piqp" else QpsolversRoute(program, name)
