@@ -10,8 +10,8 @@ from unittest.mock import patch
 import numpy as np
 
 from unifg.solvers.quadratic_programs.osqp_route import OsqpRoute
+from unifg.solvers.quadratic_programs.routes import Subproblems
 from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer
-from unifg.solvers.sqp import Subproblems
 from unifg.typing import Array
 
 
