@@ -11,15 +11,15 @@ out/benchmarks/claims.jsonl and is not solved again until the code changes. Writ
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 import unifg as fg
 from benchmarks.campaign import Key, Row, options, recorded
-from benchmarks.report import OUT, code_digest, command, machine, publish, table
+from benchmarks.report import OUT, code_digest, command, listing, machine, publish, table
 from exact_judge import AGREED, Answer, Judge, Peer, answer, disagreement
 from problems.twins import KINDS
 from variants import CONSTRAINED, EQUALITIES_ONLY
@@ -39,6 +39,9 @@ class Case:
     answers: dict[str, Answer]
     ipopt: Peer
     fatrop: Peer | None
+
+
+Mine: TypeAlias = list[tuple[Case, Answer]]
 
 
 @dataclass(frozen=True)
@@ -71,39 +74,37 @@ def results(cases: Iterable[Case]) -> dict[str, list[Case]]:
     return found
 
 
-def lost(case: Case, name: str) -> bool:
-    """Whether IPOPT solved what a backend did not."""
-    return case.ipopt.solved and case.answers[name].status != "CONVERGED"
-
-
 def summary(cases: list[Case], names: Iterable[str]) -> str:
     """One row per backend."""
-    rows = []
-    for name in names:
-        mine = [(case, case.answers[name]) for case in cases if name in case.answers]
-        solved = [(case, a) for case, a in mine if a.status == "CONVERGED"]
-        worst = [max(a.stationarity, a.violation, a.complementarity) for _, a in solved]
-        both = [a.cost / case.ipopt.cost - 1.0 for case, a in solved if case.ipopt.solved]
-        dead = Counter(a.claim for _, a in mine if a.status == "LOCALLY_INFEASIBLE")
-        rows.append(
-            (
-                name,
-                f"{len(solved)} / {len(mine)}",
-                str(sum(a.claim == "false" for _, a in solved)),
-                f"{max(worst):.2e}" if worst else "-",
-                f"{dead['true']} / {dead['saddle']} / {dead['false']}",
-                str(sum(lost(case, name) for case, _ in mine)),
-                str(sum(not case.ipopt.solved for case, _ in solved)),
-                f"{sum(b < -SAME for b in both)} / {sum(abs(b) <= SAME for b in both)} / {sum(b > SAME for b in both)}",
-                f"{np.median([a.iterations for _, a in solved]):.0f}" if solved else "-",
-                f"{np.median([a.seconds for _, a in mine]):.2f}",
-            )
-        )
-    head = (
-        "backend", "converged", "false", "largest exact KKT number", "infeasible: true / saddle / false",
-        "lost to IPOPT", "IPOPT lost", "cost below / at / above IPOPT's", "iterations", "CPU [s]",
-    )  # fmt: skip
-    return table(head, rows)
+
+    def solved(mine: Mine) -> Mine:
+        return [(case, a) for case, a in mine if a.status == "CONVERGED"]
+
+    def worst(mine: Mine) -> str:
+        largest = [max(a.stationarity, a.violation, a.complementarity) for _, a in solved(mine)]
+        return f"{max(largest):.2e}" if largest else "-"
+
+    def dead(mine: Mine) -> str:
+        claims = [a.claim for _, a in mine if a.status == "LOCALLY_INFEASIBLE"]
+        return " / ".join(str(claims.count(word)) for word in ("true", "saddle", "false"))
+
+    def beside(mine: Mine) -> str:
+        both = np.array([a.cost / case.ipopt.cost - 1.0 for case, a in solved(mine) if case.ipopt.solved])
+        return f"{(both < -SAME).sum()} / {(abs(both) <= SAME).sum()} / {(both > SAME).sum()}"
+
+    columns: dict[str, Callable[[Mine], str]] = {
+        "converged": lambda mine: f"{len(solved(mine))} / {len(mine)}",
+        "false": lambda mine: str(sum(a.claim == "false" for _, a in solved(mine))),
+        "largest exact KKT number": worst,
+        "infeasible: true / saddle / false": dead,
+        "lost to IPOPT": lambda mine: str(sum(case.ipopt.solved and a.status != "CONVERGED" for case, a in mine)),
+        "IPOPT lost": lambda mine: str(sum(not case.ipopt.solved for case, _ in solved(mine))),
+        "cost below / at / above IPOPT's": beside,
+        "iterations": lambda mine: f"{np.median([a.iterations for _, a in solved(mine)]):.0f}" if solved(mine) else "-",
+        "CPU [s]": lambda mine: f"{np.median([a.seconds for _, a in mine]):.2f}",
+    }
+    groups = {(name,): [(case, case.answers[name]) for case in cases if name in case.answers] for name in names}
+    return listing(["backend"], groups, columns)
 
 
 def endings(case_list: list[Case], name: str) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 import unifg as fg
 from benchmarks import compiled_peers
 from benchmarks.casadi_peer import available
-from benchmarks.report import table, words
+from benchmarks.report import listing, words
 from benchmarks.timing import interleave, number
 from problems.control import Problem
 from unifg.typing import Array
@@ -54,6 +54,7 @@ class Outcome:
     """What one solver made of one problem.
 
     Attributes:
+        problem, solver: which.
         status: in words.
         iterations: of the solver.
         cost: with its 1/2.
@@ -64,6 +65,8 @@ class Outcome:
         refined: what IPOPT does when it is started there; a dash where it was not asked.
     """
 
+    problem: Problem
+    solver: str
     status: str = ""
     iterations: int = 0
     cost: float = np.nan
@@ -83,11 +86,11 @@ class Outcome:
         """Whether it is a KKT point to what counts as one."""
         return self.status == "converged" or self.kkt <= rules.good
 
-    def verdict(self, problem: Problem, rules: Rules) -> str:
+    def verdict(self, rules: Rules) -> str:
         """How the cost compares with the known optima."""
         if not self.good(rules):
             return self.status
-        relative = [self.cost / known - 1.0 for known in problem.optima]
+        relative = [self.cost / known - 1.0 for known in self.problem.optima]
         if abs(relative[0]) < rules.same:
             return "listed"
         if min(map(abs, relative)) < rules.same:
@@ -97,8 +100,7 @@ class Outcome:
 
 Outcomes: TypeAlias = dict[str, Outcome]
 Results: TypeAlias = Mapping[Problem, Outcomes]
-Column: TypeAlias = Callable[[str, Outcome], str]
-"""What a table shows of the outcome of a solver."""
+Told: TypeAlias = Callable[[Outcome], str]
 
 
 def attempt(solver: fg.Solver, problem: Problem, prepared: bool) -> Callable[[Outcome], float]:
@@ -142,7 +144,7 @@ def measure(problem: Problem, solvers: Mapping[str, fg.Solver], rules: Rules, ro
     """Solve a problem with every solver, ``rounds`` times after one that is not counted."""
     attempts = {name: attempt(solver, problem, rules.prepared) for name, solver in solvers.items()}
     attempts |= {name: attempt_peer(name, problem, rules.tolerance) for name in runnable(rules.peers)}
-    outcomes = {name: Outcome() for name in attempts}
+    outcomes = {name: Outcome(problem, name) for name in attempts}
     times = interleave(
         {name: partial(solve, outcomes[name]) for name, solve in attempts.items()}, rounds, slow=rules.slow
     )
@@ -151,50 +153,53 @@ def measure(problem: Problem, solvers: Mapping[str, fg.Solver], rules: Rules, ro
     return outcomes
 
 
-def ratio(outcomes: Outcomes, name: str, peer: str) -> float:
+def ratio(results: Results, outcome: Outcome, peer: str) -> float:
     """Time over that of a peer, where both converged; plain peers are not compared with others."""
-    if peer not in outcomes or name in (peer, *PEERS[:-1]):
+    other = results[outcome.problem].get(peer)
+    if other is None or outcome.solver in (peer, *PEERS[:-1]):
         return np.nan
-    both = outcomes[name].status == outcomes[peer].status == "converged"
-    return outcomes[name].median / outcomes[peer].median if both else np.nan
+    return outcome.median / other.median if outcome.status == other.status == "converged" else np.nan
 
 
-def summary(results: Results, rules: Rules, counted: Mapping[str, Callable[[Problem, Outcome], bool]]) -> str:
+def summary(results: Results, rules: Rules, counted: Mapping[str, Callable[[Outcome], bool]]) -> str:
     """One row per solver: how often it did what is counted, its iterations and times."""
-    lines = []
-    for name in dict.fromkeys(name for outcomes in results.values() for name in outcomes):
-        mine = [(problem, outcomes[name]) for problem, outcomes in results.items()]
-        times = [outcome.median for _, outcome in mine]
-        means = []
-        for peer in runnable(rules.peers):
-            ratios = np.array([ratio(outcomes, name, peer) for outcomes in results.values()])
-            ratios = ratios[~np.isnan(ratios)]
-            means.append(f"{np.exp(np.mean(np.log(ratios))):.2f}" if len(ratios) else "-")
-        lines.append(
-            (
-                name, *(f"{sum(right(*pair) for pair in mine)} / {len(mine)}" for right in counted.values()),
-                str(sum(outcome.iterations for _, outcome in mine)), number(float(np.median(times))),
-                number(max(times)), *means,
-            )
-        )  # fmt: skip
-    means_of = (f"times {peer} (geometric mean)" for peer in runnable(rules.peers))
-    return table(("solver", *counted, "iterations in all", "median [ms]", "slowest [ms]", *means_of), lines)
+
+    def mean(peer: str) -> Callable[[list[Outcome]], str]:
+        def told(mine: list[Outcome]) -> str:
+            logs = np.log([ratio(results, outcome, peer) for outcome in mine])
+            return "-" if np.isnan(logs).all() else f"{np.exp(np.nanmean(logs)):.2f}"
+
+        return told
+
+    def share(right: Callable[[Outcome], bool]) -> Callable[[list[Outcome]], str]:
+        return lambda mine: f"{sum(map(right, mine))} / {len(mine)}"
+
+    columns: dict[str, Callable[[list[Outcome]], str]] = {
+        **{title: share(right) for title, right in counted.items()},
+        "iterations in all": lambda mine: str(sum(outcome.iterations for outcome in mine)),
+        "median [ms]": lambda mine: number(float(np.median([outcome.median for outcome in mine]))),
+        "slowest [ms]": lambda mine: number(max(outcome.median for outcome in mine)),
+        **{f"times {peer} (geometric mean)": mean(peer) for peer in runnable(rules.peers)},
+    }
+    names = dict.fromkeys(name for outcomes in results.values() for name in outcomes)
+    groups = {(name,): [outcomes[name] for outcomes in results.values()] for name in names}
+    return listing(["solver"], groups, columns)
 
 
-def every(results: Results, rules: Rules, more: Mapping[str, Column]) -> str:
+def every(results: Results, rules: Rules, more: Mapping[str, Told]) -> str:
     """One row per problem and solver; ``more`` are columns a page adds."""
-    peers = runnable(rules.peers)
-    head = ("case", "solver", "optimum", "cost", "listed", "iterations", "ms", *(f"times {p}" for p in peers), *more)
-    lines = []
-    for problem, outcomes in results.items():
-        for name, outcome in outcomes.items():
-            ratios = [ratio(outcomes, name, peer) for peer in peers]
-            lines.append(
-                (
-                    problem.title, name, outcome.verdict(problem, rules), f"{outcome.cost:.5f}",
-                    f"{problem.optima[0]:.5f}", str(outcome.iterations), number(outcome.median),
-                    *("-" if np.isnan(value) else f"{value:.2f}" for value in ratios),
-                    *(column(name, outcome) for column in more.values()),
-                )
-            )  # fmt: skip
-    return table(head, lines, text=3)
+
+    def times(peer: str) -> Told:
+        return lambda outcome: f"{ratio(results, outcome, peer):.2f}".replace("nan", "-")
+
+    columns: dict[str, Told] = {
+        "optimum": lambda outcome: outcome.verdict(rules),
+        "cost": lambda outcome: f"{outcome.cost:.5f}",
+        "listed": lambda outcome: f"{outcome.problem.optima[0]:.5f}",
+        "iterations": lambda outcome: str(outcome.iterations),
+        "ms": lambda outcome: number(outcome.median),
+        **{f"times {peer}": times(peer) for peer in runnable(rules.peers)},
+        **more,
+    }
+    every_one = [outcome for outcomes in results.values() for outcome in outcomes.values()]
+    return listing(["case", "solver"], {(one.problem.title, one.solver): one for one in every_one}, columns)

@@ -8,13 +8,15 @@ turn with ours, both with exact Hessians and the same tolerance. Writes docs/con
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from tqdm import tqdm
 
 from benchmarks import cold, compiled_peers, control_loops, control_pieces, control_starts
 from benchmarks.casadi_peer import available
 from benchmarks.cold import PEERS, Outcome, Results, Rules
 from benchmarks.report import command, machine, publish
-from problems.control import Problem, blocked, problems
+from problems.control import blocked, problems
 from unifg.solvers.names import backends
 
 RULES = Rules(tolerance=1e-4, same=1e-4, good=0.0, slow=300.0, prepared=True, peers=PEERS)
@@ -22,11 +24,10 @@ RULES = Rules(tolerance=1e-4, same=1e-4, good=0.0, slow=300.0, prepared=True, pe
 
 def render(results: Results, rounds: int) -> str:
     """The cold solves as Markdown."""
-
-    def known(problem: Problem, outcome: Outcome) -> bool:
-        return outcome.verdict(problem, RULES).startswith(("listed", "lower"))
-
-    counted = {"converged": lambda problem, outcome: outcome.status == "converged", "listed optimum or lower": known}
+    counted: dict[str, Callable[[Outcome], bool]] = {
+        "converged": lambda outcome: outcome.status == "converged",
+        "listed optimum or lower": lambda outcome: outcome.verdict(RULES).startswith(("listed", "lower")),
+    }
     notes = (
         f"Cold: from the listed guess, tolerance {RULES.tolerance:.0e} of every solver, median processor time of "
         f"{rounds} interleaved solves (one where it took more than {RULES.slow:.0f} ms). The cost of an interior point "

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
 from benchmarks.cold import PEERS, runnable
-from benchmarks.report import table
+from benchmarks.report import listing, table
 from problems.control import Driver, Problem, Quadrotor, Tick, Unicycle
 from unifg.solvers.names import backend
 from unifg.typing import Array
@@ -68,6 +68,9 @@ class Drive:
     penetration: float = -np.inf
 
 
+Row: TypeAlias = tuple[Problem, str, Drive]
+
+
 class Contestant(Protocol):
     """Who drives: a backend of ours or a solver of casadi."""
 
@@ -116,31 +119,37 @@ def drive(problem: Problem, ours: Sequence[str] = OURS, peers: tuple[str, ...] =
 
 def render(results: Mapping[Problem, Mapping[str, Drive]]) -> str:
     """A table and what it means."""
-    head = (
-        "closed loop", "solver", "median [ms]", "p99 [ms]", "iterations, median", "mean", "most", "failures",
-        "cost", "penetration [mm]", *(f"times {peer}" for peer in PEERS), "repeated [ms]", "times fatrop, repeated",
-    )  # fmt: skip
-    lines = []
-    for problem, loops in results.items():
 
-        def ratio(name: str, peer: str, times: str = "times", loops: Mapping[str, Drive] = loops) -> str:
-            if peer not in loops or name in (peer, *PEERS[:-1]):
+    def ratio(peer: str, of: str = "times") -> Callable[[Row], str]:
+        def told(row: Row) -> str:
+            problem, name, mine = row
+            other = results[problem].get(peer)
+            if other is None or name in (peer, *PEERS[:-1]):
                 return "-"
-            mine, other = (float(np.median(getattr(loops[who], times))) for who in (name, peer))
-            return f"{mine / other:.2f}"
+            return f"{np.median(getattr(mine, of)) / np.median(getattr(other, of)):.2f}"
 
-        for name, loop in loops.items():
-            failures = ", ".join(f"{count} {status}" for status, count in loop.failures.items())
-            depth = f"{1e3 * loop.penetration:.4f}" if np.isfinite(loop.penetration) else "-"
-            lines.append(
-                (
-                    problem.title, name, f"{np.median(loop.times):.3f}", f"{np.percentile(loop.times, 99):.3f}",
-                    f"{np.median(loop.iterations):.0f}", f"{np.mean(loop.iterations):.1f}",
-                    str(max(loop.iterations)), failures or "0", f"{loop.cost:.4f}", depth,
-                    *(ratio(name, peer) for peer in PEERS), f"{np.median(loop.repeated):.3f}",
-                    ratio(name, "fatrop", "repeated"),
-                )
-            )  # fmt: skip
+        return told
+
+    def of(told: Callable[[Drive], str]) -> Callable[[Row], str]:
+        return lambda row: told(row[2])
+
+    columns = {
+        "median [ms]": of(lambda drive: f"{np.median(drive.times):.3f}"),
+        "p99 [ms]": of(lambda drive: f"{np.percentile(drive.times, 99):.3f}"),
+        "iterations, median": of(lambda drive: f"{np.median(drive.iterations):.0f}"),
+        "mean": of(lambda drive: f"{np.mean(drive.iterations):.1f}"),
+        "most": of(lambda drive: str(max(drive.iterations))),
+        "failures": of(lambda drive: ", ".join(f"{n} {status}" for status, n in drive.failures.items()) or "0"),
+        "cost": of(lambda drive: f"{drive.cost:.4f}"),
+        "penetration [mm]": of(lambda drive: f"{1e3 * drive.penetration:.4f}".replace("-inf", "-")),
+        **{f"times {peer}": ratio(peer) for peer in PEERS},
+        "repeated [ms]": of(lambda drive: f"{np.median(drive.repeated):.3f}"),
+        "times fatrop, repeated": ratio("fatrop", "repeated"),
+    }
+    rows = {
+        (problem.title, name): (problem, name, drive)
+        for problem, drives in results.items() for name, drive in drives.items()
+    }  # fmt: skip
     notes = (
         f"{STEPS} steps, tolerance {TOLERANCE:.0e}, interleaved; the time is the processor time of the solve call, "
         "after a cold solve that is not counted. Warm start: values and multipliers moved by one stage, the last ones "
@@ -150,7 +159,7 @@ def render(results: Mapping[Problem, Mapping[str, Drive]]) -> str:
         "solve once more, at once; the first time the other solvers have just used the caches. One iteration: the "
         "solver is stopped after a single one in every step."
     )
-    return "\n\n".join([table(head, lines, text=2), notes])
+    return "\n\n".join([listing(["closed loop", "solver"], rows, columns), notes])
 
 
 def render_single(results: Mapping[Problem, Mapping[str, Drive]]) -> str:

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 import unifg as fg
 from benchmarks.casadi_peer import Staged, available
-from benchmarks.report import command, machine, publish, table
+from benchmarks.report import command, listing, machine, publish
 from problems import disc_fields, parkings
 from unifg.solvers import InteriorPoint
 
@@ -125,14 +125,16 @@ def parked(layouts: int, kind: parkings.Guess) -> Outcomes:
 
 def render(results: dict[str, Outcomes]) -> str:
     """One row for every study and solver."""
-    lines = []
-    for study, found in results.items():
-        for name, outcomes in found.items():
-            quartiles = np.percentile([iterations for _, iterations, _ in outcomes], [25, 50, 75, 100])
-            solved = sum(good for good, _, _ in outcomes)
-            lines.append((study, name, f"{solved} / {len(outcomes)}", *(f"{q:.0f}" for q in quartiles)))
-    head = ("guesses", "solver", "solved", "iterations, lower quartile", "median", "upper quartile", "most")
-    return table(head, lines, text=2) + "\n\n" + machine("numpy", "numba", "casadi")
+
+    def spent(percent: int) -> Callable[[list[Outcome]], str]:
+        return lambda outcomes: f"{np.percentile([iterations for _, iterations, _ in outcomes], percent):.0f}"
+
+    columns: dict[str, Callable[[list[Outcome]], str]] = {
+        "solved": lambda outcomes: f"{sum(good for good, _, _ in outcomes)} / {len(outcomes)}",
+        "iterations, lower quartile": spent(25), "median": spent(50), "upper quartile": spent(75), "most": spent(100),
+    }  # fmt: skip
+    groups = {(study, name): outcomes for study, found in results.items() for name, outcomes in found.items()}
+    return listing(["guesses", "solver"], groups, columns) + "\n\n" + machine("numpy", "numba", "casadi")
 
 
 def main(arguments: list[str] | None = None) -> int:

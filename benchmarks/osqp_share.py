@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.report import command, machine, publish, table
+from benchmarks.report import command, listing, machine, publish
 from counts import Count, counting
 from problems.control import Problem, blocked, problems, sixteen
 from unifg.scenarios.course import CourseSettings, run_course
@@ -64,18 +64,14 @@ def _starts() -> None:
 
 def render(counts: dict[str, Count]) -> str:
     """The table and what it says."""
-    rows = [
-        (
-            name,
-            f"{len(count.routes)}",
-            f"{100.0 * count.share:.0f} %" if count.routes else "-",
-            f"{np.median(count.asked):.0f} of {count.limits[0]}" if count.asked else "-",
-            f"{len(count.asked) - count.by('osqp')}",
-            f"{count.by('piqp')}",
-            f"{count.by('elastic')}",
-        )
-        for name, count in counts.items()
-    ]
+    columns: dict[str, Callable[[Count], str]] = {
+        "subproblems": lambda count: str(len(count.routes)),
+        "OSQP solved": lambda count: f"{100.0 * count.share:.0f} %" if count.routes else "-",
+        "its iterations": lambda count: f"{np.median(count.asked):.0f} of {count.limits[0]}" if count.asked else "-",
+        "it missed": lambda count: str(len(count.asked) - count.by("osqp")),
+        "PIQP solved": lambda count: str(count.by("piqp")),
+        "elastic": lambda count: str(count.by("elastic")),
+    }
     every = [route for count in counts.values() for route in count.routes]
     worst = sorted((count.share, name) for name, count in counts.items() if count.routes)[:3]
     losing = "; ".join(f"{name} ({100.0 * share:.0f} %)" for share, name in worst)
@@ -83,9 +79,7 @@ def render(counts: dict[str, Count]) -> str:
         [
             f"OSQP solved {every.count('osqp')} of {len(every)} subproblems, "
             f"{100.0 * every.count('osqp') / max(len(every), 1):.0f} %. Least: {losing}.",
-            table(
-                ("what", "subproblems", "OSQP solved", "its iterations", "it missed", "PIQP solved", "elastic"), rows
-            ),
+            listing(["what"], {(name,): count for name, count in counts.items()}, columns),
             "Its iterations: the median over all times it was asked, and its limit. The subproblems it missed are paid "
             "for twice.",
             machine("unifg", "osqp", "piqp"),

@@ -10,6 +10,7 @@ a hundred steps (:mod:`benchmarks.control_loops`). Writes docs/reference-problem
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,9 @@ from tqdm import tqdm
 
 from benchmarks import cold, control_loops
 from benchmarks.casadi_peer import available
-from benchmarks.cold import Column, Outcome, Results, Rules
+from benchmarks.cold import Outcome, Results, Rules, Told
 from benchmarks.report import command, machine, publish
-from problems.control import Problem, Unicycle, sixteen
+from problems.control import Unicycle, sixteen
 from unifg.solvers import SQP
 from unifg.solvers.names import backends
 
@@ -30,15 +31,15 @@ RULES = Rules(tolerance=1e-6, same=1e-5, good=1e-4, slow=2000.0, prepared=False,
 ALONE = "sqp, OSQP alone"  # needs no success for the exit code: it shows what the fallback is for
 
 
-def refine(problem: Problem, outcome: Outcome) -> str:
+def refine(outcome: Outcome) -> str:
     """Whether IPOPT stays at an answer that is in no list."""
-    if not available() or not outcome.good(RULES) or outcome.verdict(problem, RULES).startswith("listed"):
+    if not available() or not outcome.good(RULES) or outcome.verdict(RULES).startswith("listed"):
         return "-"
     from benchmarks.control_peers import ControlPeer
 
     # Its barrier begins small, or it would leave any answer at a limit.
     near: dict[str, Any] = {"bound_push": 1e-9, "bound_frac": 1e-9, "slack_bound_push": 1e-9, "slack_bound_frac": 1e-9}
-    peer = ControlPeer(problem, "ipopt", **near, mu_init=1e-8, tol=1e-9)
+    peer = ControlPeer(outcome.problem, "ipopt", **near, mu_init=1e-8, tol=1e-9)
     states = outcome.states.copy()
     states[:, 2] = np.unwrap(states[:, 2])
     peer.solve(states, outcome.controls)
@@ -50,23 +51,22 @@ def refine(problem: Problem, outcome: Outcome) -> str:
 def render(results: Results, loops: str, rounds: int) -> str:
     """The results as Markdown."""
 
-    def solved(problem: Problem, outcome: Outcome) -> bool:
-        known = min(abs(outcome.cost / optimum - 1.0) for optimum in problem.optima) < KNOWN
+    def solved(outcome: Outcome) -> bool:
+        known = min(abs(outcome.cost / optimum - 1.0) for optimum in outcome.problem.optima) < KNOWN
         return outcome.good(RULES) and (known or outcome.refined == "stays")
 
-    counted = {
-        "converged": lambda problem, outcome: outcome.status == "converged",
+    def route(of: str) -> Told:
+        return lambda outcome: str(outcome.routes[of]) if outcome.solver.startswith("sqp") else "---"
+
+    counted: dict[str, Callable[[Outcome], bool]] = {
+        "converged": lambda outcome: outcome.status == "converged",
         "solved": solved,
-        "listed optimum": lambda problem, outcome: outcome.verdict(problem, RULES) == "listed",
+        "listed optimum": lambda outcome: outcome.verdict(RULES) == "listed",
     }
-
-    def route(of: str) -> Column:
-        return lambda name, outcome: str(outcome.routes[of]) if name.startswith("sqp") else "---"
-
-    more: dict[str, Column] = {
-        "status": lambda name, outcome: outcome.status,
-        "IPOPT from there": lambda name, outcome: outcome.refined,
-        "KKT": lambda name, outcome: "-" if np.isnan(outcome.kkt) else f"{outcome.kkt:.0e}",
+    more: dict[str, Told] = {
+        "status": lambda outcome: outcome.status,
+        "IPOPT from there": lambda outcome: outcome.refined,
+        "KKT": lambda outcome: "-" if np.isnan(outcome.kkt) else f"{outcome.kkt:.0e}",
         "OSQP QPs": route("osqp"), "fallback QPs": route("piqp"), "elastic QPs": route("elastic"),
     }  # fmt: skip
     notes = (
@@ -96,9 +96,9 @@ def main(arguments: list[str] | None = None) -> int:
     results = {
         problem: cold.measure(problem, solvers, RULES, options.rounds) for problem in tqdm(sixteen(), unit="problem")
     }
-    for problem, outcomes in results.items():
+    for outcomes in results.values():
         for name in solvers:
-            outcomes[name].refined = refine(problem, outcomes[name])
+            outcomes[name].refined = refine(outcomes[name])
     loops = {}
     if not options.quick:
         cases = [Unicycle(instance, blocked, 50) for instance in ("straight", "behind") for blocked in (False, True)]
