@@ -10,8 +10,7 @@ the drive cycle that ships with unifg takes its place, and there is nothing to c
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -19,8 +18,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 import unifg as fg
-from benchmarks.report import OUT, command, machine, publish, shared, table
-from benchmarks.timing import interleave, number
+from benchmarks.report import OUT, command, listing, machine, publish, shared, table
+from benchmarks.timing import clock, interleave, number
 from problems.known import STARTS, Guess, ecg2o_inequality
 from problems.known import ecg2o as small
 from unifg.scenarios.velocity_tracking import TrackingSettings, state_problem
@@ -98,80 +97,93 @@ def steps(solver: fg.Solver, problem: Stated, multiplier: float | None = None) -
     return str(solution.iterations) if honest else f"{solution.iterations}†"
 
 
+def listed(values: Iterable[float]) -> dict[tuple[str], float]:
+    """Rows of a table by their numbers."""
+    return {(f"{value:g}",): value for value in values}
+
+
 def iterations_by_length() -> str:
     """Fig. 3: the paper's stop rule, then our own KKT test."""
-    rule = partial(KKT, full_steps=True, step_tolerance=STEP, tolerance=STRICT)
-    rows = []
-    for length in LENGTHS:
-        free = GaussNewton(line_search=False, step_tolerance=STEP, tolerance=STRICT)
-        linear, quadratic = drive(length, "linear"), drive(length)
-        rows.append(
-            [
-                str(length),
-                steps(free, drive(length, constrained=False)),
-                steps(rule(), linear),
-                steps(rule(), quadratic),
-                steps(literal(LITERAL, STEP, STRICT), quadratic),
-                steps(KKT(), quadratic),
-                steps(literal(LITERAL), quadratic),
-                *(steps(solver, quadratic) for solver in (AugmentedLagrangian(), SQP(), InteriorPoint())),
-                steps(Penalty(), quadratic),
-            ]
-        )
-    head = ["N", "costs alone", "KKT, linear drag", "KKT", "AL", "KKT", "AL, literal", "AL", "SQP", "IPM", "penalty"]
-    return table(head, rows, 0)
+    rule = KKT(full_steps=True, step_tolerance=STEP, tolerance=STRICT)
+    free = GaussNewton(line_search=False, step_tolerance=STEP, tolerance=STRICT)
+    ours: dict[str, fg.Solver] = {
+        "KKT": KKT(),
+        "AL, literal": literal(LITERAL),
+        "AL": AugmentedLagrangian(),
+        "SQP": SQP(),
+    }
+    ours |= {"IPM": InteriorPoint(), "penalty": Penalty()}
+
+    def of(solver: fg.Solver) -> Callable[[int], str]:
+        return lambda n: steps(solver, drive(n))
+
+    columns: dict[str, Callable[[int], str]] = {
+        "costs alone": lambda n: steps(free, drive(n, constrained=False)),
+        "KKT, linear drag, step rule": lambda n: steps(rule, drive(n, "linear")),
+        "KKT, step rule": of(rule),
+        "AL, step rule": of(literal(LITERAL, STEP, STRICT)),
+        **{name: of(solver) for name, solver in ours.items()},
+    }
+    return listing(["N"], {(str(n),): n for n in LENGTHS}, columns)
 
 
 def costs() -> str:
     """J of every backend against the reference."""
+    solvers = {"KKT": KKT(), "AL": AugmentedLagrangian(), "SQP": SQP(), "IPM": InteriorPoint(), "penalty": Penalty()}
+    cases = [(n, drag, None, j) for drag, known in COSTS.items() for n, j in zip(LENGTHS, known, strict=True)]
     rows = []
-    solvers = (KKT(), AugmentedLagrangian(), SQP(), InteriorPoint(), Penalty())
-    for drag, references in COSTS.items():
-        for length, reference in zip(LENGTHS, references, strict=True):
-            found = [2.0 * solver.solve(*drive(length, drag)).cost for solver in solvers]
-            rows.append([str(length), drag, "none", f"{found[0]:.6f}", *_against(reference, found)])
-    for (length, drag), reference in BOUNDED.items():
-        found = [2.0 * solver.solve(*drive(length, drag, BOUNDS)).cost for solver in solvers[1:]]
-        rows.append([str(length), drag, "-2000, 1500", f"{found[2]:.4f}", "-", *_against(reference, found)])
-    return table(["N", "drag", "bounds [N]", "J", "KKT", "AL", "SQP", "IPM", "penalty"], rows, 3)
+    for length, drag, bounds, reference in [*cases, *((n, drag, BOUNDS, j) for (n, drag), j in BOUNDED.items())]:
+        found = {  # KKT takes no bounds
+            name: 2.0 * solver.solve(*drive(length, drag, bounds)).cost
+            for name, solver in solvers.items() if bounds is None or name != "KKT"
+        }  # fmt: skip
+        shown = f"{found['KKT']:.6f}" if bounds is None else f"{found['IPM']:.4f}"
+        limits = "none" if bounds is None else ", ".join(f"{bound:g}" for bound in bounds)
+        apart = (f"{found[n] / reference - 1.0:.0e}" if profile() and n in found else "-" for n in solvers)
+        rows.append([str(length), drag, limits, shown, *apart])
+    return table(["N", "drag", "bounds [N]", "J", *solvers], rows, 3)
 
 
-def _against(reference: float, found: Iterable[float]) -> list[str]:
-    known = profile() is not None
-    return [f"{value / reference - 1.0:.0e}" if known else "-" for value in found]
+def against(
+    told: Callable[[fg.Solver, float | None], str],
+    multipliers: Iterable[float],
+    solvers: Mapping[str, fg.Solver],
+    penalties: Iterable[float],
+    loops: Mapping[str, Callable[[float], fg.Solver]],
+) -> str:
+    """Two tables of iterations: of solvers against the first multiplier, of loops against rho."""
+    by_multiplier = {name: partial(told, solver) for name, solver in solvers.items()}
+    by_penalty = {name: lambda rho, loop=loop: told(loop(rho), None) for name, loop in loops.items()}
+    first = listing(["first multiplier"], listed(multipliers), by_multiplier)
+    return first + "\n\n" + listing(["rho"], listed(penalties), by_penalty)
 
 
 def sensitivity() -> str:
-    """Iterations against the first multiplier, and against rho."""
-    rows = []
-    for value in MULTIPLIERS:
-        solvers = (KKT(), KKT(full_steps=True), AugmentedLagrangian(), literal(LITERAL))
-        rows.append([f"{value:g}", *(steps(solver, drive(385), value) for solver in solvers)])
-    first = table(["first multiplier", "KKT", "KKT, full steps", "AL", "AL, literal"], rows, 0)
-    rows = []
-    for rho in PENALTIES:
-        loops = (literal(rho), AugmentedLagrangian(penalty=rho, inner_iterations=1), AugmentedLagrangian(penalty=rho))
-        rows.append([f"{rho:g}", *(steps(loop, drive(385)) for loop in loops)])
-    return first + "\n\n" + table(["rho", "AL, literal", "AL, 1 inner step at most", "AL"], rows, 0)
+    """Iterations of the first study against the first multiplier, and against rho."""
+    solvers: dict[str, fg.Solver] = {"KKT": KKT(), "KKT, full steps": KKT(full_steps=True)}
+    solvers |= {"AL": AugmentedLagrangian(), "AL, literal": literal(LITERAL)}
+    loops = {
+        "AL, literal": literal,
+        "AL, 1 inner step at most": lambda rho: AugmentedLagrangian(penalty=rho, inner_iterations=1),
+        "AL": lambda rho: AugmentedLagrangian(penalty=rho),
+    }
+    return against(lambda solver, first: steps(solver, drive(385), first), MULTIPLIERS, solvers, PENALTIES, loops)
 
 
 def small_sensitivity() -> str:
     """The same for the second study: iterations from the six starts, one after the other."""
 
-    def told(solver: fg.Solver, multiplier: float | None = None) -> str:
+    def told(solver: fg.Solver, multiplier: float | None) -> str:
         return ", ".join(steps(solver, small(start), multiplier) for start in STARTS)
 
-    rows = []
-    for value in SMALL_MULTIPLIERS:
-        solvers = (KKT(), LEVENBERG, KKT(full_steps=True), AugmentedLagrangian(), damped(LITERAL_SMALL))
-        rows.append([f"{value:g}", *(told(solver, value) for solver in solvers)])
-    head = ["first multiplier", "KKT", "KKT, Levenberg", "KKT, full steps", "AL", "AL, damped loop"]
-    first = table(head, rows, 0)
-    rows = []
-    for rho in SMALL_PENALTIES:
-        solvers_of_rho = (literal(rho), damped(rho), AugmentedLagrangian(penalty=rho))
-        rows.append([f"{rho:g}", *(told(solver) for solver in solvers_of_rho)])
-    return first + "\n\n" + table(["rho", "AL, literal", "AL, damped loop", "AL"], rows, 0)
+    solvers: dict[str, fg.Solver] = {"KKT": KKT(), "KKT, Levenberg": LEVENBERG, "KKT, full steps": KKT(full_steps=True)}
+    solvers |= {"AL": AugmentedLagrangian(), "AL, damped loop": damped(LITERAL_SMALL)}
+    loops = {
+        "AL, literal": literal,
+        "AL, damped loop": damped,
+        "AL": lambda rho: AugmentedLagrangian(penalty=rho),
+    }
+    return against(told, SMALL_MULTIPLIERS, solvers, SMALL_PENALTIES, loops)
 
 
 def inner() -> str:
@@ -238,12 +250,7 @@ def times(solves: int) -> tuple[str, list[Result]]:
             run = solver.prepare(graph)
             taken[name] = run.solve(guess, check=True).iterations
 
-            def once(run: Any = run, guess: fg.Guess = guess) -> float:
-                begin = time.perf_counter()
-                run.solve(guess)
-                return time.perf_counter() - begin
-
-            candidates[name] = once
+            candidates[name] = partial(clock, partial(run.solve, guess))
         seconds = interleave(candidates, solves, warm=5)
         each = {name: 1e3 * float(seconds[name].mean()) / taken[name] for name in kinds}
         ratio = float(np.median(seconds["KKT, full steps"] / seconds["AL, literal"]))
