@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from functools import partial
+from typing import Any
 from unittest import mock
 
 import numpy as np
 
 import unifg as fg
-from benchmarks.report import table, words
-from benchmarks.timing import Stopwatch, interleave, milliseconds, number, shown
+from benchmarks.report import listing, words
+from benchmarks.section import Result, goal
+from benchmarks.timing import Split, interleave, milliseconds, number, shown, timed
 from problems.control import Unicycle
 from unifg.answers import solver
 from unifg.elimination import fronts, substitution
@@ -21,8 +22,6 @@ from unifg.program import passes
 from unifg.program.program import Program
 from unifg.solvers import AugmentedLagrangian, GaussNewton, augmented_step
 from unifg.typing import Array
-
-Result: TypeAlias = dict[str, Any]
 
 HORIZON = 50
 SOFT = 0.01  # sigma of soft dynamics [m, m, rad]
@@ -77,15 +76,15 @@ def measure(rounds: int, small: bool = False) -> Result:
     """All chains in one set of rounds; a round repeats each solve, the chains being short."""
     horizon, repeats = (4, 1) if small else (HORIZON, REPEATS)
     candidates: dict[str, Callable[[], float]] = {}
-    parts: dict[str, dict[str, list[float]]] = {}
+    splits: dict[str, Split] = {}
     rows: list[Result] = []
     for kind in CASES:
         backend, graph, guess = chain(kind, horizon)
         run = backend.prepare(graph)
         first = run.solve(guess)
-        parts[kind] = {part: [] for part in (*WATCHED, "Python")}
-        candidates[kind] = _plain(run, guess, first.iterations, repeats)
-        candidates[f"{kind}, split"] = _split(run, guess, first.iterations, repeats, parts[kind])
+        solves, count = partial(_repeat, run, guess, repeats), repeats * first.iterations
+        splits[kind] = Split(WATCHED, solves, count)
+        candidates |= {kind: timed(solves, count), f"{kind}, split": splits[kind]}
         rows.append(
             {
                 "kind": kind,
@@ -99,44 +98,15 @@ def measure(rounds: int, small: bool = False) -> Result:
         )
     times = interleave(candidates, rounds)
     for row in rows:
-        kind = row["kind"]
-        row["ms"] = milliseconds(times[kind])
-        row["parts"] = {part: milliseconds(np.array(values[-rounds:])) for part, values in parts[kind].items()}
-    goals = [
-        {"name": f"{CASES[row['kind']]}, N = {horizon}, iteration", "unit": "ms", "value": row["ms"],
-         "target": TARGET, "floor": None}
-        for row in rows
-    ]  # fmt: skip
+        row["ms"] = milliseconds(times[row["kind"]])
+        row["parts"] = splits[row["kind"]].milliseconds(rounds)
+    goals = [goal(f"{CASES[row['kind']]}, N = {horizon}, iteration", "ms", row["ms"], TARGET) for row in rows]
     return {"rows": rows, "rounds": rounds, "goals": goals}
 
 
-def _plain(run: fg.Prepared, guess: fg.Guess, iterations: int, repeats: int) -> Callable[[], float]:
-    def time_of_an_iteration() -> float:
-        begin = time.perf_counter()
-        for _ in range(repeats):
-            run.solve(guess)
-        return (time.perf_counter() - begin) / (repeats * iterations)
-
-    return time_of_an_iteration
-
-
-def _split(
-    run: fg.Prepared, guess: fg.Guess, iterations: int, repeats: int, parts: dict[str, list[float]]
-) -> Callable[[], float]:
-    watch = Stopwatch(WATCHED)
-
-    def time_of_an_iteration() -> float:
-        with watch:
-            begin = time.perf_counter()
-            for _ in range(repeats):
-                run.solve(guess)
-            elapsed = time.perf_counter() - begin
-        for part, seconds in watch.seconds.items():
-            parts[part].append(seconds / (repeats * iterations))
-        parts["Python"].append((elapsed - sum(watch.seconds.values())) / (repeats * iterations))
-        return elapsed / (repeats * iterations)
-
-    return time_of_an_iteration
+def _repeat(run: fg.Prepared, guess: fg.Guess, times: int) -> None:
+    for _ in range(times):
+        run.solve(guess)
 
 
 def eliminations(run: fg.Prepared, guess: fg.Guess) -> float:
@@ -179,40 +149,39 @@ def _compiled_parts(program: Program, guess: fg.Guess, repeats: int, rounds: int
     hessian = program.normal_entries(lin, weights)
     spare, none = hessian.copy(), np.full(program.size, 1e-6)
 
-    def eliminate() -> float:
-        begin = time.perf_counter()
-        _factor_often(factorization.plan, hessian, none, repeats)
-        return (time.perf_counter() - begin) / repeats
-
-    def assemble() -> float:
-        begin = time.perf_counter()
-        _assemble_often(program.arrays, lin.constraint_jacobian, weights, spare, repeats)
-        return (time.perf_counter() - begin) / repeats
-
-    times = interleave({"one elimination": eliminate, "one assembly": assemble}, rounds)
+    parts = {
+        "one elimination": partial(_factor_often, factorization.plan, hessian, none, repeats),
+        "one assembly": partial(_assemble_often, program.arrays, lin.constraint_jacobian, weights, spare, repeats),
+    }
+    times = interleave({name: timed(action, repeats) for name, action in parts.items()}, rounds)
     return {part: milliseconds(values) for part, values in times.items()}
+
+
+COLUMNS: dict[str, Callable[[Result], str]] = {
+    "unknowns": lambda row: str(row["unknowns"]),
+    "iterations": lambda row: f"{row['iterations']}, {row['status']}",
+    "iteration [ms]": lambda row: shown(row["ms"]),
+    "target": lambda row: f"{TARGET:g}",
+    "eliminations per iteration": lambda row: f"{row['eliminations']:.2f}",
+    "one elimination [us]": lambda row: number(1e3 * row["one elimination"][0]),
+    "one assembly of the constraints [us]": lambda row: number(1e3 * row["one assembly"][0]),
+}
 
 
 def render(result: Result) -> str:
     """Two tables."""
     rows = result["rows"]
-    head = (
-        "chain", "unknowns", "iterations", "iteration [ms]", "target", "eliminations per iteration",
-        "one elimination [us]", "one assembly of the constraints [us]",
-    )  # fmt: skip
-    lines = [
-        (
-            CASES[row["kind"]], str(row["unknowns"]), f"{row['iterations']}, {row['status']}", shown(row["ms"]),
-            f"{TARGET:g}", f"{row['eliminations']:.2f}", number(1e3 * row["one elimination"][0]),
-            number(1e3 * row["one assembly"][0]),
-        )
-        for row in rows
-    ]  # fmt: skip
-    names = list(rows[0]["parts"])
-    split = [(CASES[row["kind"]], *(number(1e3 * row["parts"][name][0]) for name in names)) for row in rows]
+    groups = {(CASES[row["kind"]],): row for row in rows}
+    split = {(CASES[row["kind"]],): row["parts"] for row in rows}
+    parts = {part: partial(_microseconds, part=part) for part in rows[0]["parts"]}
     notes = (
         f"Horizon {rows[0]['horizon']}, from the cold guess; an iteration is a solve over its iterations, {REPEATS} "
         "solves in a row. The primal step of the augmented Lagrangian is one compiled call with its assemblies, "
         "eliminations and products; how many eliminations it takes is counted in a run of its own."
     )
-    return "\n\n".join([table(head, lines), "Where an iteration goes [us]:", table(("chain", *names), split), notes])
+    tables = listing(("chain",), groups, COLUMNS), listing(("chain",), split, parts)
+    return "\n\n".join([tables[0], "Where an iteration goes [us]:", tables[1], notes])
+
+
+def _microseconds(parts: Result, part: str) -> str:
+    return number(1e3 * parts[part][0])

@@ -10,38 +10,20 @@ something is slower than its floor.
 
 from __future__ import annotations
 
-import argparse
 import datetime
 import json
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
 
 from benchmarks import chains, growth, gtsam_peer, marginals, own_residuals, pose_graphs
-from benchmarks.report import CHECKOUT, OUT, code_digest, machine, put_results, table
+from benchmarks.report import CHECKOUT, code_digest, command, listing, machine, publish
+from benchmarks.section import Result, Section, met
 from benchmarks.timing import number, pin, shown
 
-Result: TypeAlias = dict[str, Any]
-
-PAGE, STORE = CHECKOUT / "docs" / "benchmarks.md", CHECKOUT / "docs" / "benchmarks.json"
+STORE = CHECKOUT / "docs" / "benchmarks.json"
 ENOUGH = 15  # rounds that a published median is made of
 PACKAGES = ("unifg", "numpy", "scipy", "numba", "gtsam")
-
-
-class Section(NamedTuple):
-    """One part of the page.
-
-    Attributes:
-        title: its heading.
-        measure: (rounds, small) to a result that JSON can hold, with ``goals``.
-        render: result to Markdown.
-    """
-
-    title: str
-    measure: Callable[[int, bool], Result]
-    render: Callable[[Result], str]
-
 
 SECTIONS = {
     "pose-graphs": Section("Pose graphs", pose_graphs.measure, pose_graphs.render),
@@ -79,35 +61,23 @@ def record(store: Result, name: str, result: Result, seconds: float, code: str) 
     }
 
 
-def met(goal: Result, bound: str = "target") -> bool:
-    """Whether a goal's median reaches its target or floor."""
-    if goal[bound] is None:
-        return True
-    value = goal["value"][0]
-    return bool(value >= goal[bound] if goal["unit"].startswith("times faster") else value <= goal[bound])
+GOAL: dict[str, Callable[[Result], str]] = {
+    "median (quartiles)": lambda goal: _value(goal["value"]),
+    "target": lambda goal: _value(goal["target"]) + ("" if goal["floor"] is None else f" (floor {goal['floor']:g})"),
+    "met": lambda goal: (
+        "yes" if met(goal) else "floor only" if goal["floor"] is not None and met(goal, "floor") else "no"
+    ),
+    "previous run": lambda goal: "-" if goal["old"] is None else _value(goal["old"]),
+}
 
 
 def summary(store: Result) -> str:
     """All goals, with the run before."""
-    lines = []
-    for name in SECTIONS:
-        if name not in store:
-            continue
-        previous = store[name]["previous"]
-        for goal in store[name]["result"]["goals"]:
-            old = previous["goals"].get(goal["name"]) if previous else None
-            lines.append(
-                (
-                    goal["name"],
-                    goal["unit"],
-                    _value(goal["value"]),
-                    _value(goal["target"]) + ("" if goal["floor"] is None else f" (floor {goal['floor']:g})"),
-                    "yes" if met(goal) else "floor only" if goal["floor"] is not None and met(goal, "floor") else "no",
-                    "-" if old is None else _value(old),
-                )
-            )
-    head = ("what", "unit", "median (quartiles)", "target", "met", "previous run")
-    return table(head, lines, text=2)
+    groups: dict[tuple[str, str], Result] = {}
+    for section in (store[name] for name in SECTIONS if name in store):
+        old = section["previous"]["goals"] if section["previous"] else {}
+        groups |= {(g["name"], g["unit"]): {**g, "old": old.get(g["name"])} for g in section["result"]["goals"]}
+    return listing(("what", "unit"), groups, GOAL)
 
 
 def _value(value: float | list[float]) -> str:
@@ -129,23 +99,18 @@ def render(store: Result) -> str:
 
 def _runs(store: Result) -> str:
     """When, where and on which code."""
-    lines = []
-    for name, section in SECTIONS.items():
-        if name in store:
-            run, previous = store[name], store[name]["previous"]
-            before = "-" if previous is None else f"{previous['date']}, {previous['code']}"
-            lines.append(
-                (
-                    section.title,
-                    f"{run['date']}, {run['code']}",
-                    before,
-                    str(run["result"]["rounds"]),
-                    str(run["seconds"]),
-                )
-            )
-    places = dict.fromkeys(store[name]["machine"] for name in SECTIONS if name in store)
-    head = ("section", "date and code", "previous run", "rounds", "took [s]")
-    return "\n\n".join([table(head, lines, text=3), *places])
+
+    def when(run: Result | None) -> str:
+        return "-" if run is None else f"{run['date']}, {run['code']}"
+
+    runs = {name: run for name, run in store.items() if name in SECTIONS}
+    groups = {(SECTIONS[n].title, when(runs[n]), when(runs[n]["previous"])): runs[n] for n in SECTIONS if n in runs}
+    columns: dict[str, Callable[[Result], str]] = {
+        "rounds": lambda run: str(run["result"]["rounds"]),
+        "took [s]": lambda run: str(run["seconds"]),
+    }
+    told = listing(("section", "date and code", "previous run"), groups, columns)
+    return "\n\n".join([told, *dict.fromkeys(run["machine"] for run in groups.values())])
 
 
 def load(path: Path) -> Result:
@@ -156,7 +121,7 @@ def load(path: Path) -> Result:
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure and write; 0 only if every floor is reached."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.elimination", description=__doc__.split("\n")[0])
+    parser = command(__doc__)
     parser.add_argument("--only", nargs="+", choices=SECTIONS, metavar="SECTION", help=", ".join(SECTIONS))
     parser.add_argument("--rounds", type=int, default=ENOUGH, help="of everything; fewer than 15 are only printed")
     options = parser.parse_args(arguments)
@@ -172,13 +137,11 @@ def main(arguments: list[str] | None = None) -> int:
         result = SECTIONS[name].measure(options.rounds, False)
         record(store, name, result, time.perf_counter() - begin, code)
         goals += result["goals"]
-    print(render({name: store[name] for name in chosen}))
     if options.rounds >= ENOUGH and gtsam_peer.available():
-        text = json.dumps({"sections": store}, indent=1)
-        STORE.write_text(text + "\n", encoding="utf-8", newline="\n")
-        OUT.mkdir(parents=True, exist_ok=True)
-        (OUT / "elimination.md").write_text(render(store) + "\n", encoding="utf-8", newline="\n")
-        put_results(PAGE, "Benchmarks", render(store), {section["code"] for section in store.values()})
+        STORE.write_text(json.dumps({"sections": store}, indent=1) + "\n", encoding="utf-8", newline="\n")
+        publish("benchmarks", render(store), {section["code"] for section in store.values()})
+    else:
+        publish("benchmarks", render({name: store[name] for name in chosen}), docs=False)
     return 0 if all(met(goal, "floor") for goal in goals) else 1
 
 

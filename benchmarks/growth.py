@@ -16,18 +16,16 @@ import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeAlias
 
 import numpy as np
 
 from benchmarks.gtsam_peer import ORDERINGS, Peer, available
 from benchmarks.report import CHECKOUT, table
+from benchmarks.section import Result, goal
 from benchmarks.timing import clock, interleave, milliseconds, number, shown, spread
 from unifg.elimination.factorization import Factorization
 from unifg.pose_graphs import PoseGraph, manhattan
 from unifg.solvers import GaussNewton
-
-Result: TypeAlias = dict[str, Any]
 
 SIZES = (1000, 3000, 10000, 30000, 100000)
 PEER_UP_TO = 10000  # poses
@@ -46,18 +44,16 @@ def measure(rounds: int, small: bool = False) -> Result:
     """All sizes."""
     sizes = (40, 80) if small else SIZES
     rows = [measure_size(size, rounds, small) for size in sizes]
-    exponents = {
-        what: float(np.polyfit(np.log([row["poses"] for row in rows]), np.log([row[what][0] for row in rows]), 1)[0])
-        for what in ("ours", "compile", "analyse")
-    }
-    exponents["factor"] = float(
-        np.polyfit(np.log([row["poses"] for row in rows]), np.log([row["factor"] for row in rows]), 1)[0]
-    )
-    goals = [
-        {"name": f"{sizes[0]} to {sizes[-1]} poses, iteration", "unit": "growth exponent",
-         "value": [exponents["ours"]] * 3, "target": LINEAR, "floor": None}
-    ]  # fmt: skip
+    poses, what = [row["poses"] for row in rows], ("ours", "compile", "analyse", "factor")
+    exponents = {name: growth(poses, [np.ravel(row[name])[0] for row in rows]) for name in what}
+    name = f"{sizes[0]} to {sizes[-1]} poses, iteration"
+    goals = [goal(name, "growth exponent", [exponents["ours"]] * 3, LINEAR)]
     return {"rows": rows, "exponents": exponents, "rounds": rounds, "goals": goals}
+
+
+def growth(sizes: list[int], values: list[float]) -> float:
+    """Exponent of the power of the size that fits best."""
+    return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
 
 
 def measure_size(poses: int, rounds: int, small: bool) -> Result:
@@ -145,21 +141,24 @@ def _elsewhere(poses: int) -> Result:
     return found
 
 
+COLUMNS: dict[str, Callable[[Result], str]] = {
+    "poses": lambda row: str(row["poses"]),
+    "edges": lambda row: str(row["edges"]),
+    "iteration [ms]": lambda row: shown(row["ours"]),
+    "us per pose": lambda row: number(1e3 * row["ours"][0] / row["poses"]),
+    "GTSAM [ms]": lambda row: f"{shown(row['gtsam'])}, {row['ordering']}" if row["gtsam"] else "-",
+    "times faster": lambda row: shown(row.get("ratio")),
+    "compiling [ms]": lambda row: number(row["compile"][0]),
+    "ordering and symbolic [ms]": lambda row: number(row["analyse"][0]),
+    "factor [MB]": lambda row: number(row["factor"] / 1e6),
+    "peak, NumPy [MB]": lambda row: number(row["traced"] / 1e6),
+    "growth of the process [MB]": lambda row: number(row["resident"] / 1e6) if row["resident"] else "-",
+}
+
+
 def render(result: Result) -> str:
     """A table and the exponents."""
-    head = (
-        "poses", "edges", "iteration [ms]", "us per pose", "GTSAM [ms]", "times faster", "compiling [ms]",
-        "ordering and symbolic [ms]", "factor [MB]", "peak, NumPy [MB]", "growth of the process [MB]",
-    )  # fmt: skip
-    lines = [
-        (
-            str(row["poses"]), str(row["edges"]), shown(row["ours"]), number(1e3 * row["ours"][0] / row["poses"]),
-            f"{shown(row['gtsam'])}, {row['ordering']}" if row["gtsam"] else "-", shown(row.get("ratio")),
-            number(row["compile"][0]), number(row["analyse"][0]), number(row["factor"] / 1e6),
-            number(row["traced"] / 1e6), number(row["resident"] / 1e6) if row["resident"] else "-",
-        )
-        for row in result["rows"]
-    ]  # fmt: skip
+    lines = [[tell(row) for tell in COLUMNS.values()] for row in result["rows"]]
     powers = result["exponents"]
     text = (
         f"Growth exponents, fitted over all sizes: iteration {powers['ours']:.2f}, compiling {powers['compile']:.2f}, "
@@ -168,7 +167,7 @@ def render(result: Result) -> str:
         "its own: the peak of NumPy's arrays and Python's objects (tracemalloc), and what the resident set has grown "
         f"by when graph, solver and solution are kept. Structure of more than {PEER_UP_TO} poses: {FEW} rounds."
     )
-    return "\n\n".join([table(head, lines, text=0), text])
+    return "\n\n".join([table(list(COLUMNS), lines, text=0), text])
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""Smoothing pose by pose, beside GTSAM's iSAM2 and its fixed-lag smoothers: `python -m benchmarks.incremental`.
+"""Smoothing pose by pose, beside GTSAM's iSAM2 and its fixed-lag smoothers.
+
+    python -m benchmarks.incremental [--poses K] [--rounds R]
 
 M3500 (or the graph named) is fed one pose at a time, with the edges that end at it; the new pose starts where the
 estimate and the odometry put it. Only ``update`` is timed, on both sides, and stating the factors apart from it.
@@ -8,27 +10,25 @@ makes things slower.
 
 from __future__ import annotations
 
-import argparse
 import gc
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 import unifg as fg
 from benchmarks.gtsam_peer import available
-from benchmarks.pose_graphs import data_folder
-from benchmarks.report import CHECKOUT, machine, put_results, table
-from benchmarks.timing import pin
+from benchmarks.report import command, listing, machine, publish, shared
+from benchmarks.timing import interleave, pin
 from unifg.files.g2o import read_g2o
 from unifg.pose_graphs import PoseGraph, manhattan
 from unifg.pose_graphs.pose_graph import Edges
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
 
-PAGE = CHECKOUT / "docs" / "smoothing.md"
+POSES = 3500
 SPAN = 50  # poses over which drift is measured
 
 
@@ -46,12 +46,75 @@ class Run(NamedTuple):
     quality: float
 
 
-class Candidate(NamedTuple):
-    """A smoother to drive: what it is, and the drive itself."""
+class Fed(NamedTuple):
+    """A smoother that is fed one pose at a time.
 
-    name: str
-    setting: str
-    drive: Callable[[], Run]
+    Attributes:
+        state: states pose k, given its odometry (of the first its value), and the edges that end at it.
+        update: takes in what was stated.
+        poses: (2, 3) estimates of two poses.
+        cost: 1/2 chi2 of everything stated.
+    """
+
+    state: Callable[[int, Array, Edges], None]
+    update: Callable[[], None]
+    poses: Callable[[int, int], Array]
+    cost: Callable[[], float]
+
+
+def fed(smoother: Any) -> Fed:
+    """`Incremental` or `FixedLag`."""
+    x = smoother.variables("x", fg.SE2)
+    guess: Array = np.zeros(3)
+
+    def state(k: int, pose: Array, edges: Edges) -> None:
+        nonlocal guess
+        if k == 0:
+            smoother.minimize(fg.prior, x[0], pose, sigma=1e-3)
+        for i, j, measured, information in zip(*_fields(edges), strict=True):
+            smoother.minimize(fg.between, x[i], x[j], measured, information=information)
+        guess = pose if k == 0 else fg.SE2.compose(smoother.estimate(x[-1])[0], pose)
+
+    def update() -> None:
+        smoother.update({x: guess})
+
+    return Fed(state, update, lambda *ends: np.asarray(smoother.estimate(x[[*ends]])), lambda: float(smoother.cost))
+
+
+def fed_gtsam(smoother: Any, isam: bool) -> Fed:
+    """GTSAM's; its fixed-lag smoothers want a time for each pose, and do not tell the estimate of one alone."""
+    import gtsam
+
+    everything: list[Any] = []
+    stated: tuple[Any, ...] = ()
+
+    def state(k: int, pose: Array, edges: Edges) -> None:
+        nonlocal stated
+        factors, values, start = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.Pose2(*pose)
+        if k == 0:
+            factors.add(gtsam.PriorFactorPose2(0, start, gtsam.noiseModel.Isotropic.Sigma(3, 1e-3)))
+        for i, j, measured, information in zip(*_fields(edges), strict=True):
+            noise = gtsam.noiseModel.Gaussian.Information(information)
+            factors.add(gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(*measured), noise))
+        if k > 0:
+            last = smoother.calculateEstimatePose2(k - 1) if isam else smoother.calculateEstimate().atPose2(k - 1)
+            start = last.compose(start)
+        values.insert(k, start)
+        everything.append(factors)
+        stated = (factors, values) if isam else (factors, values, {k: float(k)})
+
+    def update() -> None:
+        smoother.update(*stated)
+
+    def poses(first: int, last: int) -> Array:
+        found = smoother.calculateEstimate()
+        return np.array([[pose.x(), pose.y(), pose.theta()] for pose in map(found.atPose2, (first, last))])
+
+    def cost() -> float:
+        best = smoother.calculateBestEstimate()
+        return float(sum(factors.error(best) for factors in everything))
+
+    return Fed(state, update, poses, cost)
 
 
 def one_by_one(graph: PoseGraph, lag: float = np.inf) -> Iterator[tuple[int, Array, Edges]]:
@@ -66,67 +129,21 @@ def one_by_one(graph: PoseGraph, lag: float = np.inf) -> Iterator[tuple[int, Arr
         yield k, graph.poses[0] if k == 0 else odometry[0], edges
 
 
-def clock() -> float:
-    """Processor time of this process [s]: waiting for a busy machine does not count."""
-    return time.process_time()
-
-
-def drive(graph: PoseGraph, smoother: Any, lag: float, optimum: Array | None) -> Run:
-    """Feed our smoother."""
-    x = smoother.variables("x", fg.SE2)
-    count = len(graph.poses)
+def drive(graph: PoseGraph, make: Callable[[], Fed], lag: float, optimum: Array | None) -> Run:
+    """Feed a smoother; times are the processor's: waiting for a busy machine does not count."""
+    smoother, count = make(), len(graph.poses)
     update, state, errors = np.zeros(count), np.zeros(count), []
     for k, pose, edges in one_by_one(graph, lag):
-        start = clock()
-        if k == 0:
-            smoother.minimize(fg.prior, x[0], pose, sigma=1e-3)
-        for i, j, measured, information in zip(*_fields(edges), strict=True):
-            smoother.minimize(fg.between, x[i], x[j], measured, information=information)
-        guess = pose if k == 0 else fg.SE2.compose(smoother.estimate(x[-1])[0], pose)
-        begin = clock()
-        smoother.update({x: guess})
-        end = clock()
-        update[k], state[k] = end - begin, begin - start
+        start = time.process_time()
+        smoother.state(k, pose, edges)
+        begin = time.process_time()
+        smoother.update()
+        update[k], state[k] = time.process_time() - begin, begin - start
         if optimum is not None and k % SPAN == SPAN - 1:
             first = k - int(min(SPAN, lag)) + 2  # GTSAM has dropped the one before
-            errors.append(_error(optimum, first, k, *smoother.estimate(x[[first, k]])))
-    quality = smoother.cost if optimum is None else float(np.sqrt(np.mean(np.square(errors))))
+            errors.append(_error(optimum, first, k, *smoother.poses(first, k)))
+    quality = smoother.cost() if optimum is None else float(np.sqrt(np.mean(np.square(errors))))
     return Run(update, state, quality)
-
-
-def drive_gtsam(graph: PoseGraph, make: Callable[[], Any], lag: float, optimum: Array | None) -> Run:
-    """Feed GTSAM's."""
-    import gtsam
-
-    smoother, everything = make(), gtsam.NonlinearFactorGraph()
-    count = len(graph.poses)
-    update, state, errors = np.zeros(count), np.zeros(count), []
-    last, isam = gtsam.Pose2(), np.isinf(lag)
-    for k, pose, edges in one_by_one(graph, lag):
-        start = clock()
-        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        if k == 0:
-            factors.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*pose), gtsam.noiseModel.Isotropic.Sigma(3, 1e-3)))
-        for i, j, measured, information in zip(*_fields(edges), strict=True):
-            noise = gtsam.noiseModel.Gaussian.Information(information)
-            factors.add(gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(*measured), noise))
-        if k > 0:
-            estimate = smoother.calculateEstimatePose2(k - 1) if isam else smoother.calculateEstimate().atPose2(k - 1)
-            last = estimate.compose(gtsam.Pose2(*pose))
-        values.insert(k, last if k else gtsam.Pose2(*pose))
-        arguments = (factors, values) if isam else (factors, values, {k: float(k)})
-        begin = clock()
-        smoother.update(*arguments)
-        end = clock()
-        update[k], state[k] = end - begin, begin - start
-        everything.push_back(factors)
-        if optimum is not None and k % SPAN == SPAN - 1:
-            first, estimates = k - int(min(SPAN, lag)) + 2, smoother.calculateEstimate()
-            ends = [estimates.atPose2(i) for i in (first, k)]
-            errors.append(_error(optimum, first, k, *(np.array([p.x(), p.y(), p.theta()]) for p in ends)))
-    if optimum is None:
-        return Run(update, state, everything.error(smoother.calculateBestEstimate()))
-    return Run(update, state, float(np.sqrt(np.mean(np.square(errors)))))
 
 
 def _fields(edges: Edges) -> tuple[list[int], list[int], Array, Array]:
@@ -139,119 +156,116 @@ def _error(optimum: Array, i: int, k: int, first: Array, last: Array) -> float:
     return float(np.linalg.norm((truth - found)[:2]))
 
 
+Candidates = dict[tuple[str, str], Callable[[], Run]]
+"""Drives to be timed, by smoother and setting."""
+
+
+def incremental(graph: PoseGraph, peer: bool) -> Candidates:
+    """Smoothers of the whole history."""
+
+    def ours(threshold: float, every: int) -> Fed:
+        return fed(fg.Incremental(relinearize=threshold, every=every))
+
+    def theirs(threshold: float, every: int) -> Fed:
+        import gtsam
+
+        parameters = gtsam.ISAM2Params()
+        parameters.setRelinearizeThreshold(threshold)
+        parameters.relinearizeSkip = every
+        return fed_gtsam(gtsam.ISAM2(parameters), isam=True)
+
+    makers = {"`Incremental`": ours} | ({"iSAM2": theirs} if peer else {})
+    return {
+        (name, f"{threshold:g}, {every}"): partial(drive, graph, partial(make, threshold, every), np.inf, None)
+        for threshold, every in ((0.1, 10), (0.1, 1), (0.01, 1))
+        for name, make in makers.items()
+    }
+
+
+def fixed_lag(graph: PoseGraph, optimum: Array, peer: bool) -> Candidates:
+    """Smoothers of a window."""
+
+    def theirs(lag: int, name: str) -> Fed:
+        import gtsam
+
+        return fed_gtsam(getattr(gtsam, name)(float(lag)), isam=False)
+
+    makers: dict[str, Callable[[int], Fed]] = {
+        "`FixedLag`": lambda lag: fed(fg.FixedLag(lag)),
+        "`FixedLag`, all relinearised": lambda lag: fed(fg.FixedLag(lag, relinearize=0.0, wildfire=0.0)),
+    }
+    for name in ("IncrementalFixedLagSmoother", "BatchFixedLagSmoother") if peer else ():
+        makers[name] = partial(theirs, name=name)
+    return {
+        (name, str(lag)): partial(drive, graph, partial(make, lag), lag, optimum)
+        for lag in (10, 50, 200)
+        for name, make in makers.items()
+    }
+
+
+def told(candidates: Candidates, rounds: int, setting: str, quality: str) -> str:
+    """A table: each candidate's update times, fastest of the rounds, and its quality."""
+    runs: dict[tuple[str, str], list[Run]] = {name: [] for name in candidates}
+
+    def once(name: tuple[str, str]) -> float:
+        gc.collect()
+        gc.disable()
+        runs[name].append(candidates[name]())
+        gc.enable()
+        return float(runs[name][-1].update.sum())
+
+    interleave({", ".join(name): partial(once, name) for name in candidates}, rounds, warm=0)
+    groups = {
+        name: (
+            1e3 * np.min([run.update for run in done], axis=0),
+            1e3 * float(np.median(np.min([run.state for run in done], axis=0))),
+            done[0].quality,
+        )
+        for name, done in runs.items()
+    }
+    columns: dict[str, Callable[[tuple[Array, float, float]], str]] = {
+        "median [ms]": lambda found: f"{np.median(found[0]):.3f}",
+        "mean [ms]": lambda found: f"{np.mean(found[0]):.3f}",
+        "95 % [ms]": lambda found: f"{np.percentile(found[0], 95):.3f}",
+        "99 % [ms]": lambda found: f"{np.percentile(found[0], 99):.3f}",
+        "largest [ms]": lambda found: f"{np.max(found[0][1:]):.3f}",
+        "stating, median [ms]": lambda found: f"{found[1]:.3f}",
+        quality: lambda found: f"{found[2]:.6g}",
+    }
+    return listing(("smoother", setting), groups, columns)
+
+
 def first_poses(graph: PoseGraph, count: int) -> PoseGraph:
     """The beginning of a drive."""
     inside = np.maximum(graph.edges.first, graph.edges.second) < count
     return PoseGraph(graph.ids[:count], graph.poses[:count], graph.edges[inside])
 
 
-def incremental(graph: PoseGraph, peer: bool) -> list[Candidate]:
-    """Smoothers of the whole history."""
-    result = []
-    for threshold, every in ((0.1, 10), (0.1, 1), (0.01, 1)):
-        setting = f"{threshold:g}, {every}"
-
-        def ours(threshold: float = threshold, every: int = every) -> Run:
-            return drive(graph, fg.Incremental(relinearize=threshold, every=every), np.inf, None)
-
-        def theirs(threshold: float = threshold, every: int = every) -> Run:
-            import gtsam
-
-            parameters = gtsam.ISAM2Params()
-            parameters.setRelinearizeThreshold(threshold)
-            parameters.relinearizeSkip = every
-            return drive_gtsam(graph, lambda: gtsam.ISAM2(parameters), np.inf, None)
-
-        result.append(Candidate("`Incremental`", setting, ours))
-        if peer:
-            result.append(Candidate("iSAM2", setting, theirs))
-    return result
-
-
-def fixed_lag(graph: PoseGraph, optimum: Array, peer: bool) -> list[Candidate]:
-    """Smoothers of a window."""
-    result = []
-    for lag in (10, 50, 200):
-
-        def ours(lag: int = lag) -> Run:
-            return drive(graph, fg.FixedLag(lag), lag, optimum)
-
-        def always(lag: int = lag) -> Run:
-            return drive(graph, fg.FixedLag(lag, relinearize=0.0, wildfire=0.0), lag, optimum)
-
-        result.append(Candidate("`FixedLag`", str(lag), ours))
-        result.append(Candidate("`FixedLag`, all relinearised", str(lag), always))
-        for name in ("IncrementalFixedLagSmoother", "BatchFixedLagSmoother") if peer else ():
-
-            def theirs(name: str = name, lag: int = lag) -> Run:
-                import gtsam
-
-                return drive_gtsam(graph, lambda: getattr(gtsam, name)(float(lag)), lag, optimum)
-
-            result.append(Candidate(name, str(lag), theirs))
-    return result
-
-
-def measured(candidates: list[Candidate], rounds: int) -> list[list[str]]:
-    """Rows of a table: each candidate's update times, fastest of the rounds, and its quality."""
-    runs: list[list[Run]] = [[] for _ in candidates]
-    for _ in range(rounds):
-        for candidate, done in zip(candidates, runs, strict=True):
-            gc.collect()
-            gc.disable()
-            done.append(candidate.drive())
-            gc.enable()
-    rows = []
-    for candidate, done in zip(candidates, runs, strict=True):
-        update = 1e3 * np.min([run.update for run in done], axis=0)
-        state = 1e3 * np.min([run.state for run in done], axis=0)
-        numbers = [np.median(update), np.mean(update), *np.percentile(update, [95, 99]), np.max(update[1:])]
-        rows.append(
-            [
-                candidate.name,
-                candidate.setting,
-                *(f"{number:.3f}" for number in numbers),
-                f"{np.median(state):.3f}",
-                f"{done[0].quality:.6g}",
-            ]
-        )
-    return rows
-
-
-def main() -> None:
+def main(arguments: list[str] | None = None) -> int:
     """Drive all, and put the tables into the documentation."""
-    parser = argparse.ArgumentParser(description="Smoothing pose by pose, beside GTSAM.")
-    parser.add_argument("--poses", type=int, default=3500, help="how many of the graph's poses")
+    parser = command(__doc__)
+    parser.add_argument("--poses", type=int, default=POSES, help="of the graph; with fewer the page is left alone")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--page", type=Path, default=PAGE)
-    arguments = parser.parse_args()
+    options = parser.parse_args(arguments)
     pin()
-    folder = data_folder()
-    whole = manhattan(arguments.poses).pose_graph if folder is None else read_g2o(folder / "M3500.g2o.gz")
-    graph = first_poses(whole, arguments.poses)
+    folder, peer = shared("pose_graphs"), available()
+    whole = manhattan(options.poses).pose_graph if folder is None else read_g2o(folder / "M3500.g2o.gz")
+    graph, little = first_poses(whole, options.poses), first_poses(whole, 60)
     stated, x, guess = graph.graph()
     optimum = GaussNewton().solve(stated, guess)
-    peer = available()
-    for candidate in incremental(first_poses(graph, 60), False) + fixed_lag(first_poses(graph, 60), graph.poses, False):
-        candidate.drive()  # compiles
-    head = ["median [ms]", "mean [ms]", "95 % [ms]", "99 % [ms]", "largest [ms]", "stating, median [ms]"]
+    for compiles in (incremental(little, False) | fixed_lag(little, little.poses, False)).values():
+        compiles()
+    windows = fixed_lag(graph, optimum[x], peer)
     text = [
         f"{'M3500' if folder else 'A generated grid'}, {len(graph.poses)} poses, {len(graph.edges)} edges; "
-        f"{arguments.rounds} rounds. {machine('numpy', 'numba', 'gtsam')}",
-        table(
-            ["smoother", "relinearise, every", *head, "1/2 chi2 at the end"],
-            measured(incremental(graph, peer), arguments.rounds),
-            2,
-        ),
+        f"{options.rounds} rounds. {machine('numpy', 'numba', 'gtsam')}",
+        told(incremental(graph, peer), options.rounds, "relinearise, every", "1/2 chi2 at the end"),
         f"The batch optimum is {optimum.cost:.6g}; GTSAM's value is that of its complete back-substitution.",
-        table(
-            ["smoother", "lag", *head, "error of a relative position [m]"],
-            measured(fixed_lag(graph, optimum[x], peer), arguments.rounds),
-            2,
-        ),
+        told(windows, options.rounds, "lag", "error of a relative position [m]"),
     ]
-    put_results(arguments.page, "Smoothing while driving", "\n\n".join(text))
+    publish("smoothing", "\n\n".join(text), docs=options.poses >= POSES)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

@@ -8,21 +8,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 import unifg as fg
 from benchmarks import pose_graphs
 from benchmarks.gtsam_peer import ANCHOR, Peer, available, joint
-from benchmarks.report import table
+from benchmarks.report import listing
+from benchmarks.section import Result, goal
 from benchmarks.timing import interleave, milliseconds, shown, spread
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.solvers import GaussNewton
 from unifg.typing import Array, IntArray
-
-Result: TypeAlias = dict[str, Any]
 
 PAIRS = 10  # joint covariances of two poses
 FEW = 5  # rounds at most
@@ -36,8 +35,8 @@ def measure(rounds: int, small: bool = False) -> Result:
     few = min(rounds, FEW)
     rows = [measure_case(case, few) for case in pose_graphs.cases(small)]
     goals = [
-        {"name": f"{row['name']}, marginal covariances", "unit": "relative difference from GTSAM",
-         "value": [max(row["difference"], row["joint difference"])] * 3, "target": TARGET, "floor": None}
+        goal(f"{row['name']}, marginal covariances", "relative difference from GTSAM",
+             [max(row["difference"], row["joint difference"])] * 3, TARGET)
         for row in rows if row["difference"] is not None
     ]  # fmt: skip
     return {"rows": rows, "rounds": few, "goals": goals}
@@ -106,8 +105,7 @@ def _compared(
         blocks["own"] = np.array([marginals.marginalCovariance(k) for k in range(count)])
         return time.perf_counter() - begin
 
-    few = rounds if theirs() < SLOW else 1
-    times = interleave({"all": every, "gtsam": theirs}, few, warm=0)
+    times = interleave({"all": every, "gtsam": theirs}, rounds, warm=0, slow=SLOW)
     derivatives = lin.jacobian[: edges * 2 * dim * dim].reshape(edges, dim, 2 * dim)
     marginals = peer.marginals_of(derivatives, lin.jacobian[edges * 2 * dim * dim :].reshape(dim, dim))
     chosen = np.arange(0, count, max(1, count // SAMPLE))
@@ -115,7 +113,7 @@ def _compared(
     both = np.array([joint(marginals, first, second) for first, second in pairs.tolist()])
     return {
         "gtsam": milliseconds(times["gtsam"]),
-        "ratio": spread(times["gtsam"] / times["all"]),
+        "ratio": spread(times["gtsam"] / times["all"][: len(times["gtsam"])]),
         "difference": _largest(found["blocks"][chosen], single),
         "joint difference": _largest(found["joint"], both),
         "with its own": _largest(found["blocks"], np.array([peer.ours(block) for block in blocks["own"]])),
@@ -148,22 +146,22 @@ def _largest(ours: Array, reference: Array) -> float:
     return float((np.abs(ours - reference).max(axis=(1, 2)) / size).max())
 
 
+COLUMNS: dict[str, Callable[[Result], str]] = {
+    "poses": lambda row: str(row["poses"]),
+    "all poses, ours [ms]": lambda row: shown(row["all"]),
+    "GTSAM [ms]": lambda row: shown(row.get("gtsam")),
+    "times faster": lambda row: shown(row.get("ratio")),
+    "difference": lambda row: _power(row["difference"]),
+    "with GTSAM's own Jacobians": lambda row: _power(row.get("with its own")),
+    "two poses, tree [ms]": lambda row: shown(row["tree"]),
+    "its difference": lambda row: _power(row.get("joint difference")),
+    "two poses, `solution.covariance` [ms]": lambda row: "refused" if row["refused"] else shown(row["named"]),
+    "difference from the tree": lambda row: _power(row.get("own difference")),
+}
+
+
 def render(result: Result) -> str:
     """One table."""
-    head = (
-        "graph", "poses", "all poses, ours [ms]", "GTSAM [ms]", "times faster", "difference",
-        "with GTSAM's own Jacobians", "two poses, tree [ms]", "difference",
-        "two poses, `solution.covariance` [ms]", "difference from the tree",
-    )  # fmt: skip
-    lines = [
-        (
-            row["name"], str(row["poses"]), shown(row["all"]), shown(row.get("gtsam")), shown(row.get("ratio")),
-            _power(row["difference"]), _power(row.get("with its own")), shown(row["tree"]),
-            _power(row.get("joint difference")), "refused" if row["refused"] else shown(row["named"]),
-            _power(row.get("own difference")),
-        )
-        for row in result["rows"]
-    ]  # fmt: skip
     refusals = "".join(f" {row['name']} was refused: {row['refused']}." for row in result["rows"] if row["refused"])
     notes = (
         "All poses: linearisation, ordering, factorisation and the entries of the inverse that the elimination tree "
@@ -174,7 +172,7 @@ def render(result: Result) -> str:
         "column after shows all poses with its own, whose derivative of the logarithm in the plane loses figures at "
         f"small angles. {result['rounds']} rounds, one where GTSAM takes longer than {SLOW:g} s.{refusals}"
     )
-    return "\n\n".join([table(head, lines), notes])
+    return "\n\n".join([listing(("graph",), {(row["name"],): row for row in result["rows"]}, COLUMNS), notes])
 
 
 def _power(value: float | None) -> str:

@@ -7,9 +7,9 @@ same in batched NumPy, and GTSAM's factor in C++ and as a Python callback.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from functools import partial
+from typing import Any
 
 import numba
 import numpy as np
@@ -17,12 +17,11 @@ import numpy as np
 import unifg as fg
 from benchmarks.gtsam_peer import Peer, available
 from benchmarks.report import table
-from benchmarks.timing import Spread, interleave, milliseconds, shown, spread
+from benchmarks.section import Result, goal
+from benchmarks.timing import interleave, milliseconds, shown, spread, timed
 from unifg.pose_graphs import Edges, PoseGraph
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
-
-Result: TypeAlias = dict[str, Any]
 
 LENGTHS = (200, 2000)  # poses; the targets are for the longer chain
 ITERATIONS = 3
@@ -138,10 +137,9 @@ def measure(rounds: int, small: bool = False) -> Result:
     lengths = (9,) if small else LENGTHS
     rows = [measure_length(length, rounds) for length in lengths]
     goals = [
-        {"name": f"own residual, {NAMES[name]}", "unit": "times the time of `fg.between`",
-         "value": rows[-1]["ratios"][name], "target": target, "floor": None}
+        goal(f"own residual, {NAMES[name]}", "times the time of `fg.between`", rows[-1]["ratios"][name], target)
         for name, target in TARGETS.items()
-    ]  # fmt: skip
+    ]
     return {"rows": rows, "rounds": rounds, "goals": goals}
 
 
@@ -149,36 +147,26 @@ def measure_length(poses: int, rounds: int) -> Result:
     """One chain, everything in turn; callbacks on the long chain take seconds and have rounds of their own."""
     pose_graph, known = drive(poses)
     candidates: dict[str, Callable[[], float]] = {}
-    ends: dict[str, float] = {}
+    costs: dict[str, float] = {}
     for name, residual in RESIDUALS.items():
         graph, x = stated(pose_graph, known, residual)
         run = GaussNewton(max_iterations=ITERATIONS, tolerance=1e-300).prepare(graph)
-        candidates[name] = _iteration(run, {x: pose_graph.poses}, name, ends)
+        first = run.solve({x: pose_graph.poses})
+        costs[name] = first.cost
+        candidates[name] = timed(partial(run.solve, {x: pose_graph.poses}), max(first.iterations, 1))
     slow: dict[str, Callable[[], float]] = {}
     if available():
         peer, other = _peers(pose_graph, known)
-        candidates["gtsam"] = lambda: peer.iterate("COLAMD", ITERATIONS)[0]
-        slow["gtsam again"] = candidates["gtsam"]
+        candidates["gtsam"] = slow["gtsam again"] = lambda: peer.iterate("COLAMD", ITERATIONS)[0]
         slow["callback"] = lambda: other.iterate("COLAMD", 1)[0]
     times = interleave(candidates, rounds)
-    ratios: dict[str, Spread] = {name: spread(times[name] / times["between"]) for name in candidates}
+    ratios = {name: spread(times[name] / times["between"]) for name in candidates}
     if slow:
         few = interleave(slow, min(rounds, FEW), warm=0)
         times["callback"] = few["callback"]
         ratios["callback"] = spread(few["callback"] / few["gtsam again"])
     milli = {name: milliseconds(values) for name, values in times.items()}
-    return {"poses": poses, "ms": milli, "ratios": ratios, "costs": ends}
-
-
-def _iteration(run: fg.Prepared, guess: Any, name: str, ends: dict[str, float]) -> Callable[[], float]:
-    def time_of_an_iteration() -> float:
-        begin = time.perf_counter()
-        solution = run.solve(guess)
-        elapsed = time.perf_counter() - begin
-        ends[name] = solution.cost
-        return elapsed / max(solution.iterations, 1)
-
-    return time_of_an_iteration
+    return {"poses": poses, "ms": milli, "ratios": ratios, "costs": costs}
 
 
 def _peers(pose_graph: PoseGraph, known: Array) -> tuple[Peer, Peer]:

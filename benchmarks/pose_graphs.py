@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import os
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, TypeAlias
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 import unifg as fg
 from benchmarks.gtsam_peer import ORDERINGS, Peer, available
-from benchmarks.report import CHECKOUT, table
-from benchmarks.timing import Spread, Stopwatch, interleave, milliseconds, number, shown, spread
+from benchmarks.report import listing, shared, words
+from benchmarks.section import Result, goal
+from benchmarks.timing import Split, interleave, milliseconds, number, shown, spread, timed
 from unifg.answers import solver
 from unifg.elimination import factorization, fronts, substitution
 from unifg.files.g2o import read_g2o
@@ -23,8 +22,6 @@ from unifg.program import passes
 from unifg.program.program import Program
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
-
-Result: TypeAlias = dict[str, Any]
 
 SAME = 1e-6  # relative difference of chi2
 # What the compiled passes and Python around them do in a solve; linearising adds up the normal equations too.
@@ -36,6 +33,7 @@ WATCHED: dict[str, tuple[Any, str]] = {
     "KKT test": (solver, "optimality"),
     "bind data": (Program, "bind"),
 }
+STRUCTURE: dict[str, tuple[Any, str]] = {"compile": (GaussNewton, "prepare"), "analyse": (factorization, "analyse")}
 
 
 @dataclass(frozen=True)
@@ -65,18 +63,12 @@ PUBLISHED = {
 }
 
 
-def data_folder() -> Path | None:
-    """The folder with the pose graphs, if there is one."""
-    folder = Path(os.environ.get("UNIFG_DATA", CHECKOUT.parent / "shared" / "data")) / "pose_graphs"
-    return folder if folder.is_dir() else None
-
-
 def cases(small: bool = False) -> list[Case]:
     """The published graphs, or made-up ones where the files are absent."""
     if small:
         planar, spatial = manhattan(40).pose_graph, sphere(4, 5).pose_graph
         return [Case("manhattan 40", planar, np.nan, 6.0, 4.0), Case("sphere 20", spatial, np.nan, 2.0, 1.5)]
-    folder = data_folder()
+    folder = shared("pose_graphs")
     if folder is None:
         city, ball = manhattan(3500), sphere(50, 50)
         return [
@@ -88,90 +80,68 @@ def cases(small: bool = False) -> list[Case]:
 
 def measure(rounds: int, small: bool = False) -> Result:
     """All cases."""
-    generated = small or data_folder() is None
+    generated = small or shared("pose_graphs") is None
     found = [measure_case(case, rounds) for case in cases(small)]
     goals = [
-        {"name": f"{row['name']}, iteration", "unit": "times faster than GTSAM", "value": row["ratio"],
-         "target": row["target"], "floor": row["floor"]}
-        for row in found if row["ratio"]
-    ]  # fmt: skip
+        goal(f"{row['name']}, iteration", "times faster than GTSAM", row["ratio"], row["target"], row["floor"])
+        for row in found
+        if row["ratio"]
+    ]
     return {"rows": found, "generated": generated, "rounds": rounds, "goals": goals}
 
 
 def measure_case(case: Case, rounds: int) -> Result:
     """One case: iterations, whole solves and parts in one set of rounds."""
-    graph, x, guess = case.pose_graph.graph()
+    pose_graph = case.pose_graph
+    graph, x, guess = pose_graph.graph()
     run = GaussNewton().prepare(graph)
     first = run.solve(guess)
     count = first.iterations
-    watch = Stopwatch(WATCHED)
-    parts: dict[str, list[float]] = {part: [] for part in (*WATCHED, "Python")}
-    analysis = Stopwatch({"analyse": (factorization, "analyse")})
-    compiling: list[float] = []
-    analysing: list[float] = []
 
-    def ours() -> float:
-        begin = time.perf_counter()
-        run.solve(guess)
-        return (time.perf_counter() - begin) / count
+    def fresh() -> tuple[fg.Graph, dict[fg.Family, Array]]:
+        graph, _, start = pose_graph.graph()
+        return graph, start
 
-    def split() -> float:
-        with watch:
-            begin = time.perf_counter()
-            run.solve(guess)
-            elapsed = time.perf_counter() - begin
-        for part, seconds in watch.seconds.items():
-            parts[part].append(seconds / count)
-        parts["Python"].append((elapsed - sum(watch.seconds.values())) / count)
-        return elapsed / count
-
-    def whole() -> float:
-        fresh, _, start = case.pose_graph.graph()
-        with analysis:
-            begin = time.perf_counter()
-            prepared = GaussNewton().prepare(fresh)
-            between = time.perf_counter()
-            prepared.solve(start)
-            end = time.perf_counter()
-        compiling.append(between - begin)
-        analysing.append(analysis.seconds["analyse"])
-        return end - begin
-
-    candidates: dict[str, Callable[[], float]] = {"ours": ours, "split": split, "whole": whole}
-    ends: dict[str, tuple[int, float]] = {}
+    split = Split(WATCHED, partial(run.solve, guess), count)
+    whole = Split(STRUCTURE, lambda graph, start: GaussNewton().prepare(graph).solve(start), setup=fresh)
+    candidates: dict[str, Callable[[], float]] = {
+        "ours": timed(partial(run.solve, guess), count), "split": split, "whole": whole
+    }  # fmt: skip
+    ends: list[tuple[int, float]] = []
+    best_whole = ""
     if available():
-        peer = Peer(case.pose_graph)
-        for ordering in ORDERINGS:
-            candidates[ordering] = lambda ordering=ordering: peer.iterate(ordering, count)[0]  # type: ignore[misc]
-        pilot = {ordering: min(peer.solve(ordering)[0] for _ in range(2)) for ordering in ORDERINGS}
-        best_whole = min(pilot, key=lambda ordering: pilot[ordering])
+        peer = Peer(pose_graph)
+        candidates |= {ordering: partial(_iteration, peer, ordering, count) for ordering in ORDERINGS}
+        best_whole = min(ORDERINGS, key=lambda ordering: min(peer.solve(ordering)[0] for _ in range(2)))
         candidates["GTSAM, whole"] = lambda: _whole(peer, best_whole, ends)
     times = interleave(candidates, rounds)
     result: Result = {
         "name": case.name,
-        "poses": len(case.pose_graph.poses),
-        "edges": len(case.pose_graph.edges),
+        "poses": len(pose_graph.poses),
+        "edges": len(pose_graph.edges),
         "target": case.target,
         "floor": case.floor,
         "known": case.chi2 if np.isfinite(case.chi2) else None,
-        "chi2": case.pose_graph.with_poses(first[x]).chi2(),
+        "chi2": pose_graph.with_poses(first[x]).chi2(),
         "iterations": count,
-        "status": first.status.name.lower().replace("_", " "),
+        "status": words(first.status),
         "ours": milliseconds(times["ours"]),
         "whole": milliseconds(times["whole"]),
-        "compile": milliseconds(np.array(compiling[-rounds:])),
-        "analyse": milliseconds(np.array(analysing[-rounds:])),
-        "parts": {part: milliseconds(np.array(values[-rounds:])) for part, values in parts.items()},
+        "compile": whole.milliseconds(rounds)["compile"],
+        "analyse": whole.milliseconds(rounds)["analyse"],
+        "parts": split.milliseconds(rounds),
         "ratio": None,
     }
-    if available():
-        result |= _compared(times, best_whole, *ends[best_whole])
-    return result
+    return result | _compared(times, best_whole, *ends[-1]) if ends else result
 
 
-def _whole(peer: Peer, ordering: str, ends: dict[str, tuple[int, float]]) -> float:
+def _iteration(peer: Peer, ordering: str, count: int) -> float:
+    return peer.iterate(ordering, count)[0]
+
+
+def _whole(peer: Peer, ordering: str, ends: list[tuple[int, float]]) -> float:
     elapsed, iterations, chi2 = peer.solve(ordering)
-    ends[ordering] = iterations, chi2
+    ends.append((iterations, chi2))
     return elapsed
 
 
@@ -190,67 +160,61 @@ def _compared(times: Mapping[str, Array], best_whole: str, iterations: int, chi2
     }
 
 
+def within(row: Result) -> str:
+    """Whether all found chi2 are the best known one."""
+    known = row["known"] or row["chi2"]
+    return "yes" if all(abs(row.get(end, known) - known) <= SAME * known for end in ("chi2", "gtsam_chi2")) else "no"
+
+
+Columns = dict[str, Callable[[Result], str]]
+
+ITERATIONS: Columns = {
+    "poses": lambda row: str(row["poses"]),
+    "edges": lambda row: str(row["edges"]),
+    "iterations": lambda row: str(row["iterations"]),
+    "ours [ms]": lambda row: shown(row["ours"]),
+    "GTSAM, COLAMD [ms]": lambda row: shown(row.get("gtsam", {}).get("COLAMD")),
+    "GTSAM, METIS [ms]": lambda row: shown(row.get("gtsam", {}).get("METIS")),
+    "times faster": lambda row: shown(row["ratio"]),
+    "target (floor)": lambda row: f"{row['target']:g} ({row['floor']:g})",
+}
+WHOLE: Columns = {
+    "ours [ms]": lambda row: shown(row["whole"]),
+    "of it compiling": lambda row: number(row["compile"][0]),
+    "of it ordering and symbolic": lambda row: number(row["analyse"][0]),
+    "iterations": lambda row: f"{row['iterations']}, {row['status']}",
+    "GTSAM [ms]": lambda row: shown(row.get("gtsam_whole")),
+    "ordering": lambda row: str(row.get("best_whole", "-")),
+    "its iterations": lambda row: str(row.get("gtsam_iterations", "-")),
+    "times faster": lambda row: shown(row.get("ratio_whole")),
+    "chi2, ours": lambda row: f"{row['chi2']:.7f}",
+    "chi2, GTSAM": lambda row: f"{row['gtsam_chi2']:.7f}" if "gtsam_chi2" in row else "-",
+    "best known": lambda row: f"{row['known']:.7f}" if row["known"] else "-",
+    "both within 1e-6": within,
+}
+
+
 def render(result: Result) -> str:
     """Tables of iterations, solves and parts."""
-    rows = result["rows"]
+    graphs = {(row["name"],): row for row in result["rows"]}
+    source = "Published graphs from the poses in their files."
     if result["generated"]:
         source = "The published files are not here: these graphs are generated, and start at the truth."
-    else:
-        source = "Published graphs from the poses in their files."
-    head = (
-        "graph", "poses", "edges", "iterations", "ours [ms]", "GTSAM, COLAMD [ms]", "GTSAM, METIS [ms]",
-        "times faster", "target (floor)",
-    )  # fmt: skip
-    lines = [
-        (
-            row["name"], str(row["poses"]), str(row["edges"]), str(row["iterations"]), shown(row["ours"]),
-            *(shown(row.get("gtsam", {}).get(ordering)) for ordering in ORDERINGS),
-            shown(row["ratio"]), f"{row['target']:g} ({row['floor']:g})",
-        )
-        for row in rows
-    ]  # fmt: skip
     return "\n\n".join(
         [
             f"{source} Per Gauss-Newton iteration:",
-            table(head, lines),
+            listing(("graph",), graphs, ITERATIONS),
             "Where an iteration of ours goes [ms]:",
-            _parts(rows),
+            listing(("graph",), graphs, {part: partial(_part, part=part) for part in result["rows"][0]["parts"]}),
             "Whole solves, symbolic work included:",
-            _wholes(rows),
+            listing(("graph",), graphs, WHOLE),
         ]
     )
 
 
-def _parts(rows: list[Result]) -> str:
-    names = list(rows[0]["parts"])
-    lines = []
-    for row in rows:
-        total = sum(row["parts"][name][0] for name in names)
-        cells = (f"{number(row['parts'][name][0])} ({100 * row['parts'][name][0] / total:.0f} %)" for name in names)
-        lines.append((row["name"], *cells))
-    return table(("graph", *names), lines)
-
-
-def _wholes(rows: list[Result]) -> str:
-    head = (
-        "graph", "ours [ms]", "of it compiling", "of it ordering and symbolic", "iterations", "GTSAM [ms]", "ordering",
-        "its iterations", "times faster", "chi2, ours", "chi2, GTSAM", "best known", "both within 1e-6",
-    )  # fmt: skip
-    lines = []
-    for row in rows:
-        known: Spread = [row["known"]] if row["known"] else [row["chi2"]]
-        ends = [row["chi2"], *([row["gtsam_chi2"]] if "gtsam_chi2" in row else [])]
-        close = all(abs(end - known[0]) <= SAME * known[0] for end in ends)
-        lines.append(
-            (
-                row["name"], shown(row["whole"]), number(row["compile"][0]), number(row["analyse"][0]),
-                f"{row['iterations']}, {row['status']}",
-                shown(row.get("gtsam_whole")), row.get("best_whole", "-"), str(row.get("gtsam_iterations", "-")),
-                shown(row.get("ratio_whole")), *(f"{end:.7f}" for end in ends), *["-"] * (2 - len(ends)),
-                f"{known[0]:.7f}" if row["known"] else "-", "yes" if close else "no",
-            )
-        )  # fmt: skip
-    return table(head, lines)
+def _part(row: Result, part: str) -> str:
+    median, total = row["parts"][part][0], sum(value[0] for value in row["parts"].values())
+    return f"{number(median)} ({100 * median / total:.0f} %)"
 
 
 def posed(pose_graph: PoseGraph, sigma: float) -> tuple[fg.Graph, fg.Family]:

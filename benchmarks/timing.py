@@ -35,6 +35,11 @@ def clock(action: Callable[[], Any]) -> float:
     return time.perf_counter() - begin
 
 
+def timed(action: Callable[[], Any], per: float = 1.0) -> Callable[[], float]:
+    """A candidate of :func:`interleave`: the time of an action over a number, such as its iterations [s]."""
+    return lambda: clock(action) / per
+
+
 def interleave(
     candidates: Mapping[str, Callable[[], float]], rounds: int, warm: int = 1, slow: float = np.inf
 ) -> dict[str, Array]:
@@ -130,3 +135,42 @@ class Stopwatch:
                 self.calls[part] += 1
 
         return call
+
+
+class Split:
+    """A candidate of :func:`interleave` that also tells which share of its time chosen functions take.
+
+    Args:
+        watched: as of :class:`Stopwatch`.
+        action: timed; called with what ``setup`` returns.
+        per: what times are divided by, such as iterations.
+        setup: before each round, not timed.
+
+    Attributes:
+        parts: times of all rounds by part [s]; "Python" is what no part takes.
+    """
+
+    def __init__(
+        self,
+        watched: Mapping[str, tuple[Any, str]],
+        action: Callable[..., Any],
+        per: float = 1.0,
+        setup: Callable[[], tuple[Any, ...]] = tuple,
+    ) -> None:
+        """Nothing runs before it is called."""
+        self._watch, self._action, self._per, self._setup = Stopwatch(watched), action, per, setup
+        self.parts: dict[str, list[float]] = {part: [] for part in (*watched, "Python")}
+
+    def __call__(self) -> float:
+        """Run once; the time of the whole [s]."""
+        given = self._setup()
+        with self._watch as watch:
+            elapsed = clock(lambda: self._action(*given))
+        rest = elapsed - sum(watch.seconds.values())
+        for part, seconds in (*watch.seconds.items(), ("Python", rest)):
+            self.parts[part].append(seconds / self._per)
+        return elapsed / self._per
+
+    def milliseconds(self, rounds: int) -> dict[str, Spread]:
+        """Medians and quartiles of the last rounds by part [ms]."""
+        return {part: milliseconds(np.array(values[-rounds:])) for part, values in self.parts.items()}

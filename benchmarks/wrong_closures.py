@@ -1,35 +1,36 @@
 """Wrong loop closures on published pose graphs: graduated non-convexity, dynamic covariance scaling, and GTSAM's.
 
-``python -m benchmarks.wrong_closures`` prints a Markdown table row by row; it takes about an hour, most of it for M3500
-with 30 %. Settings were chosen on the seeds 0 to 2, the table is of seeds from 10 on. Errors are distances from the
-answer without wrong closures. A wrong closure within the threshold of that answer cannot be told from a right one by
-the loss, whoever minimises it.
+    python -m benchmarks.wrong_closures [--graphs M3500:0.3 ...] [--seeds FIRST:END] [--methods unifg DCS GTSAM]
+
+Prints a Markdown table; it takes about an hour, most of it for M3500 with 30 %, and goes on where it stopped. Settings
+were chosen on the seeds 0 to 2, the table is of seeds from 10 on. Errors are distances from the answer without wrong
+closures. A wrong closure within the threshold of that answer cannot be told from a right one by the loss, whoever
+minimises it.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
-from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import unifg as fg
+from benchmarks import campaign
+from benchmarks.campaign import Row
 from benchmarks.gtsam_peer import Peer, available
-from benchmarks.pose_graphs import data_folder
-from benchmarks.report import table
+from benchmarks.report import command, listing, publish, shared
+from problems.closures import Claim, with_wrong_closures
 from unifg.files.g2o import read_g2o
 from unifg.lie import SE2
-from unifg.pose_graphs import Edges, PoseGraph
+from unifg.pose_graphs import PoseGraph
 from unifg.solvers import GaussNewton, GraduatedNonConvexity
-from unifg.typing import Array, BoolArray
-
-Claim: TypeAlias = Literal["same place", "anywhere"]
+from unifg.typing import Array
 
 THRESHOLD = {3: 3.37, 6: 4.10}  # by numbers in a measurement: 99 % of right ones
-SPREAD = 10.0  # standard deviations by which a wrong closure misses "the same place"
-FARTHEST = 1.0  # [m, rad] it does so at most
 CLAIMS: tuple[Claim, ...] = ("same place", "anywhere")
 CASES = (
     ("intel", 0.3, 3),
@@ -40,48 +41,9 @@ CASES = (
     ("smallGrid3D", 0.3, 3),
 )  # graph, share, seeds
 FIRST = 10  # seed
-HEAD = ("graph", "wrong", "claim", "seed", "method", "error [m]", "right kept", "wrong kept", "precision", "CPU [s]")
 
 
-def with_wrong_closures(pose_graph: PoseGraph, share: float, seed: int, claim: Claim) -> tuple[PoseGraph, BoolArray]:
-    """Add wrong loop closures between random poses.
-
-    Args:
-        pose_graph: the right measurements.
-        share: of all loop closures that are wrong afterwards, in [0, 1).
-        seed: of everything random.
-        claim: what the wrong ones measure: that both poses are the same place, or any distance within the graph.
-
-    Returns:
-        The graph, and (m,) whether an edge is wrong.
-    """
-    rng = np.random.default_rng(seed)
-    poses, right, edges = len(pose_graph.poses), len(pose_graph.closures), pose_graph.edges
-    count = round(share / (1.0 - share) * right)
-    ends = np.sort(np.stack([rng.choice(poses, 2, replace=False) for _ in range(count)]), axis=1)
-    neighbours = ends[:, 1] - ends[:, 0] == 1
-    ends[neighbours, 1] = (ends[neighbours, 1] + 7) % poses
-    ends = np.sort(ends, axis=1)
-    information = pose_graph.closures.information[rng.integers(0, right, count)]
-    if claim == "same place":
-        sigma = np.minimum(SPREAD / np.sqrt(np.einsum("nii->ni", information)), FARTHEST)
-        step = sigma * rng.standard_normal((count, pose_graph.group.dim))
-    else:
-        planar = pose_graph.group is SE2
-        reach, turn, size = 0.3 * np.ptp(pose_graph.poses[:, :2]), (3.0 if planar else 1.7), (2 if planar else 3)
-        away = rng.uniform(-reach, reach, (count, size))
-        step = np.concatenate([away, rng.uniform(-turn, turn, (count, pose_graph.group.dim - size))], axis=1)
-    every = Edges(
-        np.concatenate([edges.first, ends[:, 0]]),
-        np.concatenate([edges.second, ends[:, 1]]),
-        np.concatenate([edges.measured, pose_graph.group.exp(step)]),
-        np.concatenate([edges.information, information]),
-    )
-    return replace(pose_graph, edges=every), np.arange(len(every)) >= len(edges)
-
-
-@dataclass(frozen=True)
-class Found:
+class Found(NamedTuple):
     """An answer.
 
     Attributes:
@@ -131,54 +93,92 @@ def by_scaling(pose_graph: PoseGraph) -> Found:
 METHODS = {"unifg": by_graduation, "DCS": by_scaling, "GTSAM": by_gtsam}
 
 
-def rows(
-    clean: PoseGraph, name: str, share: float, seed: int, claim: Claim, methods: list[str]
-) -> list[tuple[str, ...]]:
-    """One row of the table for each method."""
+@dataclass(frozen=True)
+class Job:
+    """A method, and the wrong closures it is to find; see :func:`problems.closures.with_wrong_closures`."""
+
+    graph: str
+    share: float
+    claim: Claim
+    seed: int
+    method: str
+
+
+def attempt(clean: PoseGraph, job: Job) -> Row:
+    """What a method makes of a graph with wrong closures."""
     graph, x, guess = clean.graph()
     right = GaussNewton().solve(graph, guess, check=True)[x]
-    dirty, wrong = with_wrong_closures(clean, share, seed, claim)
-    closures, dim = ~dirty.edges.odometry, clean.group.dim
-    place = 2 if clean.group is SE2 else 3
-    result: list[tuple[str, ...]] = []
-    for method in methods:
-        started = time.process_time()
-        found = METHODS[method](dirty)
-        seconds = time.process_time() - started
-        error = np.linalg.norm(found.poses[:, :place] - right[:, :place], axis=1).max()
-        kept = dirty.with_poses(found.poses).squared_errors() <= THRESHOLD[dim] ** 2
-        good, bad = kept[closures & ~wrong], kept[wrong]
-        precision = good.sum() / max(good.sum() + bad.sum(), 1)
-        called = f"{method} ({found.remark})" if found.remark else method
-        recall, wrongly = f"{good.mean():.4f}", f"{bad.sum()} of {len(bad)}"
-        numbers = (f"{error:.3f}", recall, wrongly, f"{precision:.4f}", f"{seconds:.1f}")
-        result.append((name, f"{share:.0%}", claim, str(seed), called, *numbers))
-    return result
+    dirty, wrong = with_wrong_closures(clean, job.share, job.seed, job.claim)
+    closures, place = ~dirty.edges.odometry, 2 if clean.group is SE2 else 3
+    begin = time.process_time()
+    found = METHODS[job.method](dirty)
+    seconds = time.process_time() - begin
+    kept = dirty.with_poses(found.poses).squared_errors() <= THRESHOLD[clean.group.dim] ** 2
+    good, bad = kept[closures & ~wrong], kept[wrong]
+    return {
+        "remark": found.remark,
+        "distance": float(np.linalg.norm(found.poses[:, :place] - right[:, :place], axis=1).max()),
+        "right kept": float(good.mean()),
+        "wrong kept": int(bad.sum()),
+        "wrong": len(bad),
+        "precision": float(good.sum() / max(good.sum() + bad.sum(), 1)),
+        "seconds": seconds,
+    }
 
 
-def main() -> None:
-    """Print one row per graph, share, claim, seed and method."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--first", type=int, default=FIRST, help="the first seed")
-    parser.add_argument("--seeds", type=int, help="seeds per case, instead of three or six")
-    parser.add_argument("--graphs", nargs="+", help="only these, as NAME or NAME:SHARE")
-    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
-    options = parser.parse_args()
-    methods = [m for m in options.methods if m != "GTSAM" or available()]
-    folder = data_folder()
+def attempted(job: Job) -> Row:
+    """The same on the published graph."""
+    return attempt(published(job.graph), job)
+
+
+@cache
+def published(name: str) -> PoseGraph:
+    """A graph of the shared data."""
+    folder = shared("pose_graphs")
     if folder is None:
         raise SystemExit("there is no folder of pose graphs: set UNIFG_DATA")
-    print(table(HEAD, [], 5), flush=True)
-    for name, share, seeds in CASES:
-        if options.graphs and not {name, f"{name}:{share}"} & set(options.graphs):
-            continue
-        path = folder / f"{name}.g2o.gz"
-        clean = read_g2o(path if path.is_file() else folder / f"{name}.g2o")
-        for seed in range(options.first, options.first + (options.seeds or seeds)):
-            # Half of the seeds with either claim: what the wrong closures measure.
-            for row in rows(clean, name, share, seed, CLAIMS[seed % 2], methods):
-                print("| " + " | ".join(row) + " |", flush=True)
+    path = folder / f"{name}.g2o.gz"
+    return read_g2o(path if path.is_file() else folder / f"{name}.g2o")
+
+
+COLUMNS: dict[str, Callable[[Row], str]] = {
+    "error [m]": lambda row: f"{row['distance']:.3f}",
+    "right kept": lambda row: f"{row['right kept']:.4f}",
+    "wrong kept": lambda row: f"{row['wrong kept']} of {row['wrong']}",
+    "precision": lambda row: f"{row['precision']:.4f}",
+    "CPU [s]": lambda row: f"{row['seconds']:.1f}",
+}
+
+
+def named(row: Row) -> tuple[str, ...]:
+    """The words a line begins with."""
+    called = f"{row['method']} ({row['remark']})" if row["remark"] else row["method"]
+    return row["graph"], f"{row['share']:.0%}", row["claim"], str(row["seed"]), called
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Print one row per graph, share, claim, seed and method."""
+    parser = command(__doc__)
+    campaign.options(parser)
+    parser.add_argument("--seeds", type=campaign.seeds, metavar="FIRST:END", help="instead of three or six from 10 on")
+    parser.add_argument("--graphs", nargs="+", help="only these, as NAME or NAME:SHARE")
+    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
+    options = parser.parse_args(arguments)
+    jobs = [
+        # Half of the seeds with either claim: what the wrong closures measure.
+        Job(name, share, CLAIMS[seed % 2], seed, method)
+        for name, share, count in CASES
+        if not options.graphs or {name, f"{name}:{share}"} & set(options.graphs)
+        for seed in options.seeds or range(FIRST, FIRST + count)
+        for method in options.methods
+        if method != "GTSAM" or available()
+    ]
+    rows = {row["key"]: row for row in campaign.episodes("wrong_closures", attempted, jobs, options)}
+    asked = [rows[key] for job in jobs if (key := tuple(vars(job).values())) in rows]
+    head = ("graph", "wrong", "claim", "seed", "method")
+    publish("wrong-closures", listing(head, {named(row): row for row in asked}, COLUMNS))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

@@ -10,7 +10,8 @@ import pytest
 
 import unifg as fg
 from benchmarks import chains, collection, elimination, gtsam_peer, marginals, own_residuals, pose_graphs
-from benchmarks.timing import Stopwatch, interleave, number, shown, spread
+from benchmarks.section import Result, goal, met
+from benchmarks.timing import Split, Stopwatch, interleave, number, shown, spread
 from problems.collection import BACKENDS, CASES, attempt
 from unifg.pose_graphs import manhattan
 from unifg.program.program import Program
@@ -25,7 +26,7 @@ def test_a_section_measures_survives_json_and_renders(name: str) -> None:
     assert all(line.count("|") == text.splitlines()[0].count("|") for line in text.split("\n\n")[0].splitlines()[1:2])
     assert "nan" not in text
     assert result["goals"] or not gtsam_peer.available()
-    store: elimination.Result = {}
+    store: Result = {}
     elimination.record(store, name, result, 1.0, "code")
     elimination.record(store, name, result, 1.0, "code")
     assert store[name]["previous"]["goals"].keys() == {goal["name"] for goal in result["goals"]}
@@ -33,10 +34,10 @@ def test_a_section_measures_survives_json_and_renders(name: str) -> None:
 
 
 def test_the_page_shows_the_run_before(tmp_path: Path) -> None:
-    goal = {"name": "it", "unit": "times faster than GTSAM", "value": [5.0, 4.0, 6.0], "target": 6.0, "floor": 4.0}
-    store: elimination.Result = {}
-    elimination.record(store, "chains", {"goals": [goal], "rounds": 15}, 1.0, "code")
-    elimination.record(store, "chains", {"goals": [{**goal, "value": [3.0, 3.0, 3.5]}], "rounds": 15}, 1.0, "code")
+    found = goal("it", "times faster than GTSAM", [5.0, 4.0, 6.0], 6.0, 4.0)
+    store: Result = {}
+    elimination.record(store, "chains", {"goals": [found], "rounds": 15}, 1.0, "code")
+    elimination.record(store, "chains", {"goals": [{**found, "value": [3.0, 3.0, 3.5]}], "rounds": 15}, 1.0, "code")
     (row,) = elimination.summary(store).splitlines()[2:]
     assert [cell.strip() for cell in row.split("|")[3:-1]] == [
         "3.00 (3.00 to 3.50)",
@@ -44,8 +45,8 @@ def test_the_page_shows_the_run_before(tmp_path: Path) -> None:
         "no",
         "5.00 (4.00 to 6.00)",
     ]
-    assert not elimination.met({**goal, "value": [3.0, 3.0, 3.0]}, "floor")
-    assert elimination.met({**goal, "unit": "ms", "value": [5.0, 5.0, 5.0]})
+    assert not met({**found, "value": [3.0, 3.0, 3.0]}, "floor")
+    assert met({**found, "unit": "ms", "value": [5.0, 5.0, 5.0]})
     (tmp_path / "store.json").write_text(json.dumps({"sections": store}))
     assert elimination.load(tmp_path / "store.json") == store
     assert elimination.load(tmp_path / "none.json") == {}
@@ -81,6 +82,16 @@ def test_a_stopwatch_counts_and_puts_back() -> None:
     assert Program.linearize is original
     assert watch.calls["linearise"] == solution.iterations + 1
     assert watch.seconds["linearise"] > 0.0
+
+
+def test_a_split_adds_up() -> None:
+    graph, _, guess = manhattan(20).pose_graph.graph()
+    run = GaussNewton().prepare(graph)
+    split = Split({"linearise": (Program, "linearize")}, run.solve, per=2.0, setup=lambda: (guess,))
+    elapsed = [split(), split()]
+    np.testing.assert_allclose(np.sum(list(split.parts.values()), axis=0), elapsed, rtol=1e-9)
+    assert split.milliseconds(1)["linearise"][0] == pytest.approx(1e3 * split.parts["linearise"][1])
+    assert all(2.0 * min(values) > 0.0 for values in split.parts.values())
 
 
 @pytest.mark.parametrize("kind", chains.CASES)

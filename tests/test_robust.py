@@ -13,7 +13,8 @@ import pytest
 
 import unifg as fg
 from benchmarks import gtsam_peer
-from benchmarks.wrong_closures import HEAD, METHODS, Claim, rows, with_wrong_closures
+from benchmarks.wrong_closures import COLUMNS, METHODS, Job, attempt
+from problems.closures import Claim, with_wrong_closures
 from unifg.answers.history import Iteration
 from unifg.answers.solution import NotConverged
 from unifg.errors import BackendError, GraphError
@@ -404,24 +405,22 @@ def test_the_study_of_wrong_closures_counts_what_each_method_keeps() -> None:
     """A row per method; GTSAM's GNC agrees with ours where nothing is in doubt, in the plane and in space."""
     methods = [method for method in METHODS if method != "GTSAM" or gtsam_peer.available()]
     for clean in (manhattan(100, 1).pose_graph, sphere(5, 8).pose_graph):
-        found = {row[4].split()[0]: row for row in rows(clean, "toy", 0.3, 0, "anywhere", methods)}
-        assert list(found) == methods
+        found = {method: attempt(clean, Job("toy", 0.3, "anywhere", 0, method)) for method in methods}
         for row in found.values():
-            assert len(row) == len(HEAD)
-            assert row[7].startswith("0 of ") and int(row[7].split()[-1]) == round(0.3 / 0.7 * len(clean.closures))
-            assert row[8] == "1.0000" and float(row[6]) > 0.95
-            assert float(row[5]) < 0.2
-        if "GTSAM" in found:
-            assert found["unifg"][5:9] == found["GTSAM"][5:9]
+            assert row["wrong kept"] == 0 and row["wrong"] == round(0.3 / 0.7 * len(clean.closures))
+            assert row["precision"] == 1.0 and row["right kept"] > 0.95
+            assert row["distance"] < 0.2
+        told = {method: [tell(row) for tell in COLUMNS.values()][:4] for method, row in found.items()}
+        assert told.get("GTSAM", told["unifg"]) == told["unifg"]
 
 
 @pytest.mark.data
 def test_wrong_closures_of_a_long_drive(shared_data: Path) -> None:
     """One wrong closure that paid by the cost as stated left the answer 6 m off."""
     clean = read_g2o(shared_data / "pose_graphs" / "M3500.g2o.gz")
-    (row,) = rows(clean, "M3500", 0.1, 0, "anywhere", ["unifg"])
-    assert row[4] == "unifg (CONVERGED)"
-    assert row[5:9] == ("0.000", "1.0000", "0 of 217", "1.0000")
+    row = attempt(clean, Job("M3500", 0.1, "anywhere", 0, "unifg"))
+    assert row["remark"] == "CONVERGED"
+    assert [tell(row) for tell in COLUMNS.values()][:4] == ["0.000", "1.0000", "0 of 217", "1.0000"]
 
 
 @pytest.mark.data
