@@ -13,22 +13,10 @@ from dense import Batch, Statement, drive, one_by_one
 from unifg.errors import GraphError
 from unifg.files.g2o import read_g2o
 from unifg.smoothing import FixedLag, Incremental
-from unifg.smoothing.fields import (
-    CLIQUE_END,
-    FACTOR_END,
-    FRONT,
-    LISTS_END,
-    NUMBERS_END,
-    PIVOT_ROWS,
-    PRIORS,
-    SIZE,
-    STORAGE,
-    STRIDE,
-    VALUE,
-    VARIABLE_END,
-)
 from unifg.smoothing.priors import relinearize
 from unifg.typing import Array, IntArray
+
+ENDS = ("variable_end", "factor_end", "clique_end", "lists_end", "numbers_end")  # of tables and arenas
 
 
 def within(statement: Statement, k: int, lag: int) -> bool:
@@ -107,21 +95,21 @@ def test_a_prior_is_rewritten_when_a_point_moves(group: Any) -> None:
     smoother.update({x: group.random(rng, (4,))})
     assert list(smoother.window(x).indices) == [1, 2, 3]
     state = smoother._state
-    clique = state.cliques[state.counters[PRIORS]]
+    clique = state.cliques[state.counters["priors"][0]]
 
     def prior() -> tuple[Array, Array]:
-        size, stride = clique[SIZE], clique[STRIDE]
-        rows = slice(int(clique[PIVOT_ROWS]), int(size))
-        block = state.numbers[clique[FRONT] : clique[FRONT] + size * stride].reshape(size, stride)
+        size, stride = clique["size"], clique["stride"]
+        rows = slice(int(clique["pivot_rows"]), int(size))
+        block = state.numbers[clique["front"] : clique["front"] + size * stride].reshape(size, stride)
         upper = np.triu(block[rows, rows])
         return upper + np.triu(upper, 1).T, block[rows, size].copy()
 
     before, gradient = prior()
     row = int(x.rows(np.array([2]))[0])
-    at = state.variables[row, VALUE] + state.variables[row, STORAGE]
+    at = state.variables["value"][row] + state.variables["storage"][row]
     e = 0.4 * rng.standard_normal(d)
     state.numbers[at : at + d] = e
-    relinearize(state, row, np.zeros(200))
+    relinearize(smoother._memory, row, np.zeros(200))
     h = 1e-6
     J = np.eye(3 * d)
     moved = [group.log(group.compose(group.exp(e), group.exp(s * h * np.eye(d)))) for s in (1.0, -1.0)]
@@ -144,7 +132,8 @@ def test_memory_and_tables_stay_as_they_are() -> None:
             smoother.minimize(function, *[x[i] for i in variables], *parameters, sigma=sigma)
         smoother.update({x: np.zeros(3) if k == 0 else smoother.estimate(x[-1])[0]})
         if k in (450, 899):
-            ends.append(smoother._state.counters[[VARIABLE_END, FACTOR_END, CLIQUE_END, LISTS_END, NUMBERS_END]].copy())
+            counters = smoother._state.counters
+            ends.append(np.array([counters[end][0] for end in ENDS]))
     assert (ends[1] <= 1.2 * ends[0]).all()
     assert smoother.dropped > 100
     assert smoother.window(x).indices[0] == 894 and len(smoother) < 40
@@ -168,7 +157,7 @@ def test_kept_landmarks_collect_their_priors() -> None:
     batch.step()
     np.testing.assert_allclose(smoother.estimate(point)[0], batch.values[0], atol=1e-10)
     np.testing.assert_allclose(smoother.estimate(x[-3:]), batch.stack()[-3:], atol=1e-10)
-    assert smoother._state.counters[CLIQUE_END] < 12  # priors were united, not piled up
+    assert smoother._state.counters["clique_end"][0] < 12  # priors were united, not piled up
 
 
 def test_a_lag_in_seconds() -> None:

@@ -8,6 +8,7 @@ method is then the block tridiagonal recursion, without an index.
 
 from __future__ import annotations
 
+from unifg.elimination.assembly import add_row
 from unifg.elimination.dense import eliminate, subtract_signed
 from unifg.elimination.plan import (
     CHILD,
@@ -32,10 +33,50 @@ from unifg.elimination.plan import (
     Plan,
 )
 from unifg.machine.jit import compiled
-from unifg.machine.vectors import address, blend, get, load, plus, put, splat, store
+from unifg.machine.vectors import Address, address, get, put, splat, store
 from unifg.typing import Array
 
 BLOCK = 96  # pivots eliminated before the rest of a panel is brought up to date
+
+
+@compiled
+def eliminate_front(
+    numbers: Address, panel: int, stride: int, width: int, columns: int, update: int, apart: int, rows: int,
+    scale: Address, pivots: Address, signs: Address, first: int,
+) -> int:  # fmt: skip
+    """Eliminate the pivots of an assembled front, and take from its update matrix what they stand for.
+
+    Args:
+        numbers: address of the array of both.
+        panel: offset of the panel.
+        stride: length of its rows.
+        width: its pivots.
+        columns: its columns; right-hand sides may follow those of the update matrix.
+        update: offset of the update matrix.
+        apart: length of its rows.
+        rows: its rows.
+        scale: size of each pivot before elimination; the front's first is at ``first`` here and in the next two.
+        pivots: receives the inverse of the diagonal.
+        signs: receives the sign.
+        first: see above.
+
+    Returns:
+        -1, or the first pivot that vanished.
+    """
+    begin = 0
+    while begin < width:
+        end = begin + BLOCK if begin + BLOCK < width else width
+        failed = eliminate(numbers, panel, stride, begin, end, columns, scale, pivots, signs, first)
+        if failed >= 0:
+            return failed
+        if end < width:
+            subtract_signed(
+                numbers, panel + end * (stride + 1), stride, columns - end, panel + begin * stride + end,
+                stride, end - begin, signs, first + begin, width - end,
+            )  # fmt: skip
+        begin = end
+    subtract_signed(numbers, update, apart, columns - width, panel + width, stride, width, signs, first, rows)
+    return -1
 
 
 @compiled
@@ -85,27 +126,12 @@ def factor(plan: Plan, data: Array, added: Array) -> bool:
                 for i in range(size):
                     row = get(relative, index + i)
                     target = panel + row * stride if row < width else update + (row - width) * apart - width
-                    j = i
-                    while j < size:
-                        at, length = target + get(relative, index + j), get(runs, index + j)
-                        for k in range(0, length, 4):
-                            passed = blend(load(numbers, source + j + k), zero, length - k)
-                            store(numbers, at + k, plus(load(numbers, at + k), 1.0, passed))
-                        j += length
+                    add_row(numbers, source, i, size, target, relative, runs, index)
                     source += step
             child = fronts[child, SIBLING]
-        begin, failed = 0, -1
-        while begin < width and failed < 0:
-            end = begin + BLOCK if begin + BLOCK < width else width
-            failed = eliminate(numbers, panel, stride, begin, end, width + rows, scale, pivots, signs, first)
-            if failed < 0 and end < width:
-                subtract_signed(
-                    numbers, panel + end * (stride + 1), stride, width + rows - end, panel + begin * stride + end,
-                    stride, end - begin, signs, first + begin, width - end,
-                )  # fmt: skip
-            begin = end
-        if failed < 0:
-            subtract_signed(numbers, update, apart, rows, panel + width, stride, width, signs, first, rows)
+        failed = eliminate_front(
+            numbers, panel, stride, width, width + rows, update, apart, rows, scale, pivots, signs, first
+        )  # fmt: skip
         if failed >= 0:
             width = failed
         for i in range(first, first + width):

@@ -2,19 +2,27 @@
 
 A loss enters Gauss-Newton through its weight rho'(s) (iteratively reweighted least squares); the gradient
 rho'(s) J' r is the true one, so the KKT check judges the robust problem itself.
+
+The formulas of the shipped losses stand in :func:`value_of` and :func:`weight_of`, for one number and compiled; the
+classes apply them to arrays. They are compiled without liberties, so that NaN stays NaN and nothing is reordered.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from math import log1p, sqrt
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
 from unifg.errors import GraphError
+from unifg.machine.jit import in_order
 from unifg.typing import Array
 
+QUADRATIC, HUBER, CAUCHY, TUKEY, SCALED, GEMAN_MCCLURE, TRUNCATED = range(7)
+Form: TypeAlias = tuple[int, float, float]
+"""A loss as compiled code knows it: which formula, and its two parameters (zero where it has fewer)."""
 _SHARP = 1e4  # mu of a truncated loss whose weights go from one to zero within 0.01 % of the threshold
 
 
@@ -45,34 +53,53 @@ class Graduated(Loss, Protocol):
         ...
 
 
+class Formula:
+    """A loss whose formulas stand in :func:`value_of` and :func:`weight_of`."""
+
+    held = False
+
+    @property
+    def form(self) -> Form:
+        """How compiled code knows it."""
+        raise NotImplementedError
+
+    def value(self, squared: Array) -> Array:
+        """rho(s) for an array of squared norms."""
+        return self._each(squared, False)
+
+    def weight(self, squared: Array) -> Array:
+        """rho'(s) for an array of squared norms."""
+        return self._each(squared, True)
+
+    def _each(self, squared: Array, slopes: bool) -> Array:
+        given = np.asarray(squared, dtype=np.float64)
+        out = np.empty(given.shape)
+        _fill(*self.form, slopes, np.ascontiguousarray(given).reshape(-1), out.reshape(-1))
+        return out
+
+
 @dataclass(frozen=True)
-class Huber:
-    """Quadratic up to ``threshold`` whitened units, linear beyond (Huber 1964).
+class Huber(Formula):
+    """Quadratic up to ``threshold`` whitened units, linear beyond (Huber 1964): s inside, 2 k sqrt(s) - k^2 outside.
 
     Attributes:
-        threshold: in units of the whitened residual's norm.
+        threshold: k, in units of the whitened residual's norm.
     """
 
     threshold: float = 1.345
-    held = False
 
     def __post_init__(self) -> None:
         """Refuse a threshold that is not positive."""
         positive(self.threshold, "Huber")
 
-    def value(self, squared: Array) -> Array:
-        """rho(s) = s inside, 2 k sqrt(s) - k^2 outside."""
-        k = self.threshold
-        return np.where(squared <= k * k, squared, 2.0 * k * np.sqrt(squared) - k * k)
-
-    def weight(self, squared: Array) -> Array:
-        """rho'(s) = 1 inside, k / sqrt(s) outside."""
-        k = self.threshold
-        return k / np.sqrt(np.maximum(squared, k * k))
+    @property
+    def form(self) -> Form:
+        """By k."""
+        return HUBER, self.threshold, 0.0
 
 
 @dataclass(frozen=True)
-class Cauchy:
+class Cauchy(Formula):
     """rho(s) = k^2 log(1 + s / k^2): bounded influence, no convexity.
 
     Attributes:
@@ -80,62 +107,52 @@ class Cauchy:
     """
 
     scale: float = 2.385
-    held = False
 
     def __post_init__(self) -> None:
         """Refuse a scale that is not positive."""
         positive(self.scale, "Cauchy")
 
-    def value(self, squared: Array) -> Array:
-        """Value of the loss."""
-        return self.scale**2 * np.log1p(squared / self.scale**2)
-
-    def weight(self, squared: Array) -> Array:
-        """rho'(s) = 1 / (1 + s / k^2)."""
-        return 1.0 / (1.0 + squared / self.scale**2)
+    @property
+    def form(self) -> Form:
+        """By k^2."""
+        return CAUCHY, self.scale**2, 0.0
 
 
 @dataclass(frozen=True)
-class Tukey:
+class Tukey(Formula):
     """Biweight: residuals beyond ``threshold`` have no influence at all.
+
+    rho(s) = c^2/3 (1 - (1 - s/c^2)^3), constant beyond c^2.
 
     Attributes:
         threshold: c, in units of the whitened residual's norm.
     """
 
     threshold: float = 4.685
-    held = False
 
     def __post_init__(self) -> None:
         """Refuse a threshold that is not positive."""
         positive(self.threshold, "Tukey")
 
-    def value(self, squared: Array) -> Array:
-        """rho(s) = c^2/3 (1 - (1 - s/c^2)^3), constant beyond c; multiplied out, it does not cancel for small s."""
-        c2 = self.threshold**2
-        share = np.minimum(squared / c2, 1.0)
-        value: Array = c2 / 3.0 * share * (3.0 - 3.0 * share + share * share)
-        return value
-
-    def weight(self, squared: Array) -> Array:
-        """rho'(s) = (1 - s/c^2)^2 inside, 0 outside."""
-        return (1.0 - np.minimum(squared / self.threshold**2, 1.0)) ** 2
+    @property
+    def form(self) -> Form:
+        """By c^2."""
+        return TUKEY, self.threshold**2, 0.0
 
 
 @dataclass(frozen=True)
-class DCS:
+class DCS(Formula):
     """Dynamic covariance scaling: switchable constraints with the switches eliminated (Agarwal et al. 2013).
 
     A residual with s = |W r|^2 is scaled by t = min(1, 2 Phi / (Phi + s)). The scaling is the minimiser
     of a cost of its own, so the loss has a closed form (MacTavish and Barfoot 2015): quadratic up to s = Phi, then
-    flattening towards 3 Phi.
+    4 Phi s / (Phi + s) - Phi, which flattens towards 3 Phi.
 
     Attributes:
         phi: Phi, in units of the *squared* norm of the whitened residual.
     """
 
     phi: float = 1.0
-    held = False
 
     def __post_init__(self) -> None:
         """Refuse a parameter that is not positive."""
@@ -145,18 +162,14 @@ class DCS:
         """t(s), the factor on the residual: what a switch variable would have become."""
         return np.minimum(1.0, 2.0 * self.phi / (self.phi + squared))
 
-    def value(self, squared: Array) -> Array:
-        """rho(s) = s up to Phi, 4 Phi s / (Phi + s) - Phi beyond."""
-        phi = self.phi
-        return np.where(squared <= phi, squared, 4.0 * phi * squared / (phi + squared) - phi)
-
-    def weight(self, squared: Array) -> Array:
-        """rho'(s) = t(s)^2."""
-        return self.scaling(squared) ** 2
+    @property
+    def form(self) -> Form:
+        """By Phi."""
+        return SCALED, self.phi, 0.0
 
 
 @dataclass(frozen=True)
-class GemanMcClure:
+class GemanMcClure(Formula):
     """rho(s) = mu c^2 s / (mu c^2 + s), bounded by mu c^2 (Geman and McClure 1985; surrogate of Yang et al. 2020).
 
     Attributes:
@@ -166,22 +179,16 @@ class GemanMcClure:
 
     scale: float = 1.0
     mu: float = 1.0
-    held = False
 
     def __post_init__(self) -> None:
         """Refuse parameters that are not positive."""
         positive(self.scale, "GemanMcClure")
         positive(self.mu, "GemanMcClure")
 
-    def value(self, squared: Array) -> Array:
-        """Value of the loss."""
-        bound = self.mu * self.scale**2
-        return bound * squared / (bound + squared)
-
-    def weight(self, squared: Array) -> Array:
-        """rho'(s) = (mu c^2 / (mu c^2 + s))^2."""
-        bound = self.mu * self.scale**2
-        return (bound / (bound + squared)) ** 2
+    @property
+    def form(self) -> Form:
+        """By the bound mu c^2."""
+        return GEMAN_MCCLURE, self.mu * self.scale**2, 0.0
 
     def surrogates(self, largest: float, growth: float) -> Iterator[Loss]:
         """Losses from nearly convex to this one: mu from 2 max(s) / c^2 down to 1 (Yang et al. 2020).
@@ -198,8 +205,10 @@ class GemanMcClure:
 
 
 @dataclass(frozen=True)
-class TruncatedLeastSquares:
+class TruncatedLeastSquares(Formula):
     """rho(s) = min(s, c^2): a factor counts in full or not at all (surrogate of Yang et al. 2020).
+
+    The surrogates are s, then 2 c sqrt(s mu (mu + 1)) - mu (c^2 + s), then c^2.
 
     Attributes:
         threshold: c, in units of the whitened residual's norm.
@@ -208,7 +217,6 @@ class TruncatedLeastSquares:
 
     threshold: float = 3.0
     mu: float = np.inf
-    held = False
 
     def __post_init__(self) -> None:
         """Refuse parameters that are not positive."""
@@ -216,23 +224,10 @@ class TruncatedLeastSquares:
         if self.mu != np.inf:
             positive(self.mu, "TruncatedLeastSquares")
 
-    def value(self, squared: Array) -> Array:
-        """rho(s): s, then 2 c sqrt(s mu (mu + 1)) - mu (c^2 + s), then c^2 (Yang et al. 2020)."""
-        mu, c2 = self.mu, self.threshold**2
-        if mu == np.inf:
-            return np.minimum(squared, c2)
-        # c^2 minus a square: the published form cancels for large mu.
-        gap = np.sqrt((mu + 1.0) * c2) - np.sqrt(mu * np.minimum(squared, c2 * (mu + 1.0) / mu))
-        return np.where(squared <= c2 * mu / (mu + 1.0), squared, c2 - gap**2)
-
-    def weight(self, squared: Array) -> Array:
-        """rho'(s): 1, then c sqrt(mu (mu + 1) / s) - mu, then 0 (Yang et al. 2020)."""
-        mu, c2 = self.mu, self.threshold**2
-        if mu == np.inf:
-            return np.where(squared <= c2, 1.0, 0.0)
-        inside = c2 * mu / (mu + 1.0)
-        between = self.threshold * np.sqrt(mu * (mu + 1.0) / np.maximum(squared, inside)) - mu
-        return np.where(squared <= inside, 1.0, np.clip(between, 0.0, 1.0))
+    @property
+    def form(self) -> Form:
+        """By c and mu."""
+        return TRUNCATED, self.threshold, self.mu
 
     def surrogates(self, largest: float, growth: float) -> Iterator[Loss]:
         """Losses from nearly convex to this one: mu from c^2 / (2 max(s) - c^2) up (Yang et al. 2020).
@@ -276,3 +271,78 @@ def positive(value: float, name: str) -> None:
     """Raise unless a loss parameter is positive and finite."""
     if not (np.isfinite(value) and value > 0.0):
         raise GraphError(f"{name}: its parameter must be positive and finite, found {value}")
+
+
+def form_of(loss: Loss | None) -> Form | None:
+    """How compiled code knows a loss; None where its formulas are Python, also in a subclass of a shipped one."""
+    if loss is None:
+        return QUADRATIC, 0.0, 0.0
+    shipped = isinstance(loss, Formula) and (type(loss).value, type(loss).weight) == (Formula.value, Formula.weight)
+    return loss.form if isinstance(loss, Formula) and shipped else None
+
+
+@in_order
+def value_of(kind: int, first: float, second: float, squared: float) -> float:
+    """rho(s) of the shipped losses."""
+    if kind == HUBER:
+        return squared if squared <= first * first else 2.0 * first * sqrt(squared) - first * first
+    if kind == CAUCHY:
+        return first * log1p(squared / first)
+    if kind == TUKEY:  # multiplied out, it does not cancel for small s
+        share = squared / first
+        share = 1.0 if share > 1.0 else share
+        return first / 3.0 * share * (3.0 - 3.0 * share + share * share)
+    if kind == SCALED:
+        return squared if squared <= first else 4.0 * first * squared / (first + squared) - first
+    if kind == GEMAN_MCCLURE:
+        return first * squared / (first + squared)
+    if kind == TRUNCATED:
+        bound = first * first
+        if second == np.inf:
+            return bound if squared > bound else squared
+        if squared <= bound * second / (second + 1.0):
+            return squared
+        # c^2 minus a square: the published form cancels for large mu.
+        most = bound * (second + 1.0) / second
+        gap = sqrt((second + 1.0) * bound) - sqrt(second * (most if squared > most else squared))
+        return bound - gap * gap
+    return squared
+
+
+@in_order
+def weight_of(kind: int, first: float, second: float, squared: float) -> float:
+    """rho'(s) of the shipped losses."""
+    if kind == HUBER:
+        return first / sqrt(first * first if squared < first * first else squared)
+    if kind == CAUCHY:
+        return 1.0 / (1.0 + squared / first)
+    if kind == TUKEY:
+        share = squared / first
+        share = 1.0 if share > 1.0 else share
+        return (1.0 - share) * (1.0 - share)
+    if kind == SCALED:
+        scaling = 2.0 * first / (first + squared)
+        return 1.0 if scaling > 1.0 else scaling * scaling
+    if kind == GEMAN_MCCLURE:
+        share = first / (first + squared)
+        return share * share
+    if kind == TRUNCATED:
+        inside = first * first
+        if second == np.inf:
+            return 1.0 if squared <= inside else 0.0
+        inside = inside * second / (second + 1.0)
+        if squared <= inside:
+            return 1.0
+        between = first * sqrt(second * (second + 1.0) / squared) - second
+        return 0.0 if between < 0.0 else 1.0 if between > 1.0 else between
+    return 1.0
+
+
+@in_order
+def _fill(kind: int, first: float, second: float, slopes: bool, squared: Array, out: Array) -> None:
+    """``out`` = rho'(s) or rho(s) of all."""
+    for i in range(len(squared)):
+        if slopes:
+            out[i] = weight_of(kind, first, second, squared[i])
+        else:
+            out[i] = value_of(kind, first, second, squared[i])

@@ -5,9 +5,48 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.errors import GraphError
+from unifg.machine.jit import inlined
 from unifg.typing import Array
 
 DIAGONAL, FULL = 2, 4  # kinds of W; 1 is added when every factor has its own
+
+
+@inlined
+def whiten(kind: int, whiteners: Array, first: int, i: int, r: Array, J: Array) -> None:
+    """W r and W J of factor i in place; a full W is upper triangular.
+
+    Args:
+        kind: of W, 0 for none.
+        whiteners: reciprocal standard deviations, or whole W row by row.
+        first: where that of factor 0 begins, which is everybody's if not every factor has its own.
+        i: the factor.
+        r: (m,).
+        J: (m, D), or without rows where it is not wanted.
+    """
+    rows, width = len(r), J.shape[1]
+    if kind & DIAGONAL:
+        start = first + i * (kind & 1) * rows
+        for a in range(rows):
+            w = whiteners[start + a]
+            r[a] *= w
+            if len(J):
+                for d in range(width):
+                    J[a, d] *= w
+    elif kind & FULL:
+        start = first + i * (kind & 1) * rows * rows
+        for a in range(rows):
+            total = 0.0
+            for b in range(a, rows):
+                total += whiteners[start + a * rows + b] * r[b]
+            r[a] = total
+            if len(J):
+                w = whiteners[start + a * rows + a]
+                for d in range(width):
+                    J[a, d] *= w
+                for b in range(a + 1, rows):
+                    w = whiteners[start + a * rows + b]
+                    for d in range(width):
+                        J[a, d] += w * J[b, d]
 
 
 def reciprocals(name: str, sigma: Array, count: int, size: int) -> Array:

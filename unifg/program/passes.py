@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.kernels.whitening import DIAGONAL, FULL
+from unifg.kernels.whitening import whiten
 from unifg.machine.calls import call_residual, matrix, vector, vector_at
 from unifg.machine.jit import compiled, inlined
 from unifg.program.table import (
@@ -89,36 +89,6 @@ def _run(
 
 
 @inlined
-def _whiten(term: IntArray, i: int, whiteners: Array, r: Array, J: Array) -> None:
-    """W r and W J in place; a full W is upper triangular."""
-    rows, width = len(r), J.shape[1]
-    kind, spread = term[WHITEN], term[WHITEN] & 1
-    if kind & DIAGONAL:
-        start = term[WHITENER] + i * spread * rows
-        for a in range(rows):
-            w = whiteners[start + a]
-            r[a] *= w
-            if len(J):
-                for d in range(width):
-                    J[a, d] *= w
-    elif kind & FULL:
-        start = term[WHITENER] + i * spread * rows * rows
-        for a in range(rows):
-            total = 0.0
-            for b in range(a, rows):
-                total += whiteners[start + a * rows + b] * r[b]
-            r[a] = total
-            if len(J):
-                w = whiteners[start + a * rows + a]
-                for d in range(width):
-                    J[a, d] *= w
-                for b in range(a + 1, rows):
-                    w = whiteners[start + a * rows + b]
-                    for d in range(width):
-                        J[a, d] += w * J[b, d]
-
-
-@inlined
 def _violation(value: float, lower: float, upper: float) -> float:
     """Distance outside the limits."""
     return max(value - upper, lower - value, 0.0)
@@ -145,7 +115,7 @@ def evaluate(terms: Terms, values: Array, residual: Array, constraints: Array, s
             elif term[ADDRESS] != 0:
                 _run(term, term[ADDRESS], i, gather, sizes, parameters, values, scratch, r, matrix(scratch, 0, 0, 0))
             if kind == COST:
-                _whiten(term, i, whiteners, r, matrix(scratch, 0, 0, 0))
+                whiten(term[WHITEN], whiteners, term[WHITENER], i, r, matrix(scratch, 0, 0, 0))
                 squared = 0.0
                 for a in range(m):
                     squared += r[a] * r[a]
@@ -211,7 +181,7 @@ def linearize(
                 for a in range(m):
                     total += _violation(r[a], lower[at + a], upper[at + a]) ** 2
                 continue
-            _whiten(term, i, whiteners, r, J)
+            whiten(term[WHITEN], whiteners, term[WHITENER], i, r, J)
             squared = 0.0
             for a in range(m):
                 squared += r[a] * r[a]

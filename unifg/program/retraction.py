@@ -7,15 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from unifg.language.terms import Fix
-from unifg.lie import Manifold, Rn
-from unifg.lie.functions import functions_of
+from unifg.lie.moving import move_of, move_point
 from unifg.lie.product import leaves
-from unifg.machine.calls import RETRACTION, address, call_retraction, vector
 from unifg.machine.jit import compiled
 from unifg.program.columns import Columns, Values
 from unifg.typing import Array, IntArray
-
-ADDITION = 0  # in the place of an address: the retraction is a sum
 
 
 class Retraction:
@@ -33,16 +29,16 @@ class Retraction:
         parts = []
         for family in columns.families:
             parts_of = list(leaves(family.manifold))
-            if any(_compiled_retraction(leaf) is None for leaf, _, _ in parts_of):
+            moves = [move_of(leaf) for leaf, _, _ in parts_of]
+            if None in moves:
                 self._python.append(family)
                 continue
-            for leaf, storage, tangent in parts_of:
-                function = _compiled_retraction(leaf)
-                self._kept.append(function)
-                where = ADDITION if function == ADDITION else address(function, RETRACTION)  # type: ignore[arg-type]
+            self._kept.append(moves)
+            for (leaf, storage, tangent), found in zip(parts_of, moves, strict=True):
+                assert found is not None
                 parts.append(
                     [
-                        where,
+                        found.where,
                         family.count,
                         columns.storage[family] + storage,
                         family.manifold.storage,
@@ -87,14 +83,6 @@ class Retraction:
         return moved
 
 
-def _compiled_retraction(manifold: Manifold) -> object:
-    """The compiled retraction of a manifold, ADDITION, or None when it has only a batched one."""
-    if isinstance(manifold, Rn):
-        return ADDITION
-    functions = functions_of(manifold)
-    return None if functions is None else functions.retract
-
-
 @compiled
 def retract_parts(parts: IntArray, free: IntArray, step: Array, full: Array, values: Array, moved: Array) -> None:
     """Spread the step over the tangent space and move every part."""
@@ -104,8 +92,4 @@ def retract_parts(parts: IntArray, free: IntArray, step: Array, full: Array, val
         where, count, storage, stride, size, tangent, hop, dim = parts[p]
         for i in range(count):
             x, d = storage + i * stride, tangent + i * hop
-            if where == ADDITION:
-                for k in range(size):
-                    moved[x + k] = values[x + k] + full[d + k]
-            else:
-                call_retraction(where, vector(values, x, size), vector(full, d, dim), vector(moved, x, size))
+            move_point(where, values, x, size, full, d, dim, moved, x)

@@ -7,186 +7,168 @@ that the parent adds to its own front (J. Liu, "The multifrontal method", SIAM R
 
 from __future__ import annotations
 
-from unifg.elimination.dense import eliminate, subtract_signed
+from unifg.elimination.assembly import add_products, add_update
+from unifg.elimination.fronts import eliminate_front
+from unifg.elimination.substitution import backward
 from unifg.machine.jit import compiled
-from unifg.machine.vectors import address, blend, get, load, plus, put, splat, store
-from unifg.smoothing.fields import (
-    CANDIDATE,
-    CANDIDATES,
-    CHANGED,
-    COUNT,
-    DATA,
-    DIM,
-    FRONT,
-    FROZEN,
-    LIST,
-    LOCAL,
-    NEXT_CANDIDATE,
-    NUMBERS,
-    PIVOT_ROWS,
-    PIVOTS,
-    SIZE,
-    SLOTS,
-    STORAGE,
-    STRIDE,
-    TYPE,
-    VALUE,
-    VARIABLES,
-    WIDTH,
-    State,
-)
+from unifg.machine.vectors import Address, address, get, splat, store
+from unifg.smoothing.memory import length_of_front, take_list, take_numbers
+from unifg.smoothing.state import Record, opened
 from unifg.typing import Array, IntArray
 
 
 @compiled
-def add_factor(state: State, f: int, place: IntArray, clique: IntArray) -> None:
-    """Add J'J and -J'r of a linearised factor to a front; ``place`` has the first row of each variable by number."""
-    numbers, lists, variables, factor = state.numbers, state.lists, state.variables, state.factors[f]
-    kind = state.types[factor[TYPE]]
-    width, slots, front, stride, size = kind[WIDTH], kind[SLOTS], clique[FRONT], clique[STRIDE], clique[SIZE]
-    first, source, zero = factor[VARIABLES], factor[DATA] + kind[NUMBERS], splat(0.0)
-    column = 0
-    for s in range(slots):
-        v = get(lists, first + s)
-        row, dim = place[variables[v, LOCAL]], variables[v, DIM]
-        for i in range(dim):
-            at = front + (row + i) * stride
-            put(numbers, at + size, get(numbers, at + size) - get(numbers, source + width))
-            at += row + i
-            for k in range(0, dim - i, 4):
-                passed = blend(load(numbers, source + column + i + k), zero, dim - i - k)
-                store(numbers, at + k, plus(load(numbers, at + k), 1.0, passed))
-            other = column + dim
-            for t in range(s + 1, slots):
-                w = get(lists, first + t)
-                col, wide = place[variables[w, LOCAL]], variables[w, DIM]
-                if row < col:
-                    at = front + (row + i) * stride + col
-                    for k in range(0, wide, 4):
-                        passed = blend(load(numbers, source + other + k), zero, wide - k)
-                        store(numbers, at + k, plus(load(numbers, at + k), 1.0, passed))
-                else:
-                    at = front + col * stride + row + i
-                    for k in range(wide):
-                        put(numbers, at, get(numbers, at) + get(numbers, source + other + k))
-                        at += stride
-                other += wide
-            source += width + 1
-        column += dim
+def begin_clique(
+    memory: Address, c: int, members: IntArray, order: IntArray, first: int, last: int, separator: IntArray,
+    begin: int, end: int, size: int, place: IntArray,
+) -> None:  # fmt: skip
+    """Lay out a clique with an empty front; its children stay.
+
+    Args:
+        memory: address of the description of the smoother's arrays; there must be room.
+        c: the clique.
+        members: variables by their local numbers.
+        order: local numbers in the order of elimination.
+        first: where those it eliminates begin there.
+        last: one past them.
+        separator: local numbers of those that cliques touch beside.
+        begin: where its own begin.
+        end: one past them.
+        size: scalars of all.
+        place: receives the first row of each by its local number.
+    """
+    state = opened(memory)
+    variables, lists, numbers, clique = state.variables, state.lists, state.numbers, state.cliques[c]
+    clique.pivots, clique.count = last - first, last - first + end - begin
+    clique.size, clique.stride, clique.marked, clique.prior, clique.filled = size, size + 1, 0, 0, 1
+    clique.list, clique.front = take_list(memory, clique.count), take_numbers(memory, length_of_front(size))
+    clique.parent, clique.sibling = -1, -1
+    at, row = clique.list, 0
+    for q in range(first, last):
+        v = members[order[q]]
+        lists[at], place[order[q]] = v, row
+        variables[v].clique, variables[v].place = c, row
+        row += variables[v].dim
+        at += 1
+    clique.pivot_rows = row
+    for q in range(begin, end):
+        v = members[separator[q]]
+        lists[at], place[separator[q]] = v, row
+        row += variables[v].dim
+        at += 1
+    at, zero = clique.front, splat(0.0)
+    for q in range(size):  # from the diagonal on, and where vectors that begin in the row above may end
+        store(numbers, at, zero)
+        for column in range(q, size + 1, 4):
+            store(numbers, at + column, zero)
+        at += size + 1
+    store(numbers, at, zero)
+
+
+@compiled
+def add_factor(memory: Address, f: int, place: IntArray, clique: Record, rows: IntArray, dims: IntArray) -> None:
+    """Add a linearised factor to a front; ``place`` has the first row of each variable by its local number."""
+    state = opened(memory)
+    lists, variables, factor = state.lists, state.variables, state.factors[f]
+    kind = state.types[factor.type]
+    for s in range(kind.slots):
+        variable = variables[get(lists, factor.variables + s)]
+        rows[s], dims[s] = place[variable.local], variable.dim
+    add_products(
+        address(state.numbers), factor.data + kind.numbers, kind.width, kind.slots, rows, dims, clique.front,
+        clique.stride, clique.size,
+    )  # fmt: skip
 
 
 @compiled
 def add_child(
-    state: State, child: IntArray, place: IntArray, clique: IntArray, relative: IntArray, runs: IntArray
+    memory: Address, child: Record, place: IntArray, clique: Record, relative: IntArray, runs: IntArray
 ) -> None:
     """Add the update matrix of a child to the front of its parent."""
-    numbers, lists, variables = state.numbers, state.lists, state.variables
-    front, stride, size = clique[FRONT], clique[STRIDE], clique[SIZE]
-    step, skip = child[STRIDE], child[PIVOT_ROWS]
-    source, count, rising = child[FRONT] + skip * (step + 1), 0, True
-    for k in range(child[LIST] + child[PIVOTS], child[LIST] + child[COUNT]):
-        v = lists[k]
-        row = place[variables[v, LOCAL]]
-        rising = rising and (count == 0 or row > relative[count - 1])
-        for d in range(variables[v, DIM]):
+    state = opened(memory)
+    variables, lists, count = state.variables, state.lists, 0
+    for k in range(child.list + child.pivots, child.list + child.count):
+        variable = variables[lists[k]]
+        row = place[variable.local]
+        for d in range(variable.dim):
             relative[count] = row + d
             count += 1
-    if not rising:
-        for i in range(count):
-            row = relative[i]
-            for j in range(i, count):
-                col = relative[j]
-                at = front + (row * stride + col if row < col else col * stride + row)
-                put(numbers, at, get(numbers, at) + get(numbers, source + j))
-            at = front + row * stride + size
-            put(numbers, at, get(numbers, at) + get(numbers, source + count))
-            source += step
-        return
-    relative[count] = size
-    runs[count] = 1
-    for i in range(count - 1, -1, -1):
-        runs[i] = runs[i + 1] + 1 if relative[i + 1] == relative[i] + 1 else 1
-    zero = splat(0.0)
-    for i in range(count):
-        target, j = front + relative[i] * stride, i
-        while j <= count:
-            at, length = target + relative[j], runs[j]
-            for k in range(0, length, 4):
-                passed = blend(load(numbers, source + j + k), zero, length - k)
-                store(numbers, at + k, plus(load(numbers, at + k), 1.0, passed))
-            j += length
-        source += step
+    relative[count] = clique.size
+    add_update(
+        address(state.numbers), child.front + child.pivot_rows * (child.stride + 1), child.stride, count,
+        clique.front, clique.stride, relative, runs,
+    )  # fmt: skip
 
 
 @compiled
-def eliminate_clique(state: State, clique: IntArray, scale: Array, pivots: Array, signs: Array) -> int:
+def eliminate_clique(memory: Address, clique: Record, scale: Array, pivots: Array, signs: Array) -> int:
     """Eliminate the pivots of an assembled front; returns -1, or the variable whose pivot vanished."""
+    state = opened(memory)
     numbers, lists, variables = state.numbers, state.lists, state.variables
-    front, stride, size, width = clique[FRONT], clique[STRIDE], clique[SIZE], clique[PIVOT_ROWS]
+    front, stride, size, width = clique.front, clique.stride, clique.size, clique.pivot_rows
     at = 0
-    for k in range(clique[LIST], clique[LIST] + clique[PIVOTS]):
-        v = lists[k]
-        dim = variables[v, DIM]
-        start = variables[v, VALUE] + variables[v, STORAGE] + 2 * dim
+    for k in range(clique.list, clique.list + clique.pivots):
+        variable = variables[lists[k]]
+        dim = variable.dim
+        start = variable.value + variable.storage + 2 * dim
         for d in range(dim):
             scale[at] = numbers[start + d]
             at += 1
-    where, sign = address(numbers), address(signs)
     first = front - front  # zero, of which compiled code does not know it: functions are compiled anew for a literal
-    failed = eliminate(
-        where, front, stride, first, width, size + 1, address(scale), address(pivots), sign, first
+    failed = eliminate_front(
+        address(numbers), front, stride, width, size + 1, front + width * (stride + 1), stride, size - width,
+        address(scale), address(pivots), address(signs), first,
     )  # fmt: skip
-    end = width if failed < 0 else failed
-    for i in range(end):
+    for i in range(width if failed < 0 else failed):
         if signs[i] < 0.0:
             failed = i
             break
     if failed < 0:
-        rows = size - width
-        subtract_signed(
-            where, front + width * (stride + 1), stride, rows + 1, front + width, stride, width, sign, first, rows
-        )  # fmt: skip
         return -1
     at = 0
-    for k in range(clique[LIST], clique[LIST] + clique[PIVOTS]):
-        at += variables[lists[k], DIM]
+    for k in range(clique.list, clique.list + clique.pivots):
+        at += variables[lists[k]].dim
         if failed < at:
             return int(lists[k])
-    return int(lists[clique[LIST]])
+    return int(lists[clique.list])
 
 
 @compiled
-def substitute(state: State, clique: IntArray, threshold: float, limit: float, update: int, x: Array) -> None:
+def substitute(
+    memory: Address, clique: Record, threshold: float, limit: float, update: int, x: Array, pivots: Array
+) -> None:
     """Find the step of the pivots, given that of the separator.
 
     Args:
-        state: of the smoother.
+        memory: address of the description of the smoother's arrays.
         clique: eliminated.
         threshold: variables that moved further than this since they last did are marked.
         limit: steps beyond it make a variable a candidate for relinearisation.
         update: number of this update.
-        x: scratch, (size,).
+        x: scratch, (size + 4,).
+        pivots: the same.
     """
-    numbers, lists, variables, counters = state.numbers, state.lists, state.variables, state.counters
-    front, stride, size, width = clique[FRONT], clique[STRIDE], clique[SIZE], clique[PIVOT_ROWS]
+    state = opened(memory)
+    numbers, lists, variables, counters = state.numbers, state.lists, state.variables, state.counters[0]
+    front, stride, size, width = clique.front, clique.stride, clique.size, clique.pivot_rows
+    for i in range(width):
+        row = front + i * stride
+        x[i], pivots[i] = numbers[row + size], 1.0 / numbers[row + i]
     at = width
-    for k in range(clique[LIST] + clique[PIVOTS], clique[LIST] + clique[COUNT]):
-        v = lists[k]
-        step = variables[v, VALUE] + variables[v, STORAGE]
-        for d in range(variables[v, DIM]):
+    for k in range(clique.list + clique.pivots, clique.list + clique.count):
+        variable = variables[lists[k]]
+        step = variable.value + variable.storage
+        for d in range(variable.dim):
             x[at] = numbers[step + d]
             at += 1
-    for i in range(width - 1, -1, -1):
-        row = front + i * stride
-        total = get(numbers, row + size)
-        for j in range(i + 1, size):
-            total -= get(numbers, row + j) * get(x, j)
-        x[i] = total / numbers[row + i]
+    zero = front - front  # see above
+    backward(address(x), zero, address(numbers), front, stride, width, size, address(pivots), zero)
     at = 0
-    for k in range(clique[LIST], clique[LIST] + clique[PIVOTS]):
+    for k in range(clique.list, clique.list + clique.pivots):
         v = lists[k]
-        dim = variables[v, DIM]
-        step = variables[v, VALUE] + variables[v, STORAGE]
+        variable = variables[v]
+        dim = variable.dim
+        step = variable.value + variable.storage
         moved, largest = 0.0, 0.0
         for d in range(dim):
             numbers[step + d] = x[at]
@@ -194,10 +176,10 @@ def substitute(state: State, clique: IntArray, threshold: float, limit: float, u
             moved = max(moved, abs(x[at] - numbers[step + dim + d]))
             at += 1
         if moved > threshold:
-            variables[v, CHANGED] = update
+            variable.changed = update
             for d in range(dim):
                 numbers[step + dim + d] = numbers[step + d]
-        if largest > limit and variables[v, CANDIDATE] == 0 and variables[v, FROZEN] != 1:
-            variables[v, CANDIDATE] = 1
-            variables[v, NEXT_CANDIDATE] = counters[CANDIDATES]
-            counters[CANDIDATES] = v
+        if largest > limit and variable.candidate == 0 and variable.frozen != 1:
+            variable.candidate = 1
+            variable.next_candidate = counters.candidates
+            counters.candidates = v

@@ -12,19 +12,17 @@ from unifg.errors import GraphError
 from unifg.kernels.kernel import Kernel, side_by_side
 from unifg.kernels.per_factor import per_factor
 from unifg.kernels.residuals import Residual
-from unifg.kernels.robust import DCS, Cauchy, GemanMcClure, Huber, Loss, Tukey
+from unifg.kernels.robust import Form, Loss, form_of
 from unifg.kernels.whitening import DIAGONAL, FULL, reciprocals, square_roots
 from unifg.language.factors import prior
 from unifg.language.graph import AnyResidual, complete
 from unifg.language.variables import as_selection, is_variable
-from unifg.lie import Manifold, Rn
-from unifg.lie.functions import functions_of
+from unifg.lie import Manifold
+from unifg.lie.moving import ADDITION, move_of
 from unifg.lie.product import leaves
-from unifg.machine.calls import RETRACTION, address
 from unifg.machine.jit import compiled, is_compiled
 from unifg.smoothing.families import GrowingFamily
-from unifg.smoothing.fields import SLOTS_MAX
-from unifg.smoothing.linear import CAUCHY, DCS_LOSS, GEMAN_MCCLURE, HUBER, PART, QUADRATIC, TUKEY
+from unifg.smoothing.state import SLOTS_MAX
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 
@@ -56,13 +54,13 @@ class Types:
     """The types of factors of one smoother: a kernel, how it is whitened, its loss.
 
     Attributes:
-        fields: one row of integers for each type, as in :mod:`unifg.smoothing.fields`.
+        fields: one row for each type, as TYPE has them.
         scratch: numbers that any of them needs while it is evaluated.
     """
 
     def __init__(self) -> None:
         """Know none."""
-        self.fields: list[list[int]] = []
+        self.fields: list[tuple[float, ...]] = []
         self.scratch = 8
         self._numbers: dict[tuple[Any, ...], int] = {}
         self._kernels: dict[tuple[Any, ...], Kernel] = {}
@@ -151,28 +149,35 @@ class Types:
                 roots = square_roots(name, np.asarray(information, dtype=np.float64), count, size)
                 whitener = roots.reshape(len(roots), size * size)
             whitening = FULL
-        loss, scale = robust_code(robust, name)
-        data = side_by_side([*parameters, whitener, np.array([[scale]])], count)
+        form = form_of(robust)
+        if form is None:
+            raise GraphError(
+                f"term '{name}': {type(robust).__name__} has no compiled form; a smoother takes Huber, Cauchy, Tukey, "
+                "GemanMcClure, DCS and TruncatedLeastSquares",
+                term=name,
+            )
+        data = side_by_side([*parameters, whitener], count)
         if not isfinite(data.sum()):
             index = int(np.argwhere(~np.isfinite(data))[0, 0])
             raise GraphError(f"term '{name}': a parameter of factor {index} is not finite", term=name, index=index)
-        key = (id(kernel), tuple(shapes), whitening, loss)
+        key = (id(kernel), tuple(shapes), whitening, form)
         kind = self._numbers.get(key)
         if kind is None:
-            kind = self._numbers[key] = self._add(kernel, size, data.shape[1], whitener.shape[1], whitening, loss)
+            kind = self._numbers[key] = self._add(kernel, size, data.shape[1], whitener.shape[1], whitening, form)
         return Staged(kind, families, members, data, name)
 
-    def _add(self, kernel: Kernel, size: int, numbers: int, whitener: int, whitening: int, loss: int) -> int:
+    def _add(self, kernel: Kernel, size: int, numbers: int, whitener: int, whitening: int, form: Form) -> int:
         """Describe a new type; the kernel is kept, because compiled code knows only where it stands."""
         manifolds = kernel.manifolds
         if len(manifolds) > SLOTS_MAX:
             raise GraphError(f"{kernel.name}: {len(manifolds)} variables in one factor, at most {SLOTS_MAX} here")
         width = sum(manifold.dim for manifold in manifolds)
-        parameters = numbers - whitener - 1
+        parameters = numbers - whitener
         self._kernels[(id(kernel),)] = kernel
         self.scratch = max(self.scratch, sum(manifold.storage for manifold in manifolds) + size * (1 + width) + 8)
+        loss, first, second = form
         self.fields.append(
-            [
+            (
                 kernel.address,
                 size,
                 len(manifolds),
@@ -183,7 +188,9 @@ class Types:
                 whitening,
                 loss,
                 numbers,
-            ]
+                first,
+                second,
+            )
         )
         return len(self.fields) - 1
 
@@ -238,43 +245,17 @@ def upper_roots(information: Array, out: Array) -> bool:
     return True
 
 
-def robust_code(loss: Loss | None, name: str) -> tuple[int, float]:
-    """Number of a loss and its parameter.
-
-    Raises:
-        GraphError: for losses without a compiled form.
-    """
-    match loss:
-        case None:
-            return QUADRATIC, 0.0
-        case Huber():
-            return HUBER, loss.threshold**2
-        case Cauchy():
-            return CAUCHY, loss.scale**2
-        case Tukey():
-            return TUKEY, loss.threshold**2
-        case GemanMcClure():
-            return GEMAN_MCCLURE, loss.mu * loss.scale**2
-        case DCS():
-            return DCS_LOSS, loss.phi
-    raise GraphError(
-        f"term '{name}': {type(loss).__name__} has no compiled form; a smoother takes Huber, Cauchy, Tukey, "
-        "GemanMcClure and DCS",
-        term=name,
-    )
-
-
 class Kinds:
-    """The retractions of a smoother's manifolds, as numbers compiled code reads."""
+    """The parts of a smoother's manifolds, as compiled code reads them."""
 
     def __init__(self) -> None:
         """Know none."""
-        self.fields: list[int] = []
-        self._known: list[tuple[Manifold, int]] = []
+        self.fields: list[tuple[int, ...]] = []
+        self._known: list[tuple[Manifold, tuple[int, int]]] = []
         self._kept: list[Any] = []  # addresses are good for as long as the functions live
 
-    def of(self, manifold: Manifold, family: str) -> int:
-        """Where a manifold stands.
+    def of(self, manifold: Manifold, family: str) -> tuple[int, int]:
+        """First part of a manifold, and how many it has.
 
         Raises:
             GraphError: when it has no compiled retraction.
@@ -282,24 +263,21 @@ class Kinds:
         for known, place in self._known:
             if known == manifold:
                 return place
-        parts: list[int] = []
+        first = len(self.fields)
         for leaf, storage, tangent in leaves(manifold):
-            where = deviation = 0
-            if not isinstance(leaf, Rn):
-                functions = functions_of(leaf)
-                if functions is None:
-                    raise GraphError(
-                        f"family '{family}': {leaf.name} has no compiled retraction; a smoother takes SO2, SE2, SO3, "
-                        "SE3, Rn and their products",
-                        family=family,
-                    )
-                self._kept.append(functions.retract)
+            move, deviation = move_of(leaf), 0
+            if move is None:
+                raise GraphError(
+                    f"family '{family}': {leaf.name} has no compiled retraction; a smoother takes SO2, SE2, SO3, "
+                    "SE3, Rn and their products",
+                    family=family,
+                )
+            if move.where != ADDITION:
                 kernel = prior.on(leaf).kernel
                 assert kernel is not None
-                self._kept.append(kernel)
-                where, deviation = address(functions.retract, RETRACTION), kernel.address
-            parts += [where, deviation, storage, leaf.storage, tangent, leaf.dim]
-        place = len(self.fields)
-        self.fields += [len(parts) // PART, *parts]
+                self._kept += [move.function, kernel]
+                deviation = kernel.address
+            self.fields.append((move.where, deviation, storage, leaf.storage, tangent, leaf.dim))
+        place = first, len(self.fields) - first
         self._known.append((manifold, place))
         return place

@@ -18,15 +18,15 @@ class GrowingFamily(Family):
 
     Attributes:
         number: of the family within its smoother.
-        kind: where its retraction stands.
+        parts: first part of its manifold in the state of its smoother, and how many it has.
         keep: whether a fixed lag leaves its members alone.
     """
 
-    def __init__(self, name: str, manifold: Manifold, number: int, kind: int, keep: bool) -> None:
+    def __init__(self, name: str, manifold: Manifold, number: int, parts: tuple[int, int], keep: bool) -> None:
         """Start without members."""
         super().__init__(name, manifold, 0)
         self.number = number
-        self.kind = kind
+        self.parts = parts
         self.keep = keep
         self.finite = isinstance(manifold, Rn) or manifold.name in ("SO2", "SE2")  # any finite numbers are a point
         self._rows = np.full(64, -1, dtype=np.int64)

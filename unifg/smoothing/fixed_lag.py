@@ -11,7 +11,6 @@ from unifg.errors import GraphError
 from unifg.language.variables import Selection, Variable, as_selection
 from unifg.smoothing.factors import Staged
 from unifg.smoothing.families import GrowingFamily
-from unifg.smoothing.fields import FAMILY, MEMBER
 from unifg.smoothing.marginalize import marginalize
 from unifg.smoothing.smoother import Effort, Smoother
 from unifg.typing import Array, ArrayLike, BoolArray
@@ -110,10 +109,10 @@ class FixedLag(Smoother):
         if time is not None and not np.isfinite(time):
             raise GraphError(f"FixedLag: time must be finite, found {time}")
         self._update(values, time, iterations)
-        leaving = marginalize(self._state, self._newest - self.lag, 1 if self._fixed else 2)
+        leaving = marginalize(self._memory, self._newest - self.lag, 1 if self._fixed else 2)
         for v in leaving.tolist():
-            family = self._order[int(self._state.variables[v, FAMILY])]
-            family.forget(int(self._state.variables[v, MEMBER]))
+            family = self._order[int(self._state.variables["family"][v])]
+            family.forget(int(self._state.variables["member"][v]))
         return self._effort()
 
     def window(self, variable: Variable) -> Selection:

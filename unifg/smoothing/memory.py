@@ -9,11 +9,14 @@ from typing import TypeVar
 
 import numpy as np
 
+from unifg.machine.borrow import redescribe
 from unifg.machine.jit import compiled
-from unifg.smoothing.fields import CLASSES, HEADS, LISTS_END, NUMBERS_END, State
+from unifg.machine.vectors import Address
+from unifg.smoothing.state import CLASSES, State, opened
 from unifg.typing import Array, IntArray
 
 LEAST, VECTORS = 4, 16  # the shortest blocks; those of floats are whole vectors of four
+LISTS, NUMBERS = (State._fields.index(name) for name in ("lists", "numbers"))
 T = TypeVar("T", Array, IntArray)
 SPARE = 16  # numbers behind the last block: kernels touch a few beyond the end of a row
 
@@ -39,69 +42,69 @@ def length_of_front(size: int) -> int:
 
 
 @compiled
-def take_list(state: State, length: int) -> int:
+def take_list(memory: Address, length: int) -> int:
     """A block of integers; there must be room."""
+    state = opened(memory)
     kind, size = rounded(length, LEAST)
-    counters, lists = state.counters, state.lists
-    at = counters[HEADS + kind]
+    counters, heads = state.counters[0], state.heads
+    at = heads[kind]
     if at >= 0:
-        counters[HEADS + kind] = lists[at]
+        heads[kind] = state.lists[at]
         return int(at)
-    at = counters[LISTS_END]
-    counters[LISTS_END] = at + size
+    at = counters.lists_end
+    counters.lists_end = at + size
     return int(at)
 
 
 @compiled
-def give_list(state: State, length: int, at: int) -> None:
+def give_list(memory: Address, length: int, at: int) -> None:
     """Return a block of integers."""
+    state = opened(memory)
     kind, _ = rounded(length, LEAST)
-    state.lists[at] = state.counters[HEADS + kind]
-    state.counters[HEADS + kind] = at
+    state.lists[at] = state.heads[kind]
+    state.heads[kind] = at
 
 
 @compiled
-def take_numbers(state: State, length: int) -> int:
+def take_numbers(memory: Address, length: int) -> int:
     """A block of floats; there must be room."""
+    state = opened(memory)
     kind, size = rounded(length, VECTORS)
-    counters = state.counters
-    at = counters[HEADS + CLASSES + kind]
+    counters, heads = state.counters[0], state.heads
+    at = heads[CLASSES + kind]
     if at >= 0:
-        counters[HEADS + CLASSES + kind] = int(state.numbers[at])
+        heads[CLASSES + kind] = int(state.numbers[at])
         return int(at)
-    at = counters[NUMBERS_END]
-    counters[NUMBERS_END] = at + size
+    at = counters.numbers_end
+    counters.numbers_end = at + size
     return int(at)
 
 
 @compiled
-def give_numbers(state: State, length: int, at: int) -> None:
+def give_numbers(memory: Address, length: int, at: int) -> None:
     """Return a block of floats."""
+    state = opened(memory)
     kind, _ = rounded(length, VECTORS)
-    state.numbers[at] = float(state.counters[HEADS + CLASSES + kind])
-    state.counters[HEADS + CLASSES + kind] = at
+    state.numbers[at] = float(state.heads[CLASSES + kind])
+    state.heads[CLASSES + kind] = at
 
 
 @compiled
-def more_lists(lists: IntArray, used: int, needed: int) -> IntArray:
-    """The same integers with room for ``needed`` more."""
-    if used + needed + SPARE <= len(lists):
-        return lists
-    return _longer(lists, max(2 * len(lists), used + needed + SPARE), used)
-
-
-@compiled
-def more_numbers(numbers: Array, used: int, needed: int) -> Array:
-    """The same floats with room for ``needed`` more."""
-    if used + needed + SPARE <= len(numbers):
-        return numbers
-    return _longer(numbers, max(2 * len(numbers), used + needed + SPARE), used)
-
-
-@compiled
-def _longer(array: T, length: int, used: int) -> T:
-    """A copy with room at the end."""
-    result = np.empty(length, array.dtype)
+def more(array: T, used: int, needed: int) -> T:
+    """A longer copy with room for ``needed`` more; nothing where there is room."""
+    if used + needed + SPARE <= len(array):
+        return np.empty(0, array.dtype)
+    result = np.empty(max(2 * len(array), used + needed + SPARE), array.dtype)
     for k in range(used):
         result[k] = array[k]
     return result
+
+
+@compiled
+def grown(memory: Address, lists: IntArray, numbers: Array) -> State:
+    """The arrays with longer arenas, where there are any; the caller keeps them."""
+    if len(lists):
+        redescribe(memory, LISTS, lists)
+    if len(numbers):
+        redescribe(memory, NUMBERS, numbers)
+    return opened(memory)

@@ -9,71 +9,56 @@ from __future__ import annotations
 
 from unifg.machine.calls import call_residual, matrix, vector
 from unifg.machine.jit import compiled
-from unifg.smoothing.fields import (
-    CANDIDATE,
-    COUNT,
-    DIM,
-    FRONT,
-    FROZEN,
-    KIND,
-    LIST,
-    NEXT_CLIQUE,
-    PIVOT_ROWS,
-    PIVOTS,
-    PRIORS,
-    SIZE,
-    STORAGE,
-    STRIDE,
-    VALUE,
-    State,
-)
-from unifg.smoothing.linear import PART, retract
+from unifg.machine.vectors import Address
+from unifg.smoothing.linear import retract
+from unifg.smoothing.state import opened
 from unifg.typing import Array
 
 
 @compiled
-def relinearize(state: State, v: int, scratch: Array) -> None:
+def relinearize(memory: Address, v: int, scratch: Array) -> None:
     """Move the linearisation point of a variable to its estimate; its step becomes zero."""
+    state = opened(memory)
     numbers, variable = state.numbers, state.variables[v]
-    value, storage, dim = variable[VALUE], variable[STORAGE], variable[DIM]
+    value, storage, dim = variable.value, variable.storage, variable.dim
     at = v - v  # zero, of which compiled code does not know it: functions are compiled anew for a literal
-    retract(state, v, value + storage, scratch, at)
-    if variable[FROZEN] == 2:
-        c = state.counters[PRIORS]
+    retract(memory, v, value + storage, scratch, at)
+    if variable.frozen == 2:
+        c = state.counters[0].priors
         while c >= 0:
-            _rewrite(state, c, v, scratch)
-            c = state.cliques[c, NEXT_CLIQUE]
+            _rewrite(memory, c, v, scratch)
+            c = state.cliques[c].next
     for k in range(storage):
         numbers[value + k] = scratch[k]
     for k in range(2 * dim):
         numbers[value + storage + k] = 0.0
-    variable[CANDIDATE] = 0
+    variable.candidate = 0
 
 
 @compiled
-def _rewrite(state: State, c: int, v: int, scratch: Array) -> None:
+def _rewrite(memory: Address, c: int, v: int, scratch: Array) -> None:
     """Write a prior in steps from the new point of a variable, which stands in scratch, if it knows the variable."""
+    state = opened(memory)
     variables, lists, numbers, clique = state.variables, state.lists, state.numbers, state.cliques[c]
-    row, known = clique[PIVOT_ROWS], False
-    for q in range(clique[LIST] + clique[PIVOTS], clique[LIST] + clique[COUNT]):
+    row, known = clique.pivot_rows, False
+    for q in range(clique.list + clique.pivots, clique.list + clique.count):
         if lists[q] == v:
             known = True
             break
-        row += variables[lists[q], DIM]
+        row += variables[lists[q]].dim
     if not known:
         return
-    front, stride, size, value = clique[FRONT], clique[STRIDE], clique[SIZE], variables[v, VALUE]
-    storage, dim = variables[v, STORAGE], variables[v, DIM]
+    front, stride, size, value = clique.front, clique.stride, clique.size, variables[v].value
+    storage, dim = variables[v].storage, variables[v].dim
     step = value + storage
-    for i in range(clique[PIVOT_ROWS], size):
+    for i in range(clique.pivot_rows, size):
         total = 0.0
         for d in range(dim):
             total += numbers[front + _upper(stride, i, row + d)] * numbers[step + d]
         numbers[front + i * stride + size] -= total
-    kinds, kind = state.kinds, variables[v, KIND]
-    for part in range(kinds[kind]):
-        k = kind + 1 + PART * part
-        where, at, length, tangent, width = kinds[k + 1], kinds[k + 2], kinds[k + 3], kinds[k + 4], kinds[k + 5]
+    for p in range(variables[v].part, variables[v].part + variables[v].parts):
+        part = state.parts[p]
+        where, at, length, tangent, width = part.deviation, part.start, part.storage, part.tangent, part.dim
         if where == 0:
             continue
         start, first = storage + width, row + tangent
@@ -86,7 +71,7 @@ def _rewrite(state: State, c: int, v: int, scratch: Array) -> None:
             vector(scratch, storage, width),
             J,
         )
-        for i in range(clique[PIVOT_ROWS], size + 1):
+        for i in range(clique.pivot_rows, size + 1):
             if first <= i < first + width:
                 continue
             for b in range(width):

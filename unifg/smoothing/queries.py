@@ -5,167 +5,148 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.machine.jit import compiled
-from unifg.smoothing.fields import (
-    ALIVE,
-    CANDIDATE,
-    CHANGED,
-    CLIQUE,
-    COUNT,
-    DATA,
-    DIM,
-    FACTOR_END,
-    FACTOR_FREE,
-    FAMILY,
-    FRESH,
-    FRONT,
-    FROZEN,
-    KIND,
-    LINK,
-    LIST,
-    LISTS_END,
-    MARK,
-    MEMBER,
-    NEW_FACTORS,
-    NEW_VARIABLES,
-    NEXT,
-    NEXT_FACTOR,
-    NUMBERS,
-    NUMBERS_END,
-    PARENT,
-    PIVOT_ROWS,
-    PIVOTS,
-    PLACE,
-    SCRATCH,
-    SEQUENCE,
-    SEQUENCES,
-    SLOTS_MAX,
-    STATE,
-    STORAGE,
-    STRIDE,
-    TYPE,
-    USED,
-    VALUE,
-    VARIABLE_END,
-    VARIABLE_FREE,
-    VARIABLES,
-    State,
-)
+from unifg.machine.vectors import Address
 from unifg.smoothing.linear import cost_of, length_of, retract
-from unifg.smoothing.memory import more_lists, more_numbers, take_list, take_numbers
+from unifg.smoothing.memory import grown, more, take_list, take_numbers
+from unifg.smoothing.state import FRESH, SLOTS_MAX, opened
 from unifg.smoothing.tree import paths
 from unifg.typing import Array, IntArray
 
 
 @compiled
 def add_variables(
-    state: State, kind: int, dim: int, family: int, first: int, values: Array, stamps: Array, out: IntArray
+    memory: Address,
+    part: int,
+    parts: int,
+    dim: int,
+    family: int,
+    first: int,
+    values: Array,
+    stamps: Array,
+    out: IntArray,
 ) -> Array:
-    """Add one variable for each row of values; writes their numbers and returns the arena of floats."""
-    variables, counters = state.variables, state.counters
+    """Add one variable for each row of values; writes their numbers and returns a longer arena of floats, or nothing.
+
+    Args:
+        memory: address of the description of the smoother's arrays.
+        part: first part of their manifold.
+        parts: how many it has.
+        dim: of its tangent space.
+        family: number of their family.
+        first: number of the first as a member.
+        values: (n, storage).
+        stamps: (n,).
+        out: (n,) receives their numbers.
+    """
+    state = opened(memory)
+    variables, counters = state.variables, state.counters[0]
     count, storage = values.shape
-    numbers = more_numbers(state.numbers, counters[NUMBERS_END], count * (2 * (storage + 3 * dim) + 16))
-    state = State(
-        variables, state.factors, state.types, state.kinds, state.cliques, counters, state.stamps, state.lists, numbers
-    )
+    longer = more(state.numbers, counters.numbers_end, count * (2 * (storage + 3 * dim) + 16))
+    state = grown(memory, np.empty(0, np.int64), longer)
+    numbers = state.numbers
     for k in range(count):
-        v = counters[VARIABLE_FREE]
+        v = counters.variable_free
         if v >= 0:
-            counters[VARIABLE_FREE] = variables[v, NEXT]
+            counters.variable_free = variables[v].next
         else:
-            v = counters[VARIABLE_END]
-            counters[VARIABLE_END] = v + 1
-        variable, at = variables[v], take_numbers(state, storage + 3 * dim)
-        variable[KIND], variable[DIM], variable[STORAGE], variable[VALUE] = kind, dim, storage, at
-        variable[CLIQUE], variable[PLACE], variable[LINK], variable[MARK], variable[CHANGED] = -1, 0, -1, 0, 0
-        variable[FROZEN], variable[CANDIDATE], variable[ALIVE] = 0, 0, 1
-        variable[SEQUENCE], variable[FAMILY], variable[MEMBER] = counters[SEQUENCES], family, first + k
-        counters[SEQUENCES] += 1
-        variable[NEXT] = counters[NEW_VARIABLES]
-        counters[NEW_VARIABLES] = v
-        state.stamps[v] = stamps[k]
+            v = counters.variable_end
+            counters.variable_end = v + 1
+        variable, at = variables[v], take_numbers(memory, storage + 3 * dim)
+        variable.part, variable.parts, variable.dim, variable.storage, variable.value = part, parts, dim, storage, at
+        variable.clique, variable.place, variable.link, variable.mark, variable.changed = -1, 0, -1, 0, 0
+        variable.frozen, variable.candidate, variable.alive = 0, 0, 1
+        variable.sequence, variable.family, variable.member = counters.sequences, family, first + k
+        counters.sequences += 1
+        variable.next = counters.new_variables
+        counters.new_variables = v
+        variable.stamp = stamps[k]
         for i in range(storage):
             numbers[at + i] = values[k, i]
         for i in range(3 * dim):
             numbers[at + storage + i] = 0.0
         out[k] = v
-    return numbers
+    return longer
 
 
 @compiled
-def add_factors(state: State, kind: int, touched: IntArray, data: Array) -> tuple[IntArray, Array]:
-    """Add factors of one type: (n, slots) variables, (n, NUMBERS) numbers; returns the arenas."""
-    factors, counters, variables = state.factors, state.counters, state.variables
+def add_factors(memory: Address, kind: int, touched: IntArray, data: Array) -> tuple[IntArray, Array]:
+    """Add factors of one type: (n, slots) variables, (n, numbers) numbers; returns longer arenas, or nothing."""
+    state = opened(memory)
+    factors, counters, variables = state.factors, state.counters[0], state.variables
     count, slots = touched.shape
-    size = state.types[kind, NUMBERS]
+    size = state.types[kind].numbers
     length = length_of(state.types[kind])
-    lists = more_lists(state.lists, counters[LISTS_END], count * (4 * slots + 4))
-    numbers = more_numbers(state.numbers, counters[NUMBERS_END], count * (length + length // 3 + 16))
-    state = State(variables, factors, state.types, state.kinds, state.cliques, counters, state.stamps, lists, numbers)
+    more_lists = more(state.lists, counters.lists_end, count * (4 * slots + 4))
+    more_numbers = more(state.numbers, counters.numbers_end, count * (length + length // 3 + 16))
+    state = grown(memory, more_lists, more_numbers)
+    lists, numbers = state.lists, state.numbers
     for k in range(count):
-        f = counters[FACTOR_FREE]
+        f = counters.factor_free
         if f >= 0:
-            counters[FACTOR_FREE] = factors[f, NEXT_FACTOR]
+            counters.factor_free = factors[f].next
         else:
-            f = counters[FACTOR_END]
-            counters[FACTOR_END] = f + 1
-        factor, at, where = factors[f], take_numbers(state, length), take_list(state, 2 * slots)
-        factor[TYPE], factor[VARIABLES], factor[DATA], factor[STATE], factor[USED] = kind, where, at, FRESH, 1
+            f = counters.factor_end
+            counters.factor_end = f + 1
+        factor, at, where = factors[f], take_numbers(memory, length), take_list(memory, 2 * slots)
+        factor.type, factor.variables, factor.data, factor.state, factor.used = kind, where, at, FRESH, 1
         for i in range(size):
             numbers[at + i] = data[k, i]
         for s in range(slots):
             v = touched[k, s]
             lists[where + s] = v
-            lists[where + slots + s] = variables[v, LINK]
-            variables[v, LINK] = f * SLOTS_MAX + s
-        factor[NEXT_FACTOR] = counters[NEW_FACTORS]
-        counters[NEW_FACTORS] = f
-    return lists, numbers
+            lists[where + slots + s] = variables[v].link
+            variables[v].link = f * SLOTS_MAX + s
+        factor.next = counters.new_factors
+        counters.new_factors = f
+    return more_lists, more_numbers
 
 
 @compiled
-def estimates(state: State, chosen: IntArray, points: bool, out: Array) -> None:
+def estimates(memory: Address, chosen: IntArray, points: bool, out: Array) -> None:
     """Linearisation points of some variables, or those moved by their steps, one after the other."""
-    storage = len(out) // max(len(chosen), 1)
+    state, storage = opened(memory), len(out) // max(len(chosen), 1)
     for k in range(len(chosen)):
         v = chosen[k]
-        value = state.variables[v, VALUE]
+        value = state.variables[v].value
         if points:
             for i in range(storage):
                 out[k * storage + i] = state.numbers[value + i]
         else:
-            retract(state, v, value + storage, out, k * storage)
+            retract(memory, v, value + storage, out, k * storage)
 
 
 @compiled
-def total_cost(state: State) -> float:
+def total_cost(memory: Address) -> float:
     """Sum of the costs of all factors at the estimates."""
-    scratch, total = np.empty(state.counters[SCRATCH]), 0.0
-    for f in range(state.counters[FACTOR_END]):
-        if state.factors[f, USED]:
-            total += cost_of(state, f, scratch)
+    state = opened(memory)
+    scratch, total = np.empty(state.counters[0].scratch), 0.0
+    for f in range(state.counters[0].factor_end):
+        if state.factors[f].used:
+            total += cost_of(memory, f, scratch)
     return total
 
 
 @compiled
-def joint_covariance(state: State, chosen: IntArray) -> Array:
+def joint_covariance(memory: Address, chosen: IntArray) -> Array:
     """Covariance of some variables, in the order given.
 
     With H = U'U it is Y'Y, where Y solves U'Y = E for the unit columns E of the variables, and is zero outside the
     paths from them to their roots.
     """
+    state = opened(memory)
     variables, cliques, lists, numbers = state.variables, state.cliques, state.lists, state.numbers
-    offset, rows = paths(state, chosen)
+    offset, rows = paths(memory, chosen)
     width = 0
     for k in range(len(chosen)):
-        width += variables[chosen[k], DIM]
+        width += variables[chosen[k]].dim
     Y, column = np.zeros((rows, width)), 0
     for k in range(len(chosen)):
         v = chosen[k]
-        dim, c = variables[v, DIM], variables[v, CLIQUE]
+        dim, c = variables[v].dim, variables[v].clique
         for d in range(dim):
-            Y[offset[c] + variables[v, PLACE] + d, column + d] = 1.0
+            Y[offset[c] + variables[v].place + d, column + d] = 1.0
         while c >= 0:
-            front, stride, pivots, top = cliques[c, FRONT], cliques[c, STRIDE], cliques[c, PIVOT_ROWS], offset[c]
+            front, stride, pivots, top = cliques[c].front, cliques[c].stride, cliques[c].pivot_rows, offset[c]
             for i in range(pivots):
                 row = front + i * stride
                 for d in range(column, column + dim):
@@ -173,14 +154,14 @@ def joint_covariance(state: State, chosen: IntArray) -> Array:
                     for j in range(i + 1, pivots):
                         Y[top + j, d] -= numbers[row + j] * Y[top + i, d]
                 j = pivots
-                for q in range(cliques[c, LIST] + cliques[c, PIVOTS], cliques[c, LIST] + cliques[c, COUNT]):
+                for q in range(cliques[c].list + cliques[c].pivots, cliques[c].list + cliques[c].count):
                     w = lists[q]
-                    below = offset[variables[w, CLIQUE]] + variables[w, PLACE]
-                    for b in range(variables[w, DIM]):
+                    below = offset[variables[w].clique] + variables[w].place
+                    for b in range(variables[w].dim):
                         for d in range(column, column + dim):
                             Y[below + b, d] -= numbers[row + j] * Y[top + i, d]
                         j += 1
-            c = cliques[c, PARENT]
+            c = cliques[c].parent
         column += dim
     result = np.zeros((width, width))
     for i in range(rows):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import isfinite
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,27 +13,16 @@ from unifg.kernels.robust import Loss
 from unifg.language.graph import AnyResidual
 from unifg.language.variables import Selection, Variable, as_selection
 from unifg.lie import Manifold
+from unifg.machine.borrow import described
 from unifg.smoothing.factors import Kinds, Staged, Types
 from unifg.smoothing.families import GrowingFamily
-from unifg.smoothing.fields import (
-    CLIQUE_END,
-    FACTOR_END,
-    FAILED,
-    FAMILY,
-    LARGEST,
-    MADE_ELIMINATED,
-    MEMBER,
-    SCRATCH,
-    UPDATES,
-    USED,
-    VARIABLE_END,
-    empty_state,
-)
 from unifg.smoothing.queries import add_factors, add_variables, estimates, joint_covariance, total_cost
+from unifg.smoothing.state import MADE, PART, TYPE, Records, State, empty_state
 from unifg.smoothing.update import update_tree
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
-T = TypeVar("T", Array, IntArray)
+NONE = np.empty(0, dtype=np.int64)
+ENDS = ("variable_end", "factor_end", "clique_end")
 
 
 class Effort(NamedTuple):
@@ -82,9 +71,17 @@ class Smoother:
         self._types = Types()
         self._kinds = Kinds()
         self._staged: list[Staged] = []
-        self._state = empty_state()
+        self._words = np.zeros(2 * len(State._fields), dtype=np.int64)
+        self._memory = self._words.ctypes.data
+        self._hold(empty_state())
         self._order: list[GrowingFamily] = []
         self._written = 0  # types of factors that compiled code knows
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """A copy has arrays of its own, which stand elsewhere."""
+        self.__dict__.update(state)
+        self._memory = self._words.ctypes.data
+        self._hold(self._state)
 
     def variables(self, name: str, manifold: Manifold, *, keep: bool = False) -> GrowingFamily:
         """Add a family of unknowns, empty at first.
@@ -99,10 +96,10 @@ class Smoother:
         """
         if name in self.families:
             raise GraphError(f"family '{name}' exists already: choose another name", family=name)
-        kind = self._kinds.of(manifold, name)
+        parts = self._kinds.of(manifold, name)
         self._types.scratch = max(self._types.scratch, manifold.storage + manifold.dim * (2 * manifold.dim + 1) + 8)
-        family = GrowingFamily(name, manifold, len(self._order), kind, keep)
-        self._state = self._state._replace(kinds=np.array(self._kinds.fields, dtype=np.int64))
+        family = GrowingFamily(name, manifold, len(self._order), parts, keep)
+        self._hold(self._state._replace(parts=np.array(self._kinds.fields, dtype=PART)))
         self.families[name] = family
         self._order.append(family)
         return family
@@ -155,7 +152,7 @@ class Smoother:
         rows = self._rows(selection)
         storage = selection.family.manifold.storage
         flat = np.empty(len(rows) * storage)
-        estimates(self._state, rows, points, flat)
+        estimates(self._memory, rows, points, flat)
         out = flat.reshape(len(rows), storage)
         return out if selection.component is None else out[:, selection.storage]
 
@@ -170,7 +167,7 @@ class Smoother:
         selections = [as_selection(variable) for variable in variables]
         rows = np.concatenate([self._rows(selection) for selection in selections])
         self._require_solved()
-        result: Array = joint_covariance(self._state, rows)
+        result: Array = joint_covariance(self._memory, rows)
         if all(selection.component is None for selection in selections):
             return result
         kept: list[IntArray] = []
@@ -185,11 +182,11 @@ class Smoother:
     @property
     def cost(self) -> float:
         """Sum of 1/2 rho(|W r|^2) over all factors at the estimates; half of what is often called chi2."""
-        return float(total_cost(self._state))
+        return float(total_cost(self._memory))
 
     def __len__(self) -> int:
         """Number of factors that count."""
-        return int(self._state.factors[: self._state.counters[FACTOR_END], USED].sum())
+        return int(self._state.factors["used"][: self._state.counters["factor_end"][0]].sum())
 
     def _update(self, values: Mapping[GrowingFamily, ArrayLike] | None, time: float | None, iterations: int) -> None:
         """Take in new members and staged factors, then bring everything up to date."""
@@ -202,19 +199,19 @@ class Smoother:
             out = np.empty(len(array), dtype=np.int64)
             stamps = self._stamps(family, len(array), time)
             numbers = add_variables(
-                self._state, family.kind, family.manifold.dim, family.number, family.count, array, stamps, out
+                self._memory, *family.parts, family.manifold.dim, family.number, family.count, array, stamps, out
             )
-            self._move(self._state.lists, numbers)
+            self._move(NONE, numbers)
             family.grow(out)
         for item in self._staged:
-            lists, numbers = add_factors(self._state, item.kind, _touched(item), item.data)
+            lists, numbers = add_factors(self._memory, item.kind, _touched(item), item.data)
             self._move(lists, numbers)
         self._staged.clear()
         for _ in range(iterations):
             self._solve()
 
     def _effort(self) -> Effort:
-        return Effort(*self._state.counters[MADE_ELIMINATED : LARGEST + 1].tolist())
+        return Effort(*self._state.counters[list(MADE)][0].tolist())
 
     def _stamps(self, family: GrowingFamily, count: int, time: float | None) -> Array:
         """Ages of new members; they matter only where the order is chronological."""
@@ -230,12 +227,12 @@ class Smoother:
     def _solve(self) -> None:
         """One pass over the tree."""
         state = self._state
-        now = self.relinearize if (state.counters[UPDATES] + 1) % self.every == 0 else np.inf
-        failed, lists, numbers = update_tree(state, now, self.relinearize, self.wildfire, self._chronological)
+        now = self.relinearize if (state.counters["updates"][0] + 1) % self.every == 0 else np.inf
+        failed, lists, numbers = update_tree(self._memory, now, self.relinearize, self.wildfire, self._chronological)
         self._move(lists, numbers)
         if failed >= 0:
-            family = self._order[int(state.variables[failed, FAMILY])]
-            member = int(state.variables[failed, MEMBER])
+            family = self._order[int(state.variables["family"][failed])]
+            member = int(state.variables["member"][failed])
             raise GraphError(
                 f"{family.name}[{member}] is not determined by its factors: it, or something it is tied to, needs a "
                 "prior or another measurement. The factors are kept; add what is missing and update again",
@@ -296,28 +293,36 @@ class Smoother:
         """Make the tables long enough; arenas grow by themselves."""
         state = self._state
         counters = state.counters
-        ends = counters[: CLIQUE_END + 1].tolist()
+        variable_end, factor_end, clique_end = (int(counters[end][0]) for end in ENDS)
         grown: dict[str, Any] = {}
-        if ends[VARIABLE_END] + variables > len(state.variables):
-            grown["variables"] = longer(state.variables, ends[VARIABLE_END] + variables)
-            grown["stamps"] = longer(state.stamps, ends[VARIABLE_END] + variables)
-        if ends[FACTOR_END] + factors > len(state.factors):
-            grown["factors"] = longer(state.factors, ends[FACTOR_END] + factors)
-        if ends[CLIQUE_END] + ends[VARIABLE_END] + variables + 1 > len(state.cliques):
-            grown["cliques"] = longer(state.cliques, ends[CLIQUE_END] + ends[VARIABLE_END] + variables + 1)
+        if variable_end + variables > len(state.variables):
+            grown["variables"] = longer(state.variables, variable_end + variables)
+        if factor_end + factors > len(state.factors):
+            grown["factors"] = longer(state.factors, factor_end + factors)
+        if clique_end + variable_end + variables + 1 > len(state.cliques):
+            grown["cliques"] = longer(state.cliques, clique_end + variable_end + variables + 1)
         if len(self._types.fields) > len(state.types):
             grown["types"] = longer(state.types, len(self._types.fields))
         if grown:
-            self._state = state = state._replace(**grown)
+            self._hold(state := state._replace(**grown))
         if self._written < len(self._types.fields):
             self._written = len(self._types.fields)
-            state.types[: self._written] = self._types.fields
-        counters[SCRATCH] = self._types.scratch
+            state.types[: self._written] = np.array(self._types.fields, dtype=TYPE)
+        counters["scratch"] = self._types.scratch
 
     def _move(self, lists: IntArray, numbers: Array) -> None:
-        """Keep the arenas, which may have grown."""
-        if lists is not self._state.lists or numbers is not self._state.numbers:
-            self._state = self._state._replace(lists=lists, numbers=numbers)
+        """Keep arenas that have grown."""
+        if len(lists) or len(numbers):
+            self._hold(
+                self._state._replace(
+                    lists=lists if len(lists) else self._state.lists,
+                    numbers=numbers if len(numbers) else self._state.numbers,
+                )
+            )
+
+    def _hold(self, state: State) -> None:
+        """Keep the arrays, and their description for compiled code."""
+        self._state, self._words[:] = state, described(state)
 
     def _rows(self, selection: Selection, term: str = "") -> IntArray:
         """Rows of the selected members.
@@ -340,7 +345,7 @@ class Smoother:
         return rows
 
     def _require_solved(self) -> None:
-        if self._state.counters[FAILED] >= 0:
+        if self._state.counters["failed"][0] >= 0:
             raise GraphError("the last update failed: state what is missing and update again")
 
 
@@ -353,8 +358,8 @@ def _touched(item: Staged) -> IntArray:
     return np.stack(columns, axis=1).astype(np.int64)
 
 
-def longer(table: T, rows: int) -> T:
+def longer(table: Records, rows: int) -> Records:
     """The same table with twice the rows needed."""
-    result = np.zeros((2 * rows, *table.shape[1:]), dtype=table.dtype)
+    result = np.zeros(2 * rows, dtype=table.dtype)
     result[: len(table)] = table
-    return cast(T, result)
+    return result

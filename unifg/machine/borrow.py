@@ -1,0 +1,72 @@
+"""Many arrays handed to compiled code as one number.
+
+Every array that Python hands to a compiled function is unpacked and typed, half a microsecond each; compiled functions
+hand on seven words for each, and count references with atomic operations. Where nine arrays go to functions that work
+for a microsecond, that is most of the time. So they are described by one array of integers, of which an address is
+handed on, and views of them own nothing: they are good for as long as someone else keeps the arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar, cast
+
+import numpy as np
+from llvmlite import ir
+from numba import from_dtype, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numba.np.arrayobj import populate_array
+
+from unifg.typing import IntArray
+
+T = TypeVar("T")
+WORD = ir.IntType(64)
+
+
+def described(arrays: Sequence[Any]) -> IntArray:
+    """Where flat arrays begin and how long they are: what the function made by :func:`opener` reads."""
+    return np.array([[array.ctypes.data, len(array)] for array in arrays], dtype=np.int64).ravel()
+
+
+def opener(form: Callable[..., T], dtypes: Sequence[np.dtype[Any]]) -> Callable[[int], T]:
+    """What compiled code calls to find a named tuple of flat arrays by the address of their description.
+
+    What it does not use of them costs nothing.
+
+    Numba's cache does not see the dtypes: call it from a compiled function in the file where they stand.
+    """
+    kinds = [types.Array(from_dtype(dtype), 1, "C") for dtype in dtypes]
+    whole = types.NamedTuple(kinds, form)
+
+    def opened(typing: Any, where: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            data, parts = builder.inttoptr(values[0], WORD.as_pointer()), []
+            for k, kind in enumerate(kinds):
+                begin, length = (builder.load(cgutils.gep(builder, data, 2 * k + j)) for j in range(2))
+                array = context.make_array(kind)(context, builder)
+                item = context.get_constant(types.intp, dtypes[k].itemsize)
+                pointer = builder.inttoptr(begin, cast(ir.PointerType, array.data.type))
+                populate_array(array, data=pointer, shape=[length], strides=[item], itemsize=item, meminfo=None)
+                parts.append(array._getvalue())
+            return context.make_tuple(builder, whole, parts)
+
+        return whole(types.int64), generate
+
+    return cast(Callable[[int], T], intrinsic(opened))
+
+
+def _redescribe(typing: Any, where: Any, place: Any, array: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        data = builder.inttoptr(values[0], WORD.as_pointer())
+        view = context.make_array(signature.args[2])(context, builder, values[2])
+        first = builder.shl(values[1], WORD(1))
+        builder.store(builder.ptrtoint(view.data, WORD), builder.gep(data, [first]))
+        builder.store(view.nitems, builder.gep(data, [builder.add(first, WORD(1))]))
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64, array), generate
+
+
+redescribe = cast(Callable[[int, int, Any], None], intrinsic(_redescribe))
+"""Put another array in a place of the description at an address; the caller keeps it."""
