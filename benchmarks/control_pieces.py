@@ -17,7 +17,7 @@ from unifg.machine.links import run
 from unifg.program import passes
 from unifg.program.curvature import add_curvature
 from unifg.solvers import InteriorPoint
-from unifg.solvers import barrier_state as state
+from unifg.solvers.interior_point import state
 
 REPEATS, ROUNDS = 500, 7
 

@@ -2,7 +2,7 @@
 
 from unifg.solvers.augmented_lagrangian import AugmentedLagrangian
 from unifg.solvers.graduated_non_convexity import GraduatedNonConvexity
-from unifg.solvers.interior_point import InteriorPoint
+from unifg.solvers.interior_point.method import InteriorPoint
 from unifg.solvers.kkt import KKT
 from unifg.solvers.least_squares import DogLeg, GaussNewton, LevenbergMarquardt
 from unifg.solvers.penalty import Penalty

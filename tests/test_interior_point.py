@@ -9,7 +9,7 @@ import unifg as fg
 from problems.control import Quadrotor, Unicycle
 from problems.known import short_drive
 from unifg.solvers import SQP, InteriorPoint
-from unifg.solvers.interior_point import Workspace
+from unifg.solvers.interior_point.method import Workspace
 
 
 def test_a_watched_solve_takes_the_same_steps() -> None:
@@ -137,7 +137,7 @@ def test_control_c_while_a_stalled_solve_is_settled(monkeypatch: pytest.MonkeyPa
     def pressed(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("unifg.solvers.interior_point.nearest", pressed)
+    monkeypatch.setattr("unifg.solvers.interior_point.method.nearest", pressed)
     solution = run.solve(guess)
     assert solution.status is fg.Status.INTERRUPTED
     assert solution.violation < 11.0

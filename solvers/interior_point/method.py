@@ -1,7 +1,8 @@
 """Primal-dual interior point on the graph: hard inequalities from bad guesses, one elimination per iteration.
 
-The method is in :mod:`unifg.solvers.barrier`; this file runs it. A graph whose terms all have kernels is solved by one
-compiled loop; with batched NumPy terms, or a callback per iteration, the same functions are called from Python.
+The method is in :mod:`unifg.solvers.interior_point.barrier`; this file runs it. A graph whose terms all have kernels is
+solved by one compiled loop; with batched NumPy terms, or a callback per iteration, the same functions are called from
+Python.
 """
 
 from __future__ import annotations
@@ -21,11 +22,10 @@ from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.program.second_order import lagrangian_hessian
 from unifg.program.systems import stacked
-from unifg.program.table import CONSTRAINT, COUNT, KIND, ROW, ROWS
-from unifg.solvers import barrier_state as state
-from unifg.solvers.barrier_loop import addresses, call
-from unifg.solvers.barrier_state import Problem, Work, empty_work
 from unifg.solvers.globalize.least_violation import nearest
+from unifg.solvers.interior_point import state
+from unifg.solvers.interior_point.loop import addresses, call
+from unifg.solvers.interior_point.state import Problem, Work, empty_work
 from unifg.typing import Array
 
 ENDINGS = {
@@ -170,23 +170,23 @@ class Workspace:
         self.system = program.systems.kkt(program.equality)
         arrays, table = self.system.arrays, program.table
         plan, doubles = stacked(arrays)
-        fields = program.arrays.fields
-        unequal = [
-            row[KIND] >= CONSTRAINT and not program.equality[row[ROW] : row[ROW] + row[COUNT] * row[ROWS]].all()
-            for row in fields
-        ]
+        equalities, constraints = len(arrays.rows), table.constraints
         self.work = empty_work(
-            program.columns.stored,
-            program.columns.width,
-            program.size,
-            len(arrays.rows),
-            (table.residuals, table.constraints),
-            (table.entries, table.constraint_entries),
-            program.normal.nnz,
-            len(fields),
-            table.weights,
-            iterations,
-            len(plan.slots),
+            stored=program.columns.stored,
+            width=program.columns.width,
+            unknowns=program.size,
+            equalities=max(equalities, 1),
+            total=program.size + equalities,
+            residuals=table.residuals,
+            entries=table.entries,
+            rows=constraints,
+            row_entries=table.constraint_entries,
+            sides=max(2 * constraints, 1),
+            normal=program.normal.nnz,
+            terms=len(program.arrays.fields),
+            robust=table.weights,
+            log=iterations + 2,
+            data=len(plan.slots),
         )
         self.problem = Problem(
             np.zeros(state.LINKS, dtype=np.int64),
@@ -198,7 +198,6 @@ class Workspace:
             arrays.rows,
             arrays.entries,
             doubles,
-            np.array(unequal, dtype=np.int64),
         )
         self._describe()
         self.problem.links[:] = addresses()

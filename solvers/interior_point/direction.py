@@ -1,6 +1,6 @@
 """Newton directions of the interior point: eliminate the sides, factorise with the right inertia, solve.
 
-The formulas are derived in :mod:`unifg.solvers.barrier`.
+The formulas are derived in :mod:`unifg.solvers.interior_point.barrier`.
 """
 
 from __future__ import annotations
@@ -8,10 +8,9 @@ from __future__ import annotations
 import math
 
 from unifg.elimination.plan import NEGATIVE
-from unifg.machine.jit import compiled
 from unifg.machine.links import holds, linked, parts, run
-from unifg.program.table import BOUND, COLUMN, COUNT, ENTRY, KIND, POSITION, ROW, ROWS, WIDTH, Terms
-from unifg.solvers.barrier_state import (
+from unifg.program.passes import add_constraints, times, transposed_times
+from unifg.solvers.interior_point.state import (
     AGAIN,
     ALPHA,
     ALPHA_DUAL,
@@ -52,91 +51,11 @@ from unifg.solvers.barrier_state import (
     S,
     Y,
 )
-from unifg.typing import Array, IntArray
 
 FIRST_SHIFT, LARGEST_SHIFT, FIRST_GROWTH, SHIFT_GROWTH, SHIFT_DECAY = 1e-4, 1e20, 100.0, 8.0, 3.0
 DUAL_SHIFT = 1e-9
 SHORT = 0.01  # length of a step
 LEAST_SHARE = 0.2  # of the second derivatives, before they are left out
-
-
-@compiled
-def _condense(terms: Terms, unequal: IntArray, weights: Array, jacobian: Array, data: Array) -> None:
-    """Add A' diag(row_weights) A of the rows with sides to the Hessian at the head of ``data``."""
-    fields, positions = terms.fields, terms.positions
-    for t in range(len(fields)):
-        term = fields[t]
-        if unequal[t] == 0:
-            continue
-        m, width, row, at = term[ROWS], term[WIDTH], term[ROW], term[POSITION]
-        if term[KIND] == BOUND:
-            for i in range(term[COUNT]):
-                where = positions[at + i]
-                if where >= 0:
-                    data[where] += weights[row + i]
-            continue
-        entry, pairs = term[ENTRY], width * (width + 1) // 2
-        for _ in range(term[COUNT]):
-            for a in range(m):
-                w = weights[row + a]
-                if w != 0.0:
-                    place = at
-                    for d in range(width):
-                        scaled = w * jacobian[entry + d]
-                        for e in range(d + 1):
-                            where = positions[place + e]
-                            if where >= 0:
-                                data[where] += scaled * jacobian[entry + e]
-                            elif where != -1:
-                                data[-2 - where] += 2.0 * scaled * jacobian[entry + e]
-                        place += d + 1
-                entry += width
-            row += m
-            at += pairs
-
-
-@compiled
-def _pull(terms: Terms, unequal: IntArray, scales: Array, jacobian: Array, right: Array) -> None:
-    """Subtract A' row_terms of the rows with sides from the right-hand side."""
-    fields, columns, unknowns = terms.fields, terms.columns, terms.unknown
-    for t in range(len(fields)):
-        term = fields[t]
-        if unequal[t] == 0:
-            continue
-        m, width, row, entry, column = term[ROWS], term[WIDTH], term[ROW], term[ENTRY], term[COLUMN]
-        for _ in range(term[COUNT]):
-            for a in range(m):
-                scale = scales[row + a]
-                if scale != 0.0:
-                    for d in range(width):
-                        unknown = unknowns[columns[column + d]]
-                        if unknown >= 0:
-                            right[unknown] -= scale * jacobian[entry + d]
-                entry += width
-            row += m
-            column += width
-
-
-@compiled
-def _moves(terms: Terms, unequal: IntArray, step: Array, jacobian: Array, out: Array) -> None:
-    """A dx of the rows with sides."""
-    fields, columns, unknowns = terms.fields, terms.columns, terms.unknown
-    for t in range(len(fields)):
-        term = fields[t]
-        if unequal[t] == 0:
-            continue
-        m, width, row, entry, column = term[ROWS], term[WIDTH], term[ROW], term[ENTRY], term[COLUMN]
-        for _ in range(term[COUNT]):
-            for a in range(m):
-                total = 0.0
-                for d in range(width):
-                    unknown = unknowns[columns[column + d]]
-                    if unknown >= 0:
-                        total += jacobian[entry + d] * step[unknown]
-                out[row + a] = total
-                entry += width
-            row += m
-            column += width
 
 
 @linked
@@ -146,7 +65,7 @@ def direct(address: int) -> None:
     curvature, data, doubles, entries, free, hessian = parts(address, "curvature data doubles entries free hessian")
     links, numbers, plan, rests, row_weights, rows = parts(address, "links numbers plan rests row_weights rows")
     pairs, prices, shift, side_row, sides = parts(address, "pairs prices shift side_row sides")
-    multipliers, row_units, step, terms, unequal = parts(address, "multipliers row_units step terms unequal")
+    multipliers, row_units, step, terms = parts(address, "multipliers row_units step terms")
     (units,) = parts(address, "units")
     n, equalities, normal = len(free), len(rows), len(hessian)
     for row in range(len(row_weights)):
@@ -172,7 +91,7 @@ def direct(address: int) -> None:
         data[k] = curvature[k] if share > 0.0 else hessian[k]
     for k in range(len(entries)):
         data[normal + k] = constraint_jacobian[entries[k]]
-    _condense(terms, unequal, row_weights, constraint_jacobian, data)
+    add_constraints(terms, constraint_jacobian, row_weights, data)
     for k in range(len(doubles) // 2):
         data[doubles[2 * k]] += data[doubles[2 * k + 1]]
     delta = numbers[DELTA] if counts[FAILURES] > 0 else 0.0
@@ -219,7 +138,7 @@ def steer(address: int) -> None:
     constraint_jacobian, counts, free, full = parts(address, "constraint_jacobian counts free full")
     gradient, links, numbers, plan, rests, right = parts(address, "gradient links numbers plan rests right")
     row_terms, rows, side_row, sides, step = parts(address, "row_terms rows side_row sides step")
-    multipliers, pairs, prices, terms, unequal = parts(address, "multipliers pairs prices terms unequal")
+    multipliers, pairs, prices, spread, terms = parts(address, "multipliers pairs prices spread terms")
     mu, elastic = numbers[MU], counts[ELASTIC] == 1
     n = len(free)
     for row in range(len(row_terms)):
@@ -228,9 +147,11 @@ def steer(address: int) -> None:
         row, y = side_row[k], sides[Y, k]
         r = sides[REST, k] + sides[S, k] - sides[E, k] + mu / (prices[row] - y) - mu / y
         row_terms[row] += sides[SIGN, k] * sides[WEIGHT, k] * r
+    for k in range(len(full)):
+        spread[k] = full[k]
+    transposed_times(terms, False, constraint_jacobian, row_terms, spread)
     for k in range(n):
-        right[k] = -full[free[k]]
-    _pull(terms, unequal, row_terms, constraint_jacobian, right)
+        right[k] = -spread[free[k]]
     for k in range(len(rows)):
         row = rows[k]
         right[n + k] = -rests[row]
@@ -238,7 +159,7 @@ def steer(address: int) -> None:
             over, under = prices[row] - multipliers[row], prices[row] + multipliers[row]
             right[n + k] += pairs[N, k] - pairs[P, k] + mu / over - mu / under
     run(links[SOLVE], (plan, right, step))
-    _moves(terms, unequal, step, constraint_jacobian, row_terms)
+    times(terms, False, constraint_jacobian, step, row_terms)
     slope = 0.0
     for k in range(n):
         slope += gradient[free[k]] * step[k]

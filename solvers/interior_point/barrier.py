@@ -36,35 +36,30 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from unifg.machine.jit import compiled
 from unifg.machine.links import linked, parts, run
+from unifg.program.passes import transposed_times
 from unifg.program.table import BOUND, COLUMN, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, Terms
-from unifg.solvers.barrier_state import (
-    ACCEPT,
-    ACCEPTED,
-    AGAIN,
-    ALPHA,
-    ALPHA_DUAL,
+from unifg.solvers.interior_point.state import (
     ANSWER,
     ASKED,
     BORDER,
     COLD,
     COMPLEMENTARITY,
     CONVERGED,
-    CORRECT,
     CORRECTED,
     COST,
     COST_UNIT,
     DE,
     DELTA,
-    DESCENT,
     DN,
     DP,
     DS,
     DY,
     ELASTIC,
     FAILURES,
-    FILTER,
     FILTERED,
     FORCE,
     GAP,
@@ -83,33 +78,20 @@ from unifg.solvers.barrier_state import (
     PHI,
     RAISES,
     RELAX,
-    REST,
-    RESTORE,
     RHO,
-    SAVED_ALPHA,
-    SAVED_DE,
-    SAVED_DN,
-    SAVED_DP,
-    SAVED_DS,
-    SAVED_DUAL,
-    SAVED_DY,
-    SAVED_SLOPE,
     SCALE,
     SCALING,
     SHORT_STEPS,
     SIDES,
     SIGN,
-    SLOPE,
     STALLED,
     STATIONARITY,
-    STEER,
     STEP,
     TAKEN,
     THETA,
     THETA_LARGE,
     THETA_SMALL,
     TOLERANCE,
-    TRIAL_COST,
     TRIALS,
     TRY,
     VIOLATED,
@@ -125,11 +107,7 @@ from unifg.typing import Array, IntArray
 OBJECTIVE = 0  # table.COST
 KAPPA = 50.0  # mu is lowered when the error of the barrier problem is below KAPPA mu
 SOLVED = 50.0  # prices are looked at when it is below SOLVED mu
-ARMIJO = 1e-4
-GAMMA_THETA, GAMMA_PHI = 1e-5, 1e-8
-HALVINGS = 20
-FEW_FAILURES, MOST_FAILURES = 2, 8  # of line searches in a row, before equalities become elastic and for good
-SHORT_STEP, MOST_SHORT_STEPS = 0.05, 5  # in a row, before equalities become elastic
+MOST_SHORT_STEPS = 5  # in a row, before equalities become elastic
 RELAXED_MU = 1e-2  # of price times violation: first mu with elastic equalities
 LATE_MU = 1e-3  # the same: largest mu at which a violation is taken seriously
 AT_PRICE = 0.9  # share of the price from which on a multiplier is at it
@@ -144,7 +122,7 @@ WARM_MU = 1e-5  # largest first mu of a start with multipliers: what is active h
 
 
 @compiled
-def _merit(
+def merit(
     numbers: Array,
     counts: IntArray,
     sides: Array,
@@ -219,25 +197,7 @@ def measure(address: int) -> None:
         gap = max(gap, abs(c + sides[E, k] - sides[S, k]) / row_units[row])
     for k in range(len(full)):
         full[k] = gradient[k]
-    fields, columns, jacobian = terms.fields, terms.columns, constraint_jacobian
-    for t in range(len(fields)):
-        term = fields[t]
-        if term[KIND] == OBJECTIVE:
-            continue
-        m, width, row, entry, column = term[ROWS], term[WIDTH], term[ROW], term[ENTRY], term[COLUMN]
-        if term[KIND] == BOUND:
-            for i in range(term[COUNT]):
-                full[columns[column + i]] += multipliers[row + i]
-            continue
-        for _ in range(term[COUNT]):
-            for a in range(m):
-                scale = multipliers[row + a]
-                if scale != 0.0:
-                    for d in range(width):
-                        full[columns[column + d]] += scale * jacobian[entry + d]
-                entry += width
-            row += m
-            column += width
+    transposed_times(terms, False, constraint_jacobian, multipliers, full)
     stationarity = force = violation = paid = complementarity = size = 0.0
     for column in free:
         if not abs(full[column]) <= stationarity:  # NaN stays
@@ -282,23 +242,9 @@ def _forces(
     terms: Terms, free: IntArray, gradient: Array, multipliers: Array, jacobian: Array, full: Array
 ) -> tuple[float, float]:
     """Largest force of the objective on an unknown, and of all constraints if none of them balanced another."""
-    fields, columns = terms.fields, terms.columns
     for k in range(len(full)):
         full[k] = 0.0
-    for t in range(len(fields)):
-        term = fields[t]
-        if term[KIND] == OBJECTIVE:
-            continue
-        width, row, entry, column = term[WIDTH], term[ROW], term[ENTRY], term[COLUMN]
-        for i in range(term[COUNT]):
-            for a in range(term[ROWS]):
-                size = abs(multipliers[row + i * term[ROWS] + a])
-                for d in range(width):
-                    where = columns[column + i * width + d]
-                    if term[KIND] == BOUND:
-                        full[where] += size
-                    else:
-                        full[where] += size * abs(jacobian[entry + (i * term[ROWS] + a) * width + d])
+    transposed_times(terms, False, np.abs(jacobian), np.abs(multipliers), full)
     pull = push = 0.0
     for place in free:
         pull, push = max(pull, abs(gradient[place])), max(push, full[place])
@@ -430,7 +376,7 @@ def begin(address: int) -> None:
         y = min(y, 0.9 * price)
         sides[Y, k], sides[S, k], sides[E, k] = y, s, mu / (price - y)
         sides[DS, k] = sides[DE, k] = sides[DY, k] = 0.0
-    theta = _merit(numbers, counts, sides, side_row, pairs, prices, row_units, rows, lower, 0.0, constraints, 0.0)[1]
+    theta = merit(numbers, counts, sides, side_row, pairs, prices, row_units, rows, lower, 0.0, constraints, 0.0)[1]
     numbers[THETA_SMALL], numbers[THETA_LARGE] = 1e-4 * max(1.0, theta), 1e4 * max(1.0, theta)
     counts[FILTERED] = counts[FAILURES] = counts[SHORT_STEPS] = 0
     numbers[DELTA] = numbers[LAST_DELTA] = numbers[STEP] = numbers[TAKEN] = 0.0
@@ -504,139 +450,9 @@ def test(address: int) -> None:
         numbers[MU] = less if less > tolerance else smallest
         counts[FILTERED] = 0
     cost, lower = numbers[COST], terms.lower
-    phi, theta = _merit(numbers, counts, sides, side_row, pairs, prices, row_units, rows, lower, cost, constraints, 0.0)
+    phi, theta = merit(numbers, counts, sides, side_row, pairs, prices, row_units, rows, lower, cost, constraints, 0.0)
     numbers[PHI], numbers[THETA] = phi, theta
     counts[TRIALS], counts[CORRECTED], counts[ANSWER] = 0, 0, TRY
-
-
-@linked
-def judge(address: int) -> None:
-    """Filter test of a trial point: accept it, shorten the step, correct it, or ask for another direction."""
-    counts, filter, links, numbers, rows, side_row = parts(address, "counts filter links numbers rows side_row")
-    pairs, prices, row_units, sides, terms = parts(address, "pairs prices row_units sides terms")
-    (constraints,) = parts(address, "trial_constraints")
-    alpha, theta, phi, slope = numbers[ALPHA], numbers[THETA], numbers[PHI], numbers[SLOPE]
-    cost, lower = numbers[TRIAL_COST], terms.lower
-    phi_trial, theta_trial = _merit(
-        numbers, counts, sides, side_row, pairs, prices, row_units, rows, lower, cost, constraints, alpha
-    )
-    finite = math.isfinite(phi_trial) and math.isfinite(theta_trial)
-    slack = 1e-13 * max(1.0, abs(phi))
-    switch = slope < 0.0 and alpha * (-slope / numbers[COST_UNIT]) ** 2.3 > theta**1.1 and theta <= numbers[THETA_SMALL]
-    armijo = phi_trial <= phi + ARMIJO * alpha * slope + slack
-    good = finite and theta_trial <= numbers[THETA_LARGE]
-    if good:
-        if switch:
-            good = armijo
-        else:
-            good = theta_trial <= (1.0 - GAMMA_THETA) * theta or phi_trial <= phi - GAMMA_PHI * theta + slack
-            good = good or theta_trial <= 1e-12
-    if good:
-        for k in range(counts[FILTERED]):
-            if theta_trial >= filter[k, 0] and phi_trial >= filter[k, 1] + slack:
-                good = theta_trial <= 1e-12 and good and armijo
-    if good:
-        counts[DESCENT] = switch and armijo
-        run(links[ACCEPT], (address,))
-        counts[ANSWER] = ACCEPTED
-        return
-    counts[TRIALS] += 1
-    counts[ANSWER] = TRY
-    if counts[TRIALS] == 1 and finite and theta_trial >= theta:
-        run(links[CORRECT], (address,))
-        return
-    if counts[CORRECTED] == 1:
-        run(links[RESTORE], (address,))
-    numbers[ALPHA] *= 0.5
-    if counts[TRIALS] > HALVINGS:
-        counts[FAILURES] += 1
-        numbers[DELTA] = max(1e-3, 100.0 * numbers[DELTA])
-        counts[ANSWER] = AGAIN
-        if counts[FAILURES] > (MOST_FAILURES if counts[ELASTIC] == 1 else FEW_FAILURES):
-            if counts[ELASTIC] == 1 or numbers[VIOLATION] <= numbers[TOLERANCE]:
-                counts[ANSWER] = STALLED
-            else:
-                run(links[RELAX], (address,))
-
-
-@linked
-def correct(address: int) -> None:
-    """Solve again for the constraints as the trial found them, and keep the step in case this does not help."""
-    counts, links, numbers, rests, rows, saved = parts(address, "counts links numbers rests rows saved")
-    pairs, side_row, sides, step, terms = parts(address, "pairs side_row sides step terms")
-    (constraints,) = parts(address, "trial_constraints")
-    alpha = numbers[ALPHA]
-    for k in range(len(step)):
-        saved[k] = step[k]
-    numbers[SAVED_SLOPE], numbers[SAVED_ALPHA], numbers[SAVED_DUAL] = numbers[SLOPE], alpha, numbers[ALPHA_DUAL]
-    for k in range(counts[SIDES]):
-        sides[SAVED_DY, k], sides[SAVED_DS, k], sides[SAVED_DE, k] = sides[DY, k], sides[DS, k], sides[DE, k]
-        c = sides[SIGN, k] * (constraints[side_row[k]] - sides[BORDER, k])
-        s, e = sides[S, k] + alpha * sides[DS, k], sides[E, k] + alpha * sides[DE, k]
-        sides[REST, k] = alpha * sides[REST, k] + c + e - s
-    for k in range(len(rows)):
-        row = rows[k]
-        rests[row] = alpha * rests[row] + constraints[row] - terms.lower[row]
-        if counts[ELASTIC] == 1:
-            pairs[SAVED_DP, k], pairs[SAVED_DN, k] = pairs[DP, k], pairs[DN, k]
-            rests[row] += pairs[N, k] + alpha * pairs[DN, k] - pairs[P, k] - alpha * pairs[DP, k]
-    run(links[STEER], (address,))
-    numbers[SLOPE] = numbers[SAVED_SLOPE]
-    counts[CORRECTED] = 1
-
-
-@linked
-def restore(address: int) -> None:
-    """Go back to the step before its correction."""
-    counts, numbers, pairs, saved, sides, step = parts(address, "counts numbers pairs saved sides step")
-    for k in range(len(step)):
-        step[k] = saved[k]
-    numbers[ALPHA], numbers[ALPHA_DUAL] = numbers[SAVED_ALPHA], numbers[SAVED_DUAL]
-    for k in range(counts[SIDES]):
-        sides[DY, k], sides[DS, k], sides[DE, k] = sides[SAVED_DY, k], sides[SAVED_DS, k], sides[SAVED_DE, k]
-    if counts[ELASTIC] == 1:
-        for k in range(pairs.shape[1]):
-            pairs[DP, k], pairs[DN, k] = pairs[SAVED_DP, k], pairs[SAVED_DN, k]
-    counts[CORRECTED] = 0
-
-
-@linked
-def accept(address: int) -> None:
-    """Move multipliers and slacks and, unless the step was one of descent, remember where it came from."""
-    counts, filter, free, multipliers, numbers, rows = parts(address, "counts filter free multipliers numbers rows")
-    pairs, prices, side_row, sides, step = parts(address, "pairs prices side_row sides step")
-    (trial_constraints,) = parts(address, "trial_constraints")
-    alpha, dual, n = numbers[ALPHA], numbers[ALPHA_DUAL], len(free)
-    mu = numbers[MU]
-    total = 0.0
-    for k in range(n):
-        total += step[k] ** 2
-    elastic = counts[ELASTIC] == 1
-    for k in range(len(rows)):
-        row = rows[k]
-        multipliers[row] += (dual if elastic else alpha) * step[n + k]
-        if elastic:
-            for which in range(2):
-                pairs[P + which, k] += alpha * pairs[DP + which, k]
-            over, under = 1e-10 * mu / pairs[P, k], 1e-10 * mu / pairs[N, k]
-            multipliers[row] = min(max(multipliers[row], under - prices[row]), prices[row] - over)
-            pairs[DP, k] = pairs[DN, k] = 0.0
-    for k in range(counts[SIDES]):
-        s, e = sides[S, k] + alpha * sides[DS, k], sides[E, k] + alpha * sides[DE, k]
-        c = sides[SIGN, k] * (trial_constraints[side_row[k]] - sides[BORDER, k])
-        s = max(s, c + e)  # a longer slack costs nothing
-        y = sides[Y, k] + dual * sides[DY, k]
-        y = min(max(y, 1e-10 * mu / s), 1e10 * mu / s)  # eq. 16
-        sides[Y, k], sides[S, k], sides[E, k] = min(y, prices[side_row[k]] - 1e-10 * mu / e), s, e
-        sides[DS, k] = sides[DE, k] = 0.0
-    if counts[DESCENT] == 0 and counts[FILTERED] < FILTER:
-        filter[counts[FILTERED], 0] = (1.0 - GAMMA_THETA) * numbers[THETA]
-        filter[counts[FILTERED], 1] = numbers[PHI] - GAMMA_PHI * numbers[THETA]
-        counts[FILTERED] += 1
-    numbers[STEP], numbers[TAKEN] = alpha * math.sqrt(total), alpha
-    counts[SHORT_STEPS] = counts[SHORT_STEPS] + 1 if alpha < SHORT_STEP else 0
-    counts[ITERATION] += 1
-    counts[FAILURES] = 0
 
 
 @linked
@@ -661,7 +477,7 @@ def relax(address: int) -> None:
         multipliers[row] = prices[row] - mu / p if p > n else mu / n - prices[row]
         pairs[P, k], pairs[N, k], pairs[DP, k], pairs[DN, k] = p, n, 0.0, 0.0
     run(links[MEASURE], (address,))
-    theta = _merit(
-        numbers, counts, sides, side_row, pairs, prices, row_units, rows, terms.lower, 0.0, constraints, 0.0
-    )[1]
+    theta = merit(numbers, counts, sides, side_row, pairs, prices, row_units, rows, terms.lower, 0.0, constraints, 0.0)[
+        1
+    ]
     numbers[THETA_LARGE] = max(numbers[THETA_LARGE], 1e4 * max(1.0, theta))

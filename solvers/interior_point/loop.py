@@ -13,8 +13,8 @@ from unifg.machine.links import ADDRESS, NOTHING, NUMBER, TRUTH, link, linked, m
 from unifg.program import passes
 from unifg.program.curvature import add_curvature
 from unifg.program.retraction import retract_parts
-from unifg.solvers import barrier, barrier_direction
-from unifg.solvers.barrier_state import (
+from unifg.solvers.interior_point import barrier, direction, filter_search
+from unifg.solvers.interior_point.state import (
     ACCEPT,
     ACCEPTED,
     ADVANCE,
@@ -158,13 +158,13 @@ def addresses() -> IntArray:
         BEGIN: barrier.begin,
         MEASURE: barrier.measure,
         TEST: barrier.test,
-        JUDGE: barrier.judge,
-        CORRECT: barrier.correct,
+        JUDGE: filter_search.judge,
+        CORRECT: filter_search.correct,
         RELAX: barrier.relax,
-        RESTORE: barrier.restore,
-        ACCEPT: barrier.accept,
-        DIRECT: barrier_direction.direct,
-        STEER: barrier_direction.steer,
+        RESTORE: filter_search.restore,
+        ACCEPT: filter_search.accept,
+        DIRECT: direction.direct,
+        STEER: direction.steer,
         ADVANCE: advance,
         LOOP: loop,
     }

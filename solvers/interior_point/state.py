@@ -1,8 +1,8 @@
-"""What the interior point remembers between the calls of :mod:`unifg.solvers.barrier`, as plain arrays."""
+"""What the interior point remembers between the calls of its compiled functions, as plain arrays."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple, get_type_hints
 
 import numpy as np
 
@@ -119,7 +119,6 @@ class Problem(NamedTuple):
         rows: (E,) equality rows.
         entries: entries of the constraint Jacobian behind those of the Hessian in ``Work.data``.
         doubles: (D, 2) places in ``Work.data`` that mean one entry of the matrix: the second is added to the first.
-        unequal: (T,) whether a term has inequality rows.
     """
 
     links: IntArray
@@ -131,11 +130,10 @@ class Problem(NamedTuple):
     rows: IntArray
     entries: IntArray
     doubles: IntArray
-    unequal: IntArray
 
 
 class Work(NamedTuple):
-    """What the method remembers.
+    """What the method remembers; each array with its shape, whose words :func:`empty_work` is told.
 
     Attributes:
         numbers, counts: scalars, by the names above.
@@ -147,7 +145,7 @@ class Work(NamedTuple):
         kept: stored values of the last iterate that kept all constraints.
         values, trial: stored values of the present iterate and of a trial.
         move: (n,) tangent step to the trial.
-        spread: (width,) the same over the full tangent space.
+        spread: (width,) the same over the full tangent space; or the gradient with the sides eliminated.
         full: (width,) gradient of the Lagrangian over the full tangent space.
         residual, jacobian, constraints, constraint_jacobian, gradient, hessian: as in a linearisation.
         curvature: ``hessian`` with second derivatives, where they are used.
@@ -165,99 +163,48 @@ class Work(NamedTuple):
         log: (iterations, 9) history.
     """
 
-    numbers: Array
-    counts: IntArray
-    sides: Array
-    side_row: IntArray
-    pairs: Array
-    prices: Array
-    row_units: Array
-    units: Array
-    kept: Array
-    values: Array
-    trial: Array
-    move: Array
-    spread: Array
-    full: Array
-    residual: Array
-    jacobian: Array
-    constraints: Array
-    constraint_jacobian: Array
-    gradient: Array
-    hessian: Array
-    curvature: Array
-    trial_residual: Array
-    trial_constraints: Array
-    squares: Array
-    norms: Array
-    multipliers: Array
-    rests: Array
-    row_weights: Array
-    row_terms: Array
-    step: Array
-    saved: Array
-    right: Array
-    shift: Array
-    data: Array
-    filter: Array
-    log: Array
+    numbers: Annotated[Array, FLOATS]
+    counts: Annotated[IntArray, INTEGERS]
+    sides: Annotated[Array, SIDE_ROWS, "sides"]
+    side_row: Annotated[IntArray, "sides"]
+    pairs: Annotated[Array, PAIR_ROWS, "equalities"]
+    prices: Annotated[Array, "rows"]
+    row_units: Annotated[Array, "rows"]
+    units: Annotated[Array, "width"]
+    kept: Annotated[Array, "stored"]
+    values: Annotated[Array, "stored"]
+    trial: Annotated[Array, "stored"]
+    move: Annotated[Array, "unknowns"]
+    spread: Annotated[Array, "width"]
+    full: Annotated[Array, "width"]
+    residual: Annotated[Array, "residuals"]
+    jacobian: Annotated[Array, "entries"]
+    constraints: Annotated[Array, "rows"]
+    constraint_jacobian: Annotated[Array, "row_entries"]
+    gradient: Annotated[Array, "width"]
+    hessian: Annotated[Array, "normal"]
+    curvature: Annotated[Array, "normal"]
+    trial_residual: Annotated[Array, "residuals"]
+    trial_constraints: Annotated[Array, "rows"]
+    squares: Annotated[Array, "robust"]
+    norms: Annotated[Array, "terms"]
+    multipliers: Annotated[Array, "rows"]
+    rests: Annotated[Array, "rows"]
+    row_weights: Annotated[Array, "rows"]
+    row_terms: Annotated[Array, "rows"]
+    step: Annotated[Array, "total"]
+    saved: Annotated[Array, "total"]
+    right: Annotated[Array, "total"]
+    shift: Annotated[Array, "total"]
+    data: Annotated[Array, "data"]
+    filter: Annotated[Array, FILTER, 2]
+    log: Annotated[Array, "log", 9]
 
 
-def empty_work(
-    stored: int, width: int, unknowns: int, equalities: int, rows: tuple[int, int], entries: tuple[int, int],
-    normal: int, terms: int, robust: int, iterations: int, data: int,
-) -> Work:  # fmt: skip
-    """Arrays of the right sizes, all zero.
-
-    Args:
-        stored: numbers that store the variables.
-        width: full tangent columns.
-        unknowns: those that are unknown.
-        equalities: equality rows.
-        rows: of costs and of constraints.
-        entries: of their Jacobians.
-        normal: of the Hessian.
-        terms: how many there are.
-        robust: robust factors.
-        iterations: that the history has to hold.
-        data: entries of the KKT matrix.
-    """
-    total, constraints = unknowns + equalities, rows[1]
-    return Work(
-        numbers=np.zeros(FLOATS),
-        counts=np.zeros(INTEGERS, dtype=np.int64),
-        sides=np.zeros((SIDE_ROWS, max(2 * constraints, 1))),
-        side_row=np.zeros(max(2 * constraints, 1), dtype=np.int64),
-        pairs=np.zeros((PAIR_ROWS, max(equalities, 1))),
-        prices=np.zeros(constraints),
-        row_units=np.ones(constraints),
-        units=np.ones(width),
-        kept=np.zeros(stored),
-        values=np.zeros(stored),
-        trial=np.zeros(stored),
-        move=np.zeros(unknowns),
-        spread=np.zeros(width),
-        full=np.zeros(width),
-        residual=np.zeros(rows[0]),
-        jacobian=np.zeros(entries[0]),
-        constraints=np.zeros(constraints),
-        constraint_jacobian=np.zeros(entries[1]),
-        gradient=np.zeros(width),
-        hessian=np.zeros(normal),
-        curvature=np.zeros(normal),
-        trial_residual=np.zeros(rows[0]),
-        trial_constraints=np.zeros(constraints),
-        squares=np.zeros(robust),
-        norms=np.zeros(terms),
-        multipliers=np.zeros(constraints),
-        rests=np.zeros(constraints),
-        row_weights=np.zeros(constraints),
-        row_terms=np.zeros(constraints),
-        step=np.zeros(total),
-        saved=np.zeros(total),
-        right=np.zeros(total),
-        shift=np.zeros(total),
-        data=np.zeros(data),
-        filter=np.zeros((FILTER, 2)),
-        log=np.zeros((iterations + 2, 9)),
-    )
+def empty_work(**sizes: int) -> Work:
+    """Arrays of the shapes that :class:`Work` gives them, all zero; ``sizes`` says what the words in them mean."""
+    arrays = {}
+    for name, hint in get_type_hints(Work, include_extras=True).items():
+        shape = [sizes[size] if isinstance(size, str) else size for size in hint.__metadata__]
+        arrays[name] = np.zeros(shape, dtype=np.int64 if hint.__origin__ == IntArray else np.float64)
+    return Work(**arrays)
