@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple, get_type_hints
+from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import numpy as np
 
@@ -203,7 +203,7 @@ class Work(NamedTuple):
 
 def empty_work(**sizes: int) -> Work:
     """Arrays of the shapes that :class:`Work` gives them, all zero; ``sizes`` says what the words in them mean."""
-    arrays = {}
+    arrays: dict[str, Any] = {}
     for name, hint in get_type_hints(Work, include_extras=True).items():
         shape = [sizes[size] if isinstance(size, str) else size for size in hint.__metadata__]
         arrays[name] = np.zeros(shape, dtype=np.int64 if hint.__origin__ == IntArray else np.float64)
