@@ -28,6 +28,22 @@ def test_a_watched_solve_takes_the_same_steps() -> None:
     assert alone.history[-1].terms.keys() == watched.history[-1].terms.keys()
 
 
+def test_a_stop_rule_ends_when_full_steps_are_short() -> None:
+    """It does not grant CONVERGED, and both ways of running obey it."""
+    stated = Unicycle("straight", True, 20).formulation()
+    whole = InteriorPoint(tolerance=1e-12, max_iterations=30).solve(stated.graph, stated.guess)
+    early = InteriorPoint(tolerance=1e-12, max_iterations=30, step_tolerance=1e-2)
+    alone = early.solve(stated.graph, stated.guess)
+    watched = early.solve(stated.graph, stated.guess, callback=lambda row: None)
+    for solution in (alone, watched):
+        assert solution.status is fg.Status.STOP_RULE and solution.violation < 1e-4
+        assert solution.cost == pytest.approx(whole.cost, rel=1e-3)
+    assert alone.iterations == watched.iterations < whole.iterations
+    assert alone.history[-1].step_norm < 1e-2 * alone.history[-1].step_length
+    never = InteriorPoint(max_iterations=30, step_tolerance=1e3, violation_tolerance=1e-300)
+    assert never.solve(stated.graph, stated.guess).converged, "a violation too large to stop at"
+
+
 def test_the_same_variable_twice_in_an_equality() -> None:
     """Both columns of a factor mean one entry of the KKT matrix."""
     graph = fg.Graph()

@@ -87,6 +87,8 @@ from unifg.solvers.interior_point.state import (
     STALLED,
     STATIONARITY,
     STEP,
+    STEP_TOLERANCE,
+    STOPPED,
     TAKEN,
     THETA,
     THETA_LARGE,
@@ -96,6 +98,7 @@ from unifg.solvers.interior_point.state import (
     TRY,
     VIOLATED,
     VIOLATION,
+    VIOLATION_TOLERANCE,
     E,
     N,
     P,
@@ -405,6 +408,11 @@ def test(address: int) -> None:
     if worst <= tolerance and not guessed:
         counts[ANSWER] = CONVERGED
         return
+    # With a larger mu, what is active has not been found, and short steps are those towards another problem's answer.
+    if numbers[STEP] < numbers[STEP_TOLERANCE] * numbers[TAKEN] and numbers[MU] <= WARM_MU:
+        if numbers[VIOLATION] < numbers[VIOLATION_TOLERANCE]:
+            counts[ANSWER] = STOPPED
+            return
     if numbers[VIOLATION] <= tolerance:
         counts[KEPT] = 1
         for k in range(len(values)):

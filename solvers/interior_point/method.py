@@ -35,6 +35,7 @@ ENDINGS = {
     state.STALLED: Status.STALLED,
     state.NOT_FINITE: Status.NOT_FINITE,
     state.VIOLATED: Status.STALLED,
+    state.STOPPED: Status.STOP_RULE,
 }
 NO_ANSWER = -1
 STUCK = (state.STALLED, state.SINGULAR, state.VIOLATED)
@@ -53,6 +54,8 @@ class InteriorPoint(Solver):
         scaling: measure rows and unknowns in units that make the largest entries of the constraint Jacobian near one,
             where they are far from it, and prices and mu in proportion to a large gradient. Inside only: tolerances and
             multipliers are those of the problem as stated.
+        step_tolerance, violation_tolerance: stop rule on the norm of the full step and the largest violation, for
+            control loops. A positive step_tolerance switches it on; it does not grant CONVERGED.
     """
 
     max_iterations: int = 300
@@ -60,6 +63,8 @@ class InteriorPoint(Solver):
     barrier: float = 0.3
     price: float = 1e3
     scaling: bool = True
+    step_tolerance: float = 0.0
+    violation_tolerance: float = 1e-4
 
     def __post_init__(self) -> None:
         """Refuse options that mean nothing."""
@@ -238,6 +243,8 @@ class Workspace:
         # The test of least squares has no absolute tolerance.
         numbers[state.TOLERANCE] = 0.0 if run.program.least_squares else run.tolerance
         numbers[state.ASKED], counts[state.SCALING] = 0.0, options.scaling
+        numbers[state.STEP_TOLERANCE] = options.step_tolerance
+        numbers[state.VIOLATION_TOLERANCE] = options.violation_tolerance
         counts[state.ITERATION], counts[state.KEPT], counts[state.RAISES] = 0, 0, 0
         work.row_units[:] = work.units[:] = 1.0
         counts[state.LIMIT], counts[state.EXACT] = options.max_iterations, options.hessian == "exact"

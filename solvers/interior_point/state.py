@@ -42,8 +42,10 @@ from unifg.typing import Array, IntArray
     PAID,  # largest violation of a row times its price
     FORCE,  # stationarity in the units of the unknowns
     COST_UNIT,  # what the objective is measured in
+    STEP_TOLERANCE,  # norm of a full step below which to stop, once the violation is small enough
+    VIOLATION_TOLERANCE,
     FLOATS,
-) = range(31)
+) = range(33)
 # Places in Work.counts.
 (
     ANSWER,  # of the last call, one of the words below
@@ -96,7 +98,7 @@ from unifg.typing import Array, IntArray
 ) = range(7)
 
 # What a call answers.
-TRY, ACCEPTED, AGAIN, CONVERGED, LIMIT_REACHED, SINGULAR, STALLED, NOT_FINITE, VIOLATED = range(9)
+TRY, ACCEPTED, AGAIN, CONVERGED, LIMIT_REACHED, SINGULAR, STALLED, NOT_FINITE, VIOLATED, STOPPED = range(10)
 # Places in Problem.links.
 (
     FACTOR, SOLVE, LINEARIZE, EVALUATE, CURVE, RETRACT, BEGIN, MEASURE, TEST, DIRECT, STEER, ADVANCE, JUDGE, CORRECT,
