@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from unifg.kernels.differentiation import jacobian
+from unifg.kernels.differences import jacobian
 from unifg.lie import LieGroup, Manifold, Rn
 from unifg.models.rkmk_kernel import BEFORE, END, FLAT, WEIGHT
 from unifg.models.tableau import Tableau

@@ -14,10 +14,10 @@ import numpy as np
 
 from unifg.machine.jit import compiled
 from unifg.program.columns import Values
+from unifg.program.curvature import lagrangian_hessian
 from unifg.program.linearization import Evaluation, Linearization
 from unifg.program.passes import transposed_times
 from unifg.program.program import Program
-from unifg.program.second_order import lagrangian_hessian
 from unifg.program.table import Terms
 from unifg.typing import Array, IntArray
 

@@ -25,7 +25,6 @@ from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.program.table import ENTRY, ROW, WIDTH
 from unifg.program.term import CompiledTerm
-from unifg.program.touched import term_columns
 from unifg.typing import Array, BoolArray, IntArray
 
 CHANCE = 0.01  # that a right measurement among all is called wrong
@@ -131,7 +130,7 @@ class Innovations:
         row, entry, count = int(term.place[ROW]), int(term.place[ENTRY]), term.count
         residual = lin.residual[row : row + count * size].reshape(count, size)[chosen]
         jacobian = lin.jacobian[entry : entry + count * size * width].reshape(count, size, width)[chosen]
-        columns = program.columns.unknown[np.concatenate(term_columns(program.columns, term), axis=1)[chosen]]
+        columns = program.columns.unknown[np.concatenate(term.columns, axis=1)[chosen]]
         spread = np.einsum("nia,nab,njb->nij", jacobian, self._covariance(columns), jacobian, optimize=True)
         return residual, 0.5 * (spread + spread.transpose(0, 2, 1))
 

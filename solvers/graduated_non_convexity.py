@@ -38,7 +38,7 @@ from unifg.answers.status import Status
 from unifg.answers.verdict import Verdict
 from unifg.errors import BackendError
 from unifg.kernels.robust import DCS, Graduated, Loss
-from unifg.language.graph import Statement
+from unifg.language.statement import Statement
 from unifg.language.terms import Cost
 from unifg.language.variables import Data
 from unifg.program.term import CompiledTerm

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 import unifg as fg
-from unifg.language.graph import complete
+from unifg.language.statement import complete
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph
 from unifg.typing import Array
 

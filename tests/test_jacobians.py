@@ -13,7 +13,7 @@ import pytest
 
 import unifg as fg
 import unifg.models
-from unifg.kernels.differentiation import jacobian
+from unifg.kernels.differences import jacobian
 from unifg.kernels.residuals import Residual
 from unifg.machine.jit import compiled
 from unifg.models import avoidance, landmarks, lidar, obstacles, quadrotor, rkmk, unicycle, vehicle

@@ -11,9 +11,9 @@ import pytest
 
 import unifg as fg
 from problems import offsets
-from unifg.kernels.differentiation import gradient_and_hessian, jacobian
+from unifg.kernels.differences import gradient_and_hessian, jacobian
 from unifg.models import quadrotor, unicycle
-from unifg.program.second_order import lagrangian_hessian
+from unifg.program.curvature import lagrangian_hessian
 from unifg.typing import Array
 
 FAR = (1e3, 1e5, 5e6)  # [m]; the last is a northing in UTM

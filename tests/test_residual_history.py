@@ -12,7 +12,7 @@ import pytest
 
 import unifg as fg
 from problems.known import short_drive
-from unifg.answers.factor_norms import factor_norms
+from unifg.answers.history import factor_norms
 from unifg.scenarios.show.residual_plot import ResidualMonitor, residual_picture
 from unifg.solvers import (
     KKT,

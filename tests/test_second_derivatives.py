@@ -11,7 +11,7 @@ import unifg as fg
 from unifg.kernels.residuals import Residual, residual
 from unifg.lie import Manifold
 from unifg.models import avoidance, landmarks, obstacles, quadrotor, unicycle, vehicle
-from unifg.program.second_order import lagrangian_hessian
+from unifg.program.curvature import lagrangian_hessian
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from unifg.program.curvature import lagrangian_hessian
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
-from unifg.program.second_order import lagrangian_hessian
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
 

@@ -18,9 +18,9 @@ from unifg.answers.solver import Run, Solver
 from unifg.answers.status import Status
 from unifg.errors import BackendError
 from unifg.machine.links import memory
+from unifg.program.curvature import lagrangian_hessian
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
-from unifg.program.second_order import lagrangian_hessian
 from unifg.program.systems import stacked
 from unifg.solvers.globalize.least_violation import nearest
 from unifg.solvers.interior_point import state

@@ -13,10 +13,10 @@ from typing import Protocol
 import numpy as np
 
 from unifg.elimination.symmetric import Symmetric
+from unifg.program.curvature import lagrangian_hessian
 from unifg.program.linearization import Linearization
 from unifg.program.passes import add_constraints
 from unifg.program.program import Program
-from unifg.program.second_order import lagrangian_hessian
 from unifg.typing import Array
 
 

@@ -27,13 +27,12 @@ from unifg.answers.solution import Guess, Solution
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.symmetric import Symmetric
 from unifg.errors import BackendError, GraphError
-from unifg.kernels.differentiation import convexified
+from unifg.kernels.differences import convexified
 from unifg.language.terms import Cost
 from unifg.language.variables import Data, Family
 from unifg.program.program import Program
-from unifg.program.rows import Rows
+from unifg.program.linearization import Rows
 from unifg.program.term import CompiledTerm
-from unifg.program.touched import term_columns
 from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, qp_error, subproblem
 from unifg.solvers.ta.elimination import (
     Contradiction,
@@ -338,9 +337,7 @@ def _quadratic(
     first: IntArray,
 ) -> list[Factor]:
     """Factors of (n, D, D) Hessians and (n, D) gradients over the full columns of a term; those of zeros left out."""
-    full = np.concatenate(
-        [np.broadcast_to(c, (term.count, c.shape[1])) for c in term_columns(program.columns, term)], 1
-    )
+    full = np.concatenate(term.columns, axis=1)
     unknown = program.columns.unknown[full]
     sizes = np.diff([*first.tolist(), program.size])
     factors: list[Factor] = []

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unifg.elimination.factorization import Factorization
-from unifg.language.graph import Statement
+from unifg.language.statement import Statement
 from unifg.language.terms import ScalarCost
 from unifg.language.variables import Data, Family
 from unifg.program.columns import Values

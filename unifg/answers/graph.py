@@ -9,7 +9,7 @@ import numpy as np
 
 from unifg.answers.check import Report, check_graph
 from unifg.elimination.tree import EliminationTree
-from unifg.language.graph import Statement
+from unifg.language.statement import Statement
 from unifg.language.variables import Data, Family
 from unifg.program.program import Program, compile_graph
 from unifg.typing import ArrayLike

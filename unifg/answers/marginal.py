@@ -16,9 +16,8 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.language.variables import Selection, Variable, as_selection
-from unifg.program.linearization import Linearization
+from unifg.program.linearization import Linearization, Rows
 from unifg.program.program import Program
-from unifg.program.rows import Rows
 from unifg.typing import Array, BoolArray, IntArray
 
 Variables: TypeAlias = Variable | Sequence[Variable]

@@ -31,11 +31,9 @@ import numpy as np
 from unifg.elimination.factorization import Factorization
 from unifg.kernels.steps import ANGLE, TURN
 from unifg.machine.jit import compiled
-from unifg.program.extents import extents
+from unifg.program.curvature import lagrangian_hessian
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
-from unifg.program.second_order import lagrangian_hessian
-from unifg.program.touched import term_columns
 from unifg.typing import Array, BoolArray, IntArray
 
 EPS = 2.0**-52
@@ -115,7 +113,7 @@ class Structure:
         self, program: Program, lin: Linearization, enough: float, lent: Factored | None, guess: Array | None
     ) -> Offset:
         """See :func:`relative_offset`."""
-        values = program.columns.values(lin.values).flat
+        values = lin.values.flat
         size, cosine, rounding = _bounds(
             lin.residual,
             self.counted,
@@ -247,7 +245,7 @@ def _counted(program: Program) -> BoolArray:
     rows = [np.zeros(0, dtype=bool)]
     for term in program.cost_terms:
         touching = np.zeros(term.count, dtype=bool)
-        for columns in term_columns(program.columns, term):
+        for columns in term.columns:
             touching |= (program.columns.unknown[columns] >= 0).any(axis=1)
         rows.append(np.repeat(touching, term.size))
     counted: BoolArray = np.concatenate(rows)
@@ -262,7 +260,7 @@ def _idle(program: Program, diagonal: Array) -> BoolArray:
     touched = np.zeros(program.columns.width, dtype=bool)
     for term in program.cost_terms:
         on = np.ones(term.count, dtype=bool) if term.active is None else term.active
-        for columns in term_columns(program.columns, term):
+        for columns in term.columns:
             touched[columns[on]] = True
     idle: BoolArray = bare & ~touched[program.columns.free]
     return idle
@@ -270,7 +268,7 @@ def _idle(program: Program, diagonal: Array) -> BoolArray:
 
 def _extents(program: Program) -> tuple[IntArray, IntArray, Array]:
     """Where the numbers stand that say how large each unknown coordinate is; angles have none, but a least size."""
-    first, last, kinds = (place[program.columns.free] for place in extents(program))
+    first, last, kinds = (place[program.columns.free] for place in program.columns.extents)
     angles = (kinds == ANGLE) | (kinds == TURN)
     return np.where(angles, 0, first), np.where(angles, 0, last), angles.astype(np.float64)
 

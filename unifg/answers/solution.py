@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from unifg.answers.covariance import Covariances
-from unifg.answers.factor_norms import FactorNorms, factor_norms
-from unifg.answers.history import HEADER, Iteration, line
+from unifg.answers.history import HEADER, FactorNorms, Iteration, factor_norms, line
 from unifg.answers.marginal import Variables, information, marginal_prior
 from unifg.answers.optimality import Optimality
 from unifg.answers.status import Status
@@ -120,7 +119,7 @@ class Solution:
 
     @property
     def residuals(self) -> FactorNorms:
-        """(n,) residual norms of the factors of every term at the solution; see :mod:`unifg.answers.factor_norms`."""
+        """(n,) residual norms of the factors of every term at the solution; see :mod:`unifg.answers.history`."""
         g = self._lin.constraints
         outside = np.maximum(g - self._upper, 0.0) - np.maximum(self._lower - g, 0.0)
         return factor_norms(self._program, self._lin, outside)

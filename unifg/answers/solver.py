@@ -11,15 +11,14 @@ from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
-from unifg.answers.factor_norms import Deferred, factor_norms
-from unifg.answers.history import HEADER, Iteration, line
+from unifg.answers.history import HEADER, Deferred, Iteration, factor_norms, line
 from unifg.answers.optimality import infeasible_stationary, optimality, within_bounds
 from unifg.answers.relative_offset import Factored
 from unifg.answers.requirements import Constraints, require
 from unifg.answers.solution import Guess, NotConverged, Solution
 from unifg.answers.status import Status
 from unifg.errors import BackendError, GraphError
-from unifg.language.graph import Statement
+from unifg.language.statement import Statement
 from unifg.language.variables import Data, Family
 from unifg.program.columns import Values
 from unifg.program.linearization import Linearization, all_finite

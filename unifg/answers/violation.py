@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.elimination.factorization import Factorization
+from unifg.program.curvature import constraint_curvature
 from unifg.program.linearization import Linearization
 from unifg.program.passes import add_constraints
 from unifg.program.program import Program
-from unifg.program.second_order import constraint_curvature
 from unifg.typing import Array, BoolArray, IntArray
 
 NEGLIGIBLE = 1e-12  # share of the squared violation, as an error of 1e-6 in a residual of one takes

@@ -102,14 +102,14 @@ def prepare_arguments(name: str, arguments: tuple[Any, ...], active: Any) -> tup
     lengths: list[tuple[str, int]] = []
     for argument in normal:
         if isinstance(argument, Selection):
-            if len(argument) == 0:
+            if argument.count == 0:
                 raise GraphError(
                     f"term '{name}': the selection from family '{argument.family.name}' is empty",
                     term=name,
                     family=argument.family.name,
                 )
-            if len(argument) > 1:
-                lengths.append((f"family '{argument.family.name}'", len(argument)))
+            if argument.count > 1:
+                lengths.append((f"family '{argument.family.name}'", argument.count))
         elif isinstance(argument, Data) and argument.each:
             lengths.append((f"data '{argument.name}'", len(argument.value)))
     if not any(isinstance(argument, Selection) for argument in normal):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
 
 from unifg.errors import GraphError
+from unifg.kernels.steps import OTHER, TURN, parts_of
 from unifg.language.terms import Fix
 from unifg.language.variables import Family, Selection
 from unifg.typing import Array, IntArray
@@ -35,6 +37,7 @@ class Columns:
         stored: length of the storage of all families.
         offsets: first column of each family.
         width: number of columns, fixed variables included.
+        size: number of unknown ones.
         free: (size,) columns that are unknown.
         unknown: (width,) number of each column among the unknowns, -1 where fixed.
         fixed: (n, d) columns of each fix, by its name.
@@ -56,13 +59,9 @@ class Columns:
             self.fixed[fix.name] = self.of(fix.selection)
             is_free[self.fixed[fix.name]] = False
         self.free = np.flatnonzero(is_free)
+        self.size = len(self.free)
         self.unknown = np.full(self.width, -1, dtype=np.intp)
         self.unknown[self.free] = np.arange(len(self.free))
-
-    @property
-    def size(self) -> int:
-        """Number of unknown coordinates."""
-        return len(self.free)
 
     def of(self, selection: Selection) -> IntArray:
         """(n, d) columns of a selection."""
@@ -91,6 +90,27 @@ class Columns:
     def view(self, flat: Array) -> Values:
         """The families' storage as one array, by families."""
         return Values(self, flat)
+
+    @cached_property
+    def extents(self) -> tuple[IntArray, IntArray, IntArray]:
+        """For every tangent coordinate, found once, what the numbers are whose largest is its size.
+
+        First and last (exclusive) place in storage, and the kind of part in :mod:`unifg.kernels.steps`. All axes of a
+        position that turns share its numbers; quaternions have none.
+        """
+        first, last, kinds = (np.zeros(self.width, dtype=np.int64) for _ in range(3))
+        for family in self.families:
+            members = np.arange(family.count)
+            for part, _ in parts_of([family.manifold]):
+                shared = part.turn >= 0 or part.kind == OTHER
+                start = self.storage[family] + members * family.manifold.storage + part.start
+                for axis in range(part.dim):
+                    column = self.offsets[family] + members * family.manifold.dim + part.column + axis
+                    kinds[column] = part.kind
+                    if part.kind != TURN:
+                        first[column] = start if shared else start + axis
+                        last[column] = start + part.storage if shared else start + axis + 1
+        return first, last, kinds
 
     def nodes(self) -> tuple[IntArray, IntArray]:
         """For every full column its variable, numbered over all families; and the first unknown of each variable.

@@ -1,4 +1,4 @@
-"""Second derivatives that Gauss-Newton leaves out: sum of w_a times the Hessian of r_a, for every factor.
+"""The Hessian of the Lagrangian: what Gauss-Newton leaves out is sum of w_a times the Hessian of r_a, for every factor.
 
 The weights w are the multipliers of constraints and the whitened residuals of costs, carried back through the
 whitening. The Hessian is that of t -> r(x Exp(t)), symmetric. A kernel that does not come with it has its Jacobian
@@ -7,15 +7,20 @@ differenced along every tangent direction; where that is made of differences its
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
 
 from unifg.kernels.steps import ANGLE, ONE_SIDED, TURN, VECTOR, largest, move, rotation, step_for, step_of, to_body
 from unifg.kernels.steps import SECOND as TWICE
 from unifg.kernels.whitening import DIAGONAL, FULL
+from unifg.language.terms import Cost
 from unifg.lie.so2 import wrap
 from unifg.machine.calls import call_residual, matrix, vector, vector_at
 from unifg.machine.jit import compiled, in_order, inlined
+from unifg.program.linearization import Linearization
 from unifg.program.passes import gather_variables
+from unifg.program.program import Program
 from unifg.program.table import (
     ACTIVE,
     ADDRESS,
@@ -43,7 +48,72 @@ from unifg.program.table import (
     WIDTH,
     Terms,
 )
+from unifg.program.term import CompiledTerm
 from unifg.typing import Array, IntArray
+
+Places: TypeAlias = tuple[IntArray, IntArray, IntArray, Array, IntArray]
+
+
+def lagrangian_hessian(program: Program, lin: Linearization, multipliers: Array) -> Array:
+    """Hessian of the objective plus multipliers' g, in the order of ``Program.normal``.
+
+    Robust costs keep their Gauss-Newton part; terms evaluated by NumPy are differenced in batches.
+
+    Args:
+        program: the compiled graph.
+        lin: where.
+        multipliers: (M,).
+    """
+    entries = lin.hessian + lin.concavity if len(lin.concavity) else lin.hessian.copy()
+    add_curvature(program.arrays, lin.values.flat, lin.residual, multipliers, entries)
+    for term in program.batched:
+        _add(program, term, lin, multipliers, entries)
+    return entries
+
+
+def constraint_curvature(program: Program, lin: Linearization, multipliers: Array) -> Array:
+    """Hessian of multipliers' g alone, in the order of ``Program.normal``; arguments as above."""
+    entries = np.zeros(program.normal.nnz)
+    add_curvature(program.arrays, lin.values.flat, np.zeros(len(lin.residual)), multipliers, entries)
+    for term in program.batched:
+        if not isinstance(term.term, Cost):
+            _add(program, term, lin, multipliers, entries)
+    return entries
+
+
+def _add(program: Program, term: CompiledTerm, lin: Linearization, multipliers: Array, entries: Array) -> None:
+    """Second derivatives of a term without a kernel."""
+    if isinstance(term.term, Cost):
+        if term.term.robust is not None:
+            return
+        weights = term.carry_back(program.rows_of(term, lin.residual, lin.constraints))
+    else:
+        weights = program.rows_of(term, lin.residual, multipliers)
+    second = term.second_derivatives(lin.values, weights)
+    if not second.any():
+        return
+    known = program.once(_known)
+    if term not in known:
+        known[term] = _find(program, term)
+    factor, row, column, times, place = known[term]
+    np.add.at(entries, place, times * second[factor, row, column])
+
+
+def _known(_: Program) -> dict[CompiledTerm, Places]:
+    """Nothing is known of a program to begin with."""
+    return {}
+
+
+def _find(program: Program, term: CompiledTerm) -> Places:
+    """Factor, row and column of second derivatives, how often they count, and where in the normal matrix."""
+    width = sum(term.dims)
+    start, pairs = int(term.place[POSITION]), width * (width + 1) // 2
+    where = program.arrays.positions[start : start + term.count * pairs].reshape(term.count, pairs)
+    row, column = np.tril_indices(width)
+    factor, pair = np.nonzero(where != -1)
+    place = where[factor, pair]
+    doubled = place < -1
+    return factor, row[pair], column[pair], np.where(doubled, 2.0, 1.0), np.where(doubled, -2 - place, place)
 
 
 @compiled

@@ -1,16 +1,23 @@
-"""What a program says about a point: with and without derivatives."""
+"""What a program says about a point, with and without derivatives, and products with its stacked Jacobians."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
+import scipy.sparse as sp
 
+from unifg.elimination.symmetric import scatter
 from unifg.machine.jit import compiled
 from unifg.program.columns import Values
-from unifg.typing import Array
+from unifg.program.passes import times, transposed_times
+from unifg.program.table import COLUMN, COUNT, ROWS, WIDTH, Table
+from unifg.program.term import CompiledTerm
+from unifg.typing import Array, IntArray
 
 HeldWeights: TypeAlias = dict[str, Array]
 
@@ -80,6 +87,105 @@ class Linearization:
             and all_finite(self.constraints)
             and all_finite(self.constraint_jacobian)
         )
+
+
+class Rows:
+    """Pattern of a stacked Jacobian: term after term, factor after factor, row after row.
+
+    Attributes:
+        count: number of rows.
+        length: number of entries, those of fixed variables included.
+    """
+
+    def __init__(self, table: Table, terms: Sequence[CompiledTerm], costs: bool, unknowns: int) -> None:
+        """Describe the costs or the constraints of a table."""
+        self._table = table
+        self._terms = terms
+        self._costs = costs
+        self._unknowns = unknowns
+        self.count = table.residuals if costs else table.constraints
+        self.length = table.entries if costs else table.constraint_entries
+
+    def times(self, entries: Array, vector: Array) -> Array:
+        """J v for a vector over the unknowns."""
+        out = np.empty(self.count)
+        times(self._table.arrays, self._costs, entries, vector, out)
+        return out
+
+    def transposed_times(self, entries: Array, vector: Array) -> Array:
+        """J' v over the full tangent space, fixed variables included."""
+        out = np.zeros(len(self._table.arrays.unknown))
+        transposed_times(self._table.arrays, self._costs, entries, vector, out)
+        return out
+
+    @cached_property
+    def rows(self) -> IntArray:
+        """(length,) row of every entry."""
+        widths = [np.full(t.place[COUNT] * t.place[ROWS], t.place[WIDTH]) for t in self._terms]
+        return np.repeat(np.arange(self.count), np.concatenate([np.zeros(0, dtype=np.int64), *widths]))
+
+    @cached_property
+    def factors(self) -> IntArray:
+        """(count,) factor of every row, numbered over all terms."""
+        sizes = [np.full(term.count, term.size) for term in self._terms]
+        rows = np.concatenate([np.zeros(0, dtype=np.int64), *sizes])
+        return np.repeat(np.arange(len(rows)), rows)
+
+    @cached_property
+    def columns(self) -> IntArray:
+        """(length,) full tangent column of every entry."""
+        parts = [np.zeros(0, dtype=np.int64)]
+        for term in self._terms:
+            count, rows, width, start = (int(term.place[field]) for field in (COUNT, ROWS, WIDTH, COLUMN))
+            own = self._table.arrays.columns[start : start + count * width].reshape(count, 1, width)
+            parts.append(np.broadcast_to(own, (count, rows, width)).ravel())
+        return np.concatenate(parts)
+
+    @cached_property
+    def free(self) -> IntArray:
+        """(F,) entries whose variable is not fixed."""
+        return np.flatnonzero(self._table.arrays.unknown[self.columns] >= 0)
+
+    @cached_property
+    def free_rows(self) -> IntArray:
+        """(F,) their rows."""
+        return self.rows[self.free]
+
+    @cached_property
+    def free_columns(self) -> IntArray:
+        """(F,) their unknowns."""
+        return self._table.arrays.unknown[self.columns[self.free]]
+
+    @cached_property
+    def _compressed(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Slots of the free entries in the matrix compressed by columns, its row indices and column starts."""
+        height = max(self.count, 1)
+        unique, slots = np.unique(self.free_columns * height + self.free_rows, return_inverse=True)
+        return slots, unique % height, np.searchsorted(unique, np.arange(self._unknowns + 1) * height)
+
+    @property
+    def nnz(self) -> int:
+        """Entries of the compressed matrix."""
+        return len(self._compressed[1])
+
+    @property
+    def indices(self) -> IntArray:
+        """Row of every entry of the compressed matrix."""
+        return self._compressed[1]
+
+    @property
+    def indptr(self) -> IntArray:
+        """Where each column of the compressed matrix starts."""
+        return self._compressed[2]
+
+    def compress(self, entries: Array) -> Array:
+        """Entries by columns (CSC order), repeated ones summed."""
+        return scatter(self._compressed[0], entries[self.free], self.nnz)
+
+    def matrix(self, entries: Array) -> sp.csc_matrix:
+        """The Jacobian over the unknowns as a SciPy matrix."""
+        _, indices, starts = self._compressed
+        return sp.csc_matrix((self.compress(entries), indices, starts), shape=(self.count, self._unknowns))
 
 
 @compiled

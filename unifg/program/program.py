@@ -14,23 +14,19 @@ import numpy as np
 
 from unifg.elimination.symmetric import Symmetric
 from unifg.errors import GraphError
-from unifg.kernels.differentiation import convexified
-from unifg.language.binding import Binding
-from unifg.language.graph import Statement
+from unifg.kernels.differences import convexified
+from unifg.language.statement import Statement
 from unifg.language.terms import Constraint, Cost, ScalarCost
-from unifg.language.variables import Data, Family
+from unifg.language.variables import Binding, Data, Family
 from unifg.machine.buffers import Buffers
 from unifg.program import passes
-from unifg.program.clean_hands import require_clean
 from unifg.program.columns import Columns, Values
-from unifg.program.guess import Start
-from unifg.program.linearization import Evaluation, HeldWeights, Linearization
+from unifg.program.guess import GuessReader, require_clean
+from unifg.program.linearization import Evaluation, HeldWeights, Linearization, Rows
 from unifg.program.retraction import Retraction
-from unifg.program.rows import Rows
 from unifg.program.systems import Systems
-from unifg.program.table import ENTRY, ROW, WIDTH, Table, Terms
+from unifg.program.table import ENTRY, ROW, WIDTH, Table
 from unifg.program.term import CompiledTerm
-from unifg.program.touched import require_touched, term_columns
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 T = TypeVar("T")
@@ -52,6 +48,9 @@ class Program:
         bound_rows: (M,) whether a row bounds an unknown itself.
         systems: the normal equations and KKT matrices, their structure found once.
         table: all terms as compiled loops take them.
+        arrays: what these need to know about the terms, with the present data.
+        least_squares: whether the objective is a sum of squares, robust or not, and nothing constrains it.
+        differenced: whether some derivative comes from differences, which round.
         batched: terms without a kernel, evaluated by NumPy.
         retraction: moves all variables.
         scratch: memory for compiled loops.
@@ -65,16 +64,19 @@ class Program:
         self.families = list(graph.families.values())
         self.columns = Columns(self.families, graph.fixes)
         self.size = self.columns.size
-        self.terms = [CompiledTerm(term) for term in graph.terms]
+        self.terms = [CompiledTerm(term, self.columns) for term in graph.terms]
         self.cost_terms = [c for c in self.terms if isinstance(c.term, Cost)]
         self.scalar_terms = [c for c in self.terms if isinstance(c.term, ScalarCost)]
         self.constraint_terms = [c for c in self.terms if isinstance(c.term, Constraint)]
-        require_touched(self.columns, self.terms)
+        self._require_touched()
         variable, starts = self.columns.nodes()
         self.blocks = variable[self.columns.free]
         self.normal = self._pattern(self.cost_terms + self.scalar_terms + self.constraint_terms, variable, starts)
         stacked = self.cost_terms + self.constraint_terms
         self.table = Table(stacked, self.columns, self.normal)
+        self.arrays = self.table.arrays
+        self.least_squares = bool(self.cost_terms) and not (self.scalar_terms or self.constraint_terms)
+        self.differenced = bool(self.scalar_terms or self.table.differenced)
         self.batched = [term for term in stacked if term.kernel is None and not term.is_bound]
         self.costs = Rows(self.table, self.cost_terms, True, self.size)
         self.constraints = Rows(self.table, self.constraint_terms, False, self.size)
@@ -88,7 +90,7 @@ class Program:
         self._scalar_blocks()
         self._hessian: tuple[Symmetric, IntArray] | None = None
         self.retraction = Retraction(self.columns, graph.fixes)
-        self._start = Start(graph, self.columns, self.retraction)
+        self._read = GuessReader(graph, self.columns, self.retraction)
         self._names = [term.name for term in stacked]
         self.scratch = np.empty(self.table.scratch)
         self._buffers = Buffers([*self.table.sizes, self.columns.width, self.normal.nnz])
@@ -96,24 +98,9 @@ class Program:
         self.bind({})
 
     @property
-    def least_squares(self) -> bool:
-        """Whether the objective is a sum of squares, robust or not, and nothing constrains it."""
-        return bool(self.cost_terms) and not (self.scalar_terms or self.constraint_terms)
-
-    @property
-    def differenced(self) -> bool:
-        """Whether some derivative comes from differences, which round."""
-        return bool(self.scalar_terms or self.table.differenced)
-
-    @property
     def fully_compiled(self) -> bool:
         """Whether a compiled loop can do without Python: every term a kernel, no robust loss, compiled retractions."""
         return not (self.batched or self.scalar_terms or self.table.robust) and self.retraction.compiled
-
-    @property
-    def arrays(self) -> Terms:
-        """What compiled loops need to know about the terms, with the present data."""
-        return self.table.arrays
 
     @property
     def hessian(self) -> Symmetric:
@@ -138,7 +125,7 @@ class Program:
         if not (changed or self._fresh):
             return
         try:
-            rebound = [term for term in self.terms if term.rebind(self.data, changed)]
+            rebound = [term for term in self.terms if term.data & changed and term.rebind(self.data, changed)]
             limits = self._fresh or any(isinstance(term.term, Constraint) for term in rebound)
             if limits:
                 self._bind_limits()
@@ -170,7 +157,7 @@ class Program:
         Raises:
             GraphError: naming the family and index of what is missing, misshapen, NaN or off its manifold.
         """
-        values = self._start(guess)
+        values = self._read(guess)
         if not self._vetted:
             for term in self.terms:
                 require_clean(term, values)
@@ -197,7 +184,8 @@ class Program:
 
     def evaluate(self, values: Mapping[Family, Array], weights: HeldWeights | None = None) -> Evaluation:
         """Objective and constraints; ``weights`` are those of the linearisation whose line search this is."""
-        table, values = self.table, self.columns.values(values)
+        table = self.table
+        values = values if isinstance(values, Values) else self.columns.values(values)
         residual, constraints = np.empty(table.residuals), np.empty(table.constraints)
         squares = np.empty(table.weights)
         with np.errstate(all="ignore"):
@@ -215,7 +203,8 @@ class Program:
 
     def linearize(self, values: Mapping[Family, Array], search: bool = False) -> Linearization:
         """Everything a backend needs at ``values``; with ``search``, by search Jacobians where a residual has one."""
-        table, values = self.table, self.columns.values(values)
+        table = self.table
+        values = values if isinstance(values, Values) else self.columns.values(values)
         residual, jacobian, constraints, constraint_jacobian, gradient, hessian = self._buffers.take()
         gradient[:], hessian[:] = 0.0, 0.0
         squares, size = np.empty(table.weights), np.empty(len(table.arrays.fields))
@@ -353,11 +342,31 @@ class Program:
             chosen[slices[name]] = True
         return chosen
 
+    def _require_touched(self) -> None:
+        """Raise unless every unknown is part of some term.
+
+        Raises:
+            GraphError: naming the first variable that is not.
+        """
+        touched = np.zeros(self.columns.width, dtype=bool)
+        for term in self.terms:
+            for part in term.columns:
+                touched[part] = True
+        idle = self.columns.free[~touched[self.columns.free]]
+        if len(idle):
+            family, index = self.columns.name(int(idle[0]))
+            raise GraphError(
+                f"{family}[{index}] is in no cost or constraint and is not fixed: {len(idle)} tangent coordinates "
+                "are free to be anything; add a term, fix it, or make the family shorter",
+                family=family,
+                index=index,
+            )
+
     def _pattern(self, terms: Sequence[CompiledTerm], variable: IntArray, starts: IntArray) -> Symmetric:
         """Every two variables of a factor share a block."""
         first, second = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
         for term in terms:
-            members = [variable[columns[:, 0]] for columns in term_columns(self.columns, term)]
+            members = [variable[columns[:, 0]] for columns in term.columns]
             for k, a in enumerate(members):
                 for b in members[:k]:
                     first.append(np.minimum(a, b))
@@ -380,7 +389,7 @@ class Program:
         """Where gradient and Hessian blocks of scalar costs go."""
         self._scalars: dict[str, tuple[IntArray, IntArray, IntArray, IntArray, IntArray]] = {}
         for term in self.scalar_terms:
-            full = np.concatenate(term_columns(self.columns, term), axis=1)
+            full = np.concatenate(term.columns, axis=1)
             mapped = self.columns.unknown[full]
             keep = (mapped[:, :, None] <= mapped[:, None, :]) & (mapped[:, :, None] >= 0)
             factor, a, b = np.nonzero(keep)

@@ -21,8 +21,8 @@ from unifg.elimination.plan import Plan
 from unifg.elimination.saddle import SaddlePoint
 from unifg.elimination.symmetric import Symmetric
 from unifg.machine.jit import compiled
+from unifg.program.linearization import Rows
 from unifg.program.passes import transposed_times
-from unifg.program.rows import Rows
 from unifg.program.table import Terms
 from unifg.typing import Array, BoolArray, IntArray
 

@@ -113,7 +113,7 @@ class Table:
         self.differenced = any(term.differenced for term in terms)
         self.robust: list[tuple[CompiledTerm, slice]] = []
         for row, term in zip(fields, terms, strict=True):
-            layout = term.layout(columns, starts["parameters"])
+            layout = term.layout(starts["parameters"])
             count, m, width = layout.count, layout.rows, layout.columns.shape[1]
             row[COUNT], row[ROWS], row[WIDTH] = count, m, width
             row[SLOTS], row[STORAGE], row[KERNEL_WIDTH] = len(layout.sizes), sum(layout.sizes), layout.kernel_width

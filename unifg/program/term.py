@@ -6,31 +6,63 @@ kernel, checks, and messages.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+import logging
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
+from functools import cached_property
 from math import prod
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from unifg.errors import GraphError, name_term
-from unifg.kernels.differentiation import scalar_slopes, slopes, weighted_hessian
+from unifg.errors import GraphError
+from unifg.kernels.batched import FLOAT64, Batched
+from unifg.kernels.differences import (
+    Directions,
+    Moves,
+    Near,
+    Steps,
+    directions_of,
+    scalar_slopes,
+    slopes,
+    weighted_hessian,
+)
 from unifg.kernels.kernel import Kernel, side_by_side
-from unifg.kernels.moves import Moves, Near, Steps, directions_of
 from unifg.kernels.per_factor import per_factor
 from unifg.kernels.residuals import Residual
-from unifg.kernels.stack import Stack
 from unifg.kernels.whitening import DIAGONAL, FULL, reciprocals, square_roots
 from unifg.language.terms import Constraint, Cost, Parameter, ScalarCost, Term
 from unifg.language.variables import Data, Selection
 from unifg.lie import Manifold
 from unifg.machine.jit import is_compiled
 from unifg.program.columns import Columns, Values
-from unifg.program.gather import Gather
-from unifg.program.vetting import as_float64, as_jacobian, notice_no_information
 from unifg.typing import Array, BoolArray, IntArray
 
 Bound: TypeAlias = Mapping[Data, Array]
+logger = logging.getLogger("unifg")
+
+
+class Gather:
+    """Reads one variable argument of a term out of the values, one row per factor."""
+
+    def __init__(self, selection: Selection, count: int) -> None:
+        """Precompute the cheapest way to index."""
+        self.family = selection.family
+        self.selection = selection
+        self.shared = selection.count == 1 and count > 1
+        self.count = count
+        indices = selection.indices
+        self.rows: slice | IntArray = indices
+        if len(indices) == 1 or bool(np.all(np.diff(indices) == 1)):
+            self.rows = slice(int(indices[0]), int(indices[-1]) + 1)
+        self.columns = None if selection.component is None else selection.storage
+
+    def __call__(self, values: Values) -> Array:
+        """(n, storage) values of this argument."""
+        part = values[self.family][self.rows]
+        if self.columns is not None:
+            part = part[:, self.columns]
+        return np.broadcast_to(part, (self.count, part.shape[1])) if self.shared else part
 
 
 @dataclass
@@ -64,26 +96,29 @@ class CompiledTerm:
         count: factors n.
         size: residual dimension m.
         dims: tangent dimension of each variable argument.
+        columns: (n, d_k) full tangent columns of each variable argument.
         data: all data the term reads.
+        differenced: whether the Jacobian of a term that is no scalar cost is made of differences.
     """
 
     parameters: Array
     _packed: Array
 
-    def __init__(self, term: Term) -> None:
+    def __init__(self, term: Term, columns: Columns) -> None:
         """Find the residual's dimension by one evaluation at identity elements."""
         self.term = term
         self.name = term.name
         self.count = term.count
-        self.gathers = [Gather(s, term.count) for s in term.selections]
-        self.manifolds = [s.manifold for s in term.selections]
+        selections = term.selections
+        self.gathers = [Gather(s, term.count) for s in selections]
+        self.starts = [columns.starts(s) for s in selections]
+        self.columns = [np.broadcast_to(part, (term.count, part.shape[1])) for part in map(columns.of, selections)]
+        self.manifolds = [s.manifold for s in selections]
         self.dims = [manifold.dim for manifold in self.manifolds]
         self._places = [k for k, a in enumerate(term.arguments) if isinstance(a, Selection)]
-        self._function = term.residual.function
         self._jacobian = term.residual.jacobian
-        self._stack = Stack(self.name, self._evaluated)
-        self._jacobian_stack = Stack(self.name, self._attached)
-        self._directions = directions_of(tuple(self.manifolds))
+        self._batched = Batched(self.name, term.residual.function)
+        self._attached: Batched | None = None
         self.is_bound = isinstance(term, Constraint) and term.is_bound
         self.kernel, self.search_kernel = (None, None) if isinstance(term, ScalarCost) else _kernels(term.residual)
         self.place: IntArray = np.zeros(0, dtype=np.int64)
@@ -92,13 +127,16 @@ class CompiledTerm:
         self.data = self._shaping | {argument for argument in term.arguments if isinstance(argument, Data)}
         self._blocks: dict[int, tuple[int, int]] = {}
         self.bind({})
-        if is_compiled(self._function) and not isinstance(term, ScalarCost):
+        if is_compiled(term.residual.function) and not isinstance(term, ScalarCost):
             self.kernel = self._own_kernel()
-            self._function, self._jacobian = self.kernel, self.kernel.jacobian
+            self._batched.function, self._jacobian = self.kernel, self.kernel.jacobian
         if self.kernel is not None:
             self._require_manifolds(self.kernel)
+        self.differenced = (
+            self._jacobian is None and not self.is_bound if self.kernel is None else self.kernel.differenced
+        )
         with np.errstate(all="ignore"):
-            trial = self._call([np.tile(m.identity(), (self.count, 1)) for m in self.manifolds])
+            trial = self._batched.at([np.tile(m.identity(), (self.count, 1)) for m in self.manifolds])
         scalar = isinstance(term, ScalarCost)
         expected = "(n,)" if scalar else "(n, m)"
         if trial.ndim != (1 if scalar else 2) or len(trial) != self.count:
@@ -111,7 +149,7 @@ class CompiledTerm:
         self.shape = trial.shape
         self._bind_parameters({})
         if isinstance(self.term, Cost) and isinstance(self.term.information, np.ndarray):
-            notice_no_information(self.name, self.whitener)
+            _notice_no_information(self.name, self.whitener)
 
     def bind(self, data: Bound) -> None:
         """Take the present value of every data argument."""
@@ -119,9 +157,9 @@ class CompiledTerm:
         active = self.term.active
         mask = data.get(active, active.value) if isinstance(active, Data) else active
         self.active: BoolArray | None = None if mask is None or mask.all() else mask.astype(bool)
-        each = [k for k, a in enumerate(self.term.arguments) if isinstance(a, Data) and a.each]
-        for stack in (self._stack, self._jacobian_stack):
-            stack.bind(self._arguments, self._places, each)
+        self._bind_batched(self._batched)
+        if self._attached is not None:
+            self._bind_batched(self._attached)
         if hasattr(self, "size"):
             self._bind_parameters(data)
 
@@ -138,8 +176,9 @@ class CompiledTerm:
             self._arguments[place] = value = data.get(handle, handle.value)
             first, size = self._blocks[place]
             self._packed[:, first : first + size] = value.reshape(-1, size)
-        self._stack.forget()
-        self._jacobian_stack.forget()
+        self._batched.forget()
+        if self._attached is not None:
+            self._attached.forget()
         return False
 
     def settle(self, parameters: Array) -> None:
@@ -148,9 +187,18 @@ class CompiledTerm:
         if self.kernel is not None:
             self._packed = parameters[: self._packed.size].reshape(self._packed.shape)
 
+    @cached_property
+    def _directions(self) -> Directions:
+        """Tangent directions of the variables."""
+        return directions_of(tuple(self.manifolds))
+
+    def points(self, values: Values) -> list[Array]:
+        """(n, storage_k) values of each variable argument."""
+        return [gather(values) for gather in self.gathers]
+
     def residual(self, values: Values) -> Array:
         """(n, m) residuals, zero where inactive, not whitened; (n,) for a scalar cost."""
-        return self._masked(self._checked(self._call([gather(values) for gather in self.gathers])))
+        return self._masked(self._checked(self._batched.at(self.points(values))))
 
     def jacobians(self, values: Values, numerical: bool = False, search: bool = False) -> list[Array]:
         """One (n, m, d_k) array per variable argument, zero where inactive.
@@ -161,11 +209,11 @@ class CompiledTerm:
             search: prefer the residual's search Jacobian, which is not a derivative.
         """
         attached = self.term.residual.search if search and self.term.residual.search else self._jacobian
-        points = [gather(values) for gather in self.gathers]
+        points = self.points(values)
         if attached is None or numerical:
-            blocks = slopes(self._stack, Near(self._directions, points))
+            blocks = slopes(self._batched, self._directions, points)
         else:
-            blocks = [as_jacobian(self.name, block) for block in attached(*self.fill(points))]
+            blocks = [_as_jacobian(self.name, block) for block in attached(*self._batched.fill(points))]
             if len(blocks) > len(self.dims) and len(blocks) > max(self._places):
                 blocks = [blocks[place] for place in self._places]  # some of its arguments are constants here
             wanted = [(self.count, self.size, dim) for dim in self.dims]
@@ -190,37 +238,32 @@ class CompiledTerm:
 
     def second_derivatives(self, values: Values, weights: Array) -> Array:
         """(n, D, D) Hessians of weights' r, weights (n, m), by differences; zero where inactive."""
-        near = Near(self._directions, [gather(values) for gather in self.gathers])
+        points = self.points(values)
         with np.errstate(all="ignore"):
             if self._jacobian is None or self.differenced:
-                return self._masked(weighted_hessian(self._stack, near, weights))
+                return self._masked(weighted_hessian(self._batched, self._directions, points, weights))
+            if self._attached is None:
+                self._attached = Batched(self.name, self._side_by_side)
+                self._bind_batched(self._attached)
+            many = self._attached
 
             def slope(near: Near, steps: Steps, moves: Moves) -> Array:
-                return np.asarray(np.einsum("nm,knmd->knd", weights, self._jacobian_stack(near, steps, moves)))
+                return np.asarray(np.einsum("nm,knmd->knd", weights, many(near, steps, moves)))
 
-            second = np.concatenate(slopes(slope, near), axis=2)
+            second = np.concatenate(slopes(slope, self._directions, points), axis=2)
         return self._masked(0.5 * (second + np.swapaxes(second, 1, 2)))
 
     def scalar_derivatives(self, values: Values) -> tuple[Array, Array, Array]:
         """Gradient (n, D), Hessian (n, D, D), rounding of the gradient (n, D) of a scalar cost, zero where inactive."""
-        found = scalar_slopes(self._stack, Near(self._directions, [gather(values) for gather in self.gathers]))
+        found = scalar_slopes(self._batched, self._directions, self.points(values))
         gradient, hessian, rounding = (self._masked(array) for array in found)
         return gradient, hessian, rounding
 
-    @property
-    def differenced(self) -> bool:
-        """Whether the Jacobian of a term that is no scalar cost is made of differences."""
-        if self.kernel is not None:
-            return self.kernel.differenced
-        return self._jacobian is None and not self.is_bound
-
-    def layout(self, columns: Columns, parameters: int) -> Layout:
+    def layout(self, parameters: int) -> Layout:
         """Where this term's numbers stand, when its parameters begin at ``parameters``."""
-        tangent = [columns.of(selection) for selection in self.term.selections]
-        wide = [np.broadcast_to(part, (self.count, part.shape[1])) for part in tangent]
-        joined = np.concatenate(wide, axis=1)
-        starts = [np.broadcast_to(columns.starts(s), (self.count,)) for s in self.term.selections]
-        sizes = [selection.manifold.storage for selection in self.term.selections]
+        joined = np.concatenate(self.columns, axis=1)
+        starts = [np.broadcast_to(start, (self.count,)) for start in self.starts]
+        sizes = [manifold.storage for manifold in self.manifolds]
         if self.is_bound:
             scalars = (starts[0][:, None] + np.arange(self.size)).reshape(-1, 1)
             return Layout(self.count * self.size, 1, scalars, [1], joined.reshape(-1, 1), 1, None)
@@ -276,9 +319,9 @@ class CompiledTerm:
 
     def _pack(self, kernel: Kernel) -> None:
         """Put the kernel's parameters side by side, and after them the constants in the place of variables."""
-        points: list[Any] = [np.empty((1, m.storage)) for m in self.manifolds]
+        points = [np.empty((1, m.storage)) for m in self.manifolds]
         try:
-            variables, parameters, _ = kernel.split(self.fill(points), self.count)
+            variables, parameters, _ = kernel.split(self._batched.fill(points), self.count)
         except GraphError as error:
             raise GraphError(f"term '{self.name}': {error}", term=self.name) from None
         packed = side_by_side(parameters)
@@ -316,7 +359,7 @@ class CompiledTerm:
                 f"{len(self.term.arguments)}: {self._shapes()}",
                 term=self.name,
             )
-        for place, selection in zip(self._places, self.term.selections, strict=True):
+        for place, selection in zip(self._places, [gather.selection for gather in self.gathers], strict=True):
             expected = kernel.arguments[place]
             if expected != selection.manifold:
                 wanted = "a parameter, not a variable" if isinstance(expected, int | tuple) else expected.name
@@ -339,31 +382,20 @@ class CompiledTerm:
             full[~self.active] = none
         return full
 
-    def _call(self, points: list[Array]) -> Array:
-        return self._evaluated(self.fill(points))
+    def _bind_batched(self, batched: Batched) -> None:
+        each = [k for k, a in enumerate(self.term.arguments) if isinstance(a, Data) and a.each]
+        batched.bind(self._arguments, self._places, each)
 
-    def _attached(self, arguments: list[Any]) -> Array:
-        """(n, m, D) attached Jacobian side by side."""
+    def _side_by_side(self, *arguments: Any) -> Array:
+        """(n, m, D) attached Jacobian."""
         assert self._jacobian is not None
         blocks = [np.asarray(block) for block in self._jacobian(*arguments)]
-        return np.concatenate(
-            blocks if len(blocks) == len(self.dims) else [blocks[place] for place in self._places], axis=2
-        )
+        own = blocks if len(blocks) == len(self.dims) else [blocks[place] for place in self._places]
+        return np.concatenate(own, axis=2, dtype=np.float64)
 
-    def _evaluated(self, arguments: list[Any]) -> Array:
-        try:
-            result = self._function(*arguments)
-        except Exception as error:
-            name_term(error, self.name)
-            raise
-        return as_float64(self.name, result)
-
-    def fill(self, points: list[Array]) -> list[Any]:
+    def fill(self, points: Sequence[Array]) -> list[Any]:
         """All arguments in order, variables at these points."""
-        arguments = list(self._arguments)
-        for place, point in zip(self._places, points, strict=True):
-            arguments[place] = point
-        return arguments
+        return self._batched.fill(points)
 
     def _checked(self, residual: Array) -> Array:
         if residual.shape != self.shape:
@@ -406,3 +438,24 @@ def resolve(parameter: Parameter, data: Bound) -> Array:
     if isinstance(parameter, Data):
         return data.get(parameter, parameter.value)
     return np.asarray(parameter, dtype=np.float64)
+
+
+def _as_jacobian(name: str, block: Any) -> Array:
+    """A block of an attached Jacobian as an array; whole numbers are exact.
+
+    Raises:
+        GraphError: when it is made of coarser or complex numbers.
+    """
+    array = np.asarray(block)
+    if array.dtype != FLOAT64 and array.dtype.kind not in "iub":
+        raise GraphError(f"term '{name}': its attached Jacobian returned {array.dtype}, expected float64", term=name)
+    return np.asarray(array, dtype=np.float64)
+
+
+def _notice_no_information(name: str, whitener: Array) -> None:
+    """Say that a term counts for nothing: an infinite sigma may be meant, and a matrix that was never filled is not.
+
+    Of constants only: data switch terms off and on, and the status of a solve says whether anything is missing then.
+    """
+    if whitener.size and not whitener.any():
+        logger.warning("term '%s': its information is zero for every factor, so it counts for nothing", name)

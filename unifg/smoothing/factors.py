@@ -15,7 +15,7 @@ from unifg.kernels.residuals import Residual
 from unifg.kernels.robust import Form, Loss, form_of
 from unifg.kernels.whitening import DIAGONAL, FULL, reciprocals, square_roots
 from unifg.language.factors import prior
-from unifg.language.graph import AnyResidual, complete
+from unifg.language.statement import AnyResidual, complete
 from unifg.language.variables import as_selection, is_variable
 from unifg.lie import Manifold
 from unifg.lie.moving import ADDITION, move_of

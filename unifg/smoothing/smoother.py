@@ -10,7 +10,7 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.kernels.robust import Loss
-from unifg.language.graph import AnyResidual
+from unifg.language.statement import AnyResidual
 from unifg.language.variables import Selection, Variable, as_selection
 from unifg.lie import Manifold
 from unifg.machine.borrow import described

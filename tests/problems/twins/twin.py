@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 import unifg as fg
-from unifg.language.graph import AnyResidual
+from unifg.language.statement import AnyResidual
 from unifg.language.variables import Variable, as_selection, is_variable
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 

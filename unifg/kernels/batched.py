@@ -1,4 +1,4 @@
-"""A user's batched function at the points of many moves, in few calls where it allows that.
+"""A user's batched function: what it returns is looked at, and many moves take few calls where it allows that.
 
 A residual treats its factors one by one, so the factors of many perturbed batches may stand in one long batch: what
 small arrays cost is the call. But a function may know the length of its batch: by arrays of its own with a row per
@@ -9,31 +9,34 @@ long call fails, or returns other numbers, there is one call for each batch for 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import prod
 from typing import Any
 
 import numpy as np
 
-from unifg.kernels.moves import Moves, Near, Steps
+from unifg.errors import GraphError, name_term
+from unifg.kernels.differences import Moves, Near, Steps
 from unifg.typing import Array
 
 logger = logging.getLogger("unifg")
 LONGEST = 1 << 15  # numbers in the points of one call, which should fit into a cache with all that becomes of them
 SHORTEST = 4  # batches in a call that are worth it
+FLOAT64 = np.dtype(np.float64)
 ALIKE = 1e-12  # relative difference that another order of summation may make
 
 
-class Stack:
-    """A batched function of all arguments, and those that are constants.
+class Batched:
+    """A batched function of variables and constants.
 
     Attributes:
         name: of the term, for messages.
+        function: takes all arguments, returns (n, ...) doubles.
     """
 
-    def __init__(self, name: str, function: Callable[[list[Any]], Array]) -> None:
-        """Take a function of the list of its arguments."""
-        self.name, self._function = name, function
+    def __init__(self, name: str, function: Callable[..., Array]) -> None:
+        """Constants come with :meth:`bind`."""
+        self.name, self.function = name, function
         self._arguments: list[Any] = []
         self._places: list[int] = []
         self._each: list[int] = []
@@ -51,6 +54,37 @@ class Stack:
     def forget(self) -> None:
         """Constants have changed in place."""
         self._tiled.clear()
+
+    def fill(self, points: Sequence[Array]) -> list[Any]:
+        """All arguments in order, variables at these points."""
+        arguments = list(self._arguments)
+        for place, point in zip(self._places, points, strict=True):
+            arguments[place] = point
+        return arguments
+
+    def at(self, points: Sequence[Array]) -> Array:
+        """(n, ...) what the function returns, variables at these points.
+
+        Raises:
+            GraphError: when it is not made of doubles; of coarser numbers differences are noise. Errors of the function
+                name the term.
+        """
+        return self._vetted(self.fill(points))
+
+    def _vetted(self, arguments: list[Any]) -> Array:
+        try:
+            result = self.function(*arguments)
+        except Exception as error:
+            name_term(error, self.name)
+            raise
+        array = result if isinstance(result, np.ndarray) else np.asarray(result)
+        if array.dtype != FLOAT64:
+            raise GraphError(
+                f"term '{self.name}': its function returned {array.dtype}, expected float64: differences of anything "
+                "else are noise; convert its inputs, not its result",
+                term=self.name,
+            )
+        return array
 
     def __call__(self, near: Near, steps: Steps, moves: Moves) -> Array:
         """(K, n, ...) what the function returns after each of K moves, until it is called again."""
@@ -74,10 +108,7 @@ class Stack:
         """The same, a call for each move."""
         results = np.empty(0)
         for k in range(moves.count):
-            arguments = list(self._arguments)
-            for place, point in zip(self._places, near.after(steps, moves, k), strict=True):
-                arguments[place] = point
-            found = self._function(arguments)
+            found = self.at(near.after(steps, moves, k))
             if k == 0:
                 shape = moves.count, *np.shape(found)
                 if self._memory.size < prod(shape):
@@ -98,7 +129,7 @@ class Stack:
         for place, stack in zip(self._places, points, strict=True):
             arguments[place] = stack.reshape(k * count, stack.shape[2])
         try:
-            found = np.array(self._function(arguments))
+            found = np.array(self._vetted(arguments))
         except Exception:
             return None
         return found.reshape(k, count, *found.shape[1:]) if found.shape[:1] == (k * count,) else None
@@ -112,7 +143,7 @@ class Stack:
             anywhere = near.directions.anywhere
             points = near.moved(steps, anywhere, 0, anywhere.count)
             try:
-                alone = self._one_by_one(near, steps, anywhere).copy()
+                alone = np.stack([np.array(self.at([part[k] for part in points])) for k in range(anywhere.count)])
             except Exception:  # it refuses these points: nobody asked for them but this
                 return None
             if not np.isfinite(alone).any():
