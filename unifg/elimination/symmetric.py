@@ -24,6 +24,7 @@ class Symmetric:
 
     Attributes:
         size: number of rows and columns.
+        nnz: number of stored entries.
         indptr, indices: the compressed pattern, rows sorted within a column; the diagonal is always stored.
     """
 
@@ -33,6 +34,7 @@ class Symmetric:
         keys = [column * size + row for row, column in entries] + [diagonal * (size + 1)]
         unique = np.unique(np.concatenate(keys))
         self.size = size
+        self.nnz = len(unique)
         self.indices: IntArray = unique % max(size, 1)
         self.indptr: IntArray = np.searchsorted(unique, np.arange(size + 1) * size)
 
@@ -58,14 +60,10 @@ class Symmetric:
         column_of = np.repeat(own, lengths)
         depth = np.arange(self.size) - starts[column_of] + 1
         self.indptr = np.concatenate([[0], np.cumsum(rows_above[column_of] + depth)]).astype(np.intp)
-        self.indices = np.empty(int(self.indptr[-1]), dtype=np.intp)
+        self.nnz = int(self.indptr[-1])
+        self.indices = np.empty(self.nnz, dtype=np.intp)
         _expand(starts, first, second, self.indptr, self.indices)
         return self
-
-    @property
-    def nnz(self) -> int:
-        """Number of stored entries."""
-        return len(self.indices)
 
     @cached_property
     def diagonal(self) -> IntArray:

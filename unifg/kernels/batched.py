@@ -71,6 +71,19 @@ class Batched:
         """
         return self._vetted(self.fill(points))
 
+    def require_clean(self, points: Sequence[Array]) -> None:
+        """Call the function once, and refuse one that changes its arguments.
+
+        Raises:
+            GraphError: naming the term and the argument.
+        """
+        arguments = [np.array(a) if isinstance(a, np.ndarray) else a for a in self.fill(points)]
+        before = [a.copy() if isinstance(a, np.ndarray) else a for a in arguments]
+        self.function(*arguments)
+        for place, (given, kept) in enumerate(zip(arguments, before, strict=True)):
+            if isinstance(given, np.ndarray) and given.tobytes() != kept.tobytes():
+                raise GraphError(changes(self.name, place), term=self.name)
+
     def _vetted(self, arguments: list[Any]) -> Array:
         try:
             result = self.function(*arguments)
@@ -166,6 +179,11 @@ class Batched:
             for k, given in enumerate(self._arguments)
             if k not in known and isinstance(given, np.ndarray) and given.ndim and len(given) == count > 1
         ]
+
+
+def changes(name: str, place: int) -> str:
+    """What to say of a function that writes where it should read."""
+    return f"term '{name}': its function changes its argument {place}, which belongs to the solver: work on a copy"
 
 
 def _largest(numbers: Array) -> float:

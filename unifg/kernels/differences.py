@@ -28,11 +28,10 @@ from unifg.kernels.steps import (
     VECTOR,
     Part,
     parts_of,
-    rotations,
     steps_for,
     uncertainties,
 )
-from unifg.lie import Manifold
+from unifg.lie import SO2, SO3, Manifold
 from unifg.typing import Array, BoolArray, IntArray
 
 FURTHER = 1024.0  # steps of ``Directions.anywhere``, at most
@@ -116,7 +115,7 @@ class Directions:
         at = column = 0
         for k, manifold in enumerate(manifolds):
             own = []
-            for part, leaf in parts_of([manifold]):
+            for part, leaf in parts_of(manifold):
                 columns = slice(column + part.column, column + part.column + part.dim)
                 stored = slice(at + part.start, at + part.start + part.storage)
                 own.append((part, leaf, columns))
@@ -249,8 +248,11 @@ class Near:
 
     def rotations(self) -> list[tuple[slice, Array]]:
         """Columns of the positions that belong to a rotation, and the (n, d, d) rotations."""
-        poses = self.directions.poses
-        return [(columns, rotations(self.points[k], part.turn, part.dim)) for k, part, columns in poses]
+        found = []
+        for k, part, columns in self.directions.poses:
+            group, stored = (SO2, 1) if part.dim == 2 else (SO3, 4)
+            found.append((columns, group.matrix(self.points[k][:, part.turn : part.turn + stored])))
+        return found
 
 
 @lru_cache(maxsize=256)

@@ -122,7 +122,7 @@ def _attached(call: str, slots: Sequence[tuple[int, Manifold]], rows: int) -> It
 def _differences(call: str, slots: Sequence[tuple[int, Manifold]], rows: int, storage: int, name: str) -> Iterator[str]:
     """Central differences along every tangent direction of every variable; see :mod:`unifg.kernels.steps`."""
     manifolds = [manifold for _, manifold in slots]
-    parts = list(parts_of(manifolds))
+    parts = parts_of(*manifolds)
     yield f"    moved, step = local_vector({storage}), local_vector({max(manifold.dim for manifold in manifolds)})"
     yield f"    ahead, behind, R = local_vector({rows}), local_vector({rows}), local_matrix(3, 3)"
     yield f"    found = local_matrix(3, {rows})"

@@ -73,13 +73,16 @@ def residual(
     """
     search_kernel = search if isinstance(search, Kernel) else None
     looked_in = search.jacobian if isinstance(search, Kernel) else search
-    if is_compiled(function) and rows < 1:
+    own = is_compiled(function)
+    if own and rows < 1:
         raise GraphError(
             f"the residual '{getattr(function, '__name__', name)}' is compiled: say how many numbers it writes, rows="
         )
     if isinstance(function, Kernel) and jacobian is None:
         return Residual(function, function.jacobian, name or function.name, looked_in, function, search_kernel)
-    return Residual(function, jacobian, name or getattr(function, "__name__", "residual"), looked_in, rows=rows)
+    return Residual(
+        function, jacobian, name or getattr(function, "__name__", "residual"), looked_in, rows=rows if own else 0
+    )
 
 
 def as_residual(function: Function | Kernel | Residual) -> Residual:

@@ -20,8 +20,9 @@ coordinates of its position, which a turn afterwards makes derivatives along the
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Hashable, Sequence
+from functools import lru_cache
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -67,31 +68,39 @@ class Part(NamedTuple):
     turn: int
 
 
-def parts_of(manifolds: Sequence[Manifold]) -> Iterator[tuple[Part, Manifold]]:
+def parts_of(*manifolds: Manifold) -> tuple[tuple[Part, Manifold], ...]:
     """The parts of several variables side by side, and the manifold of each; poses fall into position and rotation."""
+    return _parts_of(cast(tuple[Hashable, ...], manifolds))
+
+
+@lru_cache(maxsize=256)
+def _parts_of(keys: tuple[Hashable, ...]) -> tuple[tuple[Part, Manifold], ...]:
+    manifolds = cast(tuple[Manifold, ...], keys)
+    parts: list[tuple[Part, Manifold]] = []
     start = column = 0
     for manifold in manifolds:
         for leaf, at, tangent in leaves(manifold, start, column):
             if isinstance(leaf, Rn):
-                yield Part(VECTOR, at, leaf.dim, leaf.dim, tangent, -1), leaf
+                parts.append((Part(VECTOR, at, leaf.dim, leaf.dim, tangent, -1), leaf))
             elif leaf == SO2:
-                yield Part(ANGLE, at, 1, 1, tangent, -1), leaf
+                parts.append((Part(ANGLE, at, 1, 1, tangent, -1), leaf))
             elif leaf == SO3:
-                yield Part(TURN, at, 4, 3, tangent, -1), leaf
+                parts.append((Part(TURN, at, 4, 3, tangent, -1), leaf))
             elif leaf == SE2:
-                yield Part(VECTOR, at, 2, 2, tangent, at + 2), Rn(2)
-                yield Part(ANGLE, at + 2, 1, 1, tangent + 2, -1), SO2
+                parts.append((Part(VECTOR, at, 2, 2, tangent, at + 2), Rn(2)))
+                parts.append((Part(ANGLE, at + 2, 1, 1, tangent + 2, -1), SO2))
             elif leaf == SE3:
-                yield Part(VECTOR, at, 3, 3, tangent, at + 3), Rn(3)
-                yield Part(TURN, at + 3, 4, 3, tangent + 3, -1), SO3
+                parts.append((Part(VECTOR, at, 3, 3, tangent, at + 3), Rn(3)))
+                parts.append((Part(TURN, at + 3, 4, 3, tangent + 3, -1), SO3))
             else:
-                yield Part(OTHER, at, leaf.storage, leaf.dim, tangent, -1), leaf
+                parts.append((Part(OTHER, at, leaf.storage, leaf.dim, tangent, -1), leaf))
         start, column = start + manifold.storage, column + manifold.dim
+    return tuple(parts)
 
 
 def compiled_parts(manifolds: Sequence[Manifold]) -> list[Part]:
     """The parts of several variables; nothing when one of them has no compiled retraction."""
-    parts = [part for part, _ in parts_of(manifolds)]
+    parts = [part for part, _ in parts_of(*manifolds)]
     return [] if any(part.kind == OTHER for part in parts) else parts
 
 
@@ -185,13 +194,6 @@ def to_body(R: Array, dim: int, J: Array, rows: int, column: int) -> None:
         z = J[a, column + 2] if dim == 3 else 0.0
         for d in range(dim):
             J[a, column + d] = x * R[0, d] + y * R[1, d] + (z * R[2, d] if dim == 3 else 0.0)
-
-
-def rotations(stored: Array, turn: int, dim: int) -> Array:
-    """(n, dim, dim) rotations of poses (n, storage)."""
-    if dim == 2:
-        return SO2.matrix(stored[:, turn : turn + 1])
-    return SO3.matrix(stored[:, turn : turn + 4])
 
 
 def as_table(parts: Sequence[Part]) -> IntArray:

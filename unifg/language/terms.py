@@ -10,7 +10,7 @@ import numpy as np
 from unifg.errors import GraphError
 from unifg.kernels.residuals import Residual
 from unifg.kernels.robust import Loss
-from unifg.language.variables import Data, Selection, as_selection, is_variable
+from unifg.language.variables import Data, Family, Selection
 from unifg.typing import Array, ArrayLike, BoolArray
 
 Parameter: TypeAlias = ArrayLike | Data
@@ -98,7 +98,7 @@ def prepare_arguments(name: str, arguments: tuple[Any, ...], active: Any) -> tup
     Raises:
         GraphError: when there is no variable among the arguments, or the lengths disagree.
     """
-    normal = tuple(as_selection(a) if is_variable(a) else a for a in arguments)
+    normal = tuple(a[:] if isinstance(a, Family) else a for a in arguments)
     lengths: list[tuple[str, int]] = []
     for argument in normal:
         if isinstance(argument, Selection):

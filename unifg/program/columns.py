@@ -11,6 +11,7 @@ from unifg.errors import GraphError
 from unifg.kernels.steps import OTHER, TURN, parts_of
 from unifg.language.terms import Fix
 from unifg.language.variables import Family, Selection
+from unifg.lie.product import leaves
 from unifg.typing import Array, IntArray
 
 
@@ -33,6 +34,7 @@ class Columns:
     """Numbering of the full tangent space and of the unknowns within it.
 
     Attributes:
+        leaves: components of each family's manifold, and where each begins in storage and tangent.
         storage: where each family's storage starts.
         stored: length of the storage of all families.
         offsets: first column of each family.
@@ -46,6 +48,7 @@ class Columns:
     def __init__(self, families: Sequence[Family], fixes: Sequence[Fix]) -> None:
         """Number the families in the order given, members in theirs."""
         self.families = list(families)
+        self.leaves = {family: list(leaves(family.manifold)) for family in families}
         self.offsets: dict[Family, int] = {}
         self.storage: dict[Family, int] = {}
         self.width = self.stored = 0
@@ -101,7 +104,7 @@ class Columns:
         first, last, kinds = (np.zeros(self.width, dtype=np.int64) for _ in range(3))
         for family in self.families:
             members = np.arange(family.count)
-            for part, _ in parts_of([family.manifold]):
+            for part, _ in parts_of(family.manifold):
                 shared = part.turn >= 0 or part.kind == OTHER
                 start = self.storage[family] + members * family.manifold.storage + part.start
                 for axis in range(part.dim):

@@ -21,7 +21,7 @@ from unifg.language.variables import Binding, Data, Family
 from unifg.machine.buffers import Buffers
 from unifg.program import passes
 from unifg.program.columns import Columns, Values
-from unifg.program.guess import GuessReader, require_clean
+from unifg.program.guess import GuessReader
 from unifg.program.linearization import Evaluation, HeldWeights, Linearization, Rows
 from unifg.program.retraction import Retraction
 from unifg.program.systems import Systems
@@ -160,7 +160,7 @@ class Program:
         values = self._read(guess)
         if not self._vetted:
             for term in self.terms:
-                require_clean(term, values)
+                term.require_clean(values)
             self._vetted = True
         return values
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from unifg.language.terms import Fix
 from unifg.lie.moving import move_of, move_point
-from unifg.lie.product import leaves
 from unifg.machine.jit import compiled
 from unifg.program.columns import Columns, Values
 from unifg.typing import Array, IntArray
@@ -28,13 +27,12 @@ class Retraction:
         self._kept = []  # addresses are good for as long as the functions live
         parts = []
         for family in columns.families:
-            parts_of = list(leaves(family.manifold))
-            moves = [move_of(leaf) for leaf, _, _ in parts_of]
+            moves = [move_of(leaf) for leaf, _, _ in columns.leaves[family]]
             if None in moves:
                 self._python.append(family)
                 continue
             self._kept.append(moves)
-            for (leaf, storage, tangent), found in zip(parts_of, moves, strict=True):
+            for (leaf, storage, tangent), found in zip(columns.leaves[family], moves, strict=True):
                 assert found is not None
                 parts.append(
                     [

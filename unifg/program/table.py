@@ -95,6 +95,7 @@ class Table:
         residuals, weights: number of rows of all costs, number of robust factors.
         constraints: number of constraint rows.
         entries, constraint_entries: lengths of the stacked Jacobians.
+        sizes: lengths of the stacked residual, its Jacobian, the stacked constraints and theirs.
         scratch: how many numbers the loops need for one factor.
         differenced: whether the Jacobian of any term is made of differences.
         robust: robust terms and their slices of weights.
@@ -162,6 +163,7 @@ class Table:
                 self.constraints += count * m
                 self.constraint_entries += entries
             term.place = row
+        self.sizes = self.residuals, self.entries, self.constraints, self.constraint_entries
         counts = fields[:, COUNT]
         self._active_starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         self.arrays = Terms(
@@ -179,11 +181,6 @@ class Table:
             np.empty(self.constraints),
         )
         locate(fields, self.arrays.columns, self.arrays.unknown, normal.indptr, normal.indices, self.arrays.positions)
-
-    @property
-    def sizes(self) -> tuple[int, int, int, int]:
-        """Lengths of the stacked residual, its Jacobian, the stacked constraints and theirs."""
-        return self.residuals, self.entries, self.constraints, self.constraint_entries
 
     def bind(self, rebound: Sequence[CompiledTerm], lower: Array, upper: Array) -> None:
         """Copy limits and everything that some terms have bound; their parameters live here from then on."""

@@ -7,7 +7,7 @@ kernel, checks, and messages.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
 from math import prod
@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.kernels.batched import FLOAT64, Batched
+from unifg.kernels.batched import FLOAT64, Batched, changes
 from unifg.kernels.differences import (
     Directions,
     Moves,
@@ -27,14 +27,13 @@ from unifg.kernels.differences import (
     slopes,
     weighted_hessian,
 )
-from unifg.kernels.kernel import Kernel, side_by_side
+from unifg.kernels.kernel import Kernel, evaluate_rows, side_by_side
 from unifg.kernels.per_factor import per_factor
 from unifg.kernels.residuals import Residual
 from unifg.kernels.whitening import DIAGONAL, FULL, reciprocals, square_roots
 from unifg.language.terms import Constraint, Cost, Parameter, ScalarCost, Term
 from unifg.language.variables import Data, Selection
 from unifg.lie import Manifold
-from unifg.machine.jit import is_compiled
 from unifg.program.columns import Columns, Values
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -127,7 +126,7 @@ class CompiledTerm:
         self.data = self._shaping | {argument for argument in term.arguments if isinstance(argument, Data)}
         self._blocks: dict[int, tuple[int, int]] = {}
         self.bind({})
-        if is_compiled(term.residual.function) and not isinstance(term, ScalarCost):
+        if term.residual.rows and not isinstance(term, ScalarCost):
             self.kernel = self._own_kernel()
             self._batched.function, self._jacobian = self.kernel, self.kernel.jacobian
         if self.kernel is not None:
@@ -224,6 +223,42 @@ class CompiledTerm:
                     term=self.name,
                 )
         return [self._masked(block) for block in blocks]
+
+    def require_clean(self, values: Values) -> None:
+        """Call a user's function once at the guess, and refuse one that changes its arguments or leaves rows out.
+
+        Raises:
+            GraphError: naming the term and the argument or row.
+        """
+        if self.is_bound:
+            return
+        with np.errstate(all="ignore"):
+            if self.kernel is None or isinstance(self.term, ScalarCost):
+                self._batched.require_clean(self.points(values))
+            elif self.term.residual.rows:
+                self._require_all_rows(self.kernel, self.points(values))
+
+    def _require_all_rows(self, kernel: Kernel, points: list[Array]) -> None:
+        """The same of a function that a user has compiled for one factor."""
+        variables, parameters, count = kernel.split(self._batched.fill(points), self.count)
+        packed, shared = side_by_side(variables, count), side_by_side(parameters)
+        v, p = packed.copy(), shared.copy()
+        twice = []
+        for filled in (np.nan, 0.0):
+            rows = np.full((count, self.size), filled)
+            evaluate_rows(kernel.address, v, p, kernel.table, rows, np.empty((0, 0, 0)))
+            twice.append(rows)
+        if v.tobytes() != packed.tobytes() or p.tobytes() != shared.tobytes():
+            place = 0 if v.tobytes() != packed.tobytes() else len(variables)
+            raise GraphError(changes(self.name, place), term=self.name)
+        missing = np.isnan(twice[0]) & ~np.isnan(twice[1])
+        if missing.any():
+            index, row = (int(k) for k in np.argwhere(missing)[0])
+            raise GraphError(
+                f"term '{self.name}': its function does not write row {row} of factor {index}",
+                term=self.name,
+                index=index,
+            )
 
     def carry_back(self, residual: Array) -> Array:
         """(n, m) W' r for whitened residuals."""
@@ -392,10 +427,6 @@ class CompiledTerm:
         blocks = [np.asarray(block) for block in self._jacobian(*arguments)]
         own = blocks if len(blocks) == len(self.dims) else [blocks[place] for place in self._places]
         return np.concatenate(own, axis=2, dtype=np.float64)
-
-    def fill(self, points: Sequence[Array]) -> list[Any]:
-        """All arguments in order, variables at these points."""
-        return self._batched.fill(points)
 
     def _checked(self, residual: Array) -> Array:
         if residual.shape != self.shape:
