@@ -30,8 +30,8 @@ from unifg.errors import BackendError, GraphError
 from unifg.kernels.differences import convexified
 from unifg.language.terms import Cost
 from unifg.language.variables import Data, Family
-from unifg.program.program import Program
 from unifg.program.linearization import Rows
+from unifg.program.program import Program
 from unifg.program.term import CompiledTerm
 from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, qp_error, subproblem
 from unifg.solvers.ta.elimination import (

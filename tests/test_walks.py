@@ -1,0 +1,27 @@
+"""The way of a lambda into a front, counted as ``benchmarks.walks`` counts; it may get shorter, and not longer."""
+
+from benchmarks.walks import Walk, front, guess
+
+FILES, HAND_OVERS = 36, 92
+
+
+def spelled(walk: Walk) -> str:
+    """What to look at when the numbers grow."""
+    return "\n".join(f"{count} {' '.join(call)}" for call, count in walk.calls.most_common())
+
+
+def test_a_lambda_reaches_a_front_in_few_hand_overs() -> None:
+    walk = front()
+    assert len(walk.files) <= FILES, sorted(walk.files)
+    assert walk.hand_overs <= HAND_OVERS, spelled(walk)
+    calls = set(walk.calls)
+    assert ("unifg/language/statement.py", "complete", "unifg/kernels/residuals.py", "as_residual") in calls
+    assert any(callee == "unifg/elimination/analysis.py" and what == "analyse" for _, _, callee, what in calls)
+
+
+def test_counting_is_repeatable_and_sees_the_second_structure_of_nothing() -> None:
+    assert front().calls == front().calls
+    walk = guess()
+    assert walk.calls == guess().calls
+    # A prepared backend analyses nothing.
+    assert not any(what == "analyse" for _, _, _, what in walk.calls)
