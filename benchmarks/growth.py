@@ -12,9 +12,9 @@ import json
 import os
 import subprocess
 import sys
-import time
 import tracemalloc
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,7 @@ import numpy as np
 from benchmarks.gtsam_peer import ORDERINGS, Peer, available
 from benchmarks.report import CHECKOUT, table
 from benchmarks.section import Result, goal
-from benchmarks.timing import clock, interleave, milliseconds, number, shown, spread
+from benchmarks.timing import clock, interleave, milliseconds, number, shown, spread, timed
 from unifg.elimination.factorization import Factorization
 from unifg.pose_graphs import PoseGraph, manhattan
 from unifg.solvers import GaussNewton
@@ -61,22 +61,16 @@ def measure_size(poses: int, rounds: int, small: bool) -> Result:
     pose_graph = walk(poses)
     graph, _, guess = pose_graph.graph()
     run = GaussNewton(max_iterations=ITERATIONS, tolerance=1e-300).prepare(graph)
+    count = max(run.solve(guess).iterations, 1)
     compiling: list[float] = []
-
-    def ours() -> float:
-        begin = time.perf_counter()
-        solution = run.solve(guess)
-        return (time.perf_counter() - begin) / max(solution.iterations, 1)
 
     def symbolic() -> float:
         fresh = pose_graph.graph()[0]
-        begin = time.perf_counter()
-        program = fresh.compile()
-        compiling.append(time.perf_counter() - begin)
+        compiling.append(clock(fresh.compile))
+        program = fresh.compile()  # the one just made
         return clock(lambda: Factorization(program.normal, program.blocks).plan)
 
-    candidates: dict[str, Callable[[], float]] = {"ours": ours}
-    structure: dict[str, Callable[[], float]] = {"analyse": symbolic}
+    candidates: dict[str, Callable[[], float]] = {"ours": timed(partial(run.solve, guess), count)}
     if available() and poses <= PEER_UP_TO:
         peer = Peer(pose_graph)
         pilot = {ordering: peer.iterate(ordering, 1)[0] for ordering in ORDERINGS}
@@ -84,7 +78,7 @@ def measure_size(poses: int, rounds: int, small: bool) -> Result:
         candidates["gtsam"] = lambda: peer.iterate(best, ITERATIONS)[0]
     times = interleave(candidates, rounds)
     few = min(rounds, FEW) if poses > PEER_UP_TO else rounds
-    times |= interleave(structure, few)
+    times |= interleave({"analyse": symbolic}, few)
     result: Result = {
         "poses": poses,
         "edges": len(pose_graph.edges),

@@ -166,7 +166,8 @@ def enter(scratch: Path) -> None:
     """Run in the copy: its folder is the working folder and the first to import from."""
     os.chdir(scratch)
     sys.dont_write_bytecode = True  # files change within the second that tells compiled ones apart
-    sys.path[:] = [str(scratch), *(entry for entry in sys.path if entry not in ("", str(CHECKOUT)))]
+    here = ("", str(CHECKOUT), str(CHECKOUT / "tests"))
+    sys.path[:] = [str(scratch), *(entry for entry in sys.path if entry not in here)]
     for name in [name for name in sys.modules if name.partition(".")[0] in ("benchmarks", "unifg")]:
         del sys.modules[name]
 

@@ -248,7 +248,7 @@ class Unicycle(Problem):
         states, controls = self.reference()
         if self.instance == "ahead":
             states[:] = STARTS["ahead"]
-        states[0] = STARTS[self.instance]
+        states[0] = self.start
         return states, controls
 
     def plant(self, state: Array, control: Array, index: int) -> Array:
