@@ -15,6 +15,7 @@ import numpy as np
 
 import unifg as fg
 from unifg.models import avoidance, landmarks, quadrotor
+from unifg.scenarios.options import option
 from unifg.scenarios.ways.polyline import arc_lengths, at_stations
 from unifg.scenarios.ways.visibility import Ways
 from unifg.scenarios.worlds.air import VEHICLE_RADIUS
@@ -58,14 +59,14 @@ class CourseSettings:
         horizon: steps N.
         dt: sampling time [s].
         solver: one of `unifg.solvers.names.SECOND_ORDER`.
-        hessian: "exact" or "gauss-newton"; None for exact.
+        hessian: of the Lagrangian; exact if none is named.
         avoidance: "potential" is Ta's cost 1/d for the cylinder and every wall, d from the hull; "hard" keeps the hull
             clear at every node.
         guess: "hover" stays at the start, "line" flies straight to the target through whatever stands there, "way"
-            follows a shortest way around it. None for hover with the potential, and way with hard clearance.
+            follows a shortest way around it. If none is named, hover with the potential and way with hard clearance.
         general: state 1/d as a general cost (`minimize_scalar`) instead of as its least-squares twin. It is the same
             objective, differentiated numerically; alm does not take it.
-        seed: of the layout; None for the nominal one.
+        seed: of a random layout; without one, the layout of the documentation.
         goal: weight of the distance to the target at each node [1/m^2].
         end: the same at the last node, in addition.
         rest: weight of the velocity at the last node [s^2/m^2].
@@ -88,11 +89,11 @@ class CourseSettings:
     horizon: int = 60
     dt: float = 0.1
     solver: str = "sqp"
-    hessian: Hessian | None = None
-    avoidance: Avoidance = "potential"
-    guess: Start | None = None
-    general: bool = False
-    seed: int | None = None
+    hessian: Hessian | None = option(None)
+    avoidance: Avoidance = option("potential")
+    guess: Start | None = option(None)
+    general: bool = option(False)
+    seed: int | None = option(None, metavar="S")
     goal: float = 0.04
     end: float = 100.0
     rest: float = 0.5

@@ -16,10 +16,12 @@ import numpy as np
 from unifg.errors import ScenarioError, UnifgError
 from unifg.models import quadrotor
 from unifg.scenarios.flying.braking import braking_control
-from unifg.scenarios.flying.coupling import make_pilot
+from unifg.scenarios.flying.coupling import COUPLINGS, make_pilot
 from unifg.scenarios.flying.estimator import EstimatorSettings
 from unifg.scenarios.flying.plan import ControllerSettings, Plan
-from unifg.scenarios.log.flight_log import FlightLog, FlightRecorder
+from unifg.scenarios.log.columns import Recorder
+from unifg.scenarios.log.flight_log import FlightLog
+from unifg.scenarios.options import option, share
 from unifg.scenarios.seeing.readings import Reading
 from unifg.scenarios.worlds.air import QuadrotorWorld
 from unifg.scenarios.worlds.conditions import draw_conditions
@@ -43,20 +45,21 @@ class FlightSettings:
 
     Attributes:
         solver: of the controller, one of `unifg.solvers.names.CONSTRAINED`.
-        coupling: "separate", "sequential" or "joint".
+        coupling: of estimation and control: without dynamics in the estimator; both with the same parameters; or one
+            graph.
         seed: of everything random.
         movers: number of moving discs.
-        mass_error: by which the mass is believed wrong at the start, relative.
+        mass_error: by which the mass is believed wrong at the start, relative, in [0, 1).
         time_limit: after which a flight is given up [s].
         estimator: of the past; its association is the flight's.
         controller: of the future; its avoidance and horizon are the flight's.
     """
 
     solver: str = "ipm"
-    coupling: str = "sequential"
-    seed: int = 0
-    movers: int = 0
-    mass_error: float = 0.05
+    coupling: str = option("sequential", choices=COUPLINGS)
+    seed: int = option(0, metavar="S")
+    movers: int = option(0, metavar="K")
+    mass_error: float = option(0.05, text=share, metavar="E")
     time_limit: float = 60.0
     estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
     controller: ControllerSettings = field(default_factory=ControllerSettings)
@@ -126,7 +129,9 @@ class Flight:
     def run(self, progress: Progress) -> FlightLog:
         """Fly to the target, or until it is no use."""
         settings, world, dt = self.settings, self.world, self.settings.controller.dt
-        recorder = FlightRecorder(world.layout, settings.summary(), dt, world.parameters.packed)
+        recorder = Recorder(
+            FlightLog, layout=world.layout, settings=settings.summary(), dt=dt, parameters_true=world.parameters.packed
+        )
         reached = interrupted = False
         control: Array | None = None
         far = float(np.linalg.norm(world.layout.target - world.layout.start))
@@ -146,7 +151,7 @@ class Flight:
         progress(1.0, "done")
         return recorder.finish(collisions=world.collisions, reached=reached, interrupted=interrupted)
 
-    def _tick(self, reading: Reading, control: Array | None, recorder: FlightRecorder) -> Array:
+    def _tick(self, reading: Reading, control: Array | None, recorder: Recorder[FlightLog]) -> Array:
         """Estimate, plan and record; the control (4,) to be flown."""
         pilot, world = self.pilot, self.world
         plan: Plan | None = None
@@ -163,9 +168,9 @@ class Flight:
             truth=world.state,
             believed=belief.state,
             believed_sigma=belief.sigma,
-            control=control,
-            plan=np.tile(belief.state[:3], (settings.horizon + 1, 1)) if plan is None else plan.states[:, :3],
-            past=pilot.estimator.window.states[:, :3],
+            controls=control,
+            plans=np.tile(belief.state[:3], (settings.horizon + 1, 1)) if plan is None else plan.states[:, :3],
+            pasts=pilot.estimator.window.states[:, :3],
             landmarks=(marks.ids, marks.positions, marks.covariances, marks.radii),
             parameters=belief.parameters.packed,
             parameters_sigma=belief.parameters_sigma,
@@ -173,7 +178,7 @@ class Flight:
             movers=world.mover_states(),
             estimate_ms=pilot.estimate_ms,
             plan_ms=pilot.plan_ms,
-            status="failed" if plan is None else plan.status.name.lower().replace("_", " "),
+            statuses="failed" if plan is None else plan.status.name.lower().replace("_", " "),
             clearance=world.clearance(),
             emergency=plan is None or plan.emergency,
         )

@@ -22,8 +22,9 @@ from unifg.models.unicycle import step
 from unifg.scenarios.driving.controller import ControllerSettings
 from unifg.scenarios.driving.pilot import make_pilot
 from unifg.scenarios.driving.route import Route
+from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.log.drive_recording import Recording
+from unifg.scenarios.options import existing, option, pose
 from unifg.scenarios.seeing.disc_tracker import DiscTracker
 from unifg.scenarios.ways.polyline import path_length
 from unifg.scenarios.worlds.building import DEMO_GOALS, DEMO_START, building_map
@@ -46,23 +47,25 @@ class NavigationSettings:
     """One episode.
 
     Attributes:
-        map: ROS map file; None for the building that ships with the package.
-        start: true start pose [m, m, rad]; None for the demonstration's.
-        goals: poses to be reached in order; None for the demonstration's.
+        map: ROS map file; without one, the building that ships with the package.
+        start: true start pose [m, m, rad]; without one, on the shipped map, the demonstration's.
+        goals: poses to be reached in this order, an option for each; without any, the demonstration's.
         solver: one of `unifg.solvers.names.CONSTRAINED`.
-        coupling: "sequential": estimation first, then control conditioned on it; "joint": one graph for both.
-        obstacles: number of unforeseen obstacles.
+        coupling: of estimation and control: estimation first, then control conditioned on it; or one graph for both.
+        obstacles: number of obstacles that are not on the map.
         seed: of everything random.
         controller: weights and limits.
     """
 
-    map: Path | None = None
-    start: tuple[float, float, float] | None = None
-    goals: tuple[tuple[float, float, float], ...] | None = None
+    map: Path | None = option(None, text=existing("the YAML file of a ROS map"), metavar="F.yaml")
+    start: tuple[float, float, float] | None = option(None, text=pose, metavar="X,Y,TH")
+    goals: tuple[tuple[float, float, float], ...] | None = option(
+        None, text=pose, metavar="X,Y,TH", flag="goal", many=True
+    )
     solver: str = "sqp"
-    coupling: str = "sequential"
-    obstacles: int = 0
-    seed: int = 0
+    coupling: str = option("sequential", choices=("sequential", "joint"))
+    obstacles: int = option(0, metavar="K")
+    seed: int = option(0, metavar="S")
     controller: ControllerSettings = field(default_factory=ControllerSettings)
 
 
@@ -123,7 +126,21 @@ class Episode:
         dt = self.settings.controller.dt
         length = path_length(self.path)
         limit = int((length / SLOWEST + 60.0) / dt)
-        recording = Recording(self.world, len(self.goals))
+        reached = [False] * len(self.goals)
+        recorder = Recorder(
+            EpisodeLog,
+            occupancy=self.occupancy,
+            path=self.path,
+            goals=self.goals,
+            start=self.start,
+            dt=dt,
+            robot_radius=self.settings.controller.robot_radius,
+            solver=self.settings.solver,
+            coupling=self.settings.coupling,
+            seed=self.settings.seed,
+            control_limits=self.settings.controller.limits,
+            scan_angles=self.world.lidar.angles,
+        )
         dead_reckoning = self.pilot.pose
         goal, driven, interrupted = 0, 0.0, False
         try:
@@ -134,9 +151,9 @@ class Episode:
                     driven += abs(odometry[0]) * dt
                 else:
                     odometry = None
-                control = self._tick(goal, odometry, dead_reckoning, recording)
+                control = self._tick(goal, odometry, dead_reckoning, recorder)
                 if self._arrived(goal):
-                    recording.reached[goal] = self._confirmed(goal)
+                    reached[goal] = self._confirmed(goal)
                     goal += 1
                     if goal == len(self.goals):
                         break
@@ -147,22 +164,14 @@ class Episode:
         except KeyboardInterrupt:
             interrupted = True
         progress(1.0, "done")
-        controller = self.settings.controller
-        return recording.log(
-            interrupted,
-            occupancy=self.occupancy,
-            path=self.path,
-            goals=self.goals,
-            start=self.start,
-            dt=controller.dt,
-            robot_radius=controller.robot_radius,
-            solver=self.settings.solver,
-            coupling=self.settings.coupling,
-            seed=self.settings.seed,
-            control_limits=controller.limits,
+        return recorder.finish(
+            collisions=self.world.collisions,
+            reached=reached,
+            obstacle_moving=self.world.obstacle_states()[:, 3].astype(bool),
+            interrupted=interrupted,
         )
 
-    def _tick(self, goal: int, odometry: Array | None, dead_reckoning: Array, recording: Recording) -> Array:
+    def _tick(self, goal: int, odometry: Array | None, dead_reckoning: Array, recorder: Recorder[EpisodeLog]) -> Array:
         """Estimate and plan; the measured time is what a robot would spend."""
         control = self.settings.controller
         scan = self.world.scan()
@@ -179,13 +188,29 @@ class Episode:
         reference = route.reference(pose, control.speed * control.dt, control.horizon + 1)
         plan = self.pilot.plan(reference, tracks)
         planned = time.perf_counter()
-        recording.add(
-            goal, self.pilot, dead_reckoning, scan, tracks, plan,
+        recorder.add(
+            time=self.world.time,
+            true_pose=self.world.pose,
+            estimate=self.pilot.pose,
+            dead_reckoning=dead_reckoning,
+            control=plan.control,
+            horizon=plan.states,
+            scan=scan.ranges,
+            obstacles=self.world.obstacle_states()[:, :3],
+            detected=np.column_stack([tracks.centre, tracks.radius]),
+            solve_ms=1e3 * (estimated - begin + planned - repaired),
             localise_ms=1e3 * (estimated - begin),
             perceive_ms=1e3 * (perceived - estimated),
             route_ms=1e3 * (repaired - perceived),
             plan_ms=1e3 * (planned - repaired),
-        )  # fmt: skip
+            localisation_iterations=self.pilot.iterations,
+            plan_iterations=plan.iterations,
+            status=plan.status.name.lower(),
+            bound_violation=plan.bound_violation,
+            clearance=self.world.clearance(),
+            goal_index=goal,
+            emergency=plan.emergency,
+        )
         return plan.control
 
     def _route(self, begin: Array, end: Array) -> Route:

@@ -1,6 +1,6 @@
 """Solving a pose graph from a file: reading, a first guess, a backend, a robust loss, and how it went.
 
-The command ``unifg solve`` is this and `unifg.scenarios.commands.graph_results`.
+The command ``unifg solve`` is this and `unifg.scenarios.commands.graphs`.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from unifg.files.pose_graph import read_pose_graph
 from unifg.kernels.robust import DCS, Cauchy, Huber, Loss, TruncatedLeastSquares, Tukey
 from unifg.pose_graphs.initialise import chordal, lago, odometric
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
+from unifg.scenarios.options import existing, option
 from unifg.solvers import GraduatedNonConvexity, names
 from unifg.typing import Array, BoolArray
 
@@ -52,19 +53,19 @@ class SolveSettings:
     """What to solve, and how.
 
     Attributes:
-        file: pose graph in the g2o or TORO format.
+        file: pose graph: .g2o or .graph (TORO), also .gz.
         solver: one of `unifg.solvers.names.LEAST_SQUARES`.
-        robust: loss of the loop closures, "huber", "cauchy", "tukey", "dcs" or "gnc", with its parameter after a colon
-            if it is not the usual one; None for none.
-        init: "file", "odometry", "lago" or "chordal".
-        residual: "log" or "g2o".
+        robust: loss on loop closures, if any: huber, cauchy, tukey, dcs, or gnc (truncated least squares, graduated),
+            with its parameter after a colon if it is not the usual one.
+        init: first guess: poses of the file, a spanning tree, LAGO (2D) or chordal relaxation.
+        residual: full logarithm, as GTSAM, or the chart of g2o; their optima differ in 3D.
     """
 
-    file: Path
+    file: Path = option(text=existing("a pose graph (g2o or TORO)"), metavar="GRAPH")
     solver: str = "gn"
-    robust: str | None = None
-    init: str = "file"
-    residual: ResidualName = "log"
+    robust: str | None = option(None, metavar="LOSS[:PARAM]")
+    init: str = option("file", choices=tuple(GUESSES))
+    residual: ResidualName = option("log")
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TypedDict
 
@@ -21,6 +22,7 @@ import numpy as np
 import unifg as fg
 from unifg.models import vehicle
 from unifg.models.vehicle import Vehicle
+from unifg.scenarios.options import count, existing, option, pair, positive
 from unifg.scenarios.ways.speed_profile import Profile, drive_cycle, read_profile
 from unifg.solvers import names
 from unifg.typing import Array
@@ -47,28 +49,28 @@ class TrackingSettings:
     Attributes:
         length: steps N.
         solver: one of `unifg.solvers.names.EQUALITIES`.
-        profile: CSV file of the speeds; None for the drive cycle that ships with unifg.
-        linear: replace the air drag by its linear stand-in.
-        force_bounds: least and greatest force [N]; None for no bounds.
+        profile: CSV file of the speeds, column v_ref_mps [m/s]; without one, the drive cycle that ships with unifg.
+        linear: air drag linear in the speed instead of quadratic.
+        force_bounds: least and greatest force [N], if any; not for kkt.
         start: speed at the beginning [m/s].
         track: Q, weight of the deviation from the profile [s^2/m^2].
         end: P, the same at the last step.
         effort: R, weight of the force [1/N^2].
         vehicle: its parameters.
-        tolerance: of the KKT test.
+        tolerance: of the KKT test; penalty reaches 1e-5.
     """
 
-    length: int = 385
+    length: int = option(385, text=partial(count, least=1), metavar="N")
     solver: str = "kkt"
-    profile: Path | None = None
-    linear: bool = False
-    force_bounds: tuple[float, float] | None = None
+    profile: Path | None = option(None, text=existing("a CSV file with a column v_ref_mps"), metavar="F.csv")
+    linear: bool = option(False)
+    force_bounds: tuple[float, float] | None = option(None, text=pair, metavar="LO,HI")
     start: float = 0.0
     track: float = 1000.0
     end: float = 1000.0
     effort: float = 0.0007
     vehicle: Vehicle = field(default_factory=Vehicle)
-    tolerance: float = 1e-6
+    tolerance: float = option(1e-6, text=positive, metavar="T")
 
     def speeds(self) -> Profile:
         """The profile to follow, N steps long.

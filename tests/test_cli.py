@@ -6,9 +6,8 @@ import re
 import signal
 import subprocess
 import sys
-import types
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,36 +19,24 @@ from unifg.errors import ScenarioError
 from unifg.files.ros_map import save_map
 from unifg.files.tum import read_tum
 from unifg.scenarios import command
-from unifg.scenarios.driving.controller import ControllerSettings
+from unifg.scenarios import navigation as navigation_scenario
+from unifg.scenarios.commands import drives
 from unifg.scenarios.log.drive_log import EpisodeLog
+from unifg.scenarios.navigation import NavigationSettings
 
 FILES = ("scene.html", "overview.png", "metrics.json", "trajectory.tum", "estimate.tum")
 
 Progress = Callable[[float, str], None]
 
 
-@dataclass
-class Settings:
-    """Stands in for the scenario's settings."""
-
-    map: Path | None
-    start: tuple[float, float, float] | None
-    goals: tuple[tuple[float, float, float], ...] | None
-    solver: str
-    coupling: str
-    obstacles: int
-    seed: int
-    controller: ControllerSettings = field(default_factory=ControllerSettings)
-
-
 class FakeNavigation:
     """Stands in for the scenario: notes the settings, reports progress, gives a made-up episode."""
 
     def __init__(self) -> None:
-        self.settings: list[Settings] = []
+        self.settings: list[NavigationSettings] = []
         self.log = episode(ticks=5)
 
-    def run(self, settings: Settings, progress: Progress) -> EpisodeLog:
+    def run(self, settings: NavigationSettings, progress: Progress) -> EpisodeLog:
         self.settings.append(settings)
         progress(0.5, "halfway")
         progress(1.0, "done")
@@ -59,20 +46,14 @@ class FakeNavigation:
 @pytest.fixture
 def navigation(monkeypatch: pytest.MonkeyPatch) -> FakeNavigation:
     fake = FakeNavigation()
-    module = types.ModuleType("unifg.scenarios.navigation")
-    module.NavigationSettings = Settings  # type: ignore[attr-defined]
-    module.run_navigation = fake.run  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "unifg.scenarios.navigation", module)
-    import unifg.scenarios
-
-    monkeypatch.setattr(unifg.scenarios, "navigation", module, raising=False)
+    monkeypatch.setattr(navigation_scenario, "run_navigation", fake.run)
     return fake
 
 
 @pytest.fixture
 def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spare tests that look at settings alone the drawing of pictures."""
-    monkeypatch.setattr(command, "write_results", lambda folder, log: [])
+    monkeypatch.setattr(drives, "write_results", lambda folder, log: [])
 
 
 def run(tmp_path: Path, *words: str) -> int:
@@ -103,6 +84,7 @@ def test_defaults_leave_the_scenario_its_own(navigation: FakeNavigation, tmp_pat
     (settings,) = navigation.settings
     assert (settings.map, settings.start, settings.goals) == (None, None, None)
     assert (settings.coupling, settings.seed) == ("sequential", 0)
+    assert settings == NavigationSettings(obstacles=3)
 
 
 @pytest.mark.usefixtures("no_files")
@@ -111,7 +93,7 @@ def test_arguments_arrive(navigation: FakeNavigation, tmp_path: Path) -> None:
     words = ["--map", str(tmp_path / "m.yaml"), "--start=0,0,0", "--goal=1,2,0.5", "--goal", "2,1e0,-3"]
     words += ["--solver", "alm", "--coupling", "sequential", "--obstacles", "4", "--seed", "17"]
     assert run(tmp_path, *words) == 0
-    expected = Settings(
+    expected = NavigationSettings(
         tmp_path / "m.yaml", (0.0, 0.0, 0.0), ((1.0, 2.0, 0.5), (2.0, 1.0, -3.0)), "alm", "sequential", 4, 17
     )
     assert navigation.settings == [expected]
@@ -171,10 +153,10 @@ def test_help_and_version_exit_0(capsys: pytest.CaptureFixture[str]) -> None:
 def test_scenario_error_is_a_message_not_a_traceback(
     navigation: FakeNavigation, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(settings: Settings, progress: Progress) -> EpisodeLog:
+    def refuse(settings: NavigationSettings, progress: Progress) -> EpisodeLog:
         raise ScenarioError("goal 1 stands in a wall")
 
-    monkeypatch.setattr(sys.modules["unifg.scenarios.navigation"], "run_navigation", refuse)
+    monkeypatch.setattr(navigation_scenario, "run_navigation", refuse)
     assert run(tmp_path) == 2
     said = capsys.readouterr()
     assert said.err.splitlines()[-1] == "unifg: error: goal 1 stands in a wall"
@@ -214,10 +196,10 @@ def test_exit_status_tells_the_outcome(
 def test_interrupt_before_the_first_tick(
     navigation: FakeNavigation, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stop(settings: Settings, progress: Progress) -> EpisodeLog:
+    def stop(settings: NavigationSettings, progress: Progress) -> EpisodeLog:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(sys.modules["unifg.scenarios.navigation"], "run_navigation", stop)
+    monkeypatch.setattr(navigation_scenario, "run_navigation", stop)
     assert run(tmp_path) == 130
     assert "before there was anything to write" in capsys.readouterr().err
     assert list((tmp_path / "out").iterdir()) == []
@@ -230,7 +212,7 @@ def test_first_interrupt_waits_for_the_end_of_the_tick(
     before = signal.getsignal(signal.SIGINT)
     finished: list[int] = []
 
-    def loop(settings: Settings, progress: Progress) -> EpisodeLog:
+    def loop(settings: NavigationSettings, progress: Progress) -> EpisodeLog:
         try:
             for tick in range(10):
                 if tick == 3:
@@ -241,24 +223,33 @@ def test_first_interrupt_waits_for_the_end_of_the_tick(
             return replace(navigation.log, interrupted=True)
         return navigation.log
 
-    monkeypatch.setattr(sys.modules["unifg.scenarios.navigation"], "run_navigation", loop)
+    monkeypatch.setattr(navigation_scenario, "run_navigation", loop)
     assert run(tmp_path) == 130
     assert finished == [0, 1, 2, 3]
     assert (tmp_path / "out" / "scene.html").exists()
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_as_a_module_without_loading_the_scenario() -> None:
+@pytest.mark.parametrize(
+    ("words", "absent"),
+    [
+        (["--help"], ("pymunk", "meshcat", "matplotlib", "unifg.scenarios.navigation")),
+        (["run", "--help"], ("pymunk", "meshcat", "matplotlib", "unifg.scenarios.navigation")),
+        (["solve", "--help"], ("pymunk", "meshcat", "matplotlib", "unifg.scenarios.navigation")),
+        (["run", "navigation", "--help"], ("meshcat", "matplotlib", "unifg.scenarios.flight")),
+    ],
+)
+def test_help_loads_the_scenario_it_speaks_of_and_no_other(words: list[str], absent: tuple[str, ...]) -> None:
     code = (
-        "import sys; from unifg.scenarios import command; status = command.main(['run', 'navigation', '--help']);"
-        "assert 'pymunk' not in sys.modules and 'meshcat' not in sys.modules; sys.exit(status)"
+        f"import sys; from unifg.scenarios import command; status = command.main({words!r});"
+        f"assert not set({absent!r}) & set(sys.modules), set({absent!r}) & set(sys.modules); sys.exit(status)"
     )
     root = Path(__file__).parent.parent
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(root)}
     )
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith("usage: unifg run navigation")
+    assert done.stdout.startswith(f"usage: unifg {' '.join(words[:-1])}".rstrip())
 
 
 def test_control_weight_reaches_the_controller(navigation: FakeNavigation, no_files: None, tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 # Inside scenarios/, where "" are the files that lie in no room: one per scenario.
 STOREYS: tuple[tuple[str, ...], ...] = (
-    ("ways",),
+    ("options", "ways"),
     ("seeing",),
     ("worlds",),
     ("driving", "flying"),

@@ -241,10 +241,11 @@ def test_command_writes_its_files(solver: str, tmp_path: Path, capsys: pytest.Ca
     assert {**obstacle, "solve_ms": 0.0} == {**expected, "solve_ms": 0.0}
 
 
-def test_command_runs_one_case(tmp_path: Path) -> None:
+def test_command_runs_one_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main(["run", "manoeuvres", "--case", "behind", "--out", str(tmp_path)]) == 0
     assert {file.name for file in tmp_path.iterdir()} == {"behind.png", "metrics.json"}
-    assert command.MANOEUVRES == tuple(CASES)
+    assert command.main(["run", "manoeuvres", "--help"]) == 0
+    assert "{" + ",".join([*CASES, "both"]) + "}" in capsys.readouterr().out
 
 
 def test_command_fails_when_a_solve_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

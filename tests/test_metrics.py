@@ -9,7 +9,8 @@ import pytest
 
 from episodes import DT, episode
 from unifg.errors import ScenarioError
-from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors, without_timings, write_metrics
+from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors
+from unifg.scenarios.log.metrics import without_timings, write_metrics
 from unifg.scenarios.ways.polyline import path_length
 
 PROMISED = {

@@ -16,12 +16,12 @@ from unifg.errors import BackendError, ScenarioError
 from unifg.lie import SO3
 from unifg.scenarios import command
 from unifg.scenarios import flight as episode
-from unifg.scenarios.commands import flight_arguments as mpc_arguments
-from unifg.scenarios.commands import flight_results as results
+from unifg.scenarios.commands import flights as results
 from unifg.scenarios.flight import Flight, FlightSettings, run_flight
 from unifg.scenarios.flying.coupling import COUPLINGS
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics, state_errors
+from unifg.scenarios.options import add_options, settings_of
 from unifg.scenarios.seeing.line_tracker import LineTracker
 from unifg.scenarios.seeing.readings import Reading
 from unifg.scenarios.worlds.conditions import DRAG, MASS, WIND, draw_conditions
@@ -311,21 +311,23 @@ def test_tracks_find_velocities(association: str) -> None:
 # ------------------------------------------------------------------- the command
 
 
-def chosen(*words: str) -> argparse.Namespace:
+def chosen(*words: str) -> FlightSettings:
     """What the command line makes of the scenario's own words."""
     parser = argparse.ArgumentParser()
-    mpc_arguments.add_arguments(parser)
-    return argparse.Namespace(**vars(parser.parse_args(words)), solver="sqp", seed=7)
+    add_options(parser, FlightSettings)
+    return settings_of(FlightSettings, parser.parse_args(["--seed", "7", *words]), solver="sqp")
 
 
 def test_arguments_arrive() -> None:
-    assert mpc_arguments.settings_of(chosen()) == FlightSettings("sqp", "sequential", 7)
+    assert chosen() == FlightSettings("sqp", "sequential", 7)
     words = ("--coupling", "joint", "--association", "unknown", "--avoidance", "potential", "--movers", "2")
-    settings = mpc_arguments.settings_of(chosen(*words, "--mass-error", "0.1"))
+    settings = chosen(*words, "--mass-error", "0.1")
     assert (settings.coupling, settings.movers, settings.mass_error) == ("joint", 2, 0.1)
     assert settings.estimator.association == "unknown"
     assert settings.controller.avoidance == "potential"
-    assert command.SCENARIOS["quadrotor-mpc"].solver == FlightSettings().solver
+    parser = argparse.ArgumentParser()
+    command.SCENARIOS["quadrotor-mpc"].add_options(parser)
+    assert parser.parse_args([]).solver == FlightSettings().solver
 
 
 @pytest.mark.parametrize("words", [("--movers", "-1"), ("--mass-error", "1"), ("--coupling", "loose")])

@@ -14,9 +14,10 @@ import pytest
 
 from unifg.errors import ScenarioError
 from unifg.lie import SO3
-from unifg.scenarios.commands import flight_results as results
-from unifg.scenarios.commands.flight_results import summary, write_results
-from unifg.scenarios.log.flight_log import FlightLog, FlightRecorder
+from unifg.scenarios.commands import flights as results
+from unifg.scenarios.commands.flights import summary, write_results
+from unifg.scenarios.log.columns import Recorder
+from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics, landmark_errors
 from unifg.scenarios.show import drone, shapes
 from unifg.scenarios.show.control_plot import control
@@ -49,7 +50,8 @@ def flight(ticks: int = 24, *, estimated: bool = True, movers: int = 1, reached:
     things, settings = layout(), {"scenario": "quadrotor-mpc", "solver": "ipm", "coupling": "sequential", "seed": 7}
     limits = {"rate_limits": [4.0, 4.0, 2.0], "thrust_limits": [2.0, 20.0]}
     true = np.array([1.0, 0.1, 0.1, 0.2, 0.3, -0.1, 0.0])
-    recorder = FlightRecorder(things, {**settings, "controller": limits}, DT, true)
+    known = {"layout": things, "settings": {**settings, "controller": limits}, "dt": DT, "parameters_true": true}
+    recorder = Recorder(FlightLog, **known)
     share = np.linspace(0.0, 1.0, max(ticks, 2))
 
     def place(s: float) -> list[float]:
@@ -68,9 +70,9 @@ def flight(ticks: int = 24, *, estimated: bool = True, movers: int = 1, reached:
             truth=truth,
             believed=believed,
             believed_sigma=np.full(9, 0.025) if estimated else np.zeros(9),
-            control=[0.1, -0.2, 0.0, 9.81 + 0.1 * k],
-            plan=ahead,
-            past=way[max(0, k - 9) : k + 1] + OFFSET if estimated else np.zeros((0, 3)),
+            controls=[0.1, -0.2, 0.0, 9.81 + 0.1 * k],
+            plans=ahead,
+            pasts=way[max(0, k - 9) : k + 1] + OFFSET if estimated else np.zeros((0, 3)),
             landmarks=(
                 ids,
                 things.cylinders[ids, :2] + SHIFT,
@@ -83,7 +85,7 @@ def flight(ticks: int = 24, *, estimated: bool = True, movers: int = 1, reached:
             movers=[[8.0 + 0.01 * k, -2.0, 0.4]] * movers,
             estimate_ms=5.0 if estimated else 0.0,
             plan_ms=7.0 + k if estimated else 0.0,
-            status="converged",
+            statuses="converged",
             clearance=1.0 + 0.01 * (k - 12) ** 2,
             emergency=estimated and k in (5, 6),
         )
@@ -426,8 +428,7 @@ def test_results_leave_files_that_can_be_read_again(log: FlightLog, tmp_path: Pa
 
 
 def test_results_of_a_flight_without_estimate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("write_overview", "write_control"):
-        monkeypatch.setattr(results, name, lambda path, log: path)
+    monkeypatch.setattr(results, "write_figure", lambda path, figure, dpi: path)
     monkeypatch.setattr(results, "flight_scene", lambda log: SimpleNamespace(write=lambda path: path))
     plain = flight(estimated=False)
     names = [path.name for path in write_results(tmp_path, plain, {"own": 1})]

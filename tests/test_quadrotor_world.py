@@ -12,7 +12,8 @@ import pytest
 from unifg.errors import FileFormatError, ScenarioError
 from unifg.lie import SO3
 from unifg.models import quadrotor
-from unifg.scenarios.log.flight_log import FlightLog, FlightRecorder
+from unifg.scenarios.log.columns import Recorder
+from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.seeing.belief import Landmarks
 from unifg.scenarios.worlds.air import VEHICLE_RADIUS, QuadrotorWorld
 from unifg.scenarios.worlds.bearing_range import SensorModel
@@ -317,16 +318,17 @@ def flown(ticks: int) -> FlightLog:
     """A short flight with lists of changing length."""
     layout = corridor(2)
     world = QuadrotorWorld(layout, 2, PARAMETERS, movers=2)
-    recorder = FlightRecorder(layout, {"solver": "sqp", "seed": 2}, 0.05, PARAMETERS.packed)
+    known = {"layout": layout, "settings": {"solver": "sqp", "seed": 2}, "dt": 0.05}
+    recorder = Recorder(FlightLog, parameters_true=PARAMETERS.packed, **known)
     for tick in range(ticks):
         reading, state = world.sense(), world.state
         count = len(reading.ids)
         recorder.add(
-            truth=state, believed=state, believed_sigma=np.full(9, 0.1), control=HOVER,
-            plan=np.tile(state[:3], (21, 1)), past=np.tile(state[:3], (tick, 1)),
+            truth=state, believed=state, believed_sigma=np.full(9, 0.1), controls=HOVER,
+            plans=np.tile(state[:3], (21, 1)), pasts=np.tile(state[:3], (tick, 1)),
             landmarks=(reading.ids, world.things()[reading.ids, :2], np.tile(np.eye(2), (count, 1, 1)), reading.radii),
             parameters=PARAMETERS.packed, parameters_sigma=np.zeros(7), seen=reading.ids, movers=world.mover_states(),
-            estimate_ms=1.0, plan_ms=2.0, status="converged", clearance=world.clearance(), emergency=tick == 1,
+            estimate_ms=1.0, plan_ms=2.0, statuses="converged", clearance=world.clearance(), emergency=tick == 1,
         )  # fmt: skip
         world.step(HOVER)
     return recorder.finish(collisions=world.collisions, reached=False)

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
-__all__ = ["Outcome", "Progress"]
+from unifg.answers.history import Iteration
+
+__all__ = ["Outcome", "Progress", "by_iterations"]
 
 Progress: TypeAlias = Callable[[float, str], None]
 """Takes the share that is done, and a word about it; raises KeyboardInterrupt when the user wants to stop."""
@@ -28,3 +30,18 @@ class Outcome:
     interrupted: bool
     summary: str
     write: Callable[[Path], list[Path]]
+
+
+def by_iterations(progress: Progress, pace: float, say: Callable[[Iteration], str]) -> Callable[[Iteration], None]:
+    """A callback of a solver that tells of its progress.
+
+    Args:
+        progress: to be told.
+        pace: nobody knows how many iterations there will be: of what is left, each leaves this share.
+        say: the word about an iteration.
+    """
+
+    def tell(row: Iteration) -> None:
+        progress(1.0 - pace**row.number, say(row))
+
+    return tell

@@ -15,6 +15,7 @@ from unifg.lie import wrap_angle
 from unifg.models import obstacles, unicycle
 from unifg.models.distance_map import DistanceMap
 from unifg.models.smooth_field import SmoothField
+from unifg.scenarios.options import option, positive
 from unifg.scenarios.seeing.tracks import Tracks, nearest
 from unifg.solvers import names
 from unifg.typing import Array, BoolArray
@@ -72,7 +73,7 @@ class ControllerSettings:
     terminal_sigma: tuple[float, float, float] = (0.1, 0.1, 0.2)
     control_sigma: tuple[float, float] = (1.0, 2.0)
     rate_sigma: tuple[float, float] = (0.5, 1.0)
-    control_weight: float = 1.0
+    control_weight: float = option(1.0, text=positive, metavar="W")
     pull: tuple[float, float, float] = (0.01, 0.01, 0.01)
     robot_radius: float = 0.17
     wall_clearance: float = 0.03

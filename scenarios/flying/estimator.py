@@ -17,6 +17,7 @@ from unifg.models import quadrotor
 from unifg.scenarios.flying.spread import JointCovariance
 from unifg.scenarios.flying.window import PARAMETER_SIZE, STATE_SIZE, Window, WindowSettings
 from unifg.scenarios.flying.window_terms import Shared, WindowTerms
+from unifg.scenarios.options import option
 from unifg.scenarios.seeing.association import DOUBTFUL, NEW, Gates, expected, nearest, places
 from unifg.scenarios.seeing.atlas import Atlas
 from unifg.scenarios.seeing.belief import Belief, Landmarks
@@ -43,7 +44,7 @@ class EstimatorSettings:
         mass_sigma: of the mass, relative to its guess.
         drag_sigma: of each coefficient [kg/s].
         wind_sigma, updraft_sigma: [m/s^2].
-        association: "known", by the readings' names, or "unknown", by gating.
+        association: whether the sensor names what it sees, or who is who is found by gating.
         gates: for unknown association.
         iterations: SQP iterations per tick.
         manoeuvre_sigma: acceleration that an estimator without dynamics expects over a tick [m/s^2].
@@ -60,7 +61,7 @@ class EstimatorSettings:
     drag_sigma: float = 0.1
     wind_sigma: float = 0.5
     updraft_sigma: float = 0.3
-    association: str = "known"
+    association: str = option("known", choices=ASSOCIATIONS)
     gates: Gates = field(default_factory=Gates)
     iterations: int = 2
     manoeuvre_sigma: float = 3.0

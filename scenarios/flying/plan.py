@@ -7,6 +7,7 @@ from typing import Literal, TypeAlias
 
 import unifg as fg
 from unifg.scenarios.flying.guide import GuideSettings
+from unifg.scenarios.options import option
 from unifg.solvers import names
 from unifg.typing import Array
 
@@ -73,7 +74,7 @@ class ControllerSettings:
     movers: int = 2
     mover_margin: float = 0.25
     mover_growth: float = 0.25
-    avoidance: Avoidance = "clearance"
+    avoidance: Avoidance = option("clearance")
     general_costs: bool = False
     goal_sigma: float = 1.0
     potential_weight: float = 1.0

@@ -1,7 +1,4 @@
-"""What one closed-loop run leaves behind: the record that metrics, plots and scenes read.
-
-The loop writes it, tick by tick; everything downstream only reads it, so a picture never needs the solver that made it.
-"""
+"""What one drive leaves behind."""
 
 from __future__ import annotations
 
@@ -10,16 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from unifg.files.ros_map import OccupancyMap
+from unifg.scenarios.log.columns import column, ragged, words
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["EpisodeLog"]
 
 
-@dataclass
+@dataclass(kw_only=True)
 class EpisodeLog:
     """One episode of T ticks with a horizon of N steps, K true obstacles and G goals.
 
-    Arrays over time share the leading axis T. Row k holds what was true, estimated and decided at ``time[k]``;
+    Columns share the leading axis T. Row k holds what was true, estimated and decided at ``time[k]``;
     ``control[k]`` is held over ``[time[k], time[k] + dt]``. An episode that was interrupted is a shorter one.
 
     Attributes:
@@ -32,31 +30,9 @@ class EpisodeLog:
         solver: name of the backend.
         coupling: how estimation and control were joined, such as ``"sequential"``.
         seed: seed of the episode.
-        time: (T,) [s].
-        true_pose: (T, 3) [m, m, rad].
-        estimate: (T, 3) localised pose [m, m, rad].
-        dead_reckoning: (T, 3) pose integrated from the wheel odometry alone [m, m, rad].
-        control: (T, 2) commanded v [m/s] and omega [rad/s].
-        horizon: (T, N + 1, 3) predicted poses [m, m, rad].
-        scan: (T, B) lidar ranges [m]; NaN is a dropout, +inf no return.
         scan_angles: (B,) beam angles in the body frame [rad].
-        obstacles: (T, K, 3) true unforeseen obstacles x, y, radius [m].
-        detected: T arrays (m, 3), tracked obstacles x, y, radius [m].
-        solve_ms: (T,) localise and plan together [ms].
-        perceive_ms: (T,) update of the tracked obstacles [ms].
-        route_ms: (T,) repair of the global route [ms], most often nothing.
-        localise_ms: (T,) [ms].
-        plan_ms: (T,) [ms].
-        localisation_iterations: (T,).
-        plan_iterations: (T,).
-        status: T status words of the plan, ``"converged"`` when all is well.
-        bound_violation: (T,) worst violation of a control bound by the plan that is driven, as the solver returned
-            it, before any clipping.
-        clearance: (T,) distance from the robot's hull to the nearest thing [m].
         collisions: distinct contact events of the episode.
-        goal_index: (T,) goal being approached.
         reached: one flag per goal.
-        emergency: (T,) True where the stored plan was driven because the tick's solve failed.
         obstacle_moving: (K,) True for obstacles that move by design; None derives it from their positions.
         control_limits: greatest abs(v) [m/s] and abs(omega) [rad/s].
         scenario: name of the scenario.
@@ -72,34 +48,50 @@ class EpisodeLog:
     solver: str
     coupling: str
     seed: int
-    time: Array
-    true_pose: Array
-    estimate: Array
-    dead_reckoning: Array
-    control: Array
-    horizon: Array
-    scan: Array
     scan_angles: Array
-    obstacles: Array
-    detected: list[Array]
-    solve_ms: Array
-    localise_ms: Array
-    plan_ms: Array
-    perceive_ms: Array
-    route_ms: Array
-    localisation_iterations: IntArray
-    plan_iterations: IntArray
-    status: list[str]
-    bound_violation: Array
-    clearance: Array
     collisions: int
-    goal_index: IntArray
     reached: list[bool]
-    emergency: BoolArray
     obstacle_moving: BoolArray | None = None
     control_limits: tuple[float, float] = (1.0, 1.0)
     scenario: str = "navigation"
     interrupted: bool = False
+
+    time: Array = column("s")
+    true_pose: Array = column("m, m, rad", 3)
+    estimate: Array = column("m, m, rad", 3)
+    """Localised pose."""
+    dead_reckoning: Array = column("m, m, rad", 3)
+    """Pose integrated from the wheel odometry alone."""
+    control: Array = column("m/s, rad/s", 2)
+    """Commanded v and omega."""
+    horizon: Array = column("m, m, rad", None, 3)
+    """Predicted poses."""
+    scan: Array = column("m", None)
+    """Lidar ranges; NaN is a dropout, +inf no return."""
+    obstacles: Array = column("m", None, 3)
+    """True unforeseen obstacles: x, y, radius."""
+    detected: list[Array] = ragged("m", 3)
+    """Tracked obstacles: x, y, radius."""
+    solve_ms: Array = column("ms")
+    """Localise and plan together."""
+    localise_ms: Array = column("ms")
+    plan_ms: Array = column("ms")
+    perceive_ms: Array = column("ms")
+    """Update of the tracked obstacles."""
+    route_ms: Array = column("ms")
+    """Repair of the global route, most often nothing."""
+    localisation_iterations: IntArray = column("iterations", dtype=np.intp)
+    plan_iterations: IntArray = column("iterations", dtype=np.intp)
+    status: list[str] = words()
+    """Of the plan, ``"converged"`` when all is well."""
+    bound_violation: Array = column()
+    """Worst violation of a control bound by the plan that is driven, as the solver returned it, before any clipping."""
+    clearance: Array = column("m")
+    """Distance from the robot's hull to the nearest thing."""
+    goal_index: IntArray = column(dtype=np.intp)
+    """Goal being approached."""
+    emergency: BoolArray = column(dtype=np.bool_)
+    """True where the stored plan was driven because the tick's solve failed."""
 
     @property
     def ticks(self) -> int:

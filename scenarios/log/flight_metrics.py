@@ -1,28 +1,22 @@
-"""Numbers that say how a flight went.
-
-Everything measured by a clock lives under keys that end in ``_ms``; the rest depends on settings and seed alone.
-:func:`unifg.scenarios.log.drive_metrics.write_metrics` writes them as JSON.
-"""
+"""Numbers that say how a flight went."""
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 
 from unifg.errors import ScenarioError
 from unifg.models import quadrotor
-from unifg.scenarios.log.drive_metrics import Timing
 from unifg.scenarios.log.flight_log import FlightLog
+from unifg.scenarios.log.metrics import errors as norms
+from unifg.scenarios.log.metrics import statistics, timing
 from unifg.scenarios.worlds.layouts import Layout
 from unifg.typing import Array, BoolArray
 
 __all__ = [
     "PARAMETERS",
-    "Errors",
-    "FlightMetrics",
     "estimated_parameters",
     "flight_metrics",
     "has_estimate",
@@ -39,64 +33,19 @@ _KNOWN = 0.01  # relative mass error from which on the mass counts as known
 _SAME = 1.0  # a landmark farther than this from everything stands for nothing [m]
 
 
-class Errors(TypedDict):
-    """Root mean square and greatest norm over the ticks of a flight."""
-
-    rms: float
-    max: float
-
-
-class FlightMetrics(TypedDict):
-    """What `flight_metrics` returns; the key says the unit.
-
-    ``duration_s`` goes from the first tick to the last, at which arrival shows. Coverage is the share of errors within
-    two standard deviations over ticks and components, 0.954 where sigmas are those of the errors. Parameters appear by
-    name, errors as estimate minus truth, and only those that are estimated. ``mass_known_s`` is when the relative mass
-    error fell below 1 % for good. ``time_to_goal_s`` is None without arrival, an early parameter error None in a flight
-    shorter than 5 s, and all of the estimate None where a flight has none.
-    """
-
-    settings: dict[str, Any]
-    layout: str
-    succeeded: bool
-    interrupted: bool
-    reached: bool
-    collisions: int
-    ticks: int
-    duration_s: float
-    time_to_goal_s: float | None
-    target_distance_m: float
-    path_length_m: float
-    mean_speed_m_per_s: float
-    max_speed_m_per_s: float
-    min_clearance_m: float
-    position_error_m: Errors | None
-    velocity_error_m_per_s: Errors | None
-    attitude_error_rad: Errors | None
-    coverage: dict[str, float] | None
-    parameter_error: dict[str, float] | None
-    parameter_error_5s: dict[str, float] | None
-    parameter_sigma: dict[str, float] | None
-    mass_error_relative: float | None
-    mass_error_relative_5s: float | None
-    mass_known_s: float | None
-    landmarks: int
-    landmark_error_m: Errors | None
-    statuses: dict[str, int]
-    emergency_ticks: int
-    tick_ms: Timing
-    estimate_ms: Timing
-    plan_ms: Timing
-
-
-def flight_metrics(log: FlightLog) -> FlightMetrics:
+def flight_metrics(log: FlightLog) -> dict[str, Any]:
     """Summarise a flight.
 
     Args:
         log: a flight of at least one tick.
 
     Returns:
-        The metrics, of plain Python numbers.
+        The metrics, of plain Python numbers; the key says the unit. ``duration_s`` goes from the first tick to the
+        last, at which arrival shows. Coverage is the share of errors within two standard deviations over ticks and
+        components, 0.954 where sigmas are those of the errors. Parameters appear by name, errors as estimate minus
+        truth, and only those that are estimated. ``mass_known_s`` is when the relative mass error fell below 1 % for
+        good. ``time_to_goal_s`` is None without arrival, an early parameter error None in a flight shorter than 5 s,
+        and all of the estimate None where a flight has none.
 
     Raises:
         ScenarioError: the flight has no tick.
@@ -111,39 +60,38 @@ def flight_metrics(log: FlightLog) -> FlightMetrics:
     early = round(_EARLY / log.dt)  # the tick of that time
     long_enough = early < log.ticks
     mass = np.abs(log.parameters[:, 0] / log.parameters_true[0] - 1.0)
-    return FlightMetrics(
-        settings=dict(log.settings),
-        layout=log.layout.name,
-        succeeded=bool(log.succeeded),
-        interrupted=bool(log.interrupted),
-        reached=bool(log.reached),
-        collisions=int(log.collisions),
-        ticks=log.ticks,
-        duration_s=duration,
-        time_to_goal_s=duration if log.reached else None,
-        target_distance_m=float(log.target_distance[-1]),
-        path_length_m=float(np.linalg.norm(np.diff(log.truth[:, :3], axis=0), axis=1).sum()),
-        mean_speed_m_per_s=float(speed.mean()),
-        max_speed_m_per_s=float(speed.max()),
-        min_clearance_m=float(np.min(log.clearance)),
-        position_error_m=_errors(errors[:, :3]) if estimated else None,
-        velocity_error_m_per_s=_errors(log.believed[:, 7:] - log.truth[:, 7:]) if estimated else None,
-        attitude_error_rad=_errors(errors[:, 3:6]) if estimated else None,
-        coverage=_coverage(log, errors, active) if estimated else None,
-        parameter_error=_by_name(log.parameters[-1] - log.parameters_true, active),
-        parameter_error_5s=_by_name(log.parameters[early] - log.parameters_true, active) if long_enough else None,
-        parameter_sigma=_by_name(log.parameters_sigma[-1], active),
-        mass_error_relative=float(mass[-1]) if active[0] else None,
-        mass_error_relative_5s=float(mass[early]) if active[0] and long_enough else None,
-        mass_known_s=_settled(log, mass) if active[0] else None,
-        landmarks=len(log.landmarks[-1].ids),
-        landmark_error_m=_errors(landmark_errors(log)) if len(landmark_errors(log)) else None,
-        statuses=dict(sorted(Counter(log.statuses).items())),
-        emergency_ticks=int(np.count_nonzero(log.emergency)),
-        tick_ms=_timing(log.estimate_ms + log.plan_ms),
-        estimate_ms=_timing(log.estimate_ms),
-        plan_ms=_timing(log.plan_ms),
-    )
+    return {
+        "settings": dict(log.settings),
+        "layout": log.layout.name,
+        "succeeded": bool(log.succeeded),
+        "interrupted": bool(log.interrupted),
+        "reached": bool(log.reached),
+        "collisions": int(log.collisions),
+        "ticks": log.ticks,
+        "duration_s": duration,
+        "time_to_goal_s": duration if log.reached else None,
+        "target_distance_m": float(log.target_distance[-1]),
+        "path_length_m": float(np.linalg.norm(np.diff(log.truth[:, :3], axis=0), axis=1).sum()),
+        "mean_speed_m_per_s": float(speed.mean()),
+        "max_speed_m_per_s": float(speed.max()),
+        "min_clearance_m": float(np.min(log.clearance)),
+        "position_error_m": norms(errors[:, :3]) if estimated else None,
+        "velocity_error_m_per_s": norms(log.believed[:, 7:] - log.truth[:, 7:]) if estimated else None,
+        "attitude_error_rad": norms(errors[:, 3:6]) if estimated else None,
+        "coverage": _coverage(log, errors, active) if estimated else None,
+        "parameter_error": _by_name(log.parameters[-1] - log.parameters_true, active),
+        "parameter_error_5s": _by_name(log.parameters[early] - log.parameters_true, active) if long_enough else None,
+        "parameter_sigma": _by_name(log.parameters_sigma[-1], active),
+        "mass_error_relative": float(mass[-1]) if active[0] else None,
+        "mass_error_relative_5s": float(mass[early]) if active[0] and long_enough else None,
+        "mass_known_s": _settled(log, mass) if active[0] else None,
+        "landmarks": len(log.landmarks[-1].ids),
+        "landmark_error_m": norms(landmark_errors(log)) if len(landmark_errors(log)) else None,
+        "statuses": dict(sorted(Counter(log.statuses).items())),
+        "emergency_ticks": int(np.count_nonzero(log.emergency)),
+        "tick_ms": timing(log.estimate_ms + log.plan_ms),
+        **statistics(log),
+    }
 
 
 def has_estimate(log: FlightLog) -> bool:
@@ -202,13 +150,3 @@ def _settled(log: FlightLog, mass: Array) -> float | None:
         return 0.0
     after = int(wrong[-1]) + 1
     return float(log.time[after]) if after < log.ticks else None
-
-
-def _errors(values: Array) -> Errors:
-    norms = np.linalg.norm(values, axis=1)
-    return Errors(rms=math.sqrt(float(np.mean(norms**2))), max=float(norms.max()))
-
-
-def _timing(values: Array) -> Timing:
-    p50, p99 = np.percentile(values, [50.0, 99.0])
-    return Timing(p50=float(p50), p99=float(p99), max=float(np.max(values)))

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.scenarios.course import Course
-from unifg.scenarios.log.flight_log import FlightLog, FlightRecorder
+from unifg.scenarios.log.columns import Recorder
+from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.worlds.air import VEHICLE_RADIUS
 
 __all__ = ["course_log"]
@@ -24,7 +25,9 @@ def course_log(course: Course) -> FlightLog:
         settings["seed"] = s.seed
     states = c.between(_FRAMES_PER_STEP)
     clearance = c.layout.distance(states[:, :2]) - VEHICLE_RADIUS
-    recorder = FlightRecorder(c.layout, settings, s.dt / _FRAMES_PER_STEP, s.vehicle.packed)
+    recorder = Recorder(
+        FlightLog, layout=c.layout, settings=settings, dt=s.dt / _FRAMES_PER_STEP, parameters_true=s.vehicle.packed
+    )
     nothing = (np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
     for tick, state in enumerate(states):
         node = min(tick // _FRAMES_PER_STEP, s.horizon - 1)
@@ -35,9 +38,9 @@ def course_log(course: Course) -> FlightLog:
             truth=state,
             believed=state,
             believed_sigma=np.zeros(9),
-            control=c.controls[node],
-            plan=plan,
-            past=np.zeros((0, 3)),
+            controls=c.controls[node],
+            plans=plan,
+            pasts=np.zeros((0, 3)),
             landmarks=nothing,
             parameters=s.vehicle.packed,
             parameters_sigma=np.zeros(7),
@@ -45,7 +48,8 @@ def course_log(course: Course) -> FlightLog:
             movers=np.zeros((0, 3)),
             estimate_ms=0.0,
             plan_ms=0.0,
-            status=c.solution.status.name,
+            statuses=c.solution.status.name,
             clearance=float(clearance[tick]),
+            emergency=False,
         )
     return recorder.finish(collisions=0 if c.clear else 1, reached=c.arrived)

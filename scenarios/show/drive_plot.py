@@ -13,7 +13,7 @@ import numpy as np
 
 from unifg.errors import ScenarioError
 from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.log.drive_metrics import EpisodeMetrics, episode_metrics, pose_errors
+from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors
 from unifg.scenarios.show.shapes import known_corners
 from unifg.scenarios.show.style import css
 from unifg.typing import Array
@@ -304,7 +304,7 @@ def _poses(log: EpisodeLog, ax: Axes) -> None:
     ax.add_patch(Circle((x, y), log.robot_radius, facecolor=css("robot"), edgecolor="white", lw=0.5, zorder=7))
 
 
-def _title(log: EpisodeLog, metrics: EpisodeMetrics) -> str:
+def _title(log: EpisodeLog, metrics: dict[str, Any]) -> str:
     collisions = metrics["collisions"]
     hits = "no collision" if collisions == 0 else f"{collisions} collision" + ("s" if collisions > 1 else "")
     stopped = ", interrupted" if log.interrupted else ""

@@ -51,6 +51,11 @@ class LidarModel:
     sigma: float = 0.02
     dropout: float = 0.01
 
+    @property
+    def angles(self) -> Array:
+        """(B,) beam directions in the body frame [rad]."""
+        return -np.pi + 2.0 * np.pi * np.arange(self.beams) / self.beams
+
 
 @dataclass(frozen=True)
 class OdometryModel:
@@ -110,7 +115,7 @@ class World:
         self._lidar_rng, self._odometry_rng = lidar_rng, odometry_rng
         self._scale = 1.0 + self._odometry_model.scale_sigma * odometry_rng.standard_normal(2)
         self._measured = np.zeros(2)
-        self._angles = -np.pi + 2.0 * np.pi * np.arange(self.lidar.beams) / self.lidar.beams
+        self._angles = self.lidar.angles
         self._command = (0.0, 0.0)
         self._space = Space(pose, robot_radius)
         self._add_walls()

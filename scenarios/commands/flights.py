@@ -1,19 +1,37 @@
-"""What a flight leaves in its folder, and the table printed for people."""
+"""``unifg run quadrotor-mpc``: what a flight leaves in its folder, and the table printed for people."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
 
-from unifg.scenarios.log.drive_metrics import write_metrics
+from unifg.scenarios import flight
+from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.log.flight_log import FlightLog
-from unifg.scenarios.log.flight_metrics import Errors, flight_metrics, has_estimate
-from unifg.scenarios.show.control_plot import write_control
-from unifg.scenarios.show.estimates_plot import write_estimates
-from unifg.scenarios.show.flight_plot import write_overview
+from unifg.scenarios.log.flight_metrics import flight_metrics, has_estimate
+from unifg.scenarios.log.metrics import table, write_metrics
+from unifg.scenarios.show.control_plot import control
+from unifg.scenarios.show.estimates_plot import estimates
+from unifg.scenarios.show.flight_plot import overview
 from unifg.scenarios.show.flight_scene import flight_scene
+from unifg.scenarios.show.style import write_figure
 
-__all__ = ["summary", "write_results"]
+__all__ = ["SETTINGS", "run", "summary", "write_results"]
+
+SETTINGS = flight.FlightSettings
+
+
+def run(settings: flight.FlightSettings, progress: Progress) -> Outcome:
+    """Fly.
+
+    Raises:
+        KeyboardInterrupt: when stopped before the first tick.
+        ScenarioError: when the movers do not fit into the corridor.
+    """
+    log = flight.run_flight(settings, progress)
+    if log.ticks == 0:
+        raise KeyboardInterrupt
+    return Outcome(log.succeeded, log.interrupted, summary(log), lambda folder: write_results(folder, log))
 
 
 def write_results(folder: str | Path, log: FlightLog, metrics: Mapping[str, object] | None = None) -> list[Path]:
@@ -36,10 +54,10 @@ def write_results(folder: str | Path, log: FlightLog, metrics: Mapping[str, obje
     numbers = write_metrics(folder / "metrics.json", flight_metrics(log) if metrics is None else metrics)
     stored = folder / "flight.npz"
     log.save(stored)
-    pictures = [write_overview(folder / "overview.png", log)]
+    pictures = [write_figure(folder / "overview.png", overview(log), 130)]
     if has_estimate(log):
-        pictures.append(write_estimates(folder / "estimates.png", log))
-    pictures.append(write_control(folder / "control.png", log))
+        pictures.append(write_figure(folder / "estimates.png", estimates(log), 120))
+    pictures.append(write_figure(folder / "control.png", control(log), 120))
     return [flight_scene(log).write(folder / "scene.html"), *pictures, numbers, stored]
 
 
@@ -51,8 +69,7 @@ def summary(log: FlightLog) -> str:
     words = [str(settings[key]) for key in ("solver", "coupling", "seed") if settings.get(key) is not None]
     arrival = m["time_to_goal_s"]
     target = f"{m['target_distance_m']:.2f} m away at the end" if arrival is None else f"reached after {arrival:.2f} s"
-    tick = m["tick_ms"]
-    rows = [
+    rows = (
         ("scenario", f"{settings.get('scenario', 'quadrotor')}, {m['layout']}"),
         ("solver, coupling, seed", ", ".join(words)),
         ("target", target + stopped),
@@ -66,14 +83,12 @@ def summary(log: FlightLog) -> str:
         ("mass error", _mass(m["mass_error_relative_5s"], m["mass_error_relative"])),
         ("plan status", ", ".join(f"{count} {status}" for status, count in m["statuses"].items())),
         ("stored plans flown", f"{m['emergency_ticks']} ticks"),
-        ("estimate + plan", f"median {tick['p50']:.1f} ms, p99 {tick['p99']:.1f}, max {tick['max']:.1f}"),
-    ]
-    rows = [(name, value) for name, value in rows if value]
-    width = max(len(name) for name, _ in rows)
-    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
+        ("estimate + plan", "median {p50:.1f} ms, p99 {p99:.1f}, max {max:.1f}".format(**m["tick_ms"])),
+    )
+    return table(rows)
 
 
-def _errors(errors: Errors | None, unit: str) -> str:
+def _errors(errors: Mapping[str, float] | None, unit: str) -> str:
     return "" if errors is None else f"rms {errors['rms']:.4f} {unit}, max {errors['max']:.4f}"
 
 

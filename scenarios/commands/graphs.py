@@ -1,8 +1,7 @@
-"""What ``unifg solve`` leaves in its folder, and the table printed for people."""
+"""``unifg solve``: what a solved pose graph leaves in its folder, and the table printed for people."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +9,24 @@ import numpy as np
 
 from unifg.files.g2o import write_g2o
 from unifg.files.tum import write_tum
+from unifg.scenarios import pose_graph
+from unifg.scenarios.commands.outcome import Outcome, Progress
+from unifg.scenarios.log.metrics import table, write_metrics
 from unifg.scenarios.pose_graph import SolvedGraph
-from unifg.scenarios.show.graph_plot import write_picture
+from unifg.scenarios.show.graph_plot import picture
 from unifg.scenarios.show.graph_scene import graph_scene
+from unifg.scenarios.show.style import write_figure
 
-__all__ = ["metrics", "summary", "write_results"]
+__all__ = ["SETTINGS", "metrics", "run", "summary", "write_results"]
+
+SETTINGS = pose_graph.SolveSettings
+
+
+def run(settings: pose_graph.SolveSettings, progress: Progress) -> Outcome:
+    """Solve the graph of a file."""
+    solved = pose_graph.solve_file(settings, progress)
+    converged = solved.solution.converged
+    return Outcome(converged, solved.interrupted, summary(solved), lambda folder: write_results(folder, solved))
 
 
 def write_results(folder: Path, solved: SolvedGraph) -> list[Path]:
@@ -31,11 +43,10 @@ def write_results(folder: Path, solved: SolvedGraph) -> list[Path]:
     graph = write_g2o(folder / "graph.g2o", solved.after)
     poses = solved.after.poses
     trajectory = write_tum(folder / "trajectory.tum", np.arange(len(poses), dtype=np.float64), poses)
-    numbers = folder / "metrics.json"
-    numbers.write_text(json.dumps(metrics(solved), indent=2) + "\n", encoding="utf-8")
-    picture = write_picture(folder / "graph.png", solved)
+    numbers = write_metrics(folder / "metrics.json", metrics(solved), sort_keys=False)
+    shown = write_figure(folder / "graph.png", picture(solved), 130)
     scene = graph_scene(solved).write(folder / "scene.html")
-    return [scene, picture, graph, trajectory, numbers]
+    return [scene, shown, graph, trajectory, numbers]
 
 
 def metrics(solved: SolvedGraph) -> dict[str, Any]:
@@ -98,8 +109,7 @@ def summary(solved: SolvedGraph) -> str:
         ("status", solved.solution.status.value),
         ("time", ", ".join(f"{name} {value:.1f} ms" for name, value in milliseconds.items())),
     ]
-    width = max(len(name) for name, _ in rows)
-    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows if value)
+    return table(rows)
 
 
 def _pairs(solved: SolvedGraph) -> list[list[int]]:

@@ -1,60 +1,43 @@
-"""What an optimised flight past obstacles leaves in its folder, and the table printed for people."""
+"""``unifg run quadrotor-obstacles``: what an optimised flight leaves in its folder, and the table for people."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TypedDict
+from typing import Any
 
 import numpy as np
 
+from unifg.answers.status import Status
+from unifg.scenarios import course as courses
+from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations
 from unifg.scenarios.course import Course
-from unifg.scenarios.log.drive_metrics import write_metrics
+from unifg.scenarios.log.metrics import table, write_metrics
 from unifg.scenarios.show.course_log import course_log
-from unifg.scenarios.show.course_plot import write_iterates
+from unifg.scenarios.show.course_plot import picture
 from unifg.scenarios.show.flight_scene import flight_scene
+from unifg.scenarios.show.style import write_figure
 
-__all__ = ["CourseMetrics", "course_metrics", "summary", "write_results"]
+__all__ = ["SETTINGS", "course_metrics", "run", "summary", "write_results"]
 
-
-class CourseMetrics(TypedDict):
-    """Numbers of one optimised flight; only ``solve_ms`` depends on the clock."""
-
-    scenario: str
-    layout: str
-    solver: str
-    hessian: str
-    avoidance: str
-    guess: str
-    general_cost: bool
-    succeeded: bool
-    status: str
-    converged: bool
-    arrived: bool
-    clear: bool
-    flyable: bool
-    cost: float
-    costs: list[float]
-    violations: list[float]
-    iterations: int
-    stationarity: float
-    violation: float
-    complementarity: float
-    target_distance_m: float
-    min_clearance_m: float
-    min_clearance_between_nodes_m: float
-    widest_way_m: float
-    drift_m: float
-    path_length_m: float
-    max_speed_m_per_s: float
-    max_tilt_rad: float
-    min_thrust_n: float
-    max_thrust_n: float
-    max_rate_rad_per_s: float
-    solve_ms: float
+SETTINGS = courses.CourseSettings
 
 
-def course_metrics(course: Course) -> CourseMetrics:
-    """The numbers of a flight; ``costs`` and ``violations`` are those of every iterate, the guess first."""
+def run(settings: courses.CourseSettings, progress: Progress) -> Outcome:
+    """Optimise the flight that was asked for."""
+    tell = by_iterations(
+        progress, 0.95, lambda row: f"iteration {row.number}, cost {row.cost:.5g}, violation {row.violation:.1e}"
+    )
+    course = courses.run_course(settings, progress=tell)
+    progress(1.0, "solved")
+    interrupted = course.solution.status is Status.INTERRUPTED
+    return Outcome(course.succeeded, interrupted, summary(course), lambda folder: write_results(folder, course))
+
+
+def course_metrics(course: Course) -> dict[str, Any]:
+    """The numbers of a flight; ``costs`` and ``violations`` are those of every iterate, the guess first.
+
+    Only ``solve_ms`` depends on the clock.
+    """
     c, s, solution = course, course.settings, course.solution
     w, x, y, z = c.states[:, 3:7].T
     upright = w * w - x * x - y * y + z * z  # how much of the thrust points up
@@ -106,8 +89,8 @@ def write_results(folder: str | Path, course: Course) -> list[Path]:
     """
     folder = Path(folder)
     numbers = write_metrics(folder / "metrics.json", course_metrics(course))
-    picture = write_iterates(folder / "iterates.png", course)
-    return [flight_scene(course_log(course)).write(folder / "scene.html"), picture, numbers]
+    shown = write_figure(folder / "iterates.png", picture(course), 90)
+    return [flight_scene(course_log(course)).write(folder / "scene.html"), shown, numbers]
 
 
 def summary(course: Course) -> str:
@@ -128,8 +111,7 @@ def summary(course: Course) -> str:
         f"{np.degrees(m['max_tilt_rad']):.0f} deg, thrust {m['min_thrust_n']:.1f} to {m['max_thrust_n']:.1f} N",
         "can be flown as planned": _said(m["flyable"], "yes", "NO"),
     }
-    width = max(map(len, rows))
-    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows.items())
+    return table(rows.items())
 
 
 def _said(fact: bool, good: str, bad: str) -> str:

@@ -1,0 +1,78 @@
+"""``unifg run navigation``: what a drive leaves in its folder, and the table printed for people."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from unifg.files.tum import write_tum
+from unifg.scenarios import navigation
+from unifg.scenarios.commands.outcome import Outcome, Progress
+from unifg.scenarios.log.drive_log import EpisodeLog
+from unifg.scenarios.log.drive_metrics import episode_metrics
+from unifg.scenarios.log.metrics import table, write_metrics
+from unifg.scenarios.show.drive_plot import overview
+from unifg.scenarios.show.drive_scene import drive_scene
+from unifg.scenarios.show.style import write_figure
+
+__all__ = ["SETTINGS", "run", "summary", "write_results"]
+
+SETTINGS = navigation.NavigationSettings
+
+
+def run(settings: navigation.NavigationSettings, progress: Progress) -> Outcome:
+    """Drive.
+
+    Raises:
+        KeyboardInterrupt: when stopped before the first tick.
+        ScenarioError: when start, goals or obstacles do not fit the map.
+    """
+    log = navigation.run_navigation(settings, progress=progress)
+    if log.ticks == 0:
+        raise KeyboardInterrupt
+    return Outcome(log.succeeded, log.interrupted, summary(log), lambda folder: write_results(folder, log))
+
+
+def write_results(folder: Path, log: EpisodeLog) -> list[Path]:
+    """Write scene, picture, metrics and both trajectories of an episode.
+
+    Args:
+        folder: existing folder; files of the same names are replaced.
+        log: an episode of at least one tick.
+
+    Returns:
+        The files written: ``scene.html``, ``overview.png``, ``metrics.json``, ``trajectory.tum`` (the truth) and
+        ``estimate.tum``.
+
+    Raises:
+        ScenarioError: the episode has no tick.
+    """
+    # The cheapest and most precious first, in case the user loses patience.
+    metrics = write_metrics(folder / "metrics.json", episode_metrics(log))
+    trajectory = write_tum(folder / "trajectory.tum", log.time, log.true_pose)
+    estimate = write_tum(folder / "estimate.tum", log.time, log.estimate)
+    picture = write_figure(folder / "overview.png", overview(log), 130)
+    scene = drive_scene(log).write(folder / "scene.html")
+    return [scene, picture, metrics, trajectory, estimate]
+
+
+def summary(log: EpisodeLog) -> str:
+    """The outcome of an episode as a table of two columns."""
+    m = episode_metrics(log)
+    stopped = " (interrupted)" if m["interrupted"] else ""
+    spread = "mean {mean:.4f} {unit}, std {std:.4f}, max {max:.4f}"
+    rows = (
+        ("scenario", f"{m['scenario']} on {m['map']}"),
+        ("solver, coupling, seed", f"{m['solver']}, {m['coupling']}, {m['seed']}"),
+        ("goals reached", f"{m['goals_reached']} of {m['goals']}{stopped}"),
+        ("collisions", f"{m['collisions']}"),
+        ("driven", f"{m['path_length_m']:.2f} m in {m['duration_s']:.1f} s, {m['steps']} ticks"),
+        ("planned path", f"{m['planned_length_m']:.2f} m"),
+        ("smallest clearance", f"{m['min_clearance_m']:.3f} m"),
+        ("localisation error", spread.format(unit="m", **m["localisation_error_m"])),
+        ("", spread.format(unit="rad", **m["localisation_error_rad"])),
+        ("odometry error", spread.format(unit="m", **m["odometry_error_m"])),
+        ("localise + plan", "median {p50:.1f} ms, p99 {p99:.1f}, max {max:.1f}".format(**m["solve_ms"])),
+        ("solver failures", f"{m['solver_failures']}"),
+        ("worst bound violation", f"{m['max_bound_violation']:.1e}"),
+    )
+    return table(rows)

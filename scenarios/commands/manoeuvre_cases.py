@@ -1,0 +1,55 @@
+"""``unifg run manoeuvres``: the cases that were asked for, their pictures and one file of numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from unifg.answers.status import Status
+from unifg.scenarios import manoeuvres
+from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations
+from unifg.scenarios.options import option
+from unifg.scenarios.show.manoeuvre_plot import picture
+from unifg.scenarios.show.style import write_figure
+
+__all__ = ["SETTINGS", "run"]
+
+
+@dataclass(frozen=True)
+class CaseSettings:
+    """What to solve.
+
+    Attributes:
+        case: which manoeuvre.
+        solver: one of `unifg.solvers.names.CONSTRAINED`.
+    """
+
+    case: str = option("both", choices=(*manoeuvres.CASES, "both"))
+    solver: str = "sqp"
+
+
+SETTINGS = CaseSettings
+
+
+def run(settings: CaseSettings, progress: Progress) -> Outcome:
+    """Solve one case after the other."""
+    names = tuple(manoeuvres.CASES) if settings.case == "both" else (settings.case,)
+    solved: list[manoeuvres.Manoeuvre] = []
+    interrupted = False
+    for number, name in enumerate(names):
+
+        def part(done: float, text: str, name: str = name, number: int = number) -> None:
+            progress((number + done) / len(names), f"{name}: {text}")
+
+        tell = by_iterations(part, 0.9, lambda row: f"iteration {row.number}, cost {row.cost:.5g}")
+        solved.append(manoeuvres.run_manoeuvre(manoeuvres.CASES[name], settings.solver, progress=tell))
+        interrupted = solved[-1].solution.status is Status.INTERRUPTED
+        if interrupted:
+            break
+    progress(1.0, "solved")
+
+    def write(folder: Path) -> list[Path]:
+        numbers = manoeuvres.write_metrics(folder / "metrics.json", solved)
+        return [*(write_figure(folder / f"{m.case.name}.png", picture(m), 105) for m in solved), numbers]
+
+    return Outcome(all(m.succeeded for m in solved), interrupted, manoeuvres.table(solved), write)

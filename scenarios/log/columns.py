@@ -1,0 +1,106 @@
+"""Columns of a log: declared once with their unit and shape, written tick by tick, stacked at the end.
+
+A log is a dataclass whose columns are declared by :func:`column`, :func:`ragged` and :func:`words`; its other fields
+are what was known before the first tick or after the last. The loop writes it with a `Recorder`; metrics, plots and
+scenes only read it, so a picture never needs the solver that made it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import Field, dataclass, field, fields
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+__all__ = ["Column", "Recorder", "column", "columns", "ragged", "words"]
+
+L = TypeVar("L")
+
+
+@dataclass(frozen=True)
+class Column:
+    """How a column is written and kept.
+
+    Attributes:
+        unit: of its numbers; "ms" is measured by a clock, "iterations" counts those of a solver.
+        entry: what is kept of a value given at a tick, a copy.
+        stack: the column, of the entries of all ticks.
+    """
+
+    unit: str
+    entry: Callable[[Any], Any]
+    stack: Callable[[list[Any]], Any]
+
+
+def column(unit: str = "", *shape: int | None, dtype: Any = np.float64) -> Any:
+    """Declare a field (T, ...) with one entry of that shape per tick; None is a length that the first tick decides."""
+    free = tuple(-1 if size is None else size for size in shape)
+    empty = tuple(0 if size is None else size for size in shape)
+
+    def entry(value: Any) -> Any:
+        array = np.array(value, dtype=dtype)
+        return array.reshape(free) if free.count(-1) <= 1 and len(free) else array
+
+    def stack(entries: list[Any]) -> Any:
+        return np.stack(entries) if entries else np.zeros((0, *empty), dtype=dtype)
+
+    return field(metadata={"column": Column(unit, entry, stack)})
+
+
+def ragged(unit: str = "", *shape: int, dtype: Any = np.float64, entry: Callable[[Any], Any] | None = None) -> Any:
+    """Declare a field with an array (n, *shape) per tick, n as it comes, or what ``entry`` makes of a value."""
+
+    def rows(value: Any) -> Any:
+        return np.array(value, dtype=dtype).reshape(-1, *shape)
+
+    return field(metadata={"column": Column(unit, entry or rows, list)})
+
+
+def words() -> Any:
+    """Declare a field with one word per tick."""
+    return field(metadata={"column": Column("word", str, list)})
+
+
+def columns(log: Any) -> dict[str, Column]:
+    """The columns of a log or of its class, by name."""
+    declared: tuple[Field[Any], ...] = fields(log)
+    return {f.name: f.metadata["column"] for f in declared if "column" in f.metadata}
+
+
+class Recorder(Generic[L]):
+    """A log in the making: one :meth:`add` per tick, then :meth:`finish`."""
+
+    def __init__(self, log: type[L], **known: Any) -> None:
+        """Start empty.
+
+        Args:
+            log: the class of the log.
+            known: of its fields those that are known before the first tick.
+        """
+        self._log, self._known = log, known
+        self._columns = columns(log)
+        self._entries: dict[str, list[Any]] = {name: [] for name in self._columns}
+
+    def add(self, **row: Any) -> None:
+        """Record one tick; copies what it is given.
+
+        Args:
+            row: a value for every column.
+
+        Raises:
+            TypeError: a column is missing, or there is none of that name.
+        """
+        if wrong := sorted(row.keys() ^ self._columns.keys()):
+            raise TypeError(f"a tick of {self._log.__name__} needs every column once, look at: {', '.join(wrong)}")
+        for name, value in row.items():
+            self._entries[name].append(self._columns[name].entry(value))
+
+    def finish(self, **known: Any) -> L:
+        """The finished record, also one without ticks.
+
+        Args:
+            known: the fields that are known after the last tick.
+        """
+        stacked = {name: self._columns[name].stack(entries) for name, entries in self._entries.items()}
+        return self._log(**self._known, **known, **stacked)

@@ -1,0 +1,88 @@
+"""Numbers of runs: statistics of declared columns, and the JSON file they end in.
+
+Everything measured by a clock lives under keys that end in ``_ms``; the rest depends on settings and seed alone, so two
+runs of the same seed compare equal after `without_timings`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unifg.scenarios.log.columns import columns
+from unifg.typing import Array, IntArray
+
+__all__ = ["errors", "iterations", "spread", "statistics", "table", "timing", "without_timings", "write_metrics"]
+
+
+def statistics(log: Any) -> dict[str, dict[str, float]]:
+    """Statistics of the declared columns that speak for themselves: times in ms, and iterations."""
+    made: dict[str, Callable[[Any], dict[str, float]]] = {"ms": timing, "iterations": iterations}
+    return {name: made[c.unit](getattr(log, name)) for name, c in columns(log).items() if c.unit in made}
+
+
+def spread(values: Array) -> dict[str, float]:
+    """Mean, standard deviation and maximum."""
+    return {"mean": float(np.mean(values)), "std": float(np.std(values)), "max": float(np.max(values))}
+
+
+def errors(values: Array) -> dict[str, float]:
+    """Root mean square and greatest norm of rows (n, d)."""
+    norms = np.linalg.norm(values, axis=1)
+    return {"rms": math.sqrt(float(np.mean(norms**2))), "max": float(norms.max())}
+
+
+def timing(values: Array) -> dict[str, float]:
+    """Percentiles and maximum."""
+    p50, p99 = np.percentile(values, [50.0, 99.0])
+    return {"p50": float(p50), "p99": float(p99), "max": float(np.max(values))}
+
+
+def iterations(values: IntArray) -> dict[str, float]:
+    """Mean and maximum of counts."""
+    return {"mean": float(np.mean(values)), "max": int(np.max(values))}
+
+
+def without_timings(metrics: Mapping[str, object]) -> dict[str, object]:
+    """The metrics that settings and seed determine: all but the keys that end in ``_ms``."""
+    return {key: value for key, value in metrics.items() if not key.endswith("_ms")}
+
+
+def write_metrics(path: str | Path, metrics: Mapping[str, object], *, sort_keys: bool = True) -> Path:
+    """Write metrics as JSON; a number that is not finite becomes null.
+
+    Args:
+        path: file to write; an existing one is replaced.
+        metrics: numbers, words, and lists and mappings of them.
+        sort_keys: False keeps the order given.
+
+    Returns:
+        The path written.
+    """
+    path = Path(path)
+    text = json.dumps(_strict(metrics), indent=2, sort_keys=sort_keys, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8", newline="\n")
+    return path
+
+
+def _strict(value: object) -> object:
+    """The same value for a strict JSON reader, which knows neither NaN nor infinity."""
+    if isinstance(value, Mapping):
+        return {str(key): _strict(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_strict(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def table(rows: Iterable[tuple[str, str]]) -> str:
+    """Names and values for people, as a table of two columns; empty values are left out."""
+    shown = [(name, value) for name, value in rows if value]
+    width = max(len(name) for name, _ in shown)
+    return "\n".join(f"{name:<{width}}  {value}" for name, value in shown)

@@ -1,0 +1,209 @@
+"""Settings as options of a command line: what a field may be is said once, where it is declared.
+
+A field declared by :func:`option` is an option of its name; its default, its kind and its choices come from the
+declaration, and its help is what the docstring of its class says of it. Settings inside settings bring their options
+along. Help of the command line therefore has to load the settings it speaks of, and nothing else.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import inspect
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import MISSING, dataclass, field, replace
+from pathlib import Path
+from types import NoneType
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+__all__ = ["add_options", "count", "existing", "option", "pair", "pose", "positive", "settings_of", "share"]
+
+S = TypeVar("S")
+Text = Callable[[str], Any]
+"""Makes a value of a word of the command line, or raises ArgumentTypeError."""
+
+
+@dataclass(frozen=True)
+class _Option:
+    text: Text | None
+    metavar: str | None
+    choices: tuple[str, ...]
+    flag: str
+    many: bool
+
+
+def option(
+    default: Any = MISSING,
+    *,
+    text: Text | None = None,
+    metavar: str | None = None,
+    choices: Sequence[str] = (),
+    flag: str = "",
+    many: bool = False,
+) -> Any:
+    """Declare a field of settings that is an option; without a default it is an argument that must be given.
+
+    Args:
+        default: of the field.
+        text: makes a value of a word; None goes by the annotation (whole numbers, literals, flags).
+        metavar: what stands for the value in the help.
+        choices: words to choose from; those of an annotated Literal need not be repeated.
+        flag: name of the option where it is not that of the field.
+        many: the option may be repeated, and the field holds a tuple of all values.
+    """
+    declared = _Option(text, metavar, tuple(choices), flag, many)
+    return field(default=default, metadata={"option": declared})
+
+
+def add_options(parser: argparse.ArgumentParser, settings: type, **defaults: Any) -> None:
+    """Add the options of a class of settings.
+
+    Args:
+        parser: to add them to.
+        settings: the class.
+        defaults: values of fields where the command line does not give one; None for the field's own.
+    """
+    for path, declared, chosen in _options(settings):
+        name = path[-1]
+        default = defaults.get(name, declared.default)
+        words: dict[str, Any] = {"help": _help(path, settings, default).replace("%", "%%"), "metavar": chosen.metavar}
+        kind = _plain(get_type_hints(_owner(settings, path))[name])
+        if kind is bool:
+            del words["metavar"]
+            words["action"] = "store_true"
+        else:
+            choices = chosen.choices or (get_args(kind) if get_origin(kind) is Literal else ())
+            words["choices"] = choices or None
+            words["type"] = chosen.text or (count if kind is int else str)
+            if chosen.many:
+                words["action"] = "append"
+        if declared.default is MISSING:
+            parser.add_argument(name, **words)
+        else:
+            flag = "--" + (chosen.flag or name).replace("_", "-")
+            parser.add_argument(flag, dest=".".join(path), default=defaults.get(name, argparse.SUPPRESS), **words)
+
+
+def settings_of(settings: type[S], chosen: argparse.Namespace, **more: Any) -> S:
+    """The settings that were chosen; what was not named keeps its default.
+
+    Args:
+        settings: the class.
+        chosen: what the parser found.
+        more: further fields.
+    """
+    given = {path: getattr(chosen, ".".join(path)) for path, _, _ in _options(settings) if ".".join(path) in chosen}
+    many = {path: declared.many for path, _, declared in _options(settings)}
+    outer = {path[0]: tuple(v) if many[path] else v for path, v in given.items() if len(path) == 1}
+    made: Any = settings(**outer, **more)
+    for (outside, *inside), value in given.items():
+        if inside:
+            made = replace(made, **{outside: replace(getattr(made, outside), **{inside[0]: value})})
+    return made  # type: ignore[no-any-return]
+
+
+def _options(settings: type) -> Iterator[tuple[tuple[str, ...], dataclasses.Field[Any], _Option]]:
+    """Every option with its path, at most one level down."""
+    for declared in dataclasses.fields(settings):
+        inner = declared.default_factory
+        if "option" in declared.metadata:
+            yield (declared.name,), declared, declared.metadata["option"]
+        elif isinstance(inner, type) and dataclasses.is_dataclass(inner):
+            yield from (
+                ((declared.name, f.name), f, f.metadata["option"])
+                for f in dataclasses.fields(inner)
+                if "option" in f.metadata
+            )
+
+
+def _owner(settings: type, path: tuple[str, ...]) -> type:
+    """The class that declares an option."""
+    if len(path) == 1:
+        return settings
+    inner = next(f.default_factory for f in dataclasses.fields(settings) if f.name == path[0])
+    assert isinstance(inner, type)
+    return inner
+
+
+def _plain(kind: Any) -> Any:
+    """An annotation without its None."""
+    kinds = [part for part in get_args(kind) if part is not NoneType]
+    return kinds[0] if NoneType in get_args(kind) and len(kinds) == 1 else kind
+
+
+def _help(path: tuple[str, ...], settings: type, default: Any) -> str:
+    """What the docstring of the class says of a field, and its default."""
+    doc = inspect.getdoc(_owner(settings, path)) or ""
+    found = re.search(rf"^    {path[-1]}: (.*?)(?=^ {{0,4}}\S|\Z)", doc, re.MULTILINE | re.DOTALL)
+    words = " ".join(found[1].split()).rstrip(".") if found else ""
+    quiet = default is MISSING or default is None or isinstance(default, bool)
+    return words if quiet else f"{words} (default: {default})"
+
+
+def count(text: str, least: int = 0) -> int:
+    """A whole number, not below the least."""
+    if not text.isdecimal() or int(text) < least:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least {least}")
+    return int(text)
+
+
+def positive(text: str) -> float:
+    """A number above zero."""
+    value = _number(text)
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
+    return value
+
+
+def share(text: str) -> float:
+    """A number from 0, less than 1."""
+    value = _number(text)
+    if not 0.0 <= value < 1.0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number in [0, 1)")
+    return value
+
+
+def pose(text: str) -> tuple[float, ...]:
+    """Three numbers X,Y,THETA."""
+    what = f"{text!r} is not a pose: "
+    try:
+        values = tuple(float(word) for word in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 3:
+        raise argparse.ArgumentTypeError(f"{what}expected three numbers X,Y,THETA [m, m, rad], without blanks")
+    if not all(abs(value) < float("inf") for value in values):
+        raise argparse.ArgumentTypeError(f"{what}every number must be finite")
+    return values
+
+
+def pair(text: str) -> tuple[float, float]:
+    """Two numbers LO,HI, the first below the second."""
+    try:
+        low, high = (float(word) for word in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not LO,HI: expected two numbers [N], without blanks") from None
+    if not low < high:
+        raise argparse.ArgumentTypeError(f"{text!r}: the first number must be below the second")
+    return low, high
+
+
+def existing(what: str) -> Text:
+    """A file that is there; ``what`` says which would do."""
+
+    def path(text: str) -> Path:
+        found = Path(text)
+        if not found.is_file():
+            raise argparse.ArgumentTypeError(f"{text}: no such file; give {what}")
+        return found
+
+    return path
+
+
+def _number(text: str) -> float:
+    """A number; what is none is not a number."""
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
