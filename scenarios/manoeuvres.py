@@ -7,7 +7,6 @@ through a disc that nobody had foreseen. Every iterate is kept for the picture.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 
 import unifg as fg
 from unifg.models import obstacles, unicycle
+from unifg.scenarios.log import metrics
 from unifg.solvers import names
 from unifg.typing import Array
 
@@ -294,8 +294,7 @@ def write_metrics(path: Path, manoeuvres: Sequence[Manoeuvre]) -> Path:
         "solver": manoeuvres[0].solver,
         "cases": {m.case.name: case_metrics(m) for m in manoeuvres},
     }
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8", newline="\n")
-    return path
+    return metrics.write_metrics(path, content, sort_keys=False)
 
 
 def table(manoeuvres: Sequence[Manoeuvre]) -> str:

@@ -10,7 +10,6 @@ The guess is the paper's: speeds, forces and multipliers zero. The paper's J has
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -22,6 +21,7 @@ import numpy as np
 import unifg as fg
 from unifg.models import vehicle
 from unifg.models.vehicle import Vehicle
+from unifg.scenarios.log import metrics as numbers
 from unifg.scenarios.options import count, existing, option, pair, positive
 from unifg.scenarios.ways.speed_profile import Profile, drive_cycle, read_profile
 from unifg.solvers import names
@@ -247,8 +247,7 @@ def metrics(drive: Drive) -> TrackingMetrics:
 
 def write_metrics(path: Path, drive: Drive) -> Path:
     """Write the numbers as JSON and return the path."""
-    path.write_text(json.dumps(metrics(drive), indent=2) + "\n", encoding="utf-8", newline="\n")
-    return path
+    return numbers.write_metrics(path, metrics(drive), sort_keys=False)
 
 
 def table(drive: Drive) -> str:
@@ -269,5 +268,4 @@ def table(drive: Drive) -> str:
     if bounds is not None:
         kept = "kept" if m["within_bounds"] else "BROKEN"
         rows["force limits"] = f"{bounds[0]:g} to {bounds[1]:g} N, {kept}, active {m['forces_at_a_bound']} times"
-    width = max(map(len, rows))
-    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows.items())
+    return numbers.table(rows.items())

@@ -1,5 +1,6 @@
 """The command line: arguments, exit status, files, without driving a real episode."""
 
+import argparse
 import json
 import os
 import re
@@ -7,8 +8,9 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from unifg.scenarios import navigation as navigation_scenario
 from unifg.scenarios.commands import drives
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.navigation import NavigationSettings
+from unifg.scenarios.options import add_options, option, pose, positive, settings_of
 
 FILES = ("scene.html", "overview.png", "metrics.json", "trajectory.tum", "estimate.tum")
 
@@ -146,8 +149,8 @@ def test_help_and_version_exit_0(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"unifg {__version__}\n"
     assert command.main(["run", "navigation", "--help"]) == 0
     said = capsys.readouterr().out
-    for option in ("--map", "--start", "--goal", "--solver", "--coupling", "--obstacles", "--seed", "--out"):
-        assert option in said
+    for flag in ("--map", "--start", "--goal", "--solver", "--coupling", "--obstacles", "--seed", "--out"):
+        assert flag in said
 
 
 def test_scenario_error_is_a_message_not_a_traceback(
@@ -265,3 +268,67 @@ def test_control_weight_reaches_the_controller(navigation: FakeNavigation, no_fi
 def test_control_weight_must_be_positive(weight: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main(["run", "navigation", f"--control-weight={weight}"]) == 2
     assert "positive" in capsys.readouterr().err
+
+
+@dataclass(frozen=True)
+class Inner:
+    """Within.
+
+    Attributes:
+        weight: of what pulls: 100 % of it.
+        other: no option.
+    """
+
+    weight: float = option(1.0, text=positive, metavar="W")
+    other: int = 3
+
+
+@dataclass(frozen=True)
+class Outer:
+    """Around.
+
+    Attributes:
+        file: what is read.
+        kind: which way,
+            told in two lines.
+        quick: without looking.
+        steps: how many.
+        places: where; again and again.
+        inner: more of it.
+    """
+
+    file: str = option()
+    kind: Literal["a", "b"] | None = option(None)
+    quick: bool = option(False)
+    steps: int = option(2, metavar="N")
+    places: tuple[tuple[float, ...], ...] = option((), text=pose, flag="place", many=True)
+    inner: Inner = field(default_factory=Inner)
+
+
+def options_of(*words: str, **defaults: object) -> Outer:
+    parser = argparse.ArgumentParser()
+    add_options(parser, Outer, **defaults)
+    return settings_of(Outer, parser.parse_args(words))
+
+
+def test_fields_are_options() -> None:
+    assert options_of("f") == Outer("f")
+    assert options_of("f", steps=5) == Outer("f", steps=5) and options_of("f", "--steps", "4", steps=5).steps == 4
+    words = ["f", "--kind", "b", "--quick", "--place", "1,2,3", "--place", "4,5,6", "--weight", "0.5"]
+    expected = Outer("f", "b", True, 2, ((1.0, 2.0, 3.0), (4.0, 5.0, 6.0)), Inner(0.5))
+    assert options_of(*words) == expected
+    for wrong in (["f", "--kind", "c"], ["f", "--steps", "-1"], ["f", "--weight", "0"], ["f", "--other", "1"], []):
+        with pytest.raises(SystemExit):
+            options_of(*wrong)
+
+
+def test_help_of_options_is_the_docstring(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        options_of("--help")
+    said = " ".join(capsys.readouterr().out.split())
+    for words in (
+        "what is read", "--kind {a,b} which way, told in two lines", "--quick without looking",
+        "--steps N how many (default: 2)", "--weight W of what pulls: 100 % of it (default: 1.0)",
+    ):  # fmt: skip
+        assert words in said
+    assert "no option" not in said and "None" not in said

@@ -1,7 +1,7 @@
 """Metrics of an episode whose numbers are known, and the file they end in."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +9,11 @@ import pytest
 
 from episodes import DT, episode
 from unifg.errors import ScenarioError
+from unifg.scenarios.log.columns import Recorder, column, columns, ragged, words
 from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors
-from unifg.scenarios.log.metrics import without_timings, write_metrics
+from unifg.scenarios.log.metrics import statistics, table, without_timings, write_metrics
 from unifg.scenarios.ways.polyline import path_length
+from unifg.typing import Array, IntArray
 
 PROMISED = {
     "reached",
@@ -105,6 +107,39 @@ def test_same_seed_differs_in_timings_only() -> None:
     assert without_timings(one).keys() >= PROMISED - {"solve_ms"}
 
 
+def test_a_recorder_copies_and_wants_every_column_once() -> None:
+    @dataclass(kw_only=True)
+    class Log:
+        name: str
+        end: int
+        place: Array = column("m", 2)
+        way: Array = column("m", None, 3)
+        seen: list[IntArray] = ragged(dtype=np.intp)
+        tick_ms: Array = column("ms")
+        steps: IntArray = column("iterations", dtype=np.intp)
+        word: list[str] = words()
+
+    recorder = Recorder(Log, name="x")
+    place = np.zeros(2)
+    row = {"way": np.zeros((4, 3)), "tick_ms": 2.0, "steps": 3, "word": "ok"}
+    for k in range(3):
+        place[:] = k
+        recorder.add(place=place, seen=range(k), **row)
+    log = recorder.finish(end=7)
+    assert (log.name, log.end, log.word) == ("x", 7, ["ok"] * 3)
+    np.testing.assert_array_equal(log.place, [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]])
+    assert log.way.shape == (3, 4, 3) and [ids.tolist() for ids in log.seen] == [[], [0], [0, 1]]
+    assert statistics(log) == {"tick_ms": {"p50": 2.0, "p99": 2.0, "max": 2.0}, "steps": {"mean": 3.0, "max": 3}}
+    assert columns(log)["place"].unit == "m" and "name" not in columns(log)
+    for wrong in ({**row, "seen": []}, {**row, "seen": [], "place": place, "more": 1}):
+        with pytest.raises(TypeError, match=r"place|more"):
+            recorder.add(**wrong)
+    with pytest.raises(ValueError, match="reshape"):
+        recorder.add(place=np.zeros(3), seen=[], **row)
+    empty = Recorder(Log, name="y").finish(end=0)
+    assert empty.place.shape == (0, 2) and empty.way.shape == (0, 0, 3) and empty.seen == []
+
+
 def test_file_is_strict_sorted_and_stable(tmp_path: Path) -> None:
     log = episode(ticks=6)
     log.clearance = np.full(6, np.inf)  # nothing around: JSON has no infinity
@@ -122,3 +157,7 @@ def test_file_is_strict_sorted_and_stable(tmp_path: Path) -> None:
     assert type(read["seed"]) is int
     reversed_keys = dict(reversed(list(metrics.items())))
     assert write_metrics(tmp_path / "again.json", reversed_keys).read_bytes() == path.read_bytes()
+
+
+def test_table_aligns_and_leaves_out_what_is_empty() -> None:
+    assert table([("a", "1"), ("nothing", ""), ("long name", "2")]) == "a          1\nlong name  2"

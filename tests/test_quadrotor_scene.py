@@ -20,13 +20,11 @@ from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics, landmark_errors
 from unifg.scenarios.show import drone, shapes
-from unifg.scenarios.show.control_plot import control
-from unifg.scenarios.show.estimates_plot import estimates
-from unifg.scenarios.show.flight_plot import moments, overview, plot_moment, write_overview
+from unifg.scenarios.show.flight_plot import control, estimates, moments, overview, plot_moment
 from unifg.scenarios.show.flight_scene import first_sights, flight_scene
 from unifg.scenarios.show.recorder import viewer_script
 from unifg.scenarios.show.stage import frame_ticks
-from unifg.scenarios.show.style import css
+from unifg.scenarios.show.style import css, write_figure
 from unifg.scenarios.worlds.layouts import Layout
 
 umsgpack = pytest.importorskip("umsgpack")
@@ -395,7 +393,7 @@ def test_overview_draws_the_moments_it_names(log: FlightLog, tmp_path: Path) -> 
     assert times == "0.0 0.2 0.5 0.7 0.9 1.2".split()
     legend = {text.get_text() for box in figure.legends for text in box.get_texts()}
     assert {"estimated past", "predicted future", "reach of the sensor", "cylinder seen by then"} <= legend
-    first, second = (write_overview(tmp_path / name, log, dpi=50).read_bytes() for name in ("a.png", "b.png"))
+    first, second = (write_figure(tmp_path / name, overview(log), 50).read_bytes() for name in ("a.png", "b.png"))
     assert first == second
     ax = plot_moment(log, 12)
     filled = [to_hex(patch.get_facecolor()) for patch in ax.patches if patch.get_fill()]

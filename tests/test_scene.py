@@ -12,23 +12,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 
 from episodes import HORIZON, episode, room
 from unifg.errors import ScenarioError
 from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.show.drive_plot import (
-    overview,
-    plot_clearance,
-    plot_controls,
-    plot_localisation,
-    plot_map,
-    plot_solve_times,
-    write_overview,
-)
+from unifg.scenarios.show.drive_plot import overview, plot_controls, plot_localisation, plot_map
 from unifg.scenarios.show.drive_scene import drive_scene, scan_points
+from unifg.scenarios.show.panels import plot_clearance, plot_times
 from unifg.scenarios.show.recorder import Recorder, viewer_script
 from unifg.scenarios.show.shapes import cover, extrude, flat, known_corners, ribbon
 from unifg.scenarios.show.stage import frame_ticks
+from unifg.scenarios.show.style import write_figure
 
 umsgpack = pytest.importorskip("umsgpack")
 
@@ -323,8 +318,8 @@ def test_ribbon_keeps_its_width_also_where_points_coincide() -> None:
 def test_overview_is_a_picture_and_deterministic(log: EpisodeLog, tmp_path: Path) -> None:
     from matplotlib.image import imread
 
-    first = write_overview(tmp_path / "a.png", log, dpi=60).read_bytes()
-    second = write_overview(tmp_path / "b.png", log, dpi=60).read_bytes()
+    first = write_figure(tmp_path / "a.png", overview(log), 60).read_bytes()
+    second = write_figure(tmp_path / "b.png", overview(log), 60).read_bytes()
     assert first == second
     pixels = imread(tmp_path / "a.png")
     assert pixels.shape[:2] == (564, 900) and pixels[..., :3].std() > 0.05
@@ -345,8 +340,11 @@ def test_overview_names_everything(log: EpisodeLog) -> None:
 def test_plots_draw_into_the_axes_they_get_without_global_state(log: EpisodeLog) -> None:
     from matplotlib.figure import Figure
 
+    def spent(log: EpisodeLog, ax: Axes | None = None) -> Axes:
+        return plot_times(log, log.solve_ms, {"localise": (log.localise_ms, "estimate")}, ax)
+
     before = "matplotlib.pyplot" in sys.modules
-    for plot in (plot_map, plot_localisation, plot_clearance, plot_solve_times):
+    for plot in (plot_map, plot_localisation, plot_clearance, spent):
         ax = Figure().subplots()
         assert plot(log, ax=ax) is ax
         assert plot(log) is not ax

@@ -9,8 +9,8 @@ import matplotlib.pyplot as plt
 from draw import COST, HARD, beside, factor, frame, variable
 
 from unifg.scenarios.flight import FlightSettings, run_flight
-from unifg.scenarios.show.flight_plot import write_overview
-from unifg.scenarios.show.style import css
+from unifg.scenarios.show.flight_plot import overview
+from unifg.scenarios.show.style import css, write_figure
 
 HERE = Path(__file__).resolve().parent
 SEED = 1003
@@ -22,7 +22,7 @@ def main() -> None:
     figure = graph()
     figure.savefig(HERE / "quadrotor-graph.png", dpi=130, bbox_inches="tight")
     plt.close(figure)
-    write_overview(HERE / "quadrotor-flight.png", run_flight(FlightSettings(seed=SEED)))
+    write_figure(HERE / "quadrotor-flight.png", overview(run_flight(FlightSettings(seed=SEED))), 130)
 
 
 def graph() -> Any:

@@ -10,9 +10,7 @@ from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics, has_estimate
 from unifg.scenarios.log.metrics import table, write_metrics
-from unifg.scenarios.show.control_plot import control
-from unifg.scenarios.show.estimates_plot import estimates
-from unifg.scenarios.show.flight_plot import overview
+from unifg.scenarios.show.flight_plot import control, estimates, overview
 from unifg.scenarios.show.flight_scene import flight_scene
 from unifg.scenarios.show.style import write_figure
 

@@ -17,7 +17,17 @@ import numpy as np
 from unifg.scenarios.log.columns import columns
 from unifg.typing import Array, IntArray
 
-__all__ = ["errors", "iterations", "spread", "statistics", "table", "timing", "without_timings", "write_metrics"]
+__all__ = [
+    "collision_words",
+    "errors",
+    "iterations",
+    "spread",
+    "statistics",
+    "table",
+    "timing",
+    "without_timings",
+    "write_metrics",
+]
 
 
 def statistics(log: Any) -> dict[str, dict[str, float]]:
@@ -46,6 +56,11 @@ def timing(values: Array) -> dict[str, float]:
 def iterations(values: IntArray) -> dict[str, float]:
     """Mean and maximum of counts."""
     return {"mean": float(np.mean(values)), "max": int(np.max(values))}
+
+
+def collision_words(count: int) -> str:
+    """How many collisions there were, for people."""
+    return "no collision" if count == 0 else f"{count} collision{'s' if count > 1 else ''}"
 
 
 def without_timings(metrics: Mapping[str, object]) -> dict[str, object]:

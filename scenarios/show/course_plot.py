@@ -6,15 +6,14 @@ circles, at the start and, in the last row, along its way.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from unifg.lie import SO3
 from unifg.scenarios.course import Course
-from unifg.scenarios.show.course_log import course_log
-from unifg.scenarios.show.style import GREY, INK, css, new_figure, write_figure
+from unifg.scenarios.show.panels import discs, face, ground, shade_distance, word
+from unifg.scenarios.show.style import GREY, INK, css, headline, key_of, new_figure
 from unifg.scenarios.worlds.air import VEHICLE_RADIUS
 from unifg.typing import Array, BoolArray
 
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["chosen_iterates", "picture", "plot_above", "plot_numbers", "plot_space", "write_iterates"]
+__all__ = ["chosen_iterates", "picture", "plot_above", "plot_numbers", "plot_space"]
 
 _WALL, _CYLINDER, _TARGET, _ROTORS, _WAY = css("wall"), css("trail"), "#7a0d12", css("moving"), css("horizon")
 _HIT = css("fixed")
@@ -33,18 +32,17 @@ _GUESSES = {"hover": "stay at the start", "line": "straight to the target", "way
 _BESIDE = 0.5  # around the last iterate [m]
 _REACH = 1.2  # how far from the hull the shading goes [m]
 _FLOOR = 1e-12  # smaller violations are drawn here
-
-
-def write_iterates(path: str | Path, course: Course, *, dpi: int = 90) -> Path:
-    """Write the picture of a flight as a PNG and return its path."""
-    return write_figure(path, picture(course), dpi)
+_TITLES = {
+    "cost": "What each iterate would cost",
+    "violation": "Largest violation of dynamics, limits and clearance",
+}
 
 
 def picture(course: Course) -> Figure:
     """Four iterates, each from above and in space; below them cost and violation of all."""
     c = course
     chosen = chosen_iterates(len(c.iterates))
-    with new_figure(course_log(c), (11.0, 3.0 * len(chosen) + 4.0)) as figure:
+    with new_figure((11.0, 3.0 * len(chosen) + 4.0)) as figure:
         above, key, below = figure.subfigures(3, 1, height_ratios=(3.0 * len(chosen), 0.6, 2.6), squeeze=False)[:, 0]
         left, right = above.subfigures(1, 2, width_ratios=(1.0, 1.1), squeeze=False)[0]
         tops = left.subplots(len(chosen), 1, sharex=True, squeeze=False)[:, 0]
@@ -53,16 +51,11 @@ def picture(course: Course) -> Figure:
             plot_above(c, number, tops[row])
             plot_space(c, number, spaces[row])
         spaces[0].set_title("The same in space; dashed: below it on the ground", y=1.0)
-        tops[-1].set_xlabel("x [m]")
-        named: dict[str, Any] = {}
-        for ax in tops:
-            handles, labels = ax.get_legend_handles_labels()
-            named |= dict(zip(labels, handles, strict=True))
-        key.legend(named.values(), named.keys(), loc="center", ncols=4)
+        key.legend(*key_of(tops), loc="center", ncols=4)
         cost, violation = below.subplots(1, 2)
         plot_numbers(c, "cost", cost)
         plot_numbers(c, "violation", violation)
-        figure.suptitle(_title(c), x=0.01, ha="left", fontsize=11.0, fontweight="bold")
+        headline(figure, _title(c), 11.0)
     return figure
 
 
@@ -74,19 +67,13 @@ def chosen_iterates(count: int) -> list[int]:
 
 def plot_above(course: Course, number: int, ax: Axes) -> Axes:
     """One iterate from above, with the nodes at which its hull would touch something."""
-    from matplotlib.patches import Circle
-
     c, nodes = course, course.iterates[number]
     final = number == len(c.iterates) - 1
-    (left, low), (right, high) = _extent(c).tolist()
     _shading(c, ax)
     for index, wall in enumerate(c.layout.walls):
         name = "wall" if index == 0 else None
         ax.plot(*wall.T, color=_WALL, lw=5.0, solid_capstyle="round", zorder=3, label=name)
-    for index, (x, y, radius) in enumerate(c.layout.cylinders.tolist()):
-        disc = Circle((x, y), radius, fc=_CYLINDER, ec=INK, lw=0.8, zorder=3)
-        disc.set_label("cylinder" if index == 0 else "")
-        ax.add_patch(disc)
+    discs(ax, c.layout.cylinders, "cylinder", fc=_CYLINDER, ec=INK, lw=0.8, zorder=3)
     ax.plot(*c.layout.target[:2], "o", color=_TARGET, ms=11, mec="white", mew=0.8, zorder=6, label="target")
     ax.plot(*nodes[:, :2].T, color=_WAY, lw=2.0, marker=".", ms=4, zorder=5, label="planned way and its nodes")
     hits = _hits(c, nodes)
@@ -98,16 +85,11 @@ def plot_above(course: Course, number: int, ax: Axes) -> Axes:
         if index == 0:
             ax.plot([], [], "o", color=_ROTORS, ms=6, label="quadrotor: four rotors, to scale")
     if number == 0:
-        for place, word in ((c.layout.start, "start"), (c.layout.target, "target")):
-            x, y = place[:2].tolist()
-            ax.annotate(
-                word, (x, y), xytext=(0, -9), textcoords="offset points", ha="center", va="top", fontweight="bold"
-            )
-    ax.set_xlim(left, right)
-    ax.set_ylim(low, high)
-    ax.set_aspect("equal")
-    ax.set_ylabel("y [m]")
+        for place, name in ((c.layout.start, "start"), (c.layout.target, "target")):
+            word(ax, place, name, (0, -9), va="top", bbox=None)
+    ground(ax, *_extent(c))
     ax.set_title(_caption(c, number))
+    ax.label_outer()
     return ax
 
 
@@ -164,16 +146,8 @@ def plot_numbers(course: Course, what: str, ax: Axes) -> Axes:
     if (values > 0.0).all() and values.max() > 10.0 * values.min():
         _logarithmic(ax, wide=values.max() > 1e4 * values.min())
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_xlabel("iterate")
-    titles = {
-        "cost": "What each iterate would cost",
-        "violation": "Largest violation of dynamics, limits and clearance",
-    }
-    ax.set_title(titles[what])
-    ax.set_axisbelow(True)
-    ax.grid(True)
     ax.legend(loc="best")
-    return ax
+    return face(ax, _TITLES[what], x="iterate")
 
 
 def _logarithmic(ax: Axes, *, wide: bool) -> None:
@@ -230,14 +204,8 @@ def _within(course: Course, points: Array) -> BoolArray:
 
 def _shading(course: Course, ax: Axes) -> None:
     """The ground, the darker the nearer the hull would be to something, and where it would touch."""
-    from matplotlib.colors import LinearSegmentedColormap
-
-    (left, low), (right, high) = _extent(course).tolist()
-    x, y = np.linspace(left, right, 250), np.linspace(low, high, 200)
-    points = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
-    gap = (course.layout.distance(points) - VEHICLE_RADIUS).reshape(len(y), len(x))
-    shading = LinearSegmentedColormap.from_list("near", ["#cfd6df", "#ffffff"])
-    ax.contourf(x, y, np.clip(gap, 0.0, _REACH), levels=np.linspace(0.0, _REACH, 8), cmap=shading, zorder=0)
+    low, high = _extent(course)
+    x, y, gap = shade_distance(ax, low, high, lambda p: course.layout.distance(p) - VEHICLE_RADIUS, _REACH, "#cfd6df")
     ax.contour(x, y, gap, levels=[0.0], colors=[GREY], linewidths=0.9, linestyles=[(0, (2, 2))], zorder=1)
     ax.plot([], [], color=GREY, lw=0.9, ls=(0, (2, 2)), label="centre inside this line: the hull touches")
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors
+from unifg.scenarios.log.metrics import collision_words
 from unifg.scenarios.show import shapes
 from unifg.scenarios.show.stage import Key, Label, Page, Readout, Stage, View
 from unifg.typing import Array, IntArray
@@ -72,7 +73,7 @@ def _robots(stage: Stage, log: EpisodeLog, pin: float) -> None:
     stage.cylinder("odometry/body", _BODY, radius, "odometry", opacity=0.55)
     stage.mesh("odometry/heading", shapes.wedge(1.2 * radius, _BODY + 0.02), "odometry", opacity=0.8)
     for path, poses in (("robot", log.true_pose), ("estimate", log.estimate), ("odometry", log.dead_reckoning)):
-        stage.move(path, _on_floor(poses), poses[:, 2])
+        stage.move(path, shapes.on_ground(poses), poses[:, 2])
 
 
 def _obstacles(stage: Stage, log: EpisodeLog) -> None:
@@ -81,7 +82,7 @@ def _obstacles(stage: Stage, log: EpisodeLog) -> None:
         x, y, radius = places[0].tolist()
         if moves:
             stage.cylinder(f"{path}/body", _WALL, radius, "moving")
-            stage.move(path, _on_floor(places))
+            stage.move(path, shapes.on_ground(places))
         else:
             stage.cylinder(f"{path}/body", _WALL, radius, "fixed", (x, y))
 
@@ -125,15 +126,9 @@ def scan_points(log: EpisodeLog, tick: int, beams: IntArray) -> Array:
     return hits
 
 
-def _on_floor(rows: Array) -> Array:
-    """Places (T, 3) [m] of rows that begin with x and y."""
-    return np.column_stack([rows[:, :2], np.zeros(len(rows))])
-
-
 def _page(log: EpisodeLog, ticks: IntArray) -> Page:
     m = episode_metrics(log)
-    hits, moving = m["collisions"], log.moving()
-    collisions = "no collision" if hits == 0 else f"{hits} collision{'s' if hits > 1 else ''}"
+    moving = log.moving()
     stopped = ", interrupted by the user" if m["interrupted"] else ""
     legend = [
         Key("robot", "disc", "robot, where it truly is (pin above it)"),
@@ -160,7 +155,7 @@ def _page(log: EpisodeLog, ticks: IntArray) -> Page:
     corners = shapes.known_corners(log.occupancy)
     return Page(
         title=f"unifg: {log.scenario} on {log.occupancy.name}",
-        outcome=f"{m['goals_reached']} of {m['goals']} goals reached, {collisions}{stopped}",
+        outcome=f"{m['goals_reached']} of {m['goals']} goals reached, {collision_words(m['collisions'])}{stopped}",
         good=m["succeeded"],
         facts={
             "solver": f"{m['solver']} ({m['coupling']})",

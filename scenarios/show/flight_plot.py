@@ -1,58 +1,63 @@
-"""A flight from above at several moments, as in Fig. 5 of Ta, Kobilarov and Dellaert (ICUAS 2014).
+"""A flight as pictures: from above at several moments, what it believed against the truth, and how it was flown.
 
-The estimated past is blue, the predicted future green, the reach of the sensor magenta; cylinders seen by then are
-filled, others hollow. Each function draws into the axes it is given, or into new ones.
+The view from above is as in Fig. 5 of Ta, Kobilarov and Dellaert (ICUAS 2014): the estimated past is blue, the
+predicted future green, the reach of the sensor magenta; cylinders seen by then are filled, others hollow. Limits of
+controls are drawn where the settings of the flight name them, at their top or under ``controller``: ``rate_limits``,
+three greatest rates [rad/s], and ``thrust_limits``, least and greatest thrust [N].
 """
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from unifg.errors import ScenarioError
 from unifg.scenarios.log.flight_log import FlightLog
-from unifg.scenarios.log.flight_metrics import has_estimate
+from unifg.scenarios.log.flight_metrics import PARAMETERS, estimated_parameters, has_estimate, state_errors
+from unifg.scenarios.log.metrics import collision_words
 from unifg.scenarios.show.flight_scene import SIGMAS, first_sights, sensor_reach
+from unifg.scenarios.show.panels import dashes, discs, ground, over_time, plot_clearance, plot_times
 from unifg.scenarios.show.shapes import ellipse_axes
-from unifg.scenarios.show.style import GREY, INK, css, heading, new_figure, over_time, write_figure
+from unifg.scenarios.show.style import GREY, INK, css, headline, key_of, new_axes, new_figure
 from unifg.scenarios.worlds.air import VEHICLE_RADIUS
-from unifg.typing import IntArray
+from unifg.typing import Array, IntArray
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["moments", "overview", "plot_moment", "write_overview"]
+__all__ = [
+    "control",
+    "estimates",
+    "moments",
+    "overview",
+    "plot_control",
+    "plot_height",
+    "plot_moment",
+    "plot_parameter",
+    "plot_speed",
+    "plot_state_error",
+]
 
 _MARGIN = 0.6  # around the layout [m]
 _WIDE = 2.0  # layouts at least this many times as long as wide are drawn in two columns, others in three
-
-
-def write_overview(path: str | Path, log: FlightLog, *, dpi: int = 130) -> Path:
-    """Write the flight from above as a PNG.
-
-    Args:
-        path: file to write; an existing one is replaced.
-        log: a flight of at least one tick.
-        dpi: dots per inch of a figure 15 inches wide.
-
-    Returns:
-        The path written.
-
-    Raises:
-        ScenarioError: the flight has no tick.
-    """
-    return write_figure(path, overview(log), dpi)
+_COLUMNS = 3  # of panels with estimates
+_NAMES = ("Mass", "Drag along x", "Drag along y", "Drag along z", "Wind along x", "Wind along y", "Updraft")
+_UNITS = ("kg", "kg/s", "kg/s", "kg/s", "m/s\u00b2", "m/s\u00b2", "m/s\u00b2")
+_STATES = (
+    *(f"Position error, {axis} [cm]" for axis in "xyz"),
+    *(f"Attitude error, body {axis} [mrad]" for axis in "xyz"),
+    *(f"Velocity error, {axis} [cm/s]" for axis in "xyz"),
+)
+_SCALES = (100.0, 1000.0, 100.0)
+_SHOWN = (0, 1, 2, 6, 7, 8, 3, 4, 5)  # position, velocity, attitude
+_CONTROLS = ("Roll rate", "Pitch rate", "Yaw rate", "Thrust")
 
 
 def overview(log: FlightLog) -> Figure:
-    """Six moments, evenly spread from the first tick to the last.
-
-    Args:
-        log: a flight of at least one tick.
+    """Six moments from above, evenly spread from the first tick to the last.
 
     Raises:
         ScenarioError: the flight has no tick.
@@ -62,25 +67,73 @@ def overview(log: FlightLog) -> Figure:
     shown = moments(log)
     rows = math.ceil(len(shown) / columns)
     panel = 14.4 / columns
-    with new_figure(log, (15.0, rows * (panel * height / width + 0.42) + 1.1)) as figure:
+    with new_figure((15.0, rows * (panel * height / width + 0.42) + 1.1), log.ticks) as figure:
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-        panels = list(grid.flat)
-        for ax, tick in zip(panels, shown.tolist(), strict=False):
-            plot_moment(log, tick, ax=ax, legend=False)
-        for ax in panels[len(shown) :]:
+        for ax in grid.flat[len(shown) :]:
             ax.set_axis_off()
-        for ax in grid[-1]:
-            ax.set_xlabel("x [m]")
-        for ax in grid[:, 0]:
-            ax.set_ylabel("y [m]")
-        named: dict[str, Artist] = {}
-        for ax in panels:
-            handles, labels = ax.get_legend_handles_labels()
-            named |= dict(zip(labels, handles, strict=True))
-        figure.legend(list(named.values()), list(named), loc="outside lower center", ncols=6)
-        hits = "no collision" if log.collisions == 0 else f"{log.collisions} collision" + "s" * (log.collisions > 1)
+        for ax, tick in zip(grid.flat, shown.tolist(), strict=False):
+            plot_moment(log, tick, ax=ax, legend=False).label_outer()
+        figure.legend(*key_of(grid.flat), loc="outside lower center", ncols=6)
         reached = "target reached" if log.reached else "target not reached"
-        heading(log, figure, f"{reached}, {hits}")
+        headline(figure, _title(log, f"{reached}, {collision_words(log.collisions)}"))
+    return figure
+
+
+def estimates(log: FlightLog) -> Figure:
+    """Every parameter that is estimated, then the errors of position, velocity and attitude.
+
+    Raises:
+        ScenarioError: the flight has no tick or no estimate.
+    """
+    if log.ticks and not has_estimate(log):
+        raise ScenarioError("nobody estimated in this flight: it has neither sigmas nor windows")
+    parameters = np.flatnonzero(estimated_parameters(log)).tolist()
+    rows = math.ceil(len(parameters) / _COLUMNS) + len(_STATES) // _COLUMNS
+    with new_figure((15.0, 2.05 * rows + 0.9), log.ticks) as figure:
+        panels = list(figure.subplots(rows, _COLUMNS, sharex=True, squeeze=False).flat)
+        for ax, index in zip(panels, parameters, strict=False):
+            plot_parameter(log, PARAMETERS[index], ax=ax)
+        begin = len(panels) - len(_STATES)
+        for ax in panels[len(parameters) : begin]:
+            ax.set_axis_off()
+        for ax, component in zip(panels[begin:], _SHOWN, strict=True):
+            plot_state_error(log, component, ax=ax)
+        for ax in panels[-_COLUMNS:]:
+            ax.set_xlabel("time [s]")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        headline(figure, _title(log, "What it believed"))
+    return figure
+
+
+def control(log: FlightLog) -> Figure:
+    """Body rates and thrust on the left; speed and height, clearance and timing on the right.
+
+    Raises:
+        ScenarioError: the flight has no tick.
+    """
+    total = log.estimate_ms + log.plan_ms
+    clock = float(total.max(initial=0.0)) > 0.0
+    with new_figure((15.0, 9.2), log.ticks) as figure:
+        left, right = figure.subfigures(1, 2, squeeze=False)[0]
+        panels = left.subplots(4, 1, sharex=True)
+        for index, ax in enumerate(panels):
+            plot_control(log, index, ax=ax)
+        others = right.subplots(4 if clock else 3, 1, sharex=True)
+        plot_speed(log, ax=others[0])
+        plot_height(log, ax=others[1])
+        plot_clearance(log, ax=others[2])
+        if clock:
+            parts = {"plan": (log.plan_ms, "horizon"), "estimate": (log.estimate_ms, "estimate")}
+            ax = plot_times(log, total, parts, ax=others[3])
+            ax.axhline(1e3 * log.dt, color=css("moving"), lw=1.1, label="control period")
+            ax.set_yscale("log")
+            ax.legend(loc="upper right", ncols=4, markerscale=3, borderpad=0.0)
+        for part, axes in ((left, panels), (right, others)):
+            axes[-1].set_xlabel("time [s]")
+            part.align_ylabels(axes)
+        stored = int(log.emergency.sum())
+        what = "How it was flown" + (f" (grey: {stored} ticks of a stored plan)" if stored else "")
+        headline(figure, _title(log, what))
     return figure
 
 
@@ -98,39 +151,29 @@ def plot_moment(log: FlightLog, tick: int, ax: Axes | None = None, *, legend: bo
         ax: axes to draw into; None for new ones.
         legend: False leaves out the legend below the axes.
     """
-    from matplotlib.patches import Circle
-
-    ax = over_time(ax)
+    ax = new_axes(ax)
     _things(log, tick, ax)
     estimated = has_estimate(log)
-    way = log.believed[: tick + 1, :2].T
     if estimated:
         ax.plot(*log.truth[: tick + 1, :2].T, color=css("odometry"), lw=0.9, label="true way", zorder=4)
     name = "estimated past" if estimated else "way flown"
-    ax.plot(*way, color=css("trail"), lw=1.6, label=name, zorder=5)
-    past = log.pasts[tick]
+    ax.plot(*log.believed[: tick + 1, :2].T, color=css("trail"), lw=1.6, label=name, zorder=5)
+    past, plan = log.pasts[tick], log.plans[tick]
     if len(past) > 1:
         ax.plot(*past[:, :2].T, color=css("robot"), lw=2.6, label="its window that is smoothed", zorder=6)
-    plan = log.plans[tick]
     if len(plan) > 1 and np.isfinite(plan).all():
         ax.plot(*plan[:, :2].T, color=css("horizon"), lw=2.6, label="predicted future", zorder=7)
     _landmarks(log, tick, ax)
     x, y = log.truth[tick, :2].tolist()
     reach = sensor_reach(log)
     if reach is not None:
-        circle = Circle((x, y), reach, fill=False, edgecolor=css("scan"), lw=1.3, zorder=3, label="reach of the sensor")
-        ax.add_patch(circle)
-    ax.add_patch(Circle((x, y), VEHICLE_RADIUS, facecolor=css("robot"), edgecolor="white", lw=0.6, zorder=9))
+        discs(ax, [x, y, reach], "reach of the sensor", fill=False, edgecolor=css("scan"), lw=1.3, zorder=3)
+    discs(ax, [x, y, VEHICLE_RADIUS], facecolor=css("robot"), edgecolor="white", lw=0.6, zorder=9)
     ax.plot(*log.layout.start[:2], "o", color=css("start"), ms=4, zorder=8, label="start")
-    ax.plot(
-        *log.layout.target[:2], "*", color=css("goal"), ms=13, mec=INK, mew=0.7, zorder=10, label="target",
-        ls="none",
-    )  # fmt: skip
+    star: dict[str, Any] = {"color": css("goal"), "ms": 13, "mec": INK, "mew": 0.7, "ls": "none", "zorder": 10}
+    ax.plot(*log.layout.target[:2], "*", label="target", **star)
 
-    low, high = log.layout.size
-    ax.set_xlim(low[0] - _MARGIN, high[0] + _MARGIN)
-    ax.set_ylim(low[1] - _MARGIN, high[1] + _MARGIN)
-    ax.set_aspect("equal")
+    ground(ax, log.layout.size[0] - _MARGIN, log.layout.size[1] + _MARGIN)
     speed = float(np.linalg.norm(log.truth[tick, 7:]))
     stored = ", stored plan flown" if log.emergency[tick] else ""
     ax.set_title(f"{log.time[tick]:.1f} s, {speed:.1f} m/s, height {log.truth[tick, 2]:.1f} m{stored}")
@@ -141,56 +184,135 @@ def plot_moment(log: FlightLog, tick: int, ax: Axes | None = None, *, legend: bo
 
 def _things(log: FlightLog, tick: int, ax: Axes) -> None:
     """Walls, cylinders and movers."""
-    from matplotlib.patches import Circle
-
     for index, wall in enumerate(log.layout.walls):
         ax.plot(*wall.T, color=css("wall"), lw=3.0, solid_capstyle="butt", zorder=2, label=None if index else "wall")
-    sensed = sensor_reach(log) is not None
-    named: set[str] = set()
-    for (x, y, radius), first in zip(log.layout.cylinders.tolist(), first_sights(log), strict=True):
-        seen = first is not None and first <= tick
-        label = ("cylinder seen by then" if seen else "not seen yet") if sensed else "cylinder"
-        ax.add_patch(
-            Circle(
-                (x, y),
-                radius,
-                zorder=2,
-                lw=1.0,
-                label=None if label in named else label,
-                facecolor=css("fixed") if seen else "none",
-                edgecolor=css("fixed") if seen else GREY,
-                linestyle="-" if seen else (0, (3, 2)),
-            )
-        )
-        named.add(label)
-    for index, (x, y, radius) in enumerate(log.movers[tick].tolist()):
-        name = None if index else "moving cylinder, and its way so far"
-        ax.plot(*log.movers[: tick + 1, index, :2].T, color=css("moving"), lw=0.9, alpha=0.6, zorder=2)
-        ax.add_patch(Circle((x, y), radius, facecolor=css("moving"), edgecolor="none", zorder=2, label=name))
+    seen = np.array([first is not None and first <= tick for first in first_sights(log)], dtype=bool)
+    name = "cylinder" if sensor_reach(log) is None else "cylinder seen by then"
+    cylinders = log.layout.cylinders
+    discs(ax, cylinders[seen], name, zorder=2, lw=1.0, facecolor=css("fixed"), edgecolor=css("fixed"))
+    discs(ax, cylinders[~seen], "not seen yet", zorder=2, lw=1.0, fc="none", ec=GREY, ls=(0, (3, 2)))
+    for places in log.movers[: tick + 1].transpose(1, 0, 2):
+        ax.plot(*places[:, :2].T, color=css("moving"), lw=0.9, alpha=0.6, zorder=2)
+    style = {"facecolor": css("moving"), "edgecolor": "none", "zorder": 2}
+    discs(ax, log.movers[tick], "moving cylinder, and its way so far", **style)
 
 
 def _landmarks(log: FlightLog, tick: int, ax: Axes) -> None:
+    from matplotlib.colors import to_rgb
     from matplotlib.patches import Ellipse
 
     row = log.landmarks[tick]
-    for index, (mean, covariance) in enumerate(zip(row.means, row.covariances, strict=True)):
+    style = {"facecolor": (*to_rgb(css("estimate")), 0.45), "edgecolor": css("estimate"), "lw": 0.8, "zorder": 6}
+    for index, (mean, covariance) in enumerate(zip(row.means.tolist(), row.covariances, strict=True)):
         long, short, direction = ellipse_axes(covariance, SIGMAS)
-        ax.add_patch(
-            Ellipse(
-                (float(mean[0]), float(mean[1])),
-                2.0 * long,
-                2.0 * short,
-                angle=math.degrees(direction),
-                zorder=6,
-                facecolor=(*_rgb("estimate"), 0.45),
-                edgecolor=css("estimate"),
-                lw=0.8,
-                label=None if index else "landmark as believed, 2\u03c3",
-            )
-        )
+        ellipse = Ellipse(mean, 2.0 * long, 2.0 * short, angle=math.degrees(direction), **style)
+        ellipse.set_label(None if index else "landmark as believed, 2\u03c3")
+        ax.add_patch(ellipse)
 
 
-def _rgb(name: str) -> tuple[float, float, float]:
-    from matplotlib.colors import to_rgb
+def plot_parameter(log: FlightLog, name: str, ax: Axes | None = None) -> Axes:
+    """One parameter over time, its band of two standard deviations, and the truth.
 
-    return to_rgb(css(name))
+    Args:
+        log: the flight.
+        name: one of `unifg.scenarios.log.flight_metrics.PARAMETERS`.
+        ax: axes to draw into; None for new ones.
+    """
+    ax, index = new_axes(ax), PARAMETERS.index(name)
+    values, sigmas = log.parameters[:, index], log.parameters_sigma[:, index]
+    true = float(log.parameters_true[index])
+    inside = _band(log, ax, values, sigmas, true, "estimate")
+    ax.lines[-1].set_label("truth (errors: zero)")
+    ends = f"ends {100.0 * (values[-1] / true - 1.0):+.1f} %" if index == 0 else f"ends {values[-1] - true:+.3f}"
+    # A first guess that knows nothing would flatten the rest.
+    settled = slice(min(10, log.ticks - 1), None)
+    low = min(true, float((values - 2.5 * sigmas)[settled].min()), float(values.min()))
+    high = max(true, float((values + 2.5 * sigmas)[settled].max()), float(values.max()))
+    margin = 0.08 * max(high - low, 1e-9)
+    ax.set_ylim(low - margin, high + margin)
+    return over_time(log, ax, f"{_NAMES[index]}, {ends}; {inside:.0f} % within 2\u03c3", f"[{_UNITS[index]}]")
+
+
+def plot_state_error(log: FlightLog, component: int, ax: Axes | None = None) -> Axes:
+    """One component of the right perturbation from belief to truth, and two standard deviations around it.
+
+    Args:
+        log: the flight.
+        component: 0-2 position, 3-5 attitude, 6-8 velocity.
+        ax: axes to draw into; None for new ones.
+    """
+    ax, scale = new_axes(ax), _SCALES[component // 3]
+    error = scale * state_errors(log)[:, component]
+    inside = _band(log, ax, error, scale * log.believed_sigma[:, component], 0.0, "robot", around=0.0)
+    name, unit = _STATES[component].split(" [")
+    rms = math.sqrt(float(np.mean(error**2)))
+    return over_time(log, ax, f"{name}, {rms:.1f} {unit[:-1]} rms; {inside:.0f} % within 2\u03c3", f"[{unit}")
+
+
+def _band(
+    log: FlightLog, ax: Axes, values: Array, sigmas: Array, true: float, colour: str, around: float | None = None
+) -> float:
+    """Values, the truth, and a band of two sigmas around the values or a level; percent of values within."""
+    middle = values if around is None else np.full_like(values, around)
+    band: dict[str, Any] = {"color": css(colour), "alpha": 0.17, "lw": 0, "label": "\u00b1 2\u03c3"}
+    ax.fill_between(log.time, middle - 2.0 * sigmas, middle + 2.0 * sigmas, **band)
+    ax.plot(log.time, values, color=css(colour), lw=1.4, label="estimate" if around is None else "error")
+    ax.axhline(true, color=INK, lw=1.0, ls="--")
+    return 100.0 * float(np.mean(np.abs(values - true) <= 2.0 * sigmas))
+
+
+def plot_control(log: FlightLog, index: int, ax: Axes | None = None) -> Axes:
+    """One control over time against its limits.
+
+    Args:
+        log: the flight.
+        index: 0-2 body rates, 3 thrust.
+        ax: axes to draw into; None for new ones.
+    """
+    ax = new_axes(ax)
+    values, limits = log.controls[:, index], _limits(log, index)
+    ax.step(log.time, values, where="post", color=css("robot"), lw=1.2)
+    dashes(ax, limits, 1.1)
+    low, high = min([float(values.min()), *limits]), max([float(values.max()), *limits])
+    margin = 0.08 * max(high - low, 0.1)
+    ax.set_ylim(low - margin, high + margin)
+    title = _CONTROLS[index] + (" and its limits" if limits else "")
+    return over_time(log, ax, title, "[N]" if index == 3 else "[rad/s]")
+
+
+def plot_speed(log: FlightLog, ax: Axes | None = None) -> Axes:
+    """True speed over time [m/s]."""
+    ax = new_axes(ax)
+    speed = np.linalg.norm(log.truth[:, 7:], axis=1)
+    ax.plot(log.time, speed, color=css("robot"), lw=1.4)
+    ax.set_ylim(0.0, 1.12 * max(float(speed.max()), 0.1))
+    return over_time(log, ax, f"Speed, at most {speed.max():.2f} m/s", "[m/s]")
+
+
+def plot_height(log: FlightLog, ax: Axes | None = None) -> Axes:
+    """True height over time, with that of the target [m]."""
+    ax = new_axes(ax)
+    ax.plot(log.time, log.truth[:, 2], color=css("robot"), lw=1.4)
+    ax.axhline(float(log.layout.target[2]), color=css("goal"), lw=1.4, ls="--")
+    ax.set_ylim(0.0, 1.15 * max(float(log.truth[:, 2].max()), float(log.layout.target[2]), 0.1))
+    return over_time(log, ax, "Height, and that of the target", "[m]")
+
+
+def _limits(log: FlightLog, index: int) -> list[float]:
+    settings = {**log.settings, **log.settings.get("controller", {})}
+    if index == 3:
+        return [float(limit) for limit in settings.get("thrust_limits", ())]
+    rates = settings.get("rate_limits", ())
+    return [-float(rates[index]), float(rates[index])] if len(rates) == 3 else []
+
+
+def _title(log: FlightLog, what: str) -> str:
+    """What a figure shows and of which flight."""
+    settings = log.settings
+    words = [what, str(settings.get("scenario", "")), log.layout.name]
+    if settings.get("solver"):
+        coupling = f" ({settings['coupling']})" if settings.get("coupling") else ""
+        words.append(f"solver {settings['solver']}{coupling}")
+    if settings.get("seed") is not None:
+        words.append(f"seed {settings['seed']}")
+    return "  |  ".join(word for word in words if word)

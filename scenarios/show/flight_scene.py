@@ -12,6 +12,7 @@ import numpy as np
 
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import estimated_parameters, flight_metrics, has_estimate
+from unifg.scenarios.log.metrics import collision_words
 from unifg.scenarios.show import drone, shapes
 from unifg.scenarios.show.stage import Key, Label, Page, Readout, Stage, View
 from unifg.scenarios.worlds.air import VEHICLE_RADIUS
@@ -168,7 +169,7 @@ def _movers(stage: Stage, log: FlightLog) -> None:
     for index in range(log.movers.shape[1]):
         places = log.movers[:, index]
         _pillar(stage, f"movers/{index}", float(places[0, 2]), "moving")
-        stage.move(f"movers/{index}", _below(places))
+        stage.move(f"movers/{index}", shapes.on_ground(places))
 
 
 def _drone(stage: Stage, log: FlightLog) -> None:
@@ -187,16 +188,11 @@ def _drone(stage: Stage, log: FlightLog) -> None:
     stage.mesh("shadow/plumb", plumb, "start", opacity=0.5)
     for tick in stage.ticks.tolist():
         stage.key("shadow/plumb", tick, scale=(1.0, 1.0, max(float(truth[tick, 2]), 1e-3)))
-    stage.move("shadow", _below(truth))
+    stage.move("shadow", shapes.on_ground(truth))
     reach = sensor_reach(log)
     if reach is not None:
         stage.mesh("sensor", shapes.ring(middle, reach - 0.07, 0.07, 0.014, corners=96), "scan")
-        stage.move("sensor", _below(truth))
-
-
-def _below(rows: Array) -> Array:
-    """Places (T, 3) [m] on the ground of rows that begin with x and y."""
-    return np.column_stack([rows[:, :2], np.zeros(len(rows))])
+        stage.move("sensor", shapes.on_ground(truth))
 
 
 def _trail(stage: Stage, log: FlightLog) -> None:
@@ -232,10 +228,9 @@ def _frames(stage: Stage, log: FlightLog) -> None:
 
 def _page(log: FlightLog, ticks: IntArray) -> Page:
     m = flight_metrics(log)
-    settings, error, tick, hits = m["settings"], m["position_error_m"], m["tick_ms"], m["collisions"]
+    settings, error, tick = m["settings"], m["position_error_m"], m["tick_ms"]
     name = str(settings.get("scenario", "quadrotor"))
     reached = "target reached" if m["reached"] else f"{m['target_distance_m']:.1f} m short of the target"
-    collisions = "no collision" if hits == 0 else f"{hits} collision{'s' if hits > 1 else ''}"
     stopped = ", interrupted by the user" if m["interrupted"] else ""
     solver = str(settings.get("solver", ""))
     if solver and settings.get("coupling"):
@@ -244,7 +239,7 @@ def _page(log: FlightLog, ticks: IntArray) -> Page:
     corners = [[x, y, z] for z in (0.0, _HEIGHT) for x in (left, right) for y in (low, high)]
     return Page(
         title=f"unifg: {name}" + (f", {log.layout.name}" if log.layout.name else ""),
-        outcome=f"{reached}, {collisions}{stopped}",
+        outcome=f"{reached}, {collision_words(log.collisions)}{stopped}",
         good=m["succeeded"],
         facts={
             "solver": solver,

@@ -1,70 +1,29 @@
-"""A solved pose graph as one picture: before, after, and how the cost fell.
-
-Figures are made without matplotlib's global state (no ``pyplot``), as in `unifg.scenarios.show.drive_plot`.
-"""
+"""A solved pose graph as one picture: before, after, and how the cost fell."""
 
 from __future__ import annotations
 
 from importlib import import_module
 from itertools import pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.scenarios.pose_graph import SolvedGraph
-from unifg.scenarios.show.style import css
+from unifg.scenarios.show.panels import face
+from unifg.scenarios.show.style import INK, css, headline, key_of, new_figure
 from unifg.typing import Array, BoolArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["picture", "plot_cost", "plot_graph", "segments", "write_picture"]
-
-
-_STYLE: dict[Any, Any] = {
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],  # ships with matplotlib: the same picture everywhere
-    "font.size": 9.0,
-    "axes.titlesize": 10.0,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": "#8a919c",
-    "grid.color": "#e3e6ea",
-    "legend.frameon": False,
-}
-
-
-def write_picture(path: str | Path, solved: SolvedGraph, *, dpi: int = 130) -> Path:
-    """Write the picture of a solved pose graph as a PNG.
-
-    Args:
-        path: file to write; an existing one is replaced.
-        solved: a solved pose graph.
-        dpi: dots per inch of a figure of 13 x 8.4 inches.
-
-    Returns:
-        The path written.
-    """
-    path = Path(path)
-    # No software version and no date in the file: the same numbers give the same picture.
-    picture(solved).savefig(path, dpi=dpi, format="png", metadata={"Software": None})
-    return path
+__all__ = ["picture", "plot_cost", "plot_graph", "segments"]
 
 
 def picture(solved: SolvedGraph) -> Figure:
     """Start on the left, solution on the right, cost over iterations below."""
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(13.0, 8.4), layout="constrained")
-        FigureCanvasAgg(figure)
+    with new_figure((13.0, 8.4)) as figure:
         spatial = solved.after.group.point_dim == 3
         projection = {"projection": "3d"} if spatial else {}
         grid = figure.add_gridspec(2, 2, height_ratios=(4.2, 1.0))
@@ -79,16 +38,10 @@ def picture(solved: SolvedGraph) -> Figure:
         plot_graph(solved.after, solved.outliers, css("robot"), "trajectory, solved", right)
         right.set_title(f"After: $\\chi^2$ = {_ending(solved)}")
         plot_cost(solved, below)
-        handles: dict[str, Any] = {}
-        for axes in (left, right):
-            handles.update(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5)
+        figure.legend(*key_of((left, right)), loc="outside lower center", ncols=5)
         graph = solved.after
-        figure.suptitle(
-            f"{solved.name}: {len(graph.poses)} poses, {len(graph.edges) - len(graph.closures)} odometry edges, "
-            f"{len(graph.closures)} loop closures",
-            x=0.01, ha="left", fontsize=12.5, fontweight="bold",
-        )  # fmt: skip
+        edges = f"{len(graph.edges) - len(graph.closures)} odometry edges, {len(graph.closures)} loop closures"
+        headline(figure, f"{solved.name}: {len(graph.poses)} poses, {edges}")
     return figure
 
 
@@ -108,7 +61,7 @@ def plot_graph(graph: PoseGraph, outliers: BoolArray, colour: str, label: str, a
     _lines(ax, segments(graph, outliers), css("outlier"), 0.8, 0.8, "loop closure taken for an outlier", 3)
     _lines(ax, segments(graph, odometry), colour, 1.5, 1.0, label, 4)
     places = graph.poses[:, : graph.group.point_dim]
-    ax.plot(*places[:1].T, "o", color="#1d2430", ms=6, label="first pose", zorder=6)
+    ax.plot(*places[:1].T, "o", color=INK, ms=6, label="first pose", zorder=6)
     if len(graph.landmarks):
         marker: dict[str, Any] = {"color": css("landmark"), "ms": 4, "ls": "none", "zorder": 5}
         ax.plot(*graph.landmarks.T, "*", label="landmark", **marker)
@@ -137,17 +90,14 @@ def plot_cost(solved: SolvedGraph, ax: Axes) -> Axes:
     ax.plot(numbers, np.maximum(costs, 1e-300), "o-", color=css("robot"), ms=3.5, lw=1.2)
     if costs.min() > 0.0 and costs.max() > 3.0 * costs.min():
         ax.set_yscale("log")
-    ax.set_xlabel("iteration")
-    ax.set_ylabel("cost")
     stages = [row.number for before, row in pairwise(rows) if _stage(before) != _stage(row)]
     for number in stages:
         ax.axvline(number - 0.5, color="#d5d9df", lw=0.8, zorder=0)
     what = "Cost with the robust loss" if solved.loss is not None else "Cost, half of $\\chi^2$"
     more = "; a line begins the next surrogate of the loss" if stages else ""
     solve = 1e3 * solved.seconds["solve"]
-    ax.set_title(f"{what}, per iteration: {solved.solution.iterations} in {solve:.0f} ms{more}")
-    ax.grid(True)
-    return ax
+    title = f"{what}, per iteration: {solved.solution.iterations} in {solve:.0f} ms{more}"
+    return face(ax, title, "cost", "iteration")
 
 
 def segments(graph: PoseGraph, chosen: BoolArray) -> Array:

@@ -2,8 +2,7 @@
 
 One panel per term, factors upwards, iterations to the right, the residual norm as a colour. FactorMPC (Yang et al.
 2025) monitors its factors in this way. :class:`ResidualMonitor` draws while the solver goes on,
-:func:`residual_picture` afterwards. Figures are made without matplotlib's global state (no ``pyplot``), as in
-`unifg.scenarios.show.drive_plot`.
+:func:`residual_picture` afterwards.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import numpy as np
 
 from unifg.answers.history import Iteration
 from unifg.errors import UnifgError
+from unifg.scenarios.show.style import new_figure, write_figure
 from unifg.typing import Array
 
 if TYPE_CHECKING:
@@ -55,8 +55,7 @@ class ResidualMonitor:
         """Take in a row of the history; never ends the solve."""
         self.rows.append(row.residuals)
         if self._path is not None:
-            # No software version and no date in the file: the same numbers give the same picture.
-            self.figure().savefig(self._path, dpi=self._dpi, format="png", metadata={"Software": None})
+            write_figure(self._path, self.figure(), self._dpi)
         return False
 
     def figure(self) -> Figure:
@@ -105,9 +104,9 @@ def plot_residuals(rows: Sequence[Mapping[str, Array]], term: str, ax: Axes) -> 
     )
     ax.figure.colorbar(image, ax=ax, pad=0.02)
     count = len(table)
-    ax.set_title(f"{term}: {count} factor{'' if count == 1 else 's'}", loc="left", fontsize=9.0)
-    ax.set_xlabel("iteration", fontsize=8.0)
-    ax.set_ylabel("factor", fontsize=8.0)
+    ax.set_title(f"{term}: {count} factor{'' if count == 1 else 's'}", loc="left")
+    ax.set_xlabel("iteration")
+    ax.set_ylabel("factor")
     ax.tick_params(labelsize=7.0)
     for axis, length in ((ax.xaxis, table.shape[1]), (ax.yaxis, count)):
         axis.set_major_locator(MaxNLocator(min(6, length), integer=True) if length > 1 else FixedLocator([0]))
@@ -115,16 +114,12 @@ def plot_residuals(rows: Sequence[Mapping[str, Array]], term: str, ax: Axes) -> 
 
 
 def _drawn(rows: Sequence[Mapping[str, Array]], terms: Sequence[str] | None) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     if not rows:
         raise UnifgError("there is no iteration to draw: solve first")
     names = list(rows[0]) if terms is None else list(terms)
     across = min(_ACROSS, len(names))
     down = -(-len(names) // across)
-    figure = Figure(figsize=(_PANEL[0] * across, _PANEL[1] * down), layout="constrained")
-    FigureCanvasAgg(figure)
-    for place, name in enumerate(names, start=1):
-        plot_residuals(rows, name, figure.add_subplot(down, across, place))
+    with new_figure((_PANEL[0] * across, _PANEL[1] * down)) as figure:
+        for place, name in enumerate(names, start=1):
+            plot_residuals(rows, name, figure.add_subplot(down, across, place))
     return figure

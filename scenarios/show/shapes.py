@@ -22,6 +22,7 @@ __all__ = [
     "flat",
     "known_corners",
     "merge",
+    "on_ground",
     "quads",
     "ribbon",
     "ring",
@@ -222,6 +223,11 @@ def box(centre: ArrayLike, size: ArrayLike) -> Mesh:
             side[:, [(axis + 1) % 3, (axis + 2) % 3]] = signs if sign > 0.0 else signs[::-1]
             sides.append(side)
     return quads(np.asarray(centre) + 0.5 * np.asarray(size) * np.stack(sides))
+
+
+def on_ground(rows: Array) -> Array:
+    """Places (n, 3) [m] on the ground of rows that begin with x and y."""
+    return np.column_stack([rows[:, :2], np.zeros(len(rows))])
 
 
 def thin(points: Array, most: int) -> Array:

@@ -1,4 +1,4 @@
-"""What all pictures share: colours, style, new figures and axes over time, and the file they become.
+"""One look for all pictures: colours, fonts, new figures and axes, and the file a figure becomes.
 
 One colour stands for one thing, in scenes and plots alike; chosen from colour-blind-safe sets (Okabe and Ito 2008).
 Figures are made without matplotlib's global state (no ``pyplot``), so drawing works in threads and on machines without
@@ -7,21 +7,18 @@ a screen.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from unifg.errors import ScenarioError
-from unifg.scenarios.log.flight_log import FlightLog
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["COLOURS", "GREY", "INK", "css", "finish", "heading", "new_figure", "over_time", "write_figure"]
+__all__ = ["COLOURS", "GREY", "INK", "css", "headline", "key_of", "new_axes", "new_figure", "write_figure"]
 
 COLOURS = {
     "floor": 0xF6F4EF,
@@ -49,7 +46,13 @@ COLOURS = {
 }
 """Name to 0xRRGGBB."""
 
-INK, GREY = "#1d2430", "#6b7280"
+
+def css(name: str) -> str:
+    """The colour as ``#rrggbb``."""
+    return f"#{COLOURS[name]:06x}"
+
+
+INK, GREY = css("ink"), "#6b7280"
 _STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],  # ships with matplotlib: the same picture everywhere
@@ -61,6 +64,7 @@ _STYLE: dict[Any, Any] = {
     "axes.spines.right": False,
     "axes.edgecolor": "#8a919c",
     "axes.labelcolor": INK,
+    "axes.axisbelow": True,
     "xtick.color": "#4b5563",
     "ytick.color": "#4b5563",
     "grid.color": "#e3e6ea",
@@ -69,31 +73,30 @@ _STYLE: dict[Any, Any] = {
 }
 
 
-def css(name: str) -> str:
-    """The colour as ``#rrggbb``."""
-    return f"#{COLOURS[name]:06x}"
-
-
 @contextmanager
-def new_figure(log: FlightLog, size: tuple[float, float]) -> Iterator[Figure]:
+def new_figure(size: tuple[float, float], ticks: int = 1) -> Iterator[Figure]:
     """A figure in the style of the house, of that size [inch]; everything is to be drawn before the block ends.
 
+    Args:
+        size: width and height [inch].
+        ticks: of the run to be drawn.
+
     Raises:
-        ScenarioError: the flight has no tick.
+        ScenarioError: there is no tick.
     """
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    if log.ticks == 0:
-        raise ScenarioError("the flight has no tick: there is nothing to draw")
+    if ticks == 0:
+        raise ScenarioError("there is no tick, and nothing to draw")
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(figure)
         yield figure
 
 
-def over_time(ax: Axes | None) -> Axes:
+def new_axes(ax: Axes | None) -> Axes:
     """The axes given, or new ones."""
     if ax is not None:
         return ax
@@ -102,27 +105,18 @@ def over_time(ax: Axes | None) -> Axes:
     return Figure(layout="constrained").subplots()
 
 
-def finish(log: FlightLog, ax: Axes) -> Axes:
-    """Grid, the span of the flight, and shading over ticks that flew a stored plan."""
-    ax.set_axisbelow(True)
-    ax.grid(True)
-    ax.set_xlim(0.0, log.ticks * log.dt)
-    steps = np.diff(np.concatenate([[0], log.emergency.astype(np.int8), [0]]))
-    for begin, end in zip(np.flatnonzero(steps == 1), np.flatnonzero(steps == -1), strict=True):
-        ax.axvspan(begin * log.dt, end * log.dt, color="#000000", alpha=0.12, lw=0)
-    return ax
+def headline(figure: Figure, text: str, size: float = 12.5) -> None:
+    """Write the title of a figure."""
+    figure.suptitle(text, x=0.01, ha="left", fontsize=size, fontweight="bold")
 
 
-def heading(log: FlightLog, figure: Figure, what: str) -> None:
-    """Title of a figure: what it shows and of which flight."""
-    settings = log.settings
-    words = [what, str(settings.get("scenario", "")), log.layout.name]
-    if settings.get("solver"):
-        coupling = f" ({settings['coupling']})" if settings.get("coupling") else ""
-        words.append(f"solver {settings['solver']}{coupling}")
-    if settings.get("seed") is not None:
-        words.append(f"seed {settings['seed']}")
-    figure.suptitle("  |  ".join(word for word in words if word), x=0.01, ha="left", fontsize=12.5, fontweight="bold")
+def key_of(axes: Iterable[Axes]) -> tuple[list[Any], list[str]]:
+    """Handles and labels of one legend for several axes, each label once."""
+    named: dict[str, Any] = {}
+    for ax in axes:
+        handles, labels = ax.get_legend_handles_labels()
+        named |= dict(zip(labels, handles, strict=True))
+    return list(named.values()), list(named)
 
 
 def write_figure(path: str | Path, figure: Figure, dpi: int) -> Path:

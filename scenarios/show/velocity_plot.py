@@ -2,55 +2,26 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from unifg.scenarios.show.style import css
+from unifg.scenarios.show.panels import face, plot_convergence
+from unifg.scenarios.show.style import GREY, INK, css, headline, new_figure
 from unifg.scenarios.velocity_tracking import Drive, metrics
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["picture", "plot_convergence", "plot_error", "plot_force", "plot_speed", "write_picture"]
+__all__ = ["picture", "plot_error", "plot_force", "plot_numbers", "plot_speed"]
 
-_STYLE: dict[Any, Any] = {
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],  # ships with matplotlib: the same picture everywhere
-    "font.size": 9.0,
-    "axes.titlesize": 10.0,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.axisbelow": True,
-    "axes.grid": True,
-    "grid.color": "#e3e6ea",
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-}
-_INK, _LIMIT = "#1d2430", "#6b7280"
 _WANTED, _DRIVEN, _MISSED = css("goal"), css("robot"), css("moving")
-
-
-def write_picture(path: Path, drive: Drive, *, dpi: int = 105) -> Path:
-    """Write the picture of a drive as a PNG and return its path."""
-    # No software version and no date in the file: the same drive gives the same picture.
-    picture(drive).savefig(path, dpi=dpi, format="png", metadata={"Software": None})
-    return path
 
 
 def picture(drive: Drive) -> Figure:
     """Speed, error and force over time, one above the other; convergence below."""
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(11.0, 9.5), layout="constrained")
-        FigureCanvasAgg(figure)
+    with new_figure((11.0, 9.5)) as figure:
         speed, error, force, convergence = figure.subplots(4, 1, height_ratios=(1.5, 0.7, 1.2, 1.0))
         plot_speed(drive, speed)
         plot_error(drive, error)
@@ -58,9 +29,9 @@ def picture(drive: Drive) -> Figure:
         for ax in (speed, error, force):
             ax.set_xlim(0.0, drive.time[-1])
         force.set_xlabel("time [s]")
-        plot_convergence(drive, convergence)
+        plot_numbers(drive, convergence)
         figure.align_ylabels()
-        figure.suptitle(_title(drive), x=0.01, ha="left", fontsize=12.0, fontweight="bold")
+        headline(figure, _title(drive), 12.0)
     return figure
 
 
@@ -68,8 +39,7 @@ def plot_speed(drive: Drive, ax: Axes) -> Axes:
     """Speed of the vehicle and the profile."""
     ax.plot(drive.time, drive.profile.speed, color=_WANTED, lw=4.5, label="profile to follow")
     ax.plot(drive.time, drive.speed, color=_DRIVEN, lw=1.6, label="speed of the vehicle")
-    ax.set_ylabel("speed [m/s]")
-    ax.set_title("Speed")
+    face(ax, "Speed", "speed [m/s]")
     ax.set_ylim(bottom=min(0.0, 1.05 * float(drive.speed.min())), top=1.08 * float(max(drive.profile.speed.max(), 1.0)))
     _key(ax)
     return ax
@@ -77,56 +47,49 @@ def plot_speed(drive: Drive, ax: Axes) -> Axes:
 
 def plot_error(drive: Drive, ax: Axes) -> Axes:
     """What the vehicle is faster than the profile."""
-    ax.axhline(0.0, color=_LIMIT, lw=0.8)
+    ax.axhline(0.0, color=GREY, lw=0.8)
     ax.plot(drive.time, drive.error, color=_MISSED, lw=1.1)
-    ax.set_ylabel("v - v_ref [m/s]")
-    ax.set_title("Deviation from the profile")
-    return ax
+    return face(ax, "Deviation from the profile", "v - v_ref [m/s]")
 
 
 def plot_force(drive: Drive, ax: Axes) -> Axes:
     """Force over time, its bounds, and what the road and the air take."""
     bounds, force = drive.settings.force_bounds, drive.force
     low, high = float(min(force.min(), 0.0)), float(max(force.max(), 0.0))
-    ax.axhline(0.0, color=_LIMIT, lw=0.8)
+    ax.axhline(0.0, color=GREY, lw=0.8)
     if bounds is not None:
         low, high = min(low, bounds[0]), max(high, bounds[1])
     room = 0.14 * (high - low)
     if bounds is not None:
         for limit, end in ((bounds[0], low - room), (bounds[1], high + room)):
-            ax.axhspan(min(limit, end), max(limit, end), color=_LIMIT, alpha=0.22, lw=0)
+            ax.axhspan(min(limit, end), max(limit, end), color=GREY, alpha=0.22, lw=0)
             ax.text(drive.time[-1], 0.5 * (limit + end), "not allowed ", ha="right", va="center", fontsize=8)
     ax.step(drive.time, np.append(force, force[-1]), where="post", color=_DRIVEN, lw=1.3, label="force of the vehicle")
     car = drive.settings.vehicle.linearised() if drive.settings.linear else drive.settings.vehicle
     resistance = car.resistance(drive.speed, drive.profile.slope)
-    ax.plot(drive.time, resistance, color=_INK, lw=1.0, ls=(0, (4, 2)), label="resistance of air and road")
+    ax.plot(drive.time, resistance, color=INK, lw=1.0, ls=(0, (4, 2)), label="resistance of air and road")
     ax.set_ylim(low - room, high + room)
-    ax.set_ylabel("force [N]")
-    ax.set_title("Drive and brake force")
+    face(ax, "Drive and brake force", "force [N]")
     _key(ax)
     return ax
 
 
-def plot_convergence(drive: Drive, ax: Axes) -> Axes:
+def plot_numbers(drive: Drive, ax: Axes) -> Axes:
     """The KKT numbers of every iterate."""
     from matplotlib.ticker import MaxNLocator
 
     history = drive.solution.history
-    number = [row.number for row in history]
-    shown = {"stationarity": (_DRIVEN, "o", "-"), "violation": (_INK, "s", "--")}
+    shown = {"stationarity": (_DRIVEN, "o", "-"), "violation": (INK, "s", "--")}
     if drive.settings.force_bounds is not None:
         shown["complementarity"] = (_MISSED, "^", ":")
-    for name, (colour, mark, line) in shown.items():
-        # What is exactly zero, as complementarity with zero multipliers, has no place on a logarithmic axis.
-        values = [value if (value := getattr(row, name)) > 0.0 else np.nan for row in history]
-        ax.plot(number, values, color=colour, marker=mark, ms=4, lw=1.0, ls=line, label=name)
-    tolerance = drive.settings.tolerance
-    ax.axhline(tolerance, color=_LIMIT, lw=0.9, ls="--")
-    ax.annotate("tolerance", (0, tolerance), xytext=(2, 2), textcoords="offset points", fontsize=8)
-    ax.set_yscale("log")
-    ax.set_xlabel("iterate")
+    styles = {name: {"color": c, "marker": mark, "ms": 4, "ls": line} for name, (c, mark, line) in shown.items()}
+
+    def values(name: str) -> list[float]:
+        """What is exactly zero, as complementarity with zero multipliers, has no place on a logarithmic axis."""
+        return [value if (value := getattr(row, name)) > 0.0 else np.nan for row in history]
+
+    plot_convergence(ax, history, styles, drive.settings.tolerance, values)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_title("What is wrong with each iterate")
     _key(ax)
     return ax
 

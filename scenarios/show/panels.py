@@ -1,0 +1,186 @@
+"""Panels and marks that several pictures share; a panel draws into the axes it is given, or new ones, and returns them.
+
+Panels over time take any log with time, clearance and marks on ticks that had to do with a stored plan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from unifg.answers.history import Iteration
+from unifg.scenarios.show.style import GREY, css, new_axes
+from unifg.typing import Array, ArrayLike, BoolArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = [
+    "dashes",
+    "discs",
+    "face",
+    "ground",
+    "over_time",
+    "plot_clearance",
+    "plot_convergence",
+    "plot_times",
+    "shade_distance",
+    "word",
+]
+
+
+class Timed(Protocol):
+    """What panels over time need of a log."""
+
+    @property
+    def ticks(self) -> int:
+        """Number of ticks."""
+        ...
+
+    @property
+    def time(self) -> Array:
+        """(T,) [s]."""
+        ...
+
+    dt: float
+    clearance: Array
+    emergency: BoolArray
+
+
+def face(ax: Axes, title: str, y: str = "", x: str = "") -> Axes:
+    """Title, labels and grid."""
+    ax.set_title(title)
+    ax.set_xlabel(x)
+    ax.set_ylabel(y)
+    ax.set_axisbelow(True)
+    ax.grid(True)
+    return ax
+
+
+def over_time(log: Timed, ax: Axes, title: str, y: str) -> Axes:
+    """The face of a panel over the time of a run, shaded where a stored plan was followed."""
+    ax.set_xlim(0.0, log.ticks * log.dt)
+    steps = np.diff(np.concatenate([[0], log.emergency.astype(np.int8), [0]]))
+    for begin, end in zip(np.flatnonzero(steps == 1), np.flatnonzero(steps == -1), strict=True):
+        ax.axvspan(begin * log.dt, end * log.dt, color="#000000", alpha=0.12, lw=0)
+    return face(ax, title, y)
+
+
+def dashes(ax: Axes, levels: Iterable[float], width: float = 1.0) -> None:
+    """Dashed lines across, for limits and quantiles."""
+    for level in levels:
+        ax.axhline(level, color=GREY, lw=width, ls="--")
+
+
+def plot_clearance(log: Timed, ax: Axes | None = None) -> Axes:
+    """Distance from the hull to the nearest thing over time [m]."""
+    ax = new_axes(ax)
+    ax.fill_between(log.time, log.clearance, color=css("horizon"), alpha=0.18, lw=0)
+    ax.plot(log.time, log.clearance, color=css("horizon"), lw=1.2)
+    ax.axhline(0.0, color=css("moving"), lw=1.2)
+    lowest = int(np.argmin(log.clearance))
+    least = float(log.clearance[lowest])
+    ax.plot(log.time[lowest], least, "v", color=css("horizon"), ms=6)
+    finite = log.clearance[np.isfinite(log.clearance)]
+    top = 1.15 * max(float(finite.max()), 0.05) if finite.size else 1.0
+    ax.set_ylim(min(0.0, 1.1 * least if np.isfinite(least) else 0.0) - 0.03 * top, top)
+    title = f"Clearance between hull and nearest thing, at least {max(0.0, least):.2f} m"
+    return over_time(log, ax, title, "clearance [m]")
+
+
+def plot_times(log: Timed, total: Array, parts: Mapping[str, tuple[Array, str]], ax: Axes | None = None) -> Axes:
+    """Time spent in each tick, in all and on each part [ms].
+
+    Args:
+        log: the run.
+        total: (T,) [ms].
+        parts: names to (T,) [ms] and colour.
+        ax: axes to draw into; None for new ones.
+    """
+    ax = new_axes(ax)
+    for name, (values, colour) in {"both": (total, "plan"), **parts}.items():
+        if (values > 0.0).any():
+            spent = np.where(values > 0.0, values, np.nan)
+            ax.plot(log.time, spent, ".", color=css(colour), ms=3.6 if values is total else 2.4, label=name)
+    p50, p99 = np.percentile(total, [50.0, 99.0])
+    dashes(ax, (p50, p99), 0.9)
+    ax.legend(loc="upper right", ncols=4, markerscale=3, borderpad=0.0)
+    return over_time(log, ax, f"Time per tick: median {p50:.1f} ms, 99 % within {p99:.0f} ms", "time [ms]")
+
+
+def plot_convergence(
+    ax: Axes,
+    history: Sequence[Iteration],
+    shown: Mapping[str, Mapping[str, Any]],
+    tolerance: float,
+    values: Callable[[str], ArrayLike],
+) -> Axes:
+    """Numbers of the KKT test at every iterate, on a logarithmic axis, with the tolerance.
+
+    Args:
+        ax: axes to draw into.
+        history: of the solution.
+        shown: attributes of its rows, each with the style of its line.
+        tolerance: of the test.
+        values: what is drawn of an attribute, one number per row.
+    """
+    for name, style in shown.items():
+        ax.plot([row.number for row in history], values(name), **{"lw": 1.0, "label": name, **style})
+    ax.axhline(tolerance, color=GREY, lw=0.9, ls="--")
+    ax.annotate("tolerance", (0, tolerance), xytext=(2, 2), textcoords="offset points", fontsize=8)
+    ax.set_yscale("log")
+    return face(ax, "What is wrong with each iterate", x="iterate")
+
+
+def discs(ax: Axes, rows: ArrayLike, label: str | None = None, **style: Any) -> None:
+    """Circles x, y, radius [m]; the first one is named in the legend."""
+    from matplotlib.patches import Circle
+
+    for index, (x, y, radius) in enumerate(np.asarray(rows).reshape(-1, 3).tolist()):
+        ax.add_patch(Circle((x, y), radius, label=None if index else label, **style))
+
+
+def word(ax: Axes, at: Array, text: str, offset: tuple[int, int], **style: Any) -> None:
+    """A word beside a place."""
+    box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8}
+    ax.annotate(
+        text, (float(at[0]), float(at[1])), xytext=offset, textcoords="offset points",
+        **{"ha": "center", "va": "center", "fontsize": 9, "fontweight": "bold", "zorder": 11, "bbox": box, **style},
+    )  # fmt: skip
+
+
+def shade_distance(
+    ax: Axes, low: Array, high: Array, distance: Callable[[Array], Array], reach: float, dark: str
+) -> tuple[Array, Array, Array]:
+    """Shade the ground, the darker the nearer something is.
+
+    Args:
+        ax: axes to draw into.
+        low: (2,) lower left corner [m].
+        high: (2,) upper right corner [m].
+        distance: of points (n, 2) [m].
+        reach: how far the shading goes [m].
+        dark: colour of distance zero.
+
+    Returns:
+        x (240,), y (160,) and distances (160, 240) [m].
+    """
+    from matplotlib.colors import LinearSegmentedColormap
+
+    x, y = np.linspace(low[0], high[0], 240), np.linspace(low[1], high[1], 160)
+    gap = distance(np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)).reshape(len(y), len(x))
+    colours = LinearSegmentedColormap.from_list("near", [dark, "#ffffff"])
+    ax.contourf(x, y, np.clip(gap, 0.0, reach), levels=np.linspace(0.0, reach, 9), cmap=colours, zorder=0)
+    return x, y, gap
+
+
+def ground(ax: Axes, low: ArrayLike, high: ArrayLike) -> None:
+    """Equal axes in metres between two corners (2,) [m]."""
+    (left, bottom), (right, top) = np.asarray(low).tolist(), np.asarray(high).tolist()
+    ax.set_xlim(left, right)
+    ax.set_ylim(bottom, top)
+    ax.set_aspect("equal")
+    ax.set_xlabel("x [m]")
+    ax.set_ylabel("y [m]")
