@@ -3,19 +3,19 @@
     python -m benchmarks.iterations
 
 The problems are those every backend is tested on (``tests/problems/known.py``), the cylinders those of
-:mod:`benchmarks.cylinder_flights`, the loops those of :mod:`benchmarks.control_loops`. Writes docs/iterations.md.
+tests/problems/cylinders.py, the loops those of :mod:`benchmarks.control_loops`. Writes docs/iterations.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from importlib.util import find_spec
+from collections.abc import Callable
 
 import numpy as np
 
 import unifg as fg
-from benchmarks import control_loops, cylinder_flights
-from benchmarks.report import command, machine, publish, table, words
+from benchmarks import control_loops
+from benchmarks.hard_guesses import CYLINDERS, Outcome, median
+from benchmarks.report import command, listing, machine, publish, table, words
 from problems.control import Driver, Problem
 from problems.cylinders import SPEED
 from problems.known import PROBLEMS, Guess
@@ -70,16 +70,14 @@ def iterations(build: Callable[[], tuple[fg.Graph, Guess]], solver: fg.Solver) -
     return f"{solution.iterations}" + ("" if solution.converged else f", {words(solution.status)}")
 
 
-def cylinders(seeds: Iterable[int] = cylinder_flights.SEEDS) -> str:
+def cylinders(count: int = CYLINDERS.count) -> str:
     """Flights among cylinders: how many each backend solves."""
-    seeds = list(seeds)
-    found = cylinder_flights.study(seeds, FLIGHTS, ipopt=find_spec("casadi") is not None)
-    rows = []
-    for name, outcomes in found.items():
-        solved = [outcome.iterations for outcome in outcomes if outcome.solved]
-        middle = f"{np.median(solved):.0f}" if solved else "-"
-        rows.append((name.replace("ipopt", "IPOPT"), f"{len(solved)} of {len(seeds)}", middle))
-    return table(("solver", "solved", "iterations, median of the solved"), rows)
+    found = CYLINDERS.run(range(count), FLIGHTS)
+    columns: dict[str, Callable[[list[Outcome]], str]] = {
+        "solved": lambda outcomes: f"{sum(one.solved for one in outcomes)} of {len(outcomes)}",
+        "iterations, median of the solved": median,
+    }
+    return listing(["solver"], {(name.replace("ipopt", "IPOPT"),): row for name, row in found.items()}, columns)
 
 
 def carried(problem: Problem, multipliers: bool, penalties: bool, steps: int = control_loops.STEPS) -> float:
