@@ -7,7 +7,7 @@
 #   make results PAGE=control-cases    measure one page of docs/ again; without PAGE, list them
 #   make stale    name the pages of docs/ whose tables were measured on other sources
 #   make release-check    the same, and fail if there are any
-#   make mutants  change decisions one at a time and see whether a test notices (hours; FILES='scenarios/driving/joint.py')
+#   make mutants  change decisions one at a time and see whether a test notices (hours; FILES='scenarios/driving/drive_joint.py')
 #   make offsets  solve the same problems with their worlds moved by up to 5000 km (minutes)
 #   make fences   run the shell commands shown in README.md and docs/
 #   make clean    remove everything made here

@@ -1,7 +1,7 @@
 """Do the tests notice when a decision is changed? Mutants of the decisions' files, each run against its tests.
 
     python -m benchmarks.mutants                            every file of TARGETS (hours)
-    python -m benchmarks.mutants scenarios/driving/joint.py         one file
+    python -m benchmarks.mutants scenarios/driving/drive_joint.py   one file
     python -m benchmarks.mutants --share 0.3 --seed 1 ...   a drawn share of the mutants of each file
 
 Everything happens in a scratch copy of the checkout. The tests of a file run once with every line they touch recorded;
@@ -80,31 +80,36 @@ TARGETS: dict[str, tuple[str, ...]] = {
         "solvers",
         "infeasible",
     ),
-    "scenarios/driving/controller.py": ("control_decisions", "navigation", "joint"),
-    "scenarios/driving/joint.py": ("control_decisions", "joint"),
+    "scenarios/driving/drive_control.py": ("control_decisions", "navigation", "joint"),
+    "scenarios/driving/drive_parts.py": ("control_decisions", "navigation", "joint"),
+    "scenarios/driving/drive_settings.py": ("control_decisions", "navigation", "joint"),
+    "scenarios/driving/drive_joint.py": ("control_decisions", "joint"),
     "scenarios/driving/localiser.py": ("navigation",),
     "scenarios/navigation.py": ("navigation",),
     "scenarios/seeing/disc_tracker.py": ("perception", "control_decisions"),
-    "scenarios/driving/pilot.py": ("navigation", "joint"),
+    "scenarios/driving/drive_pilot.py": ("navigation", "joint"),
     "scenarios/ways/grid.py": ("planner", "route"),
     "scenarios/driving/route.py": ("route", "navigation"),
+    "scenarios/horizon/loop.py": ("control_decisions", "quadrotor_decisions", "navigation"),
+    "scenarios/horizon/past.py": ("joint", "control_decisions", "quadrotor_estimator"),
     "scenarios/show/drive_scene.py": ("scene",),
     "scenarios/show/stage.py": ("scene", "quadrotor_scene"),
     "scenarios/worlds/placement.py": ("unforeseen",),
-    "scenarios/driving/window.py": ("joint", "control_decisions"),
+    "scenarios/driving/drive_window.py": ("joint", "control_decisions"),
     "scenarios/flying/arrival.py": ("quadrotor_mpc", "quadrotor_flights"),
     "scenarios/seeing/association.py": ("quadrotor_estimator", "quadrotor_world"),
     "scenarios/flying/braking.py": ("quadrotor_controller",),
-    "scenarios/flying/controller.py": ("quadrotor_decisions", "quadrotor_controller"),
+    "scenarios/flying/flight_control.py": ("quadrotor_decisions", "quadrotor_controller"),
+    "scenarios/flying/flight_parts.py": ("quadrotor_decisions", "quadrotor_controller"),
     "scenarios/flying/estimator.py": ("quadrotor_estimator", "quadrotor_joint"),
     "scenarios/flying/guide.py": ("quadrotor_controller", "quadrotor_layouts"),
-    "scenarios/flying/joint.py": ("quadrotor_decisions", "quadrotor_joint"),
+    "scenarios/flying/flight_joint.py": ("quadrotor_decisions", "quadrotor_joint"),
     "scenarios/course.py": ("quadrotor_obstacles",),
-    "scenarios/flying/plan.py": ("quadrotor_decisions", "quadrotor_controller"),
+    "scenarios/flying/flight_settings.py": ("quadrotor_decisions", "quadrotor_controller"),
     "scenarios/show/flight_scene.py": ("quadrotor_scene",),
     "scenarios/flying/slots.py": ("quadrotor_decisions", "quadrotor_controller"),
     "scenarios/seeing/line_tracker.py": ("quadrotor_estimator", "quadrotor_world"),
-    "scenarios/flying/window.py": ("quadrotor_estimator", "quadrotor_joint"),
+    "scenarios/flying/flight_window.py": ("quadrotor_estimator", "quadrotor_joint"),
 }
 
 

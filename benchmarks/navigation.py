@@ -21,8 +21,8 @@ import numpy as np
 from benchmarks import campaign
 from benchmarks.campaign import Row
 from benchmarks.report import command, machine, publish, shared, table
-from unifg.scenarios.driving.controller import ControllerSettings
-from unifg.scenarios.driving.pilot import COUPLINGS
+from unifg.scenarios.driving.drive_pilot import COUPLINGS
+from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
 from unifg.typing import Array

@@ -23,9 +23,9 @@ from benchmarks.quadrotor_flights import SOLVERS
 from benchmarks.report import command, listing, machine, publish
 from unifg.models import quadrotor
 from unifg.scenarios.flight import Flight, FlightSettings
-from unifg.scenarios.flying.joint import JointSettings
-from unifg.scenarios.flying.joint_pilot import JointPilot, joint_pilot
-from unifg.scenarios.flying.plan import Avoidance
+from unifg.scenarios.flying.flight_joint import JointSettings
+from unifg.scenarios.flying.flight_pilot import make_pilot
+from unifg.scenarios.flying.flight_settings import Avoidance
 from unifg.scenarios.seeing.belief import Belief, Landmarks
 from unifg.scenarios.worlds.layouts import TUNING_SEEDS
 from unifg.typing import Array
@@ -69,7 +69,7 @@ def flight_of(job: Job) -> Flight:
     if job.coupling == "joint":
         found, believed = flight.conditions, flight.pilot.belief.state
         common = (found.layout, believed, found.nominal, plain.estimator, controller)
-        flight.pilot = joint_pilot(job.solver, *common, JointSettings(job.pull))
+        flight.pilot = make_pilot("joint", job.solver, *common, JointSettings(job.pull))
     return flight
 
 
@@ -87,7 +87,7 @@ def fly(job: Job) -> Row:
         plan = pilot.tick(reading, control)
         spent = 1e3 * (time.process_time() - begin)
         belief = pilot.belief
-        alone = pilot.controller.alone if isinstance(pilot, JointPilot) else belief
+        alone = pilot.alone
         ticks.append({**pulled(belief, alone), **errors(belief, world.state, flight, cylinders), "tick": spent})
         emergencies += plan.emergency
         control = plan.controls[0]

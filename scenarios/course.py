@@ -7,13 +7,13 @@ kept for the picture.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 import numpy as np
 
 import unifg as fg
+from unifg.answers.solver import Callback
 from unifg.models import avoidance, landmarks, quadrotor
 from unifg.scenarios.options import option
 from unifg.scenarios.ways.polyline import arc_lengths, at_stations
@@ -39,7 +39,6 @@ __all__ = [
 Avoidance = Literal["potential", "hard"]
 Start = Literal["hover", "line", "way"]
 Hessian = Literal["exact", "gauss-newton"]
-Progress = Callable[[fg.Iteration], bool | None]
 
 AVOIDANCES: tuple[Avoidance, ...] = get_args(Avoidance)
 GUESSES: tuple[Start, ...] = get_args(Start)
@@ -281,7 +280,7 @@ class Course:
 
 
 def solve_course(
-    settings: CourseSettings, layout: Layout, solver: fg.Solver, progress: Progress | None = None
+    settings: CourseSettings, layout: Layout, solver: fg.Solver, progress: Callback | None = None
 ) -> Course:
     """Solve the problem of a layout by a solver that has been made already.
 
@@ -301,7 +300,7 @@ def solve_course(
     return Course(settings, layout, solution, solution[x], solution[u], iterates)
 
 
-def run_course(settings: CourseSettings | None = None, progress: Progress | None = None) -> Course:
+def run_course(settings: CourseSettings | None = None, progress: Callback | None = None) -> Course:
     """Solve the problem and keep every iterate.
 
     Args:

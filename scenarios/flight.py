@@ -7,7 +7,6 @@ controls; how they meet is the coupling.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -15,21 +14,20 @@ import numpy as np
 
 from unifg.errors import ScenarioError, UnifgError
 from unifg.models import quadrotor
+from unifg.scenarios.episode import Progress, run_ticks, silent
 from unifg.scenarios.flying.braking import braking_control
-from unifg.scenarios.flying.coupling import COUPLINGS, make_pilot
 from unifg.scenarios.flying.estimator import EstimatorSettings
-from unifg.scenarios.flying.plan import ControllerSettings, Plan
+from unifg.scenarios.flying.flight_pilot import COUPLINGS, make_pilot
+from unifg.scenarios.flying.flight_settings import ControllerSettings
+from unifg.scenarios.horizon.loop import Plan
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.options import option, share
-from unifg.scenarios.seeing.readings import Reading
 from unifg.scenarios.worlds.air import QuadrotorWorld
 from unifg.scenarios.worlds.conditions import draw_conditions
 from unifg.typing import Array
 
 __all__ = ["Flight", "FlightSettings", "run_flight"]
-
-Progress = Callable[[float, str], None]
 
 SCENARIO = "quadrotor-mpc"
 REACHED_DISTANCE = 0.3  # [m], by belief and truth
@@ -101,7 +99,7 @@ def run_flight(settings: FlightSettings, progress: Progress | None = None) -> Fl
     Raises:
         ScenarioError: when the seed, the movers or an option cannot be served.
     """
-    return Flight(settings).run(progress or (lambda done, text: None))
+    return Flight(settings).run(progress or silent)
 
 
 class Flight:
@@ -132,37 +130,35 @@ class Flight:
         recorder = Recorder(
             FlightLog, layout=world.layout, settings=settings.summary(), dt=dt, parameters_true=world.parameters.packed
         )
-        reached = interrupted = False
-        control: Array | None = None
-        far = float(np.linalg.norm(world.layout.target - world.layout.start))
-        try:
-            for _ in range(round(settings.time_limit / dt)):
-                control = self._tick(world.sense(), control, recorder)
-                reached = self._arrived(world.state) and self._arrived(self.pilot.belief.state)
-                if reached:
-                    break
-                world.step(control, dt)
-                if world.collisions >= COLLISIONS:
-                    break
-                left = float(np.linalg.norm(world.layout.target - world.state[:3]))
-                progress(min(max(0.0, 1.0 - left / far), 0.99), f"{left:.1f} m to go")
-        except KeyboardInterrupt:
-            interrupted = True
-        progress(1.0, "done")
-        return recorder.finish(collisions=world.collisions, reached=reached, interrupted=interrupted)
+        self._control: Array | None = None
+        self._reached = False
+        interrupted = run_ticks(round(settings.time_limit / dt), lambda number: self._tick(recorder), progress)
+        return recorder.finish(collisions=world.collisions, reached=self._reached, interrupted=interrupted)
 
-    def _tick(self, reading: Reading, control: Array | None, recorder: Recorder[FlightLog]) -> Array:
-        """Estimate, plan and record; the control (4,) to be flown."""
-        pilot, world = self.pilot, self.world
+    def _tick(self, recorder: Recorder[FlightLog]) -> tuple[float, str] | None:
+        """Decide and fly; None when the target is reached or the flight is given up."""
+        world = self.world
+        self._control = self._decide(recorder)
+        self._reached = self._arrived(world.state) and self._arrived(self.pilot.belief.state)
+        if self._reached:
+            return None
+        world.step(self._control, self.settings.controller.dt)
+        if world.collisions >= COLLISIONS:
+            return None
+        target, start = world.layout.target, world.layout.start
+        left = float(np.linalg.norm(target - world.state[:3]))
+        return 1.0 - left / float(np.linalg.norm(target - start)), f"{left:.1f} m to go"
+
+    def _decide(self, recorder: Recorder[FlightLog]) -> Array:
+        """Sense, estimate, plan and record; the control (4,) to be flown."""
+        pilot, world, reading = self.pilot, self.world, self.world.sense()
         plan: Plan | None = None
         try:
-            plan = pilot.tick(reading, control)
+            plan = pilot.tick(reading, self._control)
         except (UnifgError, ArithmeticError, ValueError) as error:  # a robot in the air has to go on
             logger.warning("the tick at %.2f s failed, the vehicle brakes: %s", world.time, error)
         belief, settings = pilot.belief, self.settings.controller
-        least = np.array([*(-rate for rate in settings.rate_limits), settings.thrust_limits[0]])
-        most = np.array([*settings.rate_limits, settings.thrust_limits[1]])
-        control = braking_control(belief.state, belief.parameters, least, most) if plan is None else plan.controls[0]
+        control = braking_control(belief.state, belief.parameters, *settings.box) if plan is None else plan.control
         marks = belief.landmarks
         recorder.add(
             truth=world.state,
@@ -176,8 +172,7 @@ class Flight:
             parameters_sigma=belief.parameters_sigma,
             seen=reading.ids,
             movers=world.mover_states(),
-            estimate_ms=pilot.estimate_ms,
-            plan_ms=pilot.plan_ms,
+            **pilot.clock.milliseconds,
             statuses="failed" if plan is None else plan.status.name.lower().replace("_", " "),
             clearance=world.clearance(),
             emergency=plan is None or plan.emergency,

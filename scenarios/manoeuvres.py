@@ -7,7 +7,7 @@ through a disc that nobody had foreseen. Every iterate is kept for the picture.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypedDict
@@ -15,6 +15,7 @@ from typing import TypedDict
 import numpy as np
 
 import unifg as fg
+from unifg.answers.solver import Callback
 from unifg.models import obstacles, unicycle
 from unifg.scenarios.log import metrics
 from unifg.solvers import names
@@ -36,8 +37,6 @@ __all__ = [
 AT_REST = 1e-3  # [m/s] and [rad/s]; smaller controls have no sign worth counting
 ROUNDING = 1e-6  # by which a limit may seem exceeded
 SUBSTEPS = 10  # looks at the way between two nodes
-
-Progress = Callable[[fg.Iteration], bool | None]
 
 
 @dataclass(frozen=True)
@@ -214,7 +213,7 @@ class Manoeuvre:
 
 
 def run_manoeuvre(
-    case: Case, solver: str = "sqp", settings: ManoeuvreSettings | None = None, progress: Progress | None = None
+    case: Case, solver: str = "sqp", settings: ManoeuvreSettings | None = None, progress: Callback | None = None
 ) -> Manoeuvre:
     """Solve one case from its cold guess.
 

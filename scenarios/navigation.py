@@ -7,8 +7,6 @@ Bazzana et al. 2022, sections IV, V and VII.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,20 +17,20 @@ from unifg.files.ros_map import load_map
 from unifg.lie import wrap_angle
 from unifg.models.distance_map import DistanceMap
 from unifg.models.unicycle import step
-from unifg.scenarios.driving.controller import ControllerSettings
-from unifg.scenarios.driving.pilot import make_pilot
+from unifg.scenarios.driving.drive_pilot import make_pilot
+from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.driving.route import Route
+from unifg.scenarios.episode import Progress, run_ticks, silent
+from unifg.scenarios.horizon.loop import Plan
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.options import existing, option, pose
-from unifg.scenarios.seeing.disc_tracker import DiscTracker
+from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.ways.polyline import path_length
 from unifg.scenarios.worlds.building import DEMO_GOALS, DEMO_START, building_map
 from unifg.scenarios.worlds.placement import place_obstacles
 from unifg.scenarios.worlds.plane import World
 from unifg.typing import Array
-
-Progress = Callable[[float, str], None]
 
 INITIAL_SIGMA = (0.1, 0.1, 0.05)  # [m, m, rad]
 REACHED_DISTANCE = 0.1  # [m], by the estimate
@@ -79,7 +77,7 @@ def run_navigation(settings: NavigationSettings, progress: Progress | None = Non
     Raises:
         ScenarioError: when start, goals or obstacles do not fit the map, or an option is unknown.
     """
-    return Episode(settings).run(progress or (lambda done, text: None))
+    return Episode(settings).run(progress or silent)
 
 
 class Episode:
@@ -116,102 +114,83 @@ class Episode:
         self.world = World(self.occupancy, self.start, discs, sensors, robot_radius=control.robot_radius)
         sigma = np.array(INITIAL_SIGMA)
         believed = self.start + sigma * belief.standard_normal(3)
-        self.tracker = DiscTracker(self.distance_map)
         self.pilot = make_pilot(
             settings.coupling, self.distance_map, settings.solver, control, believed, sigma, self.world.lidar.beams
         )
 
     def run(self, progress: Progress) -> EpisodeLog:
         """Tick until the last goal is reached or time is up."""
-        dt = self.settings.controller.dt
-        length = path_length(self.path)
-        limit = int((length / SLOWEST + 60.0) / dt)
-        reached = [False] * len(self.goals)
-        recorder = Recorder(
+        length, s = path_length(self.path), self.settings
+        self._recorder = Recorder(
             EpisodeLog,
             occupancy=self.occupancy,
             path=self.path,
             goals=self.goals,
             start=self.start,
-            dt=dt,
-            robot_radius=self.settings.controller.robot_radius,
-            solver=self.settings.solver,
-            coupling=self.settings.coupling,
-            seed=self.settings.seed,
-            control_limits=self.settings.controller.limits,
+            dt=s.controller.dt,
+            robot_radius=s.controller.robot_radius,
+            solver=s.solver,
+            coupling=s.coupling,
+            seed=s.seed,
+            control_limits=s.controller.limits,
             scan_angles=self.world.lidar.angles,
         )
-        dead_reckoning = self.pilot.pose
-        goal, driven, interrupted = 0, 0.0, False
-        try:
-            for tick in range(limit):
-                if tick:
-                    odometry = np.array(self.world.odometry())
-                    dead_reckoning = step(dead_reckoning[None], odometry[None], dt)[0]
-                    driven += abs(odometry[0]) * dt
-                else:
-                    odometry = None
-                control = self._tick(goal, odometry, dead_reckoning, recorder)
-                if self._arrived(goal):
-                    reached[goal] = self._confirmed(goal)
-                    goal += 1
-                    if goal == len(self.goals):
-                        break
-                    self.legs[goal] = self._route(self.pilot.pose, self.goals[goal])
-                    self.pilot.forget()
-                self.world.step(float(control[0]), float(control[1]), dt)
-                progress(min(driven / length, 0.99), f"goal {goal + 1}/{len(self.goals)}")
-        except KeyboardInterrupt:
-            interrupted = True
-        progress(1.0, "done")
-        return recorder.finish(
+        self._reached = [False] * len(self.goals)
+        self._goal, self._driven, self._dead_reckoning = 0, 0.0, self.pilot.pose
+        limit = int((length / SLOWEST + 60.0) / s.controller.dt)
+        interrupted = run_ticks(limit, lambda number: self._tick(number, length), progress)
+        return self._recorder.finish(
             collisions=self.world.collisions,
-            reached=reached,
+            reached=self._reached,
             obstacle_moving=self.world.obstacle_states()[:, 3].astype(bool),
             interrupted=interrupted,
         )
 
-    def _tick(self, goal: int, odometry: Array | None, dead_reckoning: Array, recorder: Recorder[EpisodeLog]) -> Array:
-        """Estimate and plan; the measured time is what a robot would spend."""
-        control = self.settings.controller
+    def _tick(self, number: int, length: float) -> tuple[float, str] | None:
+        """Move on from the last tick, scan, decide, record and drive; None at the last goal."""
+        dt, goal = self.settings.controller.dt, self._goal
+        odometry = None
+        if number:
+            odometry = np.array(self.world.odometry())
+            self._dead_reckoning = step(self._dead_reckoning[None], odometry[None], dt)[0]
+            self._driven += abs(odometry[0]) * dt
         scan = self.world.scan()
-        begin = time.perf_counter()
-        self.pilot.estimate(scan, odometry, control.dt)
-        estimated = time.perf_counter()
-        pose = self.pilot.pose
-        tracks = self.tracker.update(scan, pose, control.dt)
-        perceived = time.perf_counter()
-        route = self.legs[goal]
-        if route.repair(pose, tracks):
+        plan = self.pilot.tick(scan, odometry, self.legs[goal])
+        self._record(scan, plan)
+        if self._arrived(goal):
+            self._reached[goal] = self._confirmed(goal)
+            self._goal = goal = goal + 1
+            if goal == len(self.goals):
+                return None
+            self.legs[goal] = self._route(self.pilot.pose, self.goals[goal])
             self.pilot.forget()
-        repaired = time.perf_counter()
-        reference = route.reference(pose, control.speed * control.dt, control.horizon + 1)
-        plan = self.pilot.plan(reference, tracks)
-        planned = time.perf_counter()
-        recorder.add(
-            time=self.world.time,
-            true_pose=self.world.pose,
-            estimate=self.pilot.pose,
-            dead_reckoning=dead_reckoning,
+        self.world.step(float(plan.control[0]), float(plan.control[1]), dt)
+        return self._driven / length, f"goal {goal + 1}/{len(self.goals)}"
+
+    def _record(self, scan: Scan, plan: Plan) -> None:
+        """Keep what this tick leaves behind; the measured time is what a robot would spend."""
+        pilot, world = self.pilot, self.world
+        took = pilot.clock.milliseconds
+        self._recorder.add(
+            time=world.time,
+            true_pose=world.pose,
+            estimate=pilot.pose,
+            dead_reckoning=self._dead_reckoning,
             control=plan.control,
             horizon=plan.states,
             scan=scan.ranges,
-            obstacles=self.world.obstacle_states()[:, :3],
-            detected=np.column_stack([tracks.centre, tracks.radius]),
-            solve_ms=1e3 * (estimated - begin + planned - repaired),
-            localise_ms=1e3 * (estimated - begin),
-            perceive_ms=1e3 * (perceived - estimated),
-            route_ms=1e3 * (repaired - perceived),
-            plan_ms=1e3 * (planned - repaired),
-            localisation_iterations=self.pilot.iterations,
+            obstacles=world.obstacle_states()[:, :3],
+            detected=np.column_stack([pilot.tracks.centre, pilot.tracks.radius]),
+            solve_ms=took["localise_ms"] + took["plan_ms"],
+            **took,
+            localisation_iterations=pilot.iterations,
             plan_iterations=plan.iterations,
             status=plan.status.name.lower(),
-            bound_violation=plan.bound_violation,
-            clearance=self.world.clearance(),
-            goal_index=goal,
+            bound_violation=plan.excess,
+            clearance=world.clearance(),
+            goal_index=self._goal,
             emergency=plan.emergency,
         )
-        return plan.control
 
     def _route(self, begin: Array, end: Array) -> Route:
         return Route(self.occupancy, self.distance_map, begin, end, self.settings.controller.robot_radius)

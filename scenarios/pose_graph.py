@@ -5,7 +5,6 @@ The command ``unifg solve`` is this and `unifg.scenarios.commands.graphs`.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,13 +20,13 @@ from unifg.files.pose_graph import read_pose_graph
 from unifg.kernels.robust import DCS, Cauchy, Huber, Loss, TruncatedLeastSquares, Tukey
 from unifg.pose_graphs.initialise import chordal, lago, odometric
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
+from unifg.scenarios.episode import Progress, silent
+from unifg.scenarios.horizon.stopwatch import Stopwatch
 from unifg.scenarios.options import existing, option
 from unifg.solvers import GraduatedNonConvexity, names
 from unifg.typing import Array, BoolArray
 
 __all__ = ["SolveSettings", "SolvedGraph", "robust_loss", "solve_file"]
-
-Progress = Callable[[float, str], None]
 
 GUESSES: dict[str, Callable[[PoseGraph], Array]] = {
     "file": lambda pose_graph: pose_graph.poses,
@@ -112,7 +111,7 @@ class SolvedGraph:
         return self.solution.status is Status.INTERRUPTED
 
 
-def solve_file(settings: SolveSettings, progress: Progress = lambda done, text: None) -> SolvedGraph:
+def solve_file(settings: SolveSettings, progress: Progress = silent) -> SolvedGraph:
     """Read, initialise and solve.
 
     Args:
@@ -124,7 +123,7 @@ def solve_file(settings: SolveSettings, progress: Progress = lambda done, text: 
         FileFormatError: the file cannot be read.
         GraphError: the measurements do not determine the poses.
     """
-    clock = _Clock()
+    clock = Stopwatch()
     progress(0.0, f"reading {settings.file.name}")
     read = read_pose_graph(settings.file)
     clock.split("read")
@@ -192,21 +191,6 @@ def robust_loss(text: str | None, dim: int) -> Loss | None:
     if not 0.0 < value < np.inf:
         raise ScenarioError(f"--robust {text}: {parameter!r} is not a positive number")
     return LOSSES[name](value)
-
-
-class _Clock:
-    """Seconds by name."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self.start()
-
-    def start(self) -> None:
-        self._since = time.perf_counter()
-
-    def split(self, name: str) -> None:
-        self.seconds[name] = time.perf_counter() - self._since
-        self.start()
 
 
 class _Snapshots:

@@ -10,7 +10,6 @@ The guess is the paper's: speeds, forces and multipliers zero. The paper's J has
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import TypedDict
 import numpy as np
 
 import unifg as fg
+from unifg.answers.solver import Callback
 from unifg.models import vehicle
 from unifg.models.vehicle import Vehicle
 from unifg.scenarios.log import metrics as numbers
@@ -38,7 +38,6 @@ __all__ = [
     "write_metrics",
 ]
 
-Progress = Callable[[fg.Iteration], bool | None]
 ROUNDING = 1e-6  # relative, by which a limit may seem exceeded
 
 
@@ -168,7 +167,7 @@ class Drive:
         return self.solution.converged and self.within_bounds
 
 
-def run_tracking(settings: TrackingSettings | None = None, progress: Progress | None = None) -> Drive:
+def run_tracking(settings: TrackingSettings | None = None, progress: Callback | None = None) -> Drive:
     """Solve one problem from the guess of the paper.
 
     Args:

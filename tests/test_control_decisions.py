@@ -12,9 +12,13 @@ import unifg as fg
 from episodes import room
 from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.driving.controller import BRAKING, LEFT_BEHIND, PATIENCE, Controller, ControllerSettings, Plan
-from unifg.scenarios.driving.joint import JointController
-from unifg.scenarios.driving.window import Window
+from unifg.models.smooth_field import SmoothField
+from unifg.scenarios.driving.drive_control import BRAKING, LEFT_BEHIND, PATIENCE, Controller, is_behind
+from unifg.scenarios.driving.drive_joint import SharedPast, Smoother
+from unifg.scenarios.driving.drive_parts import disc_limits, predicted, wall_limits
+from unifg.scenarios.driving.drive_settings import ControllerSettings
+from unifg.scenarios.driving.drive_window import PAST_TERMS, PoseWindow
+from unifg.scenarios.horizon.loop import Plan
 from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.seeing.tracks import Tracks
 from unifg.scenarios.worlds.plane import World
@@ -79,7 +83,7 @@ BESIDE = (OPEN[0], OPEN[1] + HULL + GAP + 0.2, 0.2)  # not in the way: nothing e
 )
 def test_the_robot_rests_for_a_mover_that_closes_in(controller: Controller, others: Tracks, rests: bool) -> None:
     plan = controller.plan(OPEN, ahead(), others)
-    assert not plan.emergency and plan.bound_violation < 1e-3
+    assert not plan.emergency and plan.excess < 1e-3
     assert (not plan.control.any()) == rests
     if rests:  # the next tick goes on from rest, as the first change of control is counted from there
         assert not controller._applied.any()
@@ -88,17 +92,17 @@ def test_the_robot_rests_for_a_mover_that_closes_in(controller: Controller, othe
 # ---------------------------------------------------------------- how near it may come
 
 
-def test_a_robot_beside_a_standing_disc_may_come_a_little_nearer(controller: Controller) -> None:
+def test_a_robot_beside_a_standing_disc_may_come_a_little_nearer() -> None:
     """It may squeeze past what stands, by so much and no more, and never past what moves."""
     s, gap = SETTINGS, 0.05  # less than the clearance that is kept from discs
     place = (OPEN[0] + HULL + gap + 0.2, OPEN[1], 0.2)
     for mover in (False, True):
         others = tracks(place, mover=mover)
         centres = np.tile(others.centre, (s.horizon, 1, 1))
-        limits = controller._disc_limits(OPEN, centres, others.radius, others.mover)
+        limits = disc_limits(SETTINGS, OPEN, centres, others.radius, others.mover)
         assert limits[:, 0] == pytest.approx(HULL + (gap if mover else gap - 0.02))  # not nearer than 3 cm
-    roomy = controller._disc_limits(
-        OPEN, np.tile([OPEN[0] + 1.0, OPEN[1]], (s.horizon, 1, 1)), np.array([0.2]), np.array([False])
+    roomy = disc_limits(
+        SETTINGS, OPEN, np.tile([OPEN[0] + 1.0, OPEN[1]], (s.horizon, 1, 1)), np.array([0.2]), np.array([False])
     )
     assert roomy[:, 0] == pytest.approx(HULL + s.disc_clearance)
 
@@ -154,20 +158,26 @@ class Bent:
         return Answer()
 
 
-def believing(field: DistanceMap) -> tuple[JointController, World]:
+def joint(field: DistanceMap, settings: ControllerSettings, window: PoseWindow) -> tuple[Controller, Smoother]:
+    """A controller that shares its first pose with the past, and what registers that beforehand."""
+    smoother = Smoother(field, window)
+    return Controller(field, "sqp", settings, SharedPast(smoother, settings.pull)), smoother
+
+
+def believing(field: DistanceMap) -> tuple[Controller, Smoother]:
     """A joint controller whose window is full, at a tick that has been registered and not planned."""
     world = World(room(), OPEN, rng=np.random.default_rng(3))
-    window = Window(2, OPEN + np.array([0.03, -0.02, 0.01]), np.diag([0.01, 0.01, 0.0025]), world.lidar.beams)
-    controller = JointController(field, "sqp", replace(SETTINGS, pull=(0.5, 0.5, 0.5), control_weight=30.0), window)
+    window = PoseWindow(2, OPEN + np.array([0.03, -0.02, 0.01]), np.diag([0.01, 0.01, 0.0025]), world.lidar.beams)
+    controller, smoother = joint(field, replace(SETTINGS, pull=(0.5, 0.5, 0.5), control_weight=30.0), window)
     for tick in range(4):
         if tick:
             window.move(np.array(world.odometry()), SETTINGS.dt)
         window.look(world.scan())
-        controller.register()
+        smoother.register()
         if tick < 3:
-            plan = controller.plan(window.now.pose, ahead(OPEN), tracks())
+            plan = controller.plan(smoother.pose, ahead(OPEN), tracks())
             world.step(float(plan.control[0]), float(plan.control[1]), SETTINGS.dt)
-    return controller, world
+    return controller, smoother
 
 
 @pytest.mark.parametrize(
@@ -184,23 +194,21 @@ def believing(field: DistanceMap) -> tuple[JointController, World]:
 )
 def test_only_a_solve_that_ended_moves_the_past(field: DistanceMap, claims: dict[str, Any], believed: bool) -> None:
     """A solve that fell short says nothing about where the robot is: the past alone is believed, and marginalised."""
-    controller, _ = believing(field)
-    window = controller.window
-    registered = window.now.pose.copy()
-    alone = controller._registered.marginal_prior(
-        ("arrival", "odometry", "lidar past"), controller._smoother.past[0], controller._smoother.past[1]
-    )
-    for name in ("_run", "_cold"):
-        setattr(controller, name, Bent(getattr(controller, name), **claims))
+    controller, smoother = believing(field)
+    window, past = smoother.window, smoother.terms.past
+    registered = smoother.pose
+    alone = smoother.solution.marginal_prior(PAST_TERMS, past[0], past[1])
+    for name in ("warm", "cold"):
+        setattr(controller.loop, name, Bent(getattr(controller.loop, name), **claims))
     plan = controller.plan(registered, ahead(OPEN), tracks())
     assert plan.emergency == (claims.get("violation", 0.0) > 0.0)
-    moved = window.now.pose - registered
-    oldest = window.slots[0].pose
+    moved = window.present - registered
+    oldest = window.poses[0]
     if believed:
         assert moved[0] == pytest.approx(1.0, abs=0.1)
     else:
         assert not moved.any()
-        assert np.abs(oldest - controller._registered[controller._smoother.past][0]).max() == 0.0
+        assert np.abs(oldest - smoother.solution[past][0]).max() == 0.0
         assert np.array_equal(window.departure[0], alone[0][0]) and np.array_equal(window.departure[1], alone[1])
 
 
@@ -208,11 +216,11 @@ def test_only_a_solve_that_ended_moves_the_past(field: DistanceMap, claims: dict
 def test_registering_goes_on_until_the_beams_are_found(field: DistanceMap, off: tuple[float, float, float]) -> None:
     """From half a metre away the beams that count change from round to round; at rest one round is enough."""
     world = World(room(), OPEN, rng=np.random.default_rng(3))
-    window = Window(2, OPEN + np.array(off), np.diag([0.3, 0.3, 0.1]), world.lidar.beams)
-    controller = JointController(field, "sqp", SETTINGS, window)
+    window = PoseWindow(2, OPEN + np.array(off), np.diag([0.3, 0.3, 0.1]), world.lidar.beams)
+    smoother = Smoother(field, window)
     window.look(world.scan())
     solves: list[int] = []
-    inner = controller._smooth
+    inner = smoother.run
 
     class Counted:
         def solve(self, guess: Any, **options: Any) -> fg.Solution:
@@ -220,19 +228,21 @@ def test_registering_goes_on_until_the_beams_are_found(field: DistanceMap, off: 
             solves.append(solution.iterations)
             return solution
 
-    controller._smooth = Counted()  # type: ignore[assignment]
-    assert controller.register() == sum(solves)
+    smoother.run = Counted()  # type: ignore[assignment]
+    smoother.register()
+    assert smoother.iterations == sum(solves)
     assert 1 < len(solves) < 8
-    assert np.hypot(*(window.now.pose - OPEN)[:2]) < 0.03
+    assert np.hypot(*(window.present - OPEN)[:2]) < 0.03
     rounds = len(solves)
-    assert controller.register() == sum(solves[rounds:])
+    smoother.register()
+    assert smoother.iterations == sum(solves[rounds:])
     assert len(solves) == rounds + 1
 
 
 def test_a_guess_of_the_joint_solve_begins_at_the_estimate(field: DistanceMap) -> None:
     """The shifted plan begins where the last tick expected the robot; its first pose gives way to what is known now."""
-    controller, _ = believing(field)
-    pose = controller.window.now.pose.copy()
+    controller, smoother = believing(field)
+    loop, pose = controller.loop, smoother.pose
     begun: list[Array] = []
 
     class Seen:
@@ -240,12 +250,12 @@ def test_a_guess_of_the_joint_solve_begins_at_the_estimate(field: DistanceMap) -
             self.inner = inner
 
         def solve(self, guess: fg.Guess, **options: Any) -> fg.Solution:
-            begun.append(np.array(guess.values[controller._x]))
+            begun.append(np.array(guess.values[loop.x]))
             return self.inner.solve(guess, **options)
 
-    assert controller._guess is not None
-    shifted = np.array(controller._guess.values[controller._x])
-    controller._run = Seen(controller._run)  # type: ignore[assignment]
+    assert loop.guess is not None
+    shifted = np.array(loop.guess.values[loop.x])
+    loop.warm = Seen(loop.warm)  # type: ignore[assignment]
     controller.plan(pose, ahead(OPEN), tracks())
     assert np.array_equal(begun[0][0], pose) and not np.array_equal(shifted[0], pose)
     assert np.array_equal(begun[0][1:], shifted[1:])
@@ -253,14 +263,15 @@ def test_a_guess_of_the_joint_solve_begins_at_the_estimate(field: DistanceMap) -
 
 def failing(controller: Controller) -> None:
     """From now on no plan keeps its constraints."""
-    for name in ("_run", "_cold"):
-        setattr(controller, name, Bent(getattr(controller, name), violation=1.0, status=fg.Status.LOCALLY_INFEASIBLE))
+    for name in ("warm", "cold"):
+        inner = getattr(controller.loop, name)
+        setattr(controller.loop, name, Bent(inner, violation=1.0, status=fg.Status.LOCALLY_INFEASIBLE))
 
 
 def test_braking_keeps_the_shape_of_the_last_plan_and_rests_in_time(controller: Controller) -> None:
     good = controller.plan(OPEN, ahead(), tracks())
     assert good.control[0] > 0.3
-    stored = controller._stored.copy()
+    stored = controller.loop.stored.copy()
     failing(controller)
     plans: list[Plan] = [controller.plan(OPEN, ahead(), tracks()) for _ in range(BRAKING + 2)]
     assert all(plan.emergency for plan in plans)
@@ -274,18 +285,19 @@ def test_braking_keeps_the_shape_of_the_last_plan_and_rests_in_time(controller: 
 
 
 def test_after_a_failure_the_guess_is_rest_until_it_is_forgotten(controller: Controller) -> None:
+    loop, now = controller.loop, controller.now(OPEN, ahead(), tracks())
     controller.plan(OPEN, ahead(), tracks())
-    assert controller._beginning(OPEN, ahead()) == (controller._run, controller._guess)
-    good = (controller._run, controller._cold)
+    assert controller.begin(now) == (loop.warm, loop.guess)
+    good = (loop.warm, loop.cold)
     failing(controller)
     controller.plan(OPEN, ahead(), tracks())
-    controller._run, controller._cold = good
-    run, guess = controller._beginning(OPEN, ahead())
-    assert run is controller._run
-    assert not guess.values[controller._u].any() and (guess.values[controller._x] == OPEN).all()
+    loop.warm, loop.cold = good
+    run, guess = controller.begin(now)
+    assert run is loop.warm
+    assert not guess.values[loop.u].any() and (guess.values[loop.x] == OPEN).all()
     controller.forget()
-    run, guess = controller._beginning(OPEN, ahead())
-    assert run is controller._cold and guess.values[controller._u].any()
+    run, guess = controller.begin(now)
+    assert run is loop.cold and guess.values[loop.u].any()
 
 
 def test_plans_that_stay_behind_are_started_over(controller: Controller) -> None:
@@ -295,61 +307,62 @@ def test_plans_that_stay_behind_are_started_over(controller: Controller) -> None
     behind[:, 0] -= 1.01 * LEFT_BEHIND
     near = states.copy()
     near[:, 0] -= 0.99 * LEFT_BEHIND
-    given = [controller._left_behind(behind, states) for _ in range(2 * PATIENCE)]
+    loop, (is_far, is_near) = controller.loop, (is_behind(plan, states) for plan in (behind, near))
+    given = [loop.stays_behind(is_far) for _ in range(2 * PATIENCE)]
     assert given == ([False] * (PATIENCE - 1) + [True]) * 2
     for _ in range(PATIENCE - 1):
-        assert not controller._left_behind(behind, states)
-    assert not controller._left_behind(near, states)  # one tick beside the reference, and patience begins anew
-    assert not controller._left_behind(behind, states)
+        assert not loop.stays_behind(is_far)
+    assert not loop.stays_behind(is_near)  # one tick beside the reference, and patience begins anew
+    assert not loop.stays_behind(is_far)
 
 
-def test_a_mover_waits_for_a_robot_at_rest_and_is_not_trusted_to_leave(controller: Controller) -> None:
+def test_a_mover_waits_for_a_robot_at_rest_and_is_not_trusted_to_leave() -> None:
     s = SETTINGS
     towards = tracks((OPEN[0] + 1.5, OPEN[1], 0.2), velocity=(-0.5, 0.0), mover=True)
-    gaps = controller._predicted(OPEN, towards)[:, 0, 0] - OPEN[0] - 0.2 - HULL
+    gaps = predicted(SETTINGS, OPEN, towards)[:, 0, 0] - OPEN[0] - 0.2 - HULL
     assert gaps[0] == pytest.approx(1.5 - 0.05 - 0.2 - HULL)
     assert np.all(np.diff(gaps) <= 1e-12)
     assert s.courtesy <= gaps[-1] < s.courtesy + 0.05 + 1e-9  # the last stage before it has to wait
     away = tracks((OPEN[0] + 1.5, OPEN[1], 0.2), velocity=(0.5, 0.2), mover=True)
-    centres = controller._predicted(OPEN, away)[:, 0]
+    centres = predicted(SETTINGS, OPEN, away)[:, 0]
     assert np.all(centres[:, 0] == OPEN[0] + 1.5)
     assert centres[-1, 1] == pytest.approx(OPEN[1] + 0.2 * s.dt * s.horizon)
 
 
-def test_a_mover_is_approached_by_a_share_of_the_gap(controller: Controller) -> None:
+def test_a_mover_is_approached_by_a_share_of_the_gap() -> None:
     s = SETTINGS
     centres = np.tile([OPEN[0] + 2.0, OPEN[1]], (s.horizon, 1, 1))
     radius, mover = np.array([0.2]), np.array([True])
-    limits = controller._disc_limits(OPEN, centres, radius, mover)[:, 0]
+    limits = disc_limits(SETTINGS, OPEN, centres, radius, mover)[:, 0]
     stages = np.arange(1, s.horizon + 1)
     travel = np.minimum(s.mover_speed * s.dt * stages, s.mover_allowance)
     least = HULL + s.disc_clearance + travel
     expected = least + (1.8 - least) * (1.0 - s.approach) ** stages
     np.testing.assert_allclose(limits, np.minimum(expected, 1.8))
-    standing = controller._disc_limits(OPEN, centres, radius, ~mover)[:, 0]
+    standing = disc_limits(SETTINGS, OPEN, centres, radius, ~mover)[:, 0]
     assert standing == pytest.approx(HULL + s.disc_clearance)
 
 
-def test_a_robot_too_near_a_wall_may_stay_and_not_come_nearer(field: DistanceMap, controller: Controller) -> None:
-    s = SETTINGS
-    assert controller._wall_limits(OPEN) == pytest.approx(HULL + s.wall_clearance)
+def test_a_robot_too_near_a_wall_may_stay_and_not_come_nearer(field: DistanceMap) -> None:
+    s, smooth = SETTINGS, SmoothField(field)
+    assert wall_limits(SETTINGS, smooth, OPEN) == pytest.approx(HULL + s.wall_clearance)
     close = np.array([1.5, -0.8 + HULL + 0.01, 0.0])
-    now = float(controller._field.distance(close[None, :2])[0])
+    now = float(smooth.distance(close[None, :2])[0])
     assert now < HULL + s.wall_clearance
-    assert controller._wall_limits(close) == pytest.approx(now)
+    assert wall_limits(SETTINGS, smooth, close) == pytest.approx(now)
 
 
 def test_a_scan_without_returns_changes_nothing(field: DistanceMap) -> None:
-    window = Window(2, OPEN, np.diag([0.01, 0.01, 0.01]), 72)
-    controller = JointController(field, "sqp", SETTINGS, window)
+    window = PoseWindow(2, OPEN, np.diag([0.01, 0.01, 0.01]), 72)
+    smoother = Smoother(field, window)
     angles = np.linspace(-np.pi, np.pi, 72, endpoint=False)
     window.look(Scan(angles, np.full(72, np.nan)))
-    controller.register()
-    assert np.abs(window.now.pose - OPEN).max() < 1e-9
+    smoother.register()
+    assert np.abs(window.present - OPEN).max() < 1e-9
 
 
 def test_backends_take_the_settings_tolerances() -> None:
-    from unifg.scenarios.driving.controller import backend
+    from unifg.scenarios.driving.drive_settings import backend
 
     for name in ("sqp", "alm"):
         warm, cold = (backend(name, SETTINGS, patience) for patience in (1, 3))

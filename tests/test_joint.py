@@ -9,10 +9,9 @@ import pytest
 
 import unifg as fg
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.driving.controller import ControllerSettings
-from unifg.scenarios.driving.joint import JointController
-from unifg.scenarios.driving.pilot import JointPilot
-from unifg.scenarios.driving.window import NOW_TERMS, PAST_TERMS, Window
+from unifg.scenarios.driving.drive_joint import Smoother
+from unifg.scenarios.driving.drive_settings import ControllerSettings
+from unifg.scenarios.driving.drive_window import NOW_TERMS, PAST_TERMS, PoseWindow
 from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigation
 from unifg.scenarios.worlds.building import building_map
@@ -67,11 +66,11 @@ def test_marginal_prior_refuses_what_it_cannot_do(rng: np.random.Generator) -> N
 
 def test_a_window_needs_two_poses() -> None:
     with pytest.raises(fg.ScenarioError, match="at least two"):
-        Window(1, np.zeros(3), np.eye(3), 360)
+        PoseWindow(1, np.zeros(3), np.eye(3), 360)
 
 
-def settled(field: DistanceMap, weight: float, ticks: int = 12) -> tuple[Episode, JointController]:
-    """A joint episode after some ticks."""
+def settled(field: DistanceMap, weight: float, ticks: int = 12) -> tuple[Episode, Smoother]:
+    """A joint episode after some ticks, and its past."""
     settings = NavigationSettings(
         start=HERE,
         goals=(THERE,),
@@ -91,18 +90,17 @@ def settled(field: DistanceMap, weight: float, ticks: int = 12) -> tuple[Episode
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(episode, "_arrived", lambda goal: False)
         episode.run(stop)
-    assert isinstance(episode.pilot, JointPilot)
-    controller = episode.pilot.controller
-    assert isinstance(controller, JointController)
-    return episode, controller
+    smoother = episode.pilot.estimator
+    assert isinstance(smoother, Smoother)
+    return episode, smoother
 
 
 def test_the_past_ignores_a_weightless_future(field: DistanceMap) -> None:
     """With a tiny control weight the joint estimate is that of the window alone."""
-    episode, controller = settled(field, 1e-6)
-    joint = controller.window.now.pose.copy()
-    controller.register()
-    alone = controller.window.now.pose
+    episode, smoother = settled(field, 1e-6)
+    joint = smoother.pose
+    smoother.register()
+    alone = smoother.pose
     assert np.hypot(*(joint - alone)[:2]) < 1e-3
     assert np.hypot(*(joint - episode.world.pose)[:2]) < 0.15  # one step of motion after the last tick
 
@@ -121,46 +119,52 @@ def test_a_heavy_future_pulls_the_estimate() -> None:
 
 def test_the_pull_is_bounded(field: DistanceMap) -> None:
     """However heavy the future, the estimate stays within the bound around what the past alone says."""
-    _, controller = settled(field, 1000.0)
-    alone = controller._registered[controller._smoother.present]
-    moved = fg.SE2.log(fg.SE2.between(alone, controller.window.now.pose[None]))[0]
-    bound = np.array(controller.settings.pull)
+    episode, smoother = settled(field, 1000.0)
+    alone = smoother.solution[smoother.terms.present]
+    moved = fg.SE2.log(fg.SE2.between(alone, smoother.pose[None]))[0]
+    bound = np.array(episode.settings.controller.pull)
     assert (np.abs(moved) <= bound + 5e-4).all()
     assert (np.abs(moved) > 0.9 * bound).any()
 
 
 def test_beams_keep_their_weights_during_a_solve(field: DistanceMap) -> None:
     """Weights are chosen at the belief before the solve: a beam off the map counts nothing, however the poses move."""
-    _, controller = settled(field, 1.0)
-    terms, window = controller._smoother, controller.window
-    right = terms.data(window)[terms._seen_now].sum()
-    window.now.pose = window.now.pose + np.array([2.0, 0.0, 0.0])
-    wrong = terms.data(window)[terms._seen_now].sum()
+    _, smoother = settled(field, 1.0)
+    terms, window = smoother.terms, smoother.window
+
+    def told(name: str) -> Array:
+        return next(
+            np.asarray(value) for data, value in terms.data(window).items() if data.name == f"lidar now: {name}"
+        )
+
+    right = told("which count").sum()
+    window.poses[-1] += np.array([2.0, 0.0, 0.0])
+    wrong = told("which count").sum()
     assert wrong < 0.8 * right
-    information = terms.data(window)[terms._counts_now]
+    information = told("information")
     assert set(np.unique(np.round(information * 0.01, 9))) <= {0.0, 0.25, 1.0}
 
 
 def test_window_keeps_its_length_and_its_prior_is_of_the_past_alone(field: DistanceMap) -> None:
-    _, controller = settled(field, 1.0)
-    window = controller.window
-    assert len(window.slots) == window.length
+    _, smoother = settled(field, 1.0)
+    window = smoother.window
+    assert window.full and window.entered == window.length
     reference, information = window.departure
     assert np.linalg.eigvalsh(information).min() > 0.0
-    oldest = window.slots[1].pose  # the prior is about the pose that is oldest after the next move
+    oldest = window.poses[1]  # the prior is about the pose that is oldest after the next move
     assert np.hypot(*(reference - oldest)[:2]) < 0.05
 
 
 def test_covariance_counts_the_past_alone(field: DistanceMap) -> None:
     """Raising the control weight does not make the robot more certain of where it is."""
-    _, controller = settled(field, 1.0)
-    terms = controller._smoother
-    guess = {terms.past: terms.poses(controller.window), terms.present.family: controller.window.now.pose[None]}
-    solution = controller._smooth.solve(guess, data=terms.data(controller.window))
+    _, smoother = settled(field, 1.0)
+    terms, window = smoother.terms, smoother.window
+    guess = {terms.past: window.guess(), terms.present.family: smoother.pose[None]}
+    solution = smoother.run.solve(guess, data=terms.data(window))
     mine = terms.covariance(solution)
     np.testing.assert_allclose(mine, solution.covariance(terms.present), rtol=1e-5)
     everything = solution.information((*PAST_TERMS, *NOW_TERMS), terms.past, terms.present)
-    assert everything.shape == (3 * controller.window.length + 3,) * 2
+    assert everything.shape == (3 * window.length + 3,) * 2
 
 
 @pytest.mark.parametrize("solver", ["sqp", "alm"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ import unifg as fg
 from unifg.lie import SO3
 from unifg.models import avoidance, quadrotor
 from unifg.scenarios.flying.braking import brake, stopping_path
-from unifg.scenarios.flying.controller import Controller, Given
-from unifg.scenarios.flying.guide import Guide, GuideSettings, Reference
-from unifg.scenarios.flying.plan import ControllerSettings
-from unifg.scenarios.flying.slots import Obstacles, Slots
+from unifg.scenarios.flying.flight_control import Controller
+from unifg.scenarios.flying.flight_parts import GivenFlight
+from unifg.scenarios.flying.flight_settings import ControllerSettings
+from unifg.scenarios.flying.guide import Guide, GuideSettings
+from unifg.scenarios.flying.slots import FAR_AWAY, Obstacles, Slots
+from unifg.scenarios.horizon.part import known_present
 from unifg.scenarios.seeing.belief import Belief, Landmarks
 from unifg.scenarios.seeing.tracks import Tracks
 from unifg.solvers.names import CONSTRAINED
@@ -173,40 +176,45 @@ def test_a_doubtful_landmark_is_given_more_room(controllers: dict[str, Controlle
 def test_terms_of_the_estimate_can_be_replaced() -> None:
     """Parameters and landmarks as variables, as in a joint graph: fixed where they were given, they change nothing."""
 
-    class Shared(Controller):
-        def _move(self, graph: fg.Graph, x: fg.Family, u: fg.Family) -> None:
+    class Shared(GivenFlight):
+        def state(self, graph: fg.Graph, x: fg.Family, u: fg.Family) -> Any:
+            data = known_present(graph, x, u)
             manifolds = (quadrotor.MASS, quadrotor.DRAG, quadrotor.WIND, quadrotor.UPDRAFT)
             self.shared = [graph.variables(m, g, 1) for m, g in zip("mdwu", manifolds, strict=True)]
             values = np.split(HEAVY.packed, [1, 4, 6])
             for family, value in zip(self.shared, values, strict=True):
                 graph.fix(family[:], value)
-            function, dt, still = quadrotor.disturbed_dynamics, self.settings.dt, graph.variables("still", fg.Rn(6), 1)
+            function, dt = quadrotor.disturbed_dynamics, ControllerSettings().dt
+            still = graph.variables("still", fg.Rn(6), 1)
             graph.fix(still[:], np.zeros(6))
             graph.constrain(function, x[:-1], u, still[:], *self.shared, x[1:], dt, lower=0, upper=0, name="dynamics")
             self.values = {f: np.zeros((1, f.manifold.storage)) for f in (*self.shared, still)}
+            return data
 
-        def _moved(self, belief: Belief) -> Given:
-            return {}
-
-        def _keep_clear(self, graph: fg.Graph, x: fg.Family) -> None:
+        def places(self, graph: fg.Graph, x: fg.Family, u: fg.Family) -> Any:
             places = graph.variables("landmark", fg.Rn(2), len(AHEAD))
             graph.fix(places[:], AHEAD.positions)
-            least = HULL + self.settings.margin
+            least = HULL + ControllerSettings().margin
             for k, radius in enumerate(AHEAD.radii.tolist()):
                 graph.constrain(
                     avoidance.landmark_clearance, x.p[1:], places[k], radius, lower=least, name=f"landmark {k}"
                 )
             self.values[places] = AHEAD.positions
+            return lambda now: {}
 
-        def _kept_clear(self, obstacles: Obstacles) -> Given:
-            return {}
+        def split(self, obstacles: Obstacles) -> tuple[Obstacles, Any, list[int]]:
+            nowhere = replace(obstacles, centres=np.full_like(obstacles.centres, FAR_AWAY))
+            return nowhere, np.ones(len(obstacles.names), dtype=bool), []
 
-        def _solve(self, belief: Belief, reference: Reference, obstacles: Obstacles, data: Given) -> fg.Solution:
-            guess = self._along(belief, reference)
-            return self._cold.solve({**guess.values, **self.values}, data=data)
+        def apart(self, squares: bool | None) -> Any:
+            return (self.places,)
+
+        def begin(self, guess: fg.Guess, now: object) -> fg.Guess:
+            return fg.Guess({**guess.values, **self.values})
 
     usual = Controller(TARGET, WALLS, bounds=BOUNDS).plan(MOVING)
-    shared = Shared(TARGET, WALLS, bounds=BOUNDS).plan(MOVING)
+    past = Shared(ControllerSettings())
+    shared = Controller(TARGET, WALLS, bounds=BOUNDS, past=past).plan(MOVING)
     assert shared.source == "solved"
     assert np.abs(shared.states[:, :3] - usual.states[:, :3]).max() < 5e-3
 

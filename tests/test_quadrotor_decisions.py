@@ -11,9 +11,9 @@ import pytest
 import unifg as fg
 from test_quadrotor_controller import BOUNDS, TARGET, WALLS, belief, landmarks, state
 from unifg.models import quadrotor
-from unifg.scenarios.flying.controller import KEPT, LEFT_BEHIND, PATIENCE, Controller
+from unifg.scenarios.flying.flight_control import KEPT, LEFT_BEHIND, PATIENCE, Controller, is_behind
+from unifg.scenarios.flying.flight_settings import ControllerSettings
 from unifg.scenarios.flying.guide import Reference
-from unifg.scenarios.flying.plan import ControllerSettings
 from unifg.scenarios.flying.slots import Slots
 from unifg.scenarios.seeing.belief import Landmarks
 from unifg.scenarios.seeing.tracks import Tracks
@@ -48,18 +48,18 @@ def test_multipliers_stay_with_their_obstacle_and_go_with_it() -> None:
     here = state(1.0, velocity=(1.5, 0.0, 0.0))
     two = named(landmarks((3.0, 0.15, 0.5), (2.6, -1.9, 0.4)), 4, 7)
     controller.plan(belief(here, two))
-    assert controller._guess is not None
-    left = controller._guess.multipliers["cylinders"]
-    slots = controller._slots._names.tolist()
+    assert controller.loop.guess is not None
+    left = controller.loop.guess.multipliers["cylinders"]
+    slots = controller.slots._names.tolist()
     kept, gone = slots.index(4), slots.index(7)
     assert np.abs(left[:, kept]).max() > 1.0 and left[:, gone].all()
-    watched = Watched(controller._run)
-    controller._run = watched  # type: ignore[assignment]
+    watched = Watched(controller.loop.warm)
+    controller.loop.warm = watched  # type: ignore[assignment]
     other = named(landmarks((3.0, 0.15, 0.5), (9.0, 1.0, 0.4)), 4, 8)
     movers = Tracks.of_movers(np.array([[8.0, -2.0]]), np.array([[0.0, 0.3]]), np.array([0.4]))
     plan = controller.plan(belief(here, other), movers)
     assert plan.source == "solved"
-    assert controller._slots._names.tolist()[gone] == 8
+    assert controller.slots._names.tolist()[gone] == 8
     given = watched.guesses[0].multipliers
     assert np.array_equal(given["cylinders"][:, kept], left[:, kept])
     assert not given["cylinders"][:, gone].any()
@@ -135,12 +135,12 @@ def test_the_nearest_movers_are_those_whose_hulls_are_nearest() -> None:
 def test_the_control_that_is_flown_is_what_the_next_one_changes_from() -> None:
     controller, here = Controller(TARGET, WALLS, settings=SETTINGS, bounds=BOUNDS), belief(state(1.0))
     hover = quadrotor.hover(here.parameters)
-    assert np.array_equal(controller._spent(here)[controller._last], hover)
+    assert np.array_equal(controller.now(here, Tracks.none()).last, hover)
     plan = controller.plan(here)
     assert not np.allclose(plan.controls[0], hover)
-    assert np.array_equal(controller._spent(here)[controller._last], plan.controls[0])
+    assert np.array_equal(controller.now(here, Tracks.none()).last, plan.controls[0])
     controller.forget()
-    assert np.array_equal(controller._spent(here)[controller._last], hover)
+    assert np.array_equal(controller.now(here, Tracks.none()).last, hover)
 
 
 def test_the_first_control_does_not_leap_from_the_last() -> None:
@@ -159,7 +159,7 @@ def test_limits_of_the_controls_are_the_solver_s_business_not_the_clipping_s() -
     controller = Controller(TARGET, WALLS, settings=s, bounds=BOUNDS)
     plan = controller.plan(belief(state(1.0, z=3.0, velocity=(1.0, 0.0, -2.5))))
     assert plan.source == "solved" and plan.controls[:, 3].max() > 12.0 - 1e-3
-    forces = controller._guess.multipliers["control limits"]  # type: ignore[union-attr]
+    forces = controller.loop.guess.multipliers["control limits"]  # type: ignore[union-attr]
     assert forces[:, 3].max() > 0.01
     flown = quadrotor.rollout(plan.states[0], plan.controls, s.dt, quadrotor.Parameters())
     assert np.abs(flown[:, 2] - plan.states[:, 2]).max() < 0.02
@@ -170,7 +170,7 @@ def test_general_costs_are_stated_as_squares_for_a_solver_that_knows_no_others()
     general = replace(SETTINGS, avoidance="potential", general_costs=True, horizon=4)
     for solver, squares in (("alm", True), ("ipm", False)):
         controller = Controller(TARGET, WALLS, solver, general, BOUNDS)
-        scalar = [term.name for term in controller._run.program.scalar_terms]
+        scalar = [term.name for term in controller.loop.warm.program.scalar_terms]
         assert (not scalar) == squares
 
 
@@ -185,9 +185,6 @@ class Told:
 
     def __init__(self, **changes: Any) -> None:
         self.controller = Controller(TARGET, WALLS, settings=replace(SETTINGS, **changes), bounds=BOUNDS)
-        self.obstacles = self.controller._slots.fill(
-            state(1.0), np.tile([1.0, 0.0, 1.5], (SETTINGS.horizon + 1, 1)), Landmarks.none(), Tracks.none()
-        )
 
     def judge(self, controls: Array, present: Array, *, defect: float = 0.0, discs: Landmarks | None = None) -> Any:
         """What is flown for such an answer of the solver, whose states are off by ``defect`` [m] at the end."""
@@ -195,17 +192,16 @@ class Told:
         states = quadrotor.rollout(present, controls, s.dt, quadrotor.Parameters())
         states[-1, 0] += defect
         believed = belief(present, discs)
-        reference = c.guide.reference(present, believed.landmarks, s.horizon + 1, s.dt)
-        obstacles = c._slots.fill(present, reference.positions, believed.landmarks, Tracks.none())
+        now = c.now(believed, Tracks.none())
 
         class Answer:
             def __getitem__(self, variable: Any) -> Array:
-                return controls if variable is c._u else states
+                return controls if variable is c.loop.u else states
 
             def shifted(self, *families: Any) -> fg.Guess:
                 return SHIFTED
 
-        return c._judge(Answer(), believed, reference, obstacles)  # type: ignore[arg-type]
+        return c.judge(Answer(), now)  # type: ignore[arg-type]
 
 
 HOVER = quadrotor.hover(quadrotor.Parameters())
@@ -218,7 +214,7 @@ def test_a_sound_plan_is_flown_within_the_limits_and_starts_the_next() -> None:
     wild[3, 3] = SETTINGS.thrust_limits[1] + 1e-3  # within the solver's tolerance
     controls, _, source = told.judge(wild, state(1.0))
     assert source == "solved" and controls[3, 3] == SETTINGS.thrust_limits[1]
-    assert told.controller._guess is SHIFTED
+    assert told.controller.loop.guess is SHIFTED
     assert not any(told.controller.emergencies.values())
 
 
@@ -236,10 +232,10 @@ def test_old_plans_are_flown_for_some_ticks_and_then_it_brakes() -> None:
             assert np.array_equal(states, quadrotor.rollout(state(1.0), controls, SETTINGS.dt, quadrotor.Parameters()))
         else:
             assert source == "braking"
-        guess = told.controller._guess  # one stage later, from what is flown
+        guess = told.controller.loop.guess  # one stage later, from what is flown
         assert guess is not None
-        assert np.array_equal(guess.values[told.controller._u][:-1], controls[1:])
-        assert np.array_equal(guess.values[told.controller._x][:-1], states[1:])
+        assert np.array_equal(guess.values[told.controller.loop.u][:-1], controls[1:])
+        assert np.array_equal(guess.values[told.controller.loop.x][:-1], states[1:])
     assert told.controller.emergencies == {"violating": 0, "kept": KEPT, "braking": 2}
 
 
@@ -247,9 +243,10 @@ def test_without_an_old_plan_it_brakes() -> None:
     told = Told()
     controls, _, source = told.judge(REST, state(1.0, velocity=(1.0, 0.0, 0.0)), defect=1.0)
     assert source == "braking"
-    assert np.all(controls >= told.controller._least) and np.all(controls <= told.controller._most)
+    loop = told.controller.loop
+    assert np.all(controls >= loop.least) and np.all(controls <= loop.most)
     told.controller.forget()
-    assert told.controller._stored is None and told.controller._guess is None
+    assert not len(loop.left()) and loop.guess is None
 
 
 SWERVE, STRAIGHT = REST.copy(), REST.copy()
@@ -294,13 +291,13 @@ def test_plans_that_stay_behind_are_started_over() -> None:
     way = np.tile([1.0, 0.0, 1.5], (SETTINGS.horizon + 1, 1))
     reference = Reference(way, np.zeros_like(way), way[:, :2], True)
     behind, near = (np.tile(state(1.0 - share * LEFT_BEHIND), (2, 1)) for share in (1.01, 0.99))
-    c = told.controller
-    given = [c._left_behind(behind, reference) for _ in range(2 * PATIENCE)]
+    loop, (is_far, is_near) = told.controller.loop, (is_behind(plan, reference) for plan in (behind, near))
+    given = [loop.stays_behind(is_far) for _ in range(2 * PATIENCE)]
     assert given == ([False] * (PATIENCE - 1) + [True]) * 2
     for _ in range(PATIENCE - 1):
-        c._left_behind(behind, reference)
-    assert not c._left_behind(near, reference)
-    assert not c._left_behind(behind, reference)
-    assert c._lagging == 1
-    c.forget()
-    assert c._lagging == 0
+        loop.stays_behind(is_far)
+    assert not loop.stays_behind(is_near)
+    assert not loop.stays_behind(is_far)
+    assert loop.lagging == 1
+    told.controller.forget()
+    assert loop.lagging == 0

@@ -15,7 +15,7 @@ from unifg.lie import SO3
 from unifg.models import quadrotor
 from unifg.scenarios.flying.arrival import arrival, seen_from_the_vehicle
 from unifg.scenarios.flying.estimator import DeadReckoningEstimator, Estimator, EstimatorSettings
-from unifg.scenarios.flying.window import WindowSettings, without
+from unifg.scenarios.flying.flight_window import WindowSettings, without
 from unifg.scenarios.seeing.association import DOUBTFUL, NEW, Gates, nearest
 from unifg.scenarios.seeing.belief import Belief, Landmarks
 from unifg.scenarios.seeing.readings import Reading
@@ -216,7 +216,7 @@ def test_without_dynamics_nothing_is_learnt() -> None:
     log = flight(2)
     estimator = begin(2, DeadReckoningEstimator)
     found = beliefs(estimator, log)
-    assert found[-1].parameters == estimator.nominal
+    assert found[-1].parameters == estimator.model.nominal
     assert np.abs(found[-1].parameters_sigma).max() == 0.0
     informed = beliefs(begin(2), log)
 

@@ -18,12 +18,14 @@ from unifg.models import quadrotor
 from unifg.program.program import Program
 from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.flying.estimator import Estimator
-from unifg.scenarios.flying.joint import JointController, JointSettings
-from unifg.scenarios.flying.joint_pilot import JointPilot, joint_pilot
-from unifg.scenarios.flying.plan import ControllerSettings, Plan
+from unifg.scenarios.flying.flight_control import Controller
+from unifg.scenarios.flying.flight_joint import JointSettings, SharedFlight
+from unifg.scenarios.flying.flight_pilot import joint_controller, make_pilot
+from unifg.scenarios.flying.flight_settings import ControllerSettings
+from unifg.scenarios.flying.flight_terms import Shared, StateTerms
 from unifg.scenarios.flying.slots import FAR_AWAY
 from unifg.scenarios.flying.standardised import standardised
-from unifg.scenarios.flying.window_terms import Shared, WindowTerms
+from unifg.scenarios.horizon.loop import Plan
 from unifg.scenarios.seeing.belief import Belief
 from unifg.scenarios.seeing.tracks import Tracks
 from unifg.scenarios.worlds.layouts import Layout
@@ -48,10 +50,10 @@ class Past:
         self.estimator: Estimator = flight.pilot.estimator
         self.belief: Belief = self.estimator.update(flight.world.sense(), control)
 
-    def controller(self, joint: JointSettings, solver: str = "ipm", **changes: object) -> JointController:
+    def controller(self, joint: JointSettings, solver: str = "ipm", **changes: object) -> Controller:
         """A joint graph on this window."""
         settings = replace(ControllerSettings(), **changes)  # type: ignore[arg-type]
-        return JointController(self.estimator, self.layout, solver, settings, joint)
+        return joint_controller(self.estimator, self.layout, solver, settings, joint)
 
     def pulled(self, believed: Belief) -> dict[str, Array]:
         """How far a belief is from what the past says, in standard deviations."""
@@ -84,12 +86,18 @@ def compilations(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     yield made
 
 
+def latest(controller: Controller) -> Belief:
+    """What the last joint solve says."""
+    assert isinstance(controller.past, SharedFlight)
+    return controller.past.latest
+
+
 def alone(past: Past) -> tuple[fg.Solution, fg.Family, Shared]:
     """The past's terms in a graph of their own, solved to the end."""
     window, graph = past.estimator.window, fg.Graph()
     present = graph.variables("present", quadrotor.STATE, 1)
     shared = Shared(graph, window.settings, window.parameters)
-    terms = WindowTerms(graph, present[:], shared, window.settings)
+    terms = StateTerms(graph, present[:], shared, window.settings)
     guess = {**terms.guess(window), present: window.present[None]}
     solution = InteriorPoint(tolerance=1e-9).solve(graph, guess, data=terms.data(window))
     assert solution.status.converged
@@ -124,7 +132,7 @@ def test_without_wishes_the_past_decides(past: Past) -> None:
     assert controller.plan(past.belief).status is fg.Status.CONVERGED
     solution, present, shared = alone(past)
     marks = [past.estimator.atlas.slot_of(name) for name in past.belief.landmarks.ids.tolist()]
-    believed = controller.believed
+    believed = latest(controller)
     assert np.abs(quadrotor.STATE.local(solution[present], believed.state[None])).max() < 1e-6
     assert np.abs(believed.landmarks.positions - solution[shared.landmarks][marks]).max() < 1e-6
     found = np.concatenate([solution[family][0] for family in shared.parameters])
@@ -137,7 +145,7 @@ def test_wishes_pull_on_what_is_shared(past: Past) -> None:
     for weight in (0.1, 1.0, 100.0):
         controller = past.controller(FREE, control_weight=weight)
         assert controller.plan(past.belief).source == "solved"
-        pulled.append({name: float(np.abs(value).max()) for name, value in past.pulled(controller.believed).items()})
+        pulled.append({name: float(np.abs(value).max()) for name, value in past.pulled(latest(controller)).items()})
     for name in ("state", "parameters", "landmarks"):
         weak, normal, strong = (row[name] for row in pulled)
         assert 2.0 * weak < normal < 0.2
@@ -149,14 +157,14 @@ def test_the_pull_is_bounded(past: Past) -> None:
     for bound in (0.1, 0.5):
         controller = past.controller(JointSettings(bound), control_weight=100.0)
         assert controller.plan(past.belief).status.converged
-        found = np.concatenate([np.abs(value).ravel() for value in past.pulled(controller.believed).values()])
+        found = np.concatenate([np.abs(value).ravel() for value in past.pulled(latest(controller)).values()])
         assert bound - 2e-3 < found.max() < bound + 2e-3
 
 
 @pytest.mark.parametrize("solver", CONSTRAINED)
 def test_a_plan_moves_as_the_shared_parameters_say_and_keeps_clear_of_the_shared_map(solver: str, past: Past) -> None:
     controller = past.controller(JointSettings(), solver, margin=0.9)  # so wide that the way does not keep it
-    s, plan, believed = controller.settings, controller.plan(past.belief), controller.believed
+    s, plan, believed = controller.settings, controller.plan(past.belief), latest(controller)
     assert plan.source == "solved"
     assert believed is not past.belief
     assert np.array_equal(plan.states[0], believed.state)
@@ -176,7 +184,7 @@ def test_backends_believe_the_same(past: Past) -> None:
     for solver in CONSTRAINED:
         controller = past.controller(FREE, solver)
         controller.plan(past.belief)
-        found[solver] = past.pulled(controller.believed)
+        found[solver] = past.pulled(latest(controller))
     for name, value in found["ipm"].items():
         assert np.abs(value).max() > 0.02
         for solver in ("sqp", "alm"):
@@ -189,9 +197,9 @@ def test_a_known_mass_stays_what_it_is() -> None:
     past = Past(12, replace(flight, estimator=replace(flight.estimator, window=window)))
     controller = past.controller(FREE, control_weight=10.0)
     assert controller.plan(past.belief).source == "solved"
-    assert controller.believed.parameters.mass == past.belief.parameters.mass
-    assert controller.believed.parameters.drag == past.belief.parameters.drag
-    assert controller.believed.parameters.wind != past.belief.parameters.wind
+    assert latest(controller).parameters.mass == past.belief.parameters.mass
+    assert latest(controller).parameters.drag == past.belief.parameters.drag
+    assert latest(controller).parameters.wind != past.belief.parameters.wind
 
 
 @pytest.mark.parametrize("general", [False, True])
@@ -202,8 +210,8 @@ def test_ta_s_costs_pull_on_the_map_too_and_are_bounded(general: bool, past: Pas
         controller = past.controller(joint, avoidance="potential", general_costs=general, potential_weight=100.0)
         plan = controller.plan(past.belief)
         assert plan.source == "solved"
-        found.append(max(float(np.abs(value).max()) for value in past.pulled(controller.believed).values()))
-        before, after = past.belief.landmarks.cylinders, controller.believed.landmarks.cylinders
+        found.append(max(float(np.abs(value).max()) for value in past.pulled(latest(controller)).values()))
+        before, after = past.belief.landmarks.cylinders, latest(controller).landmarks.cylinders
         away = before.positions - plan.states[1:, None, :2]
         near = int(np.argmin(np.hypot(*np.moveaxis(away, 2, 0)).min(axis=0) - before.radii))
         push = (away[:, near] / (away[:, near] ** 2).sum(axis=1, keepdims=True)).sum(axis=0)
@@ -219,7 +227,7 @@ def test_no_wish_makes_drag_negative() -> None:
     flight = Flight(settings)
     found, state = flight.conditions, flight.pilot.belief.state
     wishful = replace(settings.controller, avoidance="potential")
-    pilot = joint_pilot("ipm", found.layout, state, found.nominal, settings.estimator, wishful, FREE)
+    pilot = make_pilot("joint", "ipm", found.layout, state, found.nominal, settings.estimator, wishful, FREE)
     control: Array | None = None
     drag = []
     for _ in range(25):
@@ -238,30 +246,32 @@ def test_a_solve_that_bends_its_constraints_is_not_believed(past: Past, monkeypa
     """A first step from far away says little; the vehicle brakes, and the estimate is that of the past."""
     controller = past.controller(JointSettings(0.5), control_weight=100.0)
     before = past.estimator.window.states.copy()
-    monkeypatch.setattr(controller, "_cold", InteriorPoint(max_iterations=1).prepare(controller._cold.program.graph))
+    loop = controller.loop
+    monkeypatch.setattr(loop, "cold", InteriorPoint(max_iterations=1).prepare(loop.cold.program.graph))
     plan = controller.plan(past.belief)
     assert plan.status is fg.Status.ITERATION_LIMIT
     assert plan.emergency
-    assert controller.believed is past.belief
+    assert latest(controller) is past.belief
     assert np.array_equal(past.estimator.window.states, before)
 
 
 def test_multipliers_stay_with_what_they_belong_to(past: Past) -> None:
     controller = past.controller(JointSettings())
     controller.plan(past.belief)
-    obstacles = controller._slots.fill(
-        past.belief.state, np.tile(past.belief.state[:3], (31, 1)), past.belief.landmarks, Tracks.none()
-    )
-    guess = controller._guess
+    joint = controller.past
+    assert isinstance(joint, SharedFlight)
+    now = controller.now(past.belief, Tracks.none())
+    guess = controller.loop.guess
     assert guess is not None
     given = {name: np.ones_like(value) for name, value in guess.multipliers.items()}
     given["dynamics"] = np.arange(given["dynamics"].size, dtype=float).reshape(given["dynamics"].shape)
-    others, held, slots = controller._split(obstacles)
+    others, held, slots = now.others, now.held, now.marks
     assert held.sum() == len(slots) >= 3
     assert np.all(others.centres[:, held] == FAR_AWAY)  # nothing is both data and variable
     gone = slots[0]
-    controller._names[gone] = 99  # at the last solve the slot held something else
-    kept = controller._refreshed(fg.Guess(guess.values, given), obstacles).multipliers
+    joint.names[gone] = 99  # at the last solve the slot held something else
+    given = controller.kept_multipliers(fg.Guess(guess.values, given), now)
+    kept = joint.kept_multipliers(fg.Guess(guess.values, given), now)
     pairs = kept["landmarks"].reshape(controller.settings.horizon, -1)
     expected = np.zeros(pairs.shape[1])
     expected[slots[1:]] = 1.0
@@ -278,7 +288,6 @@ def test_the_structure_is_compiled_once(compilations: list[int]) -> None:
     settings = FlightSettings(seed=SEED, coupling="joint")
     window = replace(settings.estimator.window, landmarks=4, length=5)
     flight = Flight(replace(settings, estimator=replace(settings.estimator, window=window)))
-    assert isinstance(flight.pilot, JointPilot)
     control: Array | None = None
     begun, known, retired = 0, [], 0
     for tick in range(60):
@@ -299,7 +308,6 @@ def test_a_flight_believes_what_the_joint_graph_says(association: str) -> None:
     settings = FlightSettings(seed=SEED, coupling="joint")
     flight = Flight(replace(settings, estimator=replace(settings.estimator, association=association)))
     pilot, world = flight.pilot, flight.world
-    assert isinstance(pilot, JointPilot)
     control: Array | None = None
     errors, differences = [], []
     for _ in range(50):
@@ -321,9 +329,9 @@ def test_the_window_goes_on_from_the_past_alone() -> None:
     past = Past(30, FlightSettings(seed=SEED))
     controller = past.controller(JointSettings(np.inf), control_weight=10.0)
     controller.plan(past.belief)
-    assert np.abs(controller.believed.state - past.belief.state).max() > 1e-5
+    assert np.abs(latest(controller).state - past.belief.state).max() > 1e-5
     assert np.array_equal(past.estimator.window.present, past.belief.state)
-    assert past.estimator.window.parameters[0] != controller.believed.parameters.mass
+    assert past.estimator.window.parameters[0] != latest(controller).parameters.mass
 
 
 # ---------------------------------------------------------------- settings and residuals

@@ -17,8 +17,9 @@ from unifg.lie import SO3
 from unifg.scenarios import command
 from unifg.scenarios import flight as episode
 from unifg.scenarios.commands import flights as results
+from unifg.scenarios.episode import Progress
 from unifg.scenarios.flight import Flight, FlightSettings, run_flight
-from unifg.scenarios.flying.coupling import COUPLINGS
+from unifg.scenarios.flying.flight_pilot import COUPLINGS
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics, state_errors
 from unifg.scenarios.options import add_options, settings_of
@@ -338,7 +339,7 @@ def test_wrong_arguments_are_refused(words: tuple[str, ...], tmp_path: Path) -> 
 def only_a_moment(monkeypatch: pytest.MonkeyPatch, change: Callable[[FlightLog], FlightLog]) -> None:
     """Let the command fly for half a second."""
 
-    def fly(settings: FlightSettings, progress: episode.Progress) -> FlightLog:
+    def fly(settings: FlightSettings, progress: Progress) -> FlightLog:
         return change(run_flight(replace(settings, time_limit=0.5), progress))
 
     monkeypatch.setattr(episode, "run_flight", fly)

@@ -11,7 +11,8 @@ import pytest
 from unifg.files.ros_map import OccupancyMap
 from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.driving.controller import Controller, ControllerSettings
+from unifg.scenarios.driving.drive_control import Controller
+from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.driving.route import ALLOWANCE, GAP, PATIENCE, STUCK_TICKS, WALL_GAP, Route
 from unifg.scenarios.seeing.tracks import Tracks
 from unifg.scenarios.ways.grid import SPACING
@@ -125,8 +126,8 @@ def test_a_guess_without_a_warm_start_can_be_driven(heading: float) -> None:
     route, start = through_the_hall()
     pose = np.array([start[0], start[1], heading])
     reference = route.reference(pose, 0.1, 31)
-    values = controller._along(pose, reference).values
-    states, controls = np.asarray(values[controller._x]), np.asarray(values[controller._u])
+    values = controller.along(controller.now(pose, reference, Tracks.none())).values
+    states, controls = np.asarray(values[controller.loop.x]), np.asarray(values[controller.loop.u])
     assert np.abs(controls).max() <= 1.0
     np.testing.assert_allclose(states, unicycle.rollout(pose, controls, 0.1), atol=1e-9)
     if heading > 1.5:

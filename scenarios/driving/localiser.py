@@ -56,6 +56,12 @@ class Localiser:
         )
         self._run = GaussNewton(max_iterations=12, step_tolerance=1e-5).prepare(graph)
 
+    def update(self, scan: Scan, odometry: Array | None, dt: float) -> None:
+        """Move by odometry (2,) since the last scan, None for none, and register a scan."""
+        if odometry is not None:
+            self.predict(odometry, dt)
+        self.correct(scan)
+
     def predict(self, u: Array, dt: float) -> None:
         """Move the estimate by the wheels' measured velocities (2,) [m/s, rad/s]."""
         self.pose, self.covariance = odometry.predict(self.pose, self.covariance, u, dt, self._noise)

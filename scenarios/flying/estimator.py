@@ -1,7 +1,7 @@
 """Where is the vehicle, how heavy is it, where are the obstacles? A sliding window, solved anew at each tick.
 
 :class:`Estimator` knows the dynamics: controls, process noise and the unknown parameters tie the states to each other.
-:class:`DeadReckoningEstimator` has the same sensors and does not.
+With :class:`DeadReckoning` in their place it has the same sensors and does not.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 
 import unifg as fg
 from unifg.models import quadrotor
+from unifg.scenarios.flying.flight_terms import Shared, StateTerms
+from unifg.scenarios.flying.flight_window import PARAMETER_SIZE, STATE_SIZE, StateWindow, WindowSettings
 from unifg.scenarios.flying.spread import JointCovariance
-from unifg.scenarios.flying.window import PARAMETER_SIZE, STATE_SIZE, Window, WindowSettings
-from unifg.scenarios.flying.window_terms import Shared, WindowTerms
 from unifg.scenarios.options import option
 from unifg.scenarios.seeing.association import DOUBTFUL, NEW, Gates, expected, nearest, places
 from unifg.scenarios.seeing.atlas import Atlas
@@ -82,6 +82,61 @@ class EstimatorSettings:
         return np.repeat(sigmas, [1, 3, 2, 1])
 
 
+@dataclass(frozen=True)
+class Dynamics:
+    """How the vehicle moves from one reading to the next: by the controller's dynamics.
+
+    Attributes:
+        nominal: parameters believed at the start.
+    """
+
+    nominal: quadrotor.Parameters
+
+    def window(self, settings: EstimatorSettings) -> WindowSettings:
+        """Sizes and noise."""
+        return settings.window
+
+    def start(self) -> Array:
+        """(7,) parameters at the start."""
+        return self.nominal.packed
+
+    def motion(self, reading: Reading, control: Array) -> tuple[Array, Array]:
+        """Control (4,) that stands in the dynamics, and what the gyro saw beyond it (3,)."""
+        return control, reading.rates - control[:3]
+
+    def believed(self, parameters: Array) -> quadrotor.Parameters:
+        """What is believed where the window holds ``parameters`` (7,)."""
+        return flyable(parameters)
+
+
+@dataclass(frozen=True)
+class DeadReckoning(Dynamics):
+    """Constant velocity disturbed by accelerations, attitude by the gyro.
+
+    A body without thrust and drag, in an updraft that carries its weight, moves just so; the window's terms are the
+    same. Nothing is learnt about mass, drag and wind: they stay nominal.
+    """
+
+    def window(self, settings: EstimatorSettings) -> WindowSettings:
+        """Nothing is estimated, and manoeuvres are noise."""
+        own = settings.window
+        gyro = own.gyro_sigma if own.gyro_sigma is not None else own.noise_sigma[0]
+        sigma = (*[gyro] * 3, *[settings.manoeuvre_sigma] * 3)
+        return replace(own, estimated=(), noise_sigma=sigma, gyro_sigma=None)
+
+    def start(self) -> Array:
+        """Those of a body that floats."""
+        return quadrotor.Parameters(updraft=quadrotor.GRAVITY).packed
+
+    def motion(self, reading: Reading, control: Array) -> tuple[Array, Array]:
+        """The gyro's rates without thrust; nothing beyond them."""
+        return np.concatenate([reading.rates, [0.0]]), np.zeros(3)
+
+    def believed(self, parameters: Array) -> quadrotor.Parameters:
+        """Nothing else than at the start."""
+        return self.nominal
+
+
 class Estimator:
     """A fixed-lag smoother of state, mass, drag, wind and landmarks (Ta et al. 2014, section II-B).
 
@@ -90,7 +145,7 @@ class Estimator:
 
     Attributes:
         settings: priors and noise.
-        nominal: parameters believed at the start.
+        model: how the vehicle moves.
         window: the past; a joint graph of past and future works on the same one.
         terms: its terms in a graph of its own.
         atlas: what the landmarks' slots hold.
@@ -104,6 +159,7 @@ class Estimator:
         nominal: quadrotor.Parameters,
         settings: EstimatorSettings | None = None,
         survey: Array | None = None,
+        model: Dynamics | None = None,
     ) -> None:
         """State the graph and prepare its solver.
 
@@ -112,13 +168,14 @@ class Estimator:
             nominal: parameters believed at the start.
             settings: priors and noise.
             survey: (C, 2) corners that are on the map [m]; None for none.
+            model: how the vehicle moves; None for the controller's dynamics.
         """
         self.settings = settings = settings or EstimatorSettings()
         self._survey = np.zeros((0, 2)) if survey is None else np.asarray(survey, dtype=np.float64)
-        self.nominal = nominal
-        own, parameters = self._window_settings(), self._start_parameters()
+        self.model = model or Dynamics(nominal)
+        own, parameters = self.model.window(settings), self.model.start()
         sigma = settings.parameters_sigma(nominal)
-        self.window = Window(own, state, np.diag(settings.state_sigma**2), parameters, sigma)
+        self.window = StateWindow(own, state, np.diag(settings.state_sigma**2), parameters, sigma)
         self.atlas = Atlas(own.landmarks)
         self.covariance = np.zeros((FIRST_LANDMARK + 2 * own.landmarks,) * 2)
         self.covariance[:STATE_SIZE, :STATE_SIZE] = np.diag(settings.state_sigma**2)
@@ -126,7 +183,7 @@ class Estimator:
         graph = fg.Graph()
         self._present = graph.variables("present", quadrotor.STATE, 1)
         shared = Shared(graph, own, parameters)
-        self.terms = WindowTerms(graph, self._present[:], shared, own)
+        self.terms = StateTerms(graph, self._present[:], shared, own)
         # The guess keeps the dynamics to rounding: with a sharper tolerance a step that bends them counts as worse.
         solver = SQP(max_iterations=settings.iterations, full_steps=True, tolerance=TOLERANCE, step_tolerance=1e-4)
         self._run = solver.prepare(graph)
@@ -149,7 +206,7 @@ class Estimator:
         window = self.window
         if self._time is not None and control is not None:
             dt = reading.time - self._time
-            control, turned = self._motion(reading, np.asarray(control, dtype=np.float64))
+            control, turned = self.model.motion(reading, np.asarray(control, dtype=np.float64))
             noise = np.zeros(6)
             noise[:3] = turned * self._gain(dt)
             moved = control + np.concatenate([noise[:3], [0.0]])
@@ -204,25 +261,10 @@ class Estimator:
         return Belief(
             state=window.present.copy(),
             covariance=self.covariance[:STATE_SIZE, :STATE_SIZE].copy(),
-            parameters=self._believed(),
+            parameters=self.model.believed(window.parameters),
             parameters_sigma=np.sqrt(np.diag(self.covariance)[STATE_SIZE:FIRST_LANDMARK]),
             landmarks=self.atlas.landmarks(window.landmarks, spread),
         )
-
-    # ---------------------------------------------------------------- what an estimator without dynamics does otherwise
-
-    def _window_settings(self) -> WindowSettings:
-        return self.settings.window
-
-    def _start_parameters(self) -> Array:
-        return self.nominal.packed
-
-    def _motion(self, reading: Reading, control: Array) -> tuple[Array, Array]:
-        """Control (4,) that stands in the dynamics, and what the gyro saw beyond it (3,)."""
-        return control, reading.rates - control[:3]
-
-    def _believed(self) -> quadrotor.Parameters:
-        return flyable(self.window.parameters)
 
     # ---------------------------------------------------------------- steps
 
@@ -294,26 +336,17 @@ class Estimator:
 
 
 class DeadReckoningEstimator(Estimator):
-    """The same sensors without dynamics: constant velocity disturbed by accelerations, attitude by the gyro.
+    """The same sensors without dynamics: see :class:`DeadReckoning`."""
 
-    A body without thrust and drag, in an updraft that carries its weight, moves just so; the window's terms are the
-    same. Nothing is learnt about mass, drag and wind: they stay nominal.
-    """
-
-    def _window_settings(self) -> WindowSettings:
-        own, settings = self.settings.window, self.settings
-        gyro = own.gyro_sigma if own.gyro_sigma is not None else own.noise_sigma[0]
-        sigma = (*[gyro] * 3, *[settings.manoeuvre_sigma] * 3)
-        return replace(own, estimated=(), noise_sigma=sigma, gyro_sigma=None)
-
-    def _start_parameters(self) -> Array:
-        return quadrotor.Parameters(updraft=quadrotor.GRAVITY).packed
-
-    def _motion(self, reading: Reading, control: Array) -> tuple[Array, Array]:
-        return np.concatenate([reading.rates, [0.0]]), np.zeros(3)
-
-    def _believed(self) -> quadrotor.Parameters:
-        return self.nominal
+    def __init__(
+        self,
+        state: Array,
+        nominal: quadrotor.Parameters,
+        settings: EstimatorSettings | None = None,
+        survey: Array | None = None,
+    ) -> None:
+        """State the graph; arguments as of :class:`Estimator`."""
+        super().__init__(state, nominal, settings, survey, DeadReckoning(nominal))
 
 
 def flyable(packed: Array) -> quadrotor.Parameters:

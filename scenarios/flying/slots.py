@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unifg.scenarios.flying.braking import DELAY, stopping_path
-from unifg.scenarios.flying.plan import ControllerSettings
+from unifg.scenarios.flying.flight_settings import ControllerSettings
 from unifg.scenarios.seeing.belief import Landmarks
 from unifg.scenarios.seeing.tracks import Tracks
 from unifg.scenarios.ways.polyline import segment_distance
@@ -41,6 +41,19 @@ class Obstacles:
     limits: Array
     changed: BoolArray
     wall_limits: Array
+
+    def room(self, states: Array, walls: Array) -> float:
+        """Least distance of the nodes after the first beyond what they have to keep clear [m], negative in a violation.
+
+        Args:
+            states: (k, 10), the first being the present, k at most N + 1.
+            walls: (W, 2, 2) segments [m].
+        """
+        ahead = states[1:, :2]
+        count = len(ahead)
+        gaps = np.hypot(*np.moveaxis(ahead[:, None] - self.centres[:count], 2, 0)) - self.radii
+        beside = segment_distance(ahead, walls) - self.wall_limits[:count]
+        return float(min((gaps - self.limits[:count]).min(initial=np.inf), beside.min(initial=np.inf)))
 
 
 class Slots:

@@ -1,6 +1,6 @@
 """The quadrotor's past as numbers: what was done and measured at the last ticks, and what is believed about it.
 
-How it becomes a factor graph is stated in :mod:`unifg.scenarios.flying.window_terms`. A slot that no state has
+How it becomes a factor graph is stated in :mod:`unifg.scenarios.flying.flight_terms`. A slot that no state has
 entered yet lasts zero seconds: its dynamics say that it equals the next one, so that the structure never changes.
 """
 
@@ -12,6 +12,7 @@ import numpy as np
 
 import unifg as fg
 from unifg.scenarios.flying.arrival import seen_from_the_vehicle
+from unifg.scenarios.horizon.past import Window
 from unifg.scenarios.worlds.disturbance import DisturbanceModel
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -71,7 +72,7 @@ class WindowSettings:
         return mask
 
 
-class Window:
+class StateWindow(Window):
     """The last L states, oldest first, then the present one, and what they saw of K landmarks.
 
     Attributes:
@@ -88,7 +89,6 @@ class Window:
         survey: (K, 2) where the map has them; ``surveyed`` (K,) which of them are on it.
         arrival: reference (S,) and information (D, D) of the prior on the oldest state, the parameters and landmarks,
             as :mod:`unifg.scenarios.flying.arrival` has them.
-        departure: what ``arrival`` becomes when the oldest state leaves.
     """
 
     def __init__(
@@ -104,6 +104,7 @@ class Window:
             sigma: (7,) their standard deviations; what is not estimated is taken as it is.
         """
         length, count = settings.length, settings.landmarks
+        super().__init__(length, entered=length)  # by states that lasted no time
         self.settings = settings
         self.states = np.tile(np.asarray(state, dtype=np.float64), (length + 1, 1))
         self.noises, self.controls, self.durations = np.zeros((length, 6)), np.zeros((length, 4)), np.zeros(length)
@@ -140,12 +141,10 @@ class Window:
             noise: (6,) with which it does.
             turned: (3,) gyro's rates since then, less those commanded [rad/s].
         """
-        self.arrival = self.departure
-        for array in (
+        self.shift(
             self.states, self.noises, self.controls, self.durations, self.turned, self.heights, self.tilts,
             self.measured, self.sightings, self.seen,
-        ):  # fmt: skip
-            array[:-1] = array[1:]
+        )  # fmt: skip
         self.states[-1], self.controls[-1], self.durations[-1] = state, control, dt
         self.noises[-1], self.turned[-1] = noise, turned
         self.measured[-1], self.seen[-1] = False, False

@@ -8,6 +8,8 @@ smoother, or joined to a control horizon.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 import unifg as fg
@@ -15,7 +17,8 @@ from unifg.kernels.kernel import Kernel
 from unifg.machine.jit import compiled
 from unifg.models import landmarks, quadrotor
 from unifg.scenarios.flying.arrival import arrival
-from unifg.scenarios.flying.window import PLACES, Window, WindowSettings
+from unifg.scenarios.flying.flight_window import PLACES, StateWindow, WindowSettings
+from unifg.scenarios.horizon.part import Given
 from unifg.typing import Array
 
 PAST_TERMS = ("arrival", "noise", "gyro", "dynamics", "sightings", "height", "tilt")
@@ -62,17 +65,17 @@ class Shared:
         """Mass, drag, wind, updraft: as ``quadrotor.disturbed_dynamics`` takes them."""
         return self.mass, self.drag, self.wind, self.updraft
 
-    def guess(self, window: Window) -> dict[fg.Family, Array]:
+    def guess(self, window: StateWindow) -> dict[fg.Family, Array]:
         """Present beliefs."""
         guess = {f: window.parameters[None, PLACES[f.name]] for f in self.parameters}
         return {**guess, self.landmarks: window.landmarks}
 
-    def data(self, window: Window) -> dict[fg.Data, Array]:
+    def data(self, window: StateWindow) -> dict[fg.Data, Array]:
         """Present values of what is not estimated."""
         return {data: window.parameters[PLACES[name]] for name, data in self._given.items()}
 
 
-class WindowTerms:
+class StateTerms:
     """The window's terms in one graph, and the data that fill them.
 
     Attributes:
@@ -103,35 +106,32 @@ class WindowTerms:
         graph.minimize(fg.prior, marks, self._survey, sigma=sigma, active=self._surveyed, name="survey")
         graph.minimize(arrival(count), *about, self._arrival, information=self._information, name="arrival")
         last = length - 1
-        self._steps = [
-            (slice(0, last), _Steps(graph, past[:last], past[1:], noise[:last], shared, settings, "")),
-            (slice(last, length), _Steps(graph, past[last], present, noise[last], shared, settings, " now")),
-        ]
-        self._views = [
-            (slice(0, length), _Views(graph, past[:], shared, settings, "")),
-            (slice(length, length + 1), _Views(graph, present, shared, settings, " now")),
+        steps, now = (past[:last], past[1:], noise[:last]), (past[last], present, noise[last])
+        self._gives = [
+            (slice(0, last), _steps(graph, *steps, shared, settings, "")),
+            (slice(last, length), _steps(graph, *now, shared, settings, " now")),
+            (slice(0, length), _views(graph, past[:], shared, settings, "")),
+            (slice(length, length + 1), _views(graph, present, shared, settings, " now")),
         ]
 
-    def data(self, window: Window) -> dict[fg.Data, Array]:
+    def data(self, window: StateWindow) -> Given:
         """What the window knows."""
-        found: dict[fg.Data, Array] = {
+        found: Given = {
             self._arrival: window.arrival[0],
             self._information: window.arrival[1],
             self._survey: window.survey,
             self._surveyed: window.surveyed,
             **self.shared.data(window),
         }
-        for steps, terms in self._steps:
-            found |= terms.data(window, steps)
-        for states, views in self._views:
-            found |= views.data(window, states)
+        for at, give in self._gives:
+            found |= give(window, at)
         return found
 
-    def guess(self, window: Window) -> dict[fg.Family, Array]:
+    def guess(self, window: StateWindow) -> dict[fg.Family, Array]:
         """Present beliefs about everything but the present state."""
         return {self.past: window.states[:-1], self.noise: window.noises, **self.shared.guess(window)}
 
-    def accept(self, window: Window, solution: fg.Solution) -> None:
+    def accept(self, window: StateWindow, solution: fg.Solution) -> None:
         """Take the estimate from a solution, and marginalise the oldest state, which leaves at the next move."""
         window.states[:-1], window.states[-1] = solution[self.past], solution[self.present][0]
         window.noises[:] = solution[self.noise]
@@ -143,90 +143,52 @@ class WindowTerms:
         window.depart(window.stacked(1), reference[0], information)
 
 
-class _Steps:
+def _steps(
+    graph: fg.Graph,
+    start: fg.Selection,
+    end: fg.Selection,
+    noise: fg.Selection,
+    shared: Shared,
+    settings: WindowSettings,
+    suffix: str,
+) -> Callable[[StateWindow, slice], Given]:
     """Noise, gyro and dynamics of some steps."""
-
-    def __init__(
-        self,
-        graph: fg.Graph,
-        start: fg.Selection,
-        end: fg.Selection,
-        noise: fg.Selection,
-        shared: Shared,
-        settings: WindowSettings,
-        suffix: str,
-    ) -> None:
-        n = len(start)
-        self._controls = graph.data(f"controls{suffix}", np.zeros((n, 4)), each=True)
-        self._durations = graph.data(f"durations{suffix}", np.zeros(n), each=True)
-        self._turned = graph.data(f"turned{suffix}", np.zeros((n, 3)), each=True)
-        graph.minimize(fg.prior, noise, np.zeros(6), sigma=settings.noise_sigma, name=f"noise{suffix}")
-        if settings.gyro_sigma is not None:
-            graph.minimize(gyro, noise, self._turned, sigma=settings.gyro_sigma, name=f"gyro{suffix}")
-        graph.constrain(
-            quadrotor.disturbed_dynamics,
-            start,
-            self._controls,
-            noise,
-            *shared.parameters,
-            end,
-            self._durations,
-            lower=0.0,
-            upper=0.0,
-            name=f"dynamics{suffix}",
-        )
-
-    def data(self, window: Window, steps: slice) -> dict[fg.Data, Array]:
-        return {
-            self._controls: window.controls[steps],
-            self._durations: window.durations[steps],
-            self._turned: window.turned[steps],
-        }
+    n = len(start)
+    controls = graph.data(f"controls{suffix}", np.zeros((n, 4)), each=True)
+    durations = graph.data(f"durations{suffix}", np.zeros(n), each=True)
+    turned = graph.data(f"turned{suffix}", np.zeros((n, 3)), each=True)
+    graph.minimize(fg.prior, noise, np.zeros(6), sigma=settings.noise_sigma, name=f"noise{suffix}")
+    if settings.gyro_sigma is not None:
+        graph.minimize(gyro, noise, turned, sigma=settings.gyro_sigma, name=f"gyro{suffix}")
+    motion = (start, controls, noise, *shared.parameters, end, durations)
+    graph.constrain(quadrotor.disturbed_dynamics, *motion, lower=0.0, upper=0.0, name=f"dynamics{suffix}")
+    return lambda window, at: {
+        controls: window.controls[at], durations: window.durations[at], turned: window.turned[at],
+    }  # fmt: skip
 
 
-class _Views:
+def _views(
+    graph: fg.Graph, states: fg.Selection, shared: Shared, settings: WindowSettings, suffix: str
+) -> Callable[[StateWindow, slice], Given]:
     """What was measured at some states."""
-
-    def __init__(
-        self, graph: fg.Graph, states: fg.Selection, shared: Shared, settings: WindowSettings, suffix: str
-    ) -> None:
-        n, count = len(states), settings.landmarks
-        self._sightings = graph.data(f"sightings{suffix}", np.ones((n * count, 2)), each=True)
-        self._seen = graph.data(f"seen{suffix}", np.zeros(n * count, dtype=bool), each=True)
-        self._heights = graph.data(f"heights{suffix}", np.zeros(n), each=True)
-        self._tilts = graph.data(f"tilts{suffix}", np.zeros((n, 3)), each=True)
-        self._measured = graph.data(f"measured{suffix}", np.zeros(n, dtype=bool), each=True)
-        graph.minimize(
-            landmarks.bearing_range,
-            states[np.repeat(np.arange(n), count)] if n > 1 else states,
-            shared.landmarks[np.tile(np.arange(count), n)],
-            self._sightings,
-            sigma=[settings.bearing_sigma, settings.range_sigma],
-            active=self._seen,
-            name=f"sightings{suffix}",
-        )
-        graph.minimize(
-            landmarks.height,
-            states.p,
-            self._heights,
-            sigma=settings.height_sigma,
-            active=self._measured,
-            name=f"height{suffix}",
-        )
-        graph.minimize(
-            landmarks.tilt,
-            states.R,
-            self._tilts,
-            sigma=settings.tilt_sigma,
-            active=self._measured,
-            name=f"tilt{suffix}",
-        )
-
-    def data(self, window: Window, states: slice) -> dict[fg.Data, Array]:
-        return {
-            self._sightings: window.sightings[states].reshape(-1, 2),
-            self._seen: window.seen[states].ravel(),
-            self._heights: window.heights[states],
-            self._tilts: window.tilts[states],
-            self._measured: window.measured[states],
-        }
+    n, count = len(states), settings.landmarks
+    sightings = graph.data(f"sightings{suffix}", np.ones((n * count, 2)), each=True)
+    seen = graph.data(f"seen{suffix}", np.zeros(n * count, dtype=bool), each=True)
+    heights = graph.data(f"heights{suffix}", np.zeros(n), each=True)
+    tilts = graph.data(f"tilts{suffix}", np.zeros((n, 3)), each=True)
+    measured = graph.data(f"measured{suffix}", np.zeros(n, dtype=bool), each=True)
+    pairs = (
+        states[np.repeat(np.arange(n), count)] if n > 1 else states,
+        shared.landmarks[np.tile(np.arange(count), n)],
+        sightings,
+    )
+    sigma = [settings.bearing_sigma, settings.range_sigma]
+    graph.minimize(landmarks.bearing_range, *pairs, sigma=sigma, active=seen, name=f"sightings{suffix}")
+    graph.minimize(
+        landmarks.height, states.p, heights, sigma=settings.height_sigma, name=f"height{suffix}", active=measured
+    )
+    graph.minimize(landmarks.tilt, states.R, tilts, sigma=settings.tilt_sigma, name=f"tilt{suffix}", active=measured)
+    return lambda window, at: {
+        sightings: window.sightings[at].reshape(-1, 2), seen: window.seen[at].ravel(), heights: window.heights[at],
+        tilts: window.tilts[at], measured: window.measured[at],
+    }  # fmt: skip

@@ -1,17 +1,18 @@
-"""What a controller is asked with, what it answers, and how it may be set."""
+"""Weights and limits of the flying controller, and its backends by name."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
+import numpy as np
+
 import unifg as fg
 from unifg.scenarios.flying.guide import GuideSettings
 from unifg.scenarios.options import option
 from unifg.solvers import names
-from unifg.typing import Array
+from unifg.typing import Array, ArrayLike
 
-Source: TypeAlias = Literal["solved", "violating", "kept", "braking"]
 Avoidance: TypeAlias = Literal["clearance", "potential"]
 
 
@@ -84,32 +85,16 @@ class ControllerSettings:
     feasible: float = 1e-2
     give: float = 0.04
 
-
-@dataclass(frozen=True)
-class Plan:
-    """What a tick decided.
-
-    Attributes:
-        controls: (N, 4), the first to be applied now [rad/s, N].
-        states: (N + 1, 10) predicted, the first being the present.
-        status: of the solve.
-        milliseconds: wall-clock time of the whole decision.
-        iterations: of the backend.
-        source: "solved"; or, where the solve gave nothing that keeps clear, what keeps off best: its answer all the
-            same, "violating"; the plan of an earlier tick, "kept"; or a stop without a solver, "braking".
-    """
-
-    controls: Array
-    states: Array
-    status: fg.Status
-    milliseconds: float
-    iterations: int
-    source: Source
+    def weighted(self, sigma: ArrayLike) -> Array:
+        """Standard deviations of costs of the controller, scaled by their common weight."""
+        scaled: Array = np.asarray(sigma) / np.sqrt(self.control_weight)
+        return scaled
 
     @property
-    def emergency(self) -> bool:
-        """Whether the solve gave nothing that may be flown."""
-        return self.source != "solved"
+    def box(self) -> tuple[Array, Array]:
+        """Least and greatest controls (4,) [rad/s, N]."""
+        least, most = self.thrust_limits
+        return np.array([*(-limit for limit in self.rate_limits), least]), np.array([*self.rate_limits, most])
 
 
 def backend(name: str, settings: ControllerSettings, cold: bool = False) -> fg.Solver:

@@ -1,0 +1,166 @@
+"""Where to go? A model-predictive controller as a factor graph (Bazzana et al. 2022, section V).
+
+Costs: distance to reference poses along the path (eq. 8), control effort, control rate, soft margins to walls and
+discs. Constraints: unicycle dynamics, velocity limits, hard clearance from walls and from tracked discs.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+import unifg as fg
+from unifg.lie import wrap_angle
+from unifg.models import unicycle
+from unifg.models.distance_map import DistanceMap
+from unifg.models.smooth_field import SmoothField
+from unifg.scenarios.driving.drive_parts import DriveNow, clearance, following, motion
+from unifg.scenarios.driving.drive_settings import ControllerSettings, backend
+from unifg.scenarios.horizon.loop import Loop, Plan
+from unifg.scenarios.horizon.part import Part, effort, stated
+from unifg.scenarios.horizon.past import GivenPast, Past
+from unifg.scenarios.seeing.tracks import Tracks
+from unifg.typing import Array
+
+COLD_PATIENCE = 3  # a tick without a warm start may iterate longer
+YIELD_SPEED = 0.05  # [m/s] towards the robot
+LEFT_BEHIND = 0.6  # [m] between the ends of plan and reference
+BRAKING = 6  # ticks to come to rest when no new plan is found
+PURSUIT = 0.3  # [m] ahead of the robot, where a guess aims at the reference
+PURSUIT_TIME = 0.2  # [s] in which it would turn there
+ARRIVED = 0.05  # [m] to the end of the reference, where it only turns
+PATIENCE = 5  # ticks of being left behind before the plan starts over from the reference
+
+
+class Controller:
+    """Decides the next control from a pose, a reference and tracks.
+
+    Attributes:
+        settings: weights and limits.
+        past: what ties the horizon to what is known; without one the pose is given.
+        data: what gives the data of the whole graph at a tick.
+        loop: the prepared graph.
+    """
+
+    def __init__(
+        self, distance_map: DistanceMap, solver: str, settings: ControllerSettings, past: Past[DriveNow] | None = None
+    ) -> None:
+        """State the graph and prepare the backend."""
+        self.settings = s = settings
+        self.past: Past[DriveNow] = past or GivenPast()
+        parts: list[Part[DriveNow]] = [
+            self.past.state,
+            following(s),
+            effort(s.weighted(s.control_sigma), s.weighted(s.rate_sigma)),
+            motion(s),
+            clearance(s, SmoothField(distance_map)),
+        ]
+        graph = fg.Graph()
+        x = graph.variables("pose", fg.SE2, s.horizon + 1)
+        u = graph.variables("control", fg.Rn(2), s.horizon)
+        self.data = stated(parts, graph, x, u)
+        self.loop = Loop(graph, x, u, backend(solver, s), backend(solver, s, COLD_PATIENCE), s.box, PATIENCE)
+        self._applied = np.zeros(2)
+
+    def plan(self, pose: Array, reference: Array, tracks: Tracks) -> Plan:
+        """Decide the next control.
+
+        Args:
+            pose: (3,) estimate by the past alone [m, m, rad].
+            reference: (N + 1, 3) poses along the path, the first beside the robot.
+            tracks: discs the robot has seen.
+        """
+        begin = time.perf_counter()
+        now = self.now(pose, reference, tracks)
+        run, guess = self.begin(now)
+        solution = run.solve(self.past.begin(guess, now), data=self.data(now))
+        controls, states, source = self.judge(solution, now)
+        self.past.take(solution, now, source)
+        elapsed = 1e3 * (time.perf_counter() - begin)
+        return Plan(controls, states, solution.status, solution.iterations, source, self.loop.excess, elapsed)
+
+    def now(self, pose: Array, reference: Array, tracks: Tracks) -> DriveNow:
+        """What the graph's parts ask for."""
+        cruise = np.zeros((self.settings.horizon, 2))
+        cruise[:, 0] = np.hypot(*np.diff(reference[:, :2], axis=0).T) / self.settings.dt
+        return DriveNow(pose, cruise, self._applied, reference, tracks)
+
+    def begin(self, now: DriveNow) -> tuple[fg.Prepared, fg.Guess]:
+        """The shifted solution; without one, rest after a failure, and the reference otherwise."""
+        return self.loop.begin(lambda: self.along(now), lambda: self.staying(now.present))
+
+    def forget(self) -> None:
+        """Drop the warm start, as when a new route makes it misleading."""
+        self.loop.forget()
+
+    def judge(self, solution: fg.Solution, now: DriveNow) -> tuple[Array, Array, str]:
+        """Drive a plan that keeps the constraints; brake along the last one otherwise; rest where a mover nears.
+
+        Of a solve that ended early this is where it stopped. The cheapest iterate it has passed that keeps the
+        constraints was tried: such plans brush past obstacles and creep up to those that stand in the way.
+        """
+        s, loop = self.settings, self.loop
+        if solution.violation <= s.feasible:
+            states = solution[loop.x]
+            loop.accept(solution, behind=is_behind(states, now.reference))
+            controls, source = loop.within(loop.stored), "solved"
+        else:
+            loop.refuse()
+            controls, source = self._braking(), "braking"
+            states = unicycle.rollout(now.present, controls, s.dt)
+        if self._yields(now.present, now.tracks):
+            controls = np.zeros_like(controls)
+        self._applied = controls[0]
+        return controls, states, source
+
+    def _braking(self) -> Array:
+        """(N, 2) stored plan slowed to rest; the path keeps its shape, and the robot rests well before its end."""
+        left, controls = self.loop.left(), np.zeros((self.settings.horizon, 2))
+        fade = np.maximum(1.0 - (self.loop.age + np.arange(len(left))) / BRAKING, 0.0)
+        stored = left * fade[:, None]
+        fastest = np.abs(stored[:, 0]).max(initial=0.0)
+        slower = min(1.0, abs(float(self._applied[0])) / fastest) if fastest > 0.0 else 1.0
+        controls[: len(left)] = slower * stored
+        return controls
+
+    def staying(self, pose: Array) -> fg.Guess:
+        """Guess rest, which is feasible: from there a solver that failed finds the near side of what stopped it."""
+        n = self.settings.horizon
+        return fg.Guess({self.loop.x: np.tile(pose, (n + 1, 1)), self.loop.u: np.zeros((n, 2))})
+
+    def along(self, now: DriveNow) -> fg.Guess:
+        """Guess how a simple pursuit would follow the reference, which leads around whatever the route leads around.
+
+        It keeps limits and dynamics: it turns first where the reference begins behind the robot's back.
+        """
+        s, reference = self.settings, now.reference
+        speeds, controls = now.wanted[:, 0], np.zeros((s.horizon, 2))
+        states = np.tile(now.present, (s.horizon + 1, 1))
+        aim = 0
+        for k in range(s.horizon):
+            here = states[k]
+            while aim < s.horizon and np.hypot(*(reference[aim] - here)[:2]) < PURSUIT:
+                aim += 1
+            ahead = reference[aim] - here
+            distance = float(np.hypot(*ahead[:2]))
+            bearing = np.arctan2(ahead[1], ahead[0]) if distance > ARRIVED else reference[aim, 2]
+            turn = float(wrap_angle(bearing - here[2]))
+            speed = min(speeds[k], distance / s.dt) * max(np.cos(turn), 0.0) ** 2 if distance > ARRIVED else 0.0
+            controls[k] = np.clip([speed, turn / PURSUIT_TIME], *s.box)
+            states[k + 1] = unicycle.step(here[None], controls[k : k + 1], s.dt)[0]
+        return fg.Guess({self.loop.x: states, self.loop.u: controls})
+
+    def _yields(self, pose: Array, tracks: Tracks) -> bool:
+        """Whether a mover is so near and closing in that resting, which it respects, is the only safe answer."""
+        s = self.settings
+        offset = pose[:2] - tracks.centre
+        distance = np.hypot(*offset.T)
+        closing = np.einsum("ij,ij->i", offset, tracks.velocity) / np.maximum(distance, 1e-9)
+        near = distance - tracks.radius - s.robot_radius < s.yield_distance
+        return bool((tracks.mover & near & (closing > YIELD_SPEED)).any())
+
+
+def is_behind(states: Array, reference: Array) -> bool:
+    """Whether a plan (N + 1, 3) ends far from its reference: it may be caught in a dead end."""
+    return bool(np.hypot(*(states[-1] - reference[-1])[:2]) > LEFT_BEHIND)

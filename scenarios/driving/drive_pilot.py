@@ -1,0 +1,135 @@
+"""How estimation and control are coupled: two graphs one after the other, or one graph for both."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from unifg.errors import ScenarioError
+from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.driving.drive_control import Controller
+from unifg.scenarios.driving.drive_joint import SharedPast, Smoother
+from unifg.scenarios.driving.drive_settings import ControllerSettings
+from unifg.scenarios.driving.drive_window import PoseWindow
+from unifg.scenarios.driving.localiser import Localiser
+from unifg.scenarios.driving.route import Route
+from unifg.scenarios.horizon.loop import Plan
+from unifg.scenarios.horizon.stopwatch import Stopwatch
+from unifg.scenarios.seeing.disc_tracker import DiscTracker
+from unifg.scenarios.seeing.readings import Scan
+from unifg.scenarios.seeing.tracks import Tracks
+from unifg.typing import Array
+
+COUPLINGS = ("sequential", "joint")
+WINDOW = 4  # past poses in the joint graph
+
+
+class Estimator(Protocol):
+    """What says where the robot is.
+
+    Attributes:
+        iterations: of the last update.
+    """
+
+    iterations: int
+
+    @property
+    def pose(self) -> Array:
+        """(3,) present estimate [m, m, rad]."""
+        ...
+
+    def update(self, scan: Scan, odometry: Array | None, dt: float) -> None:
+        """Take in a scan and the odometry (2,) since the last one, None on the first."""
+        ...
+
+
+class Pilot:
+    """Estimates, looks for discs that no map shows, repairs the route, and plans along it.
+
+    Attributes:
+        estimator: of the pose; a joint graph moves its estimate when it plans.
+        controller: of the drive.
+        tracker: of discs.
+        tracks: after the last tick.
+        iterations: of the estimator at the last tick.
+        clock: how long the stages of the last tick took: localise, perceive, route, plan.
+    """
+
+    def __init__(self, estimator: Estimator, controller: Controller, tracker: DiscTracker) -> None:
+        """Join what stands for itself."""
+        self.estimator, self.controller, self.tracker = estimator, controller, tracker
+        self.tracks = Tracks.none()
+        self.clock = Stopwatch()
+
+    @property
+    def pose(self) -> Array:
+        """(3,) present estimate [m, m, rad]."""
+        return self.estimator.pose
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of the last estimate."""
+        return self.estimator.iterations
+
+    def tick(self, scan: Scan, odometry: Array | None, route: Route) -> Plan:
+        """Decide; the estimate is that of the plan afterwards.
+
+        Args:
+            scan: of now.
+            odometry: (2,) since the last scan; None at the first one.
+            route: to follow.
+        """
+        s = self.controller.settings
+        self.clock.start()
+        self.estimator.update(scan, odometry, s.dt)
+        self.clock.split("localise")
+        pose = self.pose
+        self.tracks = self.tracker.update(scan, pose, s.dt)
+        self.clock.split("perceive")
+        if route.repair(pose, self.tracks):
+            self.controller.forget()
+        self.clock.split("route")
+        plan = self.controller.plan(pose, route.reference(pose, s.speed * s.dt, s.horizon + 1), self.tracks)
+        self.clock.split("plan")
+        return plan
+
+    def forget(self) -> None:
+        """Drop the warm start of the horizon."""
+        self.controller.forget()
+
+
+def make_pilot(
+    coupling: str,
+    distance_map: DistanceMap,
+    solver: str,
+    settings: ControllerSettings,
+    pose: Array,
+    sigma: Array,
+    beams: int,
+) -> Pilot:
+    """The pilot for a coupling.
+
+    Args:
+        coupling: "sequential", estimation first, then control given the estimate; "joint", one graph for both.
+        distance_map: of the map that the robot was given.
+        solver: of the controller.
+        settings: weights and limits.
+        pose: (3,) believed at the start [m, m, rad].
+        sigma: (3,) its standard deviations [m, m, rad].
+        beams: number of beams in a scan.
+
+    Raises:
+        ScenarioError: for an unknown coupling.
+    """
+    estimator: Estimator
+    if coupling == "sequential":
+        estimator = Localiser(distance_map, pose, sigma, beams)
+        controller = Controller(distance_map, solver, settings)
+    elif coupling == "joint":
+        window = PoseWindow(WINDOW, pose, np.diag(np.asarray(sigma) ** 2), beams)
+        estimator = smoother = Smoother(distance_map, window)
+        controller = Controller(distance_map, solver, settings, SharedPast(smoother, settings.pull))
+    else:
+        raise ScenarioError(f"unknown coupling '{coupling}': choose {' or '.join(COUPLINGS)}")
+    return Pilot(estimator, controller, DiscTracker(distance_map))

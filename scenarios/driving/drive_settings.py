@@ -1,0 +1,106 @@
+"""Weights and limits of the driving controller, and its backends by name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+import unifg as fg
+from unifg.scenarios.options import option, positive
+from unifg.solvers import names
+from unifg.typing import Array
+
+PENALTY = 3e4  # of the augmented Lagrangian; the automatic one is stiffer than a tick has time for
+
+
+@dataclass(frozen=True)
+class ControllerSettings:
+    """Weights and limits of the controller.
+
+    Attributes:
+        horizon: steps N.
+        dt: sampling time [s].
+        speed: reference speed along the path [m/s].
+        limits: greatest |v| [m/s] and |omega| [rad/s].
+        pose_sigma: (x, y, theta) of the stage cost [m, m, rad].
+        terminal_sigma: the same at the end of the horizon.
+        control_sigma: (v, omega) deviation from the reference control [m/s, rad/s].
+        rate_sigma: (v, omega) change between samples [m/s, rad/s].
+        control_weight: factor on all costs of the controller; matters where they meet those of the estimate.
+        pull: most by which they may move a joint estimate from where the past puts it [m, m, rad].
+        robot_radius: [m].
+        wall_clearance: least distance of the hull to walls [m].
+        disc_clearance: least distance of the hull to tracked discs [m].
+        mover_speed: fastest walk of a mover [m/s].
+        mover_allowance: most that is added to the clearance from discs that have ever moved [m].
+        mover_margin: added to the soft margin around such discs [m].
+        approach: share of the gap to such a disc that one step may close.
+        squeeze: how much nearer than at rest a plan may pass a standing disc where the clearance is violated [m].
+        courtesy: gap at which movers wait for a robot at rest [m].
+        yield_distance: gap to a mover that closes in at which the robot rests [m].
+        margin: distance of the hull below which the soft costs begin [m].
+        margin_sigma: [m].
+        discs: tracked discs considered at once.
+        tolerance: of the KKT test.
+        step_tolerance: norm of a step over the whole horizon below which iterating on is of no use to the robot.
+        feasible: largest violation of a plan that may be driven.
+    """
+
+    horizon: int = 30
+    dt: float = 0.1
+    speed: float = 1.0
+    limits: tuple[float, float] = (1.0, 1.0)
+    pose_sigma: tuple[float, float, float] = (0.3, 0.3, 0.6)
+    terminal_sigma: tuple[float, float, float] = (0.1, 0.1, 0.2)
+    control_sigma: tuple[float, float] = (1.0, 2.0)
+    rate_sigma: tuple[float, float] = (0.5, 1.0)
+    control_weight: float = option(1.0, text=positive, metavar="W")
+    pull: tuple[float, float, float] = (0.01, 0.01, 0.01)
+    robot_radius: float = 0.17
+    wall_clearance: float = 0.03
+    disc_clearance: float = 0.06
+    mover_speed: float = 0.3
+    mover_allowance: float = 0.15
+    mover_margin: float = 0.3
+    approach: float = 0.12
+    squeeze: float = 0.03
+    courtesy: float = 0.1
+    yield_distance: float = 0.3
+    margin: float = 0.2
+    margin_sigma: float = 0.1
+    discs: int = 3
+    tolerance: float = 1e-4
+    step_tolerance: float = 3e-3
+    feasible: float = 5e-4
+
+    def weighted(self, sigma: tuple[float, ...]) -> Array:
+        """Standard deviations of costs of the controller, scaled by their common weight."""
+        scaled: Array = np.array(sigma) / np.sqrt(self.control_weight)
+        return scaled
+
+    @property
+    def box(self) -> tuple[Array, Array]:
+        """Least and greatest controls (2,) [m/s, rad/s]."""
+        limits: Array = np.array(self.limits)
+        return -limits, limits
+
+
+def backend(name: str, settings: ControllerSettings, patience: int = 1) -> fg.Solver:
+    """The backend of a control loop by its short name.
+
+    Args:
+        name: one of `unifg.solvers.names.CONSTRAINED`.
+        settings: tolerances.
+        patience: factor on the iterations of a warm-started tick.
+
+    Raises:
+        BackendError: for an unknown name.
+    """
+    early = {"step_tolerance": settings.step_tolerance, "violation_tolerance": 0.5 * settings.feasible}
+    own: dict[str, dict[str, float]] = {
+        "sqp": {**early, "max_iterations": 10 * patience},
+        "alm": {**early, "max_iterations": 18 * patience, "penalty": PENALTY},
+        "ipm": {"max_iterations": 25 * patience},
+    }
+    return names.backend(name, tolerance=settings.tolerance, **own.get(name, {}))
