@@ -9,8 +9,7 @@ import argparse
 import json
 import multiprocessing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
-from contextlib import ExitStack
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import Field, fields
 from functools import partial
 from pathlib import Path
@@ -32,7 +31,6 @@ class Job(Protocol):
 
 
 Setting = TypeVar("Setting")
-Result = TypeVar("Result")
 Key: TypeAlias = tuple[Any, ...]
 Row: TypeAlias = dict[str, Any]
 Read: TypeAlias = Callable[[Row], float | None]
@@ -129,21 +127,29 @@ def recorded(
     rows = {tuple(row["key"]): row for row in lines_of(store) if any_code or row["code"] == code}
     missing = {key: job for key, job in jobs.items() if not chosen.report and (chosen.fresh or key not in rows)}
     store.parent.mkdir(parents=True, exist_ok=True)
-    pool = None
-    with ExitStack() as stack:
-        file, bar = (stack.enter_context(c) for c in (store.open("a", encoding="utf-8"), tqdm(total=len(missing))))
-        if chosen.workers > 1:
-            pool = ProcessPoolExecutor(chosen.workers, mp_context=multiprocessing.get_context("spawn"))
-            stack.callback(pool.shutdown, cancel_futures=True)
+    with store.open("a", encoding="utf-8") as file, tqdm(total=len(missing)) as bar:
         if file.tell() and not store.read_bytes().endswith(b"\n"):
             file.write("\n")  # a run that was killed left half a line
-        for key, row in campaign(partial(_keyed, task), missing.items(), pool):
+        for key, row in _finished(task, missing, chosen.workers):
             rows[key] = {"key": key, "code": code, **row}
             file.write(json.dumps(rows[key]) + "\n")
             file.flush()
             bar.set_postfix_str(", ".join(map(str, key)))
             bar.update()
     return [{**row, "key": key} for key, row in rows.items()]
+
+
+def _finished(task: Callable[[Setting], Row], jobs: Mapping[Key, Setting], workers: int) -> Iterator[tuple[Key, Row]]:
+    """Rows as they come; one worker is this process, which is the only way to times that mean something."""
+    if workers == 1 or not jobs:
+        yield from ((key, task(job)) for key, job in jobs.items())
+        return
+    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+    try:
+        futures = {pool.submit(task, job): key for key, job in jobs.items()}
+        yield from ((futures[future], future.result()) for future in as_completed(futures))
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def lines_of(store: Path) -> Iterator[Row]:
@@ -153,28 +159,6 @@ def lines_of(store: Path) -> Iterator[Row]:
             yield json.loads(line)
         except json.JSONDecodeError:
             continue
-
-
-def _keyed(task: Callable[[Setting], Row], job: tuple[Key, Setting]) -> tuple[Key, Row]:
-    return job[0], task(job[1])
-
-
-def campaign(
-    task: Callable[[Setting], Result], settings: Iterable[Setting], executor: Executor | None = None
-) -> Iterator[Result]:
-    """Yield the results of a task for every setting, as they come.
-
-    Args:
-        task: a function that can be pickled.
-        settings: what it is to be called with.
-        executor: where it runs, such as a process pool; None runs one after the other here, which is the only way to
-            times that mean something.
-    """
-    if executor is None:
-        yield from map(task, settings)
-        return
-    for future in as_completed([executor.submit(task, setting) for setting in settings]):
-        yield future.result()
 
 
 # ---------------------------------------------------------------- what the rows say

@@ -36,6 +36,14 @@ def planar_or_spatial(pose: Array) -> Any:
     return gtsam.Pose3(gtsam.Rot3.Quaternion(*pose[3:]), pose[:3])
 
 
+def as_array(pose: Any) -> Array:
+    """The inverse of :func:`planar_or_spatial`."""
+    if hasattr(pose, "theta"):
+        return np.array([pose.x(), pose.y(), pose.theta()])
+    turned = pose.rotation().toQuaternion()
+    return np.array([*pose.translation(), turned.w(), turned.x(), turned.y(), turned.z()])
+
+
 class Peer:
     """A pose graph as GTSAM's factors.
 

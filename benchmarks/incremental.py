@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import unifg as fg
-from benchmarks.gtsam_peer import available
+from benchmarks.gtsam_peer import as_array, available
 from benchmarks.report import command, listing, machine, publish, shared
 from benchmarks.timing import interleave, pin
 from unifg.files.g2o import read_g2o
@@ -108,7 +108,7 @@ def fed_gtsam(smoother: Any, isam: bool) -> Fed:
 
     def poses(first: int, last: int) -> Array:
         found = smoother.calculateEstimate()
-        return np.array([[pose.x(), pose.y(), pose.theta()] for pose in map(found.atPose2, (first, last))])
+        return np.array([as_array(found.atPose2(k)) for k in (first, last)])
 
     def cost() -> float:
         best = smoother.calculateBestEstimate()

@@ -11,8 +11,9 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping
-from types import TracebackType
+from contextlib import ExitStack
 from typing import Any, TypeAlias
+from unittest import mock
 
 import numpy as np
 
@@ -92,62 +93,18 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:.{min(places, 9)}f}"
 
 
-class Stopwatch:
-    """Adds up the time spent in chosen functions while it is entered.
-
-    Args:
-        watched: for each part the owner (module or class) and the name of the function its callers look up there.
-
-    Attributes:
-        seconds: by part.
-        calls: by part.
-    """
-
-    def __init__(self, watched: Mapping[str, tuple[Any, str]]) -> None:
-        """Nothing is replaced before it is entered."""
-        self._watched = watched
-        self._originals = {part: getattr(owner, name) for part, (owner, name) in watched.items()}
-        self.seconds = dict.fromkeys(watched, 0.0)
-        self.calls = dict.fromkeys(watched, 0)
-
-    def __enter__(self) -> Stopwatch:
-        """Start from zero."""
-        for part, (owner, name) in self._watched.items():
-            self.seconds[part], self.calls[part] = 0.0, 0
-            setattr(owner, name, self._timed(part))
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        """Put the functions back."""
-        for part, (owner, name) in self._watched.items():
-            setattr(owner, name, self._originals[part])
-
-    def _timed(self, part: str) -> Callable[..., Any]:
-        original = self._originals[part]
-
-        @functools.wraps(original)
-        def call(*arguments: Any, **named: Any) -> Any:
-            begin = time.perf_counter()
-            try:
-                return original(*arguments, **named)
-            finally:
-                self.seconds[part] += time.perf_counter() - begin
-                self.calls[part] += 1
-
-        return call
-
-
 class Split:
     """A candidate of :func:`interleave` that also tells which share of its time chosen functions take.
 
     Args:
-        watched: as of :class:`Stopwatch`.
+        watched: for each part the owner (module or class) and the name of the function its callers look up there.
         action: timed; called with what ``setup`` returns.
         per: what times are divided by, such as iterations.
         setup: before each round, not timed.
 
     Attributes:
         parts: times of all rounds by part [s]; "Python" is what no part takes.
+        calls: of the last round by part.
     """
 
     def __init__(
@@ -157,19 +114,35 @@ class Split:
         per: float = 1.0,
         setup: Callable[[], tuple[Any, ...]] = tuple,
     ) -> None:
-        """Nothing runs before it is called."""
-        self._watch, self._action, self._per, self._setup = Stopwatch(watched), action, per, setup
+        """Nothing runs, and nothing is replaced, before it is called."""
+        self._watched, self._action, self._per, self._setup = watched, action, per, setup
         self.parts: dict[str, list[float]] = {part: [] for part in (*watched, "Python")}
+        self.calls: dict[str, int] = {}
 
     def __call__(self) -> float:
         """Run once; the time of the whole [s]."""
         given = self._setup()
-        with self._watch as watch:
+        spent = dict.fromkeys(self._watched, 0.0)
+        self.calls = dict.fromkeys(self._watched, 0)
+        with ExitStack() as replaced:
+            for part, (owner, name) in self._watched.items():
+                replaced.enter_context(mock.patch.object(owner, name, self._timed(part, getattr(owner, name), spent)))
             elapsed = clock(lambda: self._action(*given))
-        rest = elapsed - sum(watch.seconds.values())
-        for part, seconds in (*watch.seconds.items(), ("Python", rest)):
+        for part, seconds in (*spent.items(), ("Python", elapsed - sum(spent.values()))):
             self.parts[part].append(seconds / self._per)
         return elapsed / self._per
+
+    def _timed(self, part: str, original: Callable[..., Any], spent: dict[str, float]) -> Callable[..., Any]:
+        @functools.wraps(original)
+        def call(*arguments: Any, **named: Any) -> Any:
+            begin = time.perf_counter()
+            try:
+                return original(*arguments, **named)
+            finally:
+                spent[part] += time.perf_counter() - begin
+                self.calls[part] += 1
+
+        return call
 
     def milliseconds(self, rounds: int) -> dict[str, Spread]:
         """Medians and quartiles of the last rounds by part [ms]."""

@@ -14,14 +14,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 import unifg as fg
 from benchmarks import campaign
 from benchmarks.campaign import Row
-from benchmarks.gtsam_peer import Peer, available
+from benchmarks.gtsam_peer import Peer, as_array, available
 from benchmarks.report import command, listing, publish, shared
 from problems.closures import Claim, with_wrong_closures
 from unifg.files.g2o import read_g2o
@@ -66,15 +66,9 @@ def by_gtsam(pose_graph: PoseGraph) -> Found:
     options.setLossType(gtsam.GncLossType.TLS)
     optimizer = gtsam.GncGaussNewtonOptimizer(peer.graph, peer.start, options)
     optimizer.setInlierCostThresholds(0.5 * THRESHOLD[dim] ** 2)
-    found, every = optimizer.optimize(), range(len(pose_graph.poses))
-    if pose_graph.group is SE2:
-        planar = [found.atPose2(k) for k in every]
-        return Found(np.array([[pose.x(), pose.y(), pose.theta()] for pose in planar]))
-    spatial = [found.atPose3(k) for k in every]
-    turned: list[Any] = [pose.rotation().toQuaternion() for pose in spatial]
-    return Found(
-        np.array([[*p.translation(), q.w(), q.x(), q.y(), q.z()] for p, q in zip(spatial, turned, strict=True)])
-    )
+    found = optimizer.optimize()
+    pose = found.atPose2 if pose_graph.group is SE2 else found.atPose3
+    return Found(np.array([as_array(pose(k)) for k in range(len(pose_graph.poses))]))
 
 
 def by_graduation(pose_graph: PoseGraph) -> Found:

@@ -11,7 +11,7 @@ import pytest
 import unifg as fg
 from benchmarks import chains, collection, elimination, gtsam_peer, marginals, own_residuals, pose_graphs
 from benchmarks.section import Result, goal, met
-from benchmarks.timing import Split, Stopwatch, interleave, number, shown, spread
+from benchmarks.timing import Split, interleave, number, shown, spread
 from problems.collection import BACKENDS, CASES, attempt
 from unifg.pose_graphs import manhattan
 from unifg.program.program import Program
@@ -73,25 +73,16 @@ def test_spreads_and_digits() -> None:
     assert [number(value) for value in (0.0123, 0.0, 4567.0)] == ["0.0123", "0.000", "4567"]
 
 
-def test_a_stopwatch_counts_and_puts_back() -> None:
-    pose_graph = manhattan(20).pose_graph
-    graph, _, guess = pose_graph.graph()
-    original = Program.linearize
-    with Stopwatch({"linearise": (Program, "linearize")}) as watch:
-        solution = GaussNewton().solve(graph, guess)
-    assert Program.linearize is original
-    assert watch.calls["linearise"] == solution.iterations + 1
-    assert watch.seconds["linearise"] > 0.0
-
-
-def test_a_split_adds_up() -> None:
+def test_a_split_counts_adds_up_and_puts_back() -> None:
     graph, _, guess = manhattan(20).pose_graph.graph()
-    run = GaussNewton().prepare(graph)
+    run, original = GaussNewton().prepare(graph), Program.linearize
     split = Split({"linearise": (Program, "linearize")}, run.solve, per=2.0, setup=lambda: (guess,))
     elapsed = [split(), split()]
+    assert Program.linearize is original
+    assert split.calls["linearise"] == run.solve(guess).iterations + 1
     np.testing.assert_allclose(np.sum(list(split.parts.values()), axis=0), elapsed, rtol=1e-9)
     assert split.milliseconds(1)["linearise"][0] == pytest.approx(1e3 * split.parts["linearise"][1])
-    assert all(2.0 * min(values) > 0.0 for values in split.parts.values())
+    assert min(split.parts["linearise"]) > 0.0
 
 
 @pytest.mark.parametrize("kind", chains.CASES)
