@@ -22,7 +22,7 @@ from typing import Literal
 
 import numpy as np
 
-from unifg.answers.solver import Run, Solver
+from unifg.answers.solver import Solver, SolveState
 from unifg.answers.status import Status
 from unifg.errors import BackendError
 from unifg.machine.jit import compiled
@@ -96,13 +96,13 @@ class AugmentedLagrangian(Solver):
         """The factorisation of the primal step."""
         return Primal(program)
 
-    def search_step(self, run: Run, workspace: Primal, lin: Linearization) -> Array | None:
+    def search_step(self, run: SolveState, workspace: Primal, lin: Linearization) -> Array | None:
         """The primal step at the initial damping, with the penalty that suits the present iterate."""
         rho, weights = self._first_penalties(run, workspace)
         found = model_step(workspace, lin, run.multipliers, rho * weights, self.damping)
         return None if found is None else found[0]
 
-    def iterate(self, run: Run, workspace: Primal) -> Status | None:
+    def iterate(self, run: SolveState, workspace: Primal) -> Status | None:
         """Alternate primal and dual steps."""
         rho, weights = self._first_penalties(run, workspace)
         if self.schedule == "bazzana":
@@ -111,7 +111,7 @@ class AugmentedLagrangian(Solver):
             return self._damped(run, workspace, rho, weights)
         return self._tightening(run, workspace, rho, weights)
 
-    def _literal(self, run: Run, primal: Primal, rho: float, weights: Array) -> Status | None:
+    def _literal(self, run: SolveState, primal: Primal, rho: float, weights: Array) -> Status | None:
         """One Gauss-Newton step, one dual step, constant rho."""
         run.penalties = penalty = rho * weights
         while run.status is None:
@@ -128,7 +128,7 @@ class AugmentedLagrangian(Solver):
                 return Status.STOP_RULE
         return None
 
-    def _damped(self, run: Run, primal: Primal, rho: float, weights: Array) -> Status | None:
+    def _damped(self, run: SolveState, primal: Primal, rho: float, weights: Array) -> Status | None:
         """The same with Levenberg and Marquardt's damping: a primal step has to lower the augmented objective."""
         run.penalties = penalty = rho * weights
         damping = Damping(self.damping)
@@ -149,7 +149,7 @@ class AugmentedLagrangian(Solver):
                 return Status.STOP_RULE
         return None
 
-    def _tightening(self, run: Run, primal: Primal, rho: float, weights: Array) -> Status | None:
+    def _tightening(self, run: SolveState, primal: Primal, rho: float, weights: Array) -> Status | None:
         """Solve each subproblem only as accurately as its multipliers deserve."""
         multipliers = expected = run.multipliers
         damping = Damping(self.damping)
@@ -254,7 +254,7 @@ class AugmentedLagrangian(Solver):
                 damping = Damping(self.damping)
         return None
 
-    def _first_penalties(self, run: Run, primal: Primal) -> tuple[float, Array]:
+    def _first_penalties(self, run: SolveState, primal: Primal) -> tuple[float, Array]:
         """Initial rho, and (M,) weights of the rows: their penalties are rho times them."""
         scale = self._scale(primal, run.lin)
         weights = scale**2
@@ -292,14 +292,16 @@ class AugmentedLagrangian(Solver):
         less = np.where((unit > 1.0) & (wanted < GROWN * unit), np.maximum(wanted, 1.0) / unit, 1.0)
         return less if (less < 1.0).any() else None
 
-    def _goals(self, run: Run, primal: Primal, rho: float, multipliers: Array, penalty: Array) -> tuple[float, float]:
+    def _goals(
+        self, run: SolveState, primal: Primal, rho: float, multipliers: Array, penalty: Array
+    ) -> tuple[float, float]:
         """First accuracy of the subproblem's gradient, and the scaled violation that earns a dual step."""
         if run.program.least_squares:  # one subproblem, and no absolute measure of its gradient
             return 0.0, 1.0
         size = largest(primal.gradient(run.lin, multipliers, penalty))
         return max(min(0.1 * size, 1.0), 0.1 * self.tolerance), float(max(rho**-0.1, 0.1 * self.tolerance))
 
-    def _stop_rule(self, run: Run, step_norm: float) -> bool:
+    def _stop_rule(self, run: SolveState, step_norm: float) -> bool:
         return step_norm < self.step_tolerance and run.optimality.violation < self.violation_tolerance
 
 

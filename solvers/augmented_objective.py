@@ -18,7 +18,7 @@ from unifg.program.curvature import lagrangian_hessian
 from unifg.program.linearization import Evaluation, Linearization
 from unifg.program.passes import transposed_times
 from unifg.program.program import Program
-from unifg.program.table import Terms
+from unifg.program.table import TermArrays
 from unifg.typing import Array, IntArray
 
 DIAGONAL_FLOOR = 1e-9  # of the largest diagonal entry: damping must act on unknowns with little curvature too
@@ -134,7 +134,7 @@ class Primal:
 
 
 @compiled
-def _slope(terms: Terms, free: IntArray, gradient: Array, entries: Array, multipliers: Array) -> float:
+def _slope(terms: TermArrays, free: IntArray, gradient: Array, entries: Array, multipliers: Array) -> float:
     """Max |gradient + A' multipliers| over the unknowns; NaN where one is."""
     full, largest = gradient.copy(), 0.0
     transposed_times(terms, False, entries, multipliers, full)

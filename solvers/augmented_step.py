@@ -21,7 +21,7 @@ from unifg.machine.jit import compiled
 from unifg.program.columns import Values
 from unifg.program.linearization import Linearization
 from unifg.program.passes import add_constraints, times, transposed_times
-from unifg.program.table import Terms
+from unifg.program.table import TermArrays
 from unifg.solvers.augmented_objective import DIAGONAL_FLOOR, Primal, barrier, update
 from unifg.solvers.globalize.damping import LARGEST, SUFFICIENT, Damping, gain
 from unifg.typing import Array, BoolArray, IntArray
@@ -158,7 +158,7 @@ def model_step(
 
 @compiled
 def _minimize(
-    terms: Terms,
+    terms: TermArrays,
     plan: Plan,
     free: IntArray,
     indptr: IntArray,

@@ -33,7 +33,7 @@ import numpy as np
 
 from unifg.answers.history import Iteration
 from unifg.answers.solution import NotConverged, Solution
-from unifg.answers.solver import Backend, Callback, Prepared, Solver, Start
+from unifg.answers.solver import AnyGuess, Backend, Callback, Prepared, Solver
 from unifg.answers.status import Status
 from unifg.answers.verdict import Verdict
 from unifg.errors import BackendError
@@ -146,7 +146,7 @@ class GraduatedNonConvexity(Backend):
     def solve(
         self,
         graph: Statement,
-        guess: Start,
+        guess: AnyGuess,
         *,
         data: Mapping[Data, ArrayLike] | None = None,
         check: bool = False,
@@ -205,7 +205,7 @@ class _Search:
         self._terms = [t for t, _ in robust if isinstance(t.term, Cost) and isinstance(t.term.robust, _Stage)]
         self._parts = {term.name: part for term, part in self._last.program.table.robust}
 
-    def best(self, guess: Start) -> Solution:
+    def best(self, guess: AnyGuess) -> Solution:
         """The best answer found, judged with the losses themselves."""
         graduated = self._graduated(guess)
         if graduated.status is Status.INTERRUPTED:
@@ -221,7 +221,7 @@ class _Search:
             answer = rival
         return self._concluded(self._revised(answer))
 
-    def _graduated(self, guess: Start) -> Solution:
+    def _graduated(self, guess: AnyGuess) -> Solution:
         """Through the surrogates, each from the guess."""
         stages = self._stages
         solution = self.history.add(self._plain, guess, self._data, restart=True)
@@ -238,7 +238,7 @@ class _Search:
                 stage.now = next(path, stage.goal)
         return solution
 
-    def _better(self, guess: Start, before: Solution) -> Solution:
+    def _better(self, guess: AnyGuess, before: Solution) -> Solution:
         """Solve the present surrogate from the guess and from the solution of the one before."""
         anew = self._from(guess)
         seen = [stage.squared for stage in self._stages]
@@ -251,7 +251,7 @@ class _Search:
             return anew
         return on
 
-    def _from(self, start: Start) -> Solution:
+    def _from(self, start: AnyGuess) -> Solution:
         """Solve the present stage; with damping, where weights of zero leave something undetermined."""
         found = self.history.add(self._run, start, self._data, restart=True)
         if found.status is not Status.SINGULAR:
@@ -426,7 +426,7 @@ class _History:
         self._restart = False
 
     def add(
-        self, run: Prepared, start: Start, data: Mapping[Data, ArrayLike] | None, *, restart: bool = False
+        self, run: Prepared, start: AnyGuess, data: Mapping[Data, ArrayLike] | None, *, restart: bool = False
     ) -> Solution:
         """Solve and keep the rows."""
         self._stage += 1

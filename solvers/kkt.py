@@ -27,7 +27,7 @@ from typing import Literal
 import numpy as np
 
 from unifg.answers.requirements import require
-from unifg.answers.solver import Run, Solver
+from unifg.answers.solver import Solver, SolveState
 from unifg.answers.status import Status
 from unifg.errors import BackendError
 from unifg.program.linearization import Linearization
@@ -84,13 +84,13 @@ class KKT(Solver):
         """Structure of the KKT matrix."""
         return Newton(program)
 
-    def search_step(self, run: Run, workspace: Newton, lin: Linearization) -> Array | None:
+    def search_step(self, run: SolveState, workspace: Newton, lin: Linearization) -> Array | None:
         """The unknowns' part of the full step."""
         workspace.begin(self.name)
         found = workspace.step(lin, run.multipliers, SMALLEST_DAMPING, 0.0)
         return None if found is None else found[0]
 
-    def iterate(self, run: Run, workspace: Newton) -> Status | None:
+    def iterate(self, run: SolveState, workspace: Newton) -> Status | None:
         """Iterate to convergence."""
         workspace.begin(self.name)
         if self.globalization == "levenberg-marquardt":
@@ -134,7 +134,7 @@ class KKT(Solver):
             slackness = 0.1 * slackness if slackness > SMALLEST_DAMPING else 0.0
         return None
 
-    def _damped(self, run: Run, workspace: Newton) -> Status | None:
+    def _damped(self, run: SolveState, workspace: Newton) -> Status | None:
         """Levenberg and Marquardt's iteration."""
         merit, damping = OnePrice(run.program), Damping(FIRST_LEVENBERG)
         rejected, slackness = 0, 0.0
@@ -178,7 +178,7 @@ class KKT(Solver):
         return None
 
     def _search(
-        self, run: Run, workspace: Newton, merit: OnePrice, step: Array, change: Array
+        self, run: SolveState, workspace: Newton, merit: OnePrice, step: Array, change: Array
     ) -> tuple[Linearization, Array, Array, float, bool] | None:
         """New linearisation, step and change of multipliers as taken, length, whether corrected; None for no step."""
         program, lin = run.program, run.lin

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.answers.solver import Run, Solver
+from unifg.answers.solver import Solver, SolveState
 from unifg.answers.status import Status
 from unifg.errors import BackendError
 from unifg.program.linearization import Linearization
@@ -57,12 +57,12 @@ class GaussNewton(LeastSquares):
 
     line_search: bool = True
 
-    def search_step(self, run: Run, workspace: Primal, lin: Linearization) -> Array | None:
+    def search_step(self, run: SolveState, workspace: Primal, lin: Linearization) -> Array | None:
         """The full Gauss-Newton step."""
         none = np.zeros(0)
         return workspace.direction(lin.hessian, workspace.gradient(lin, none, none))
 
-    def iterate(self, run: Run, workspace: Primal) -> Status | None:
+    def iterate(self, run: SolveState, workspace: Primal) -> Status | None:
         """Iterate to convergence."""
         none, run.lent, merit = np.zeros(0), workspace, Merit(run.program)
         while run.status is None:
@@ -94,12 +94,12 @@ class LevenbergMarquardt(LeastSquares):
 
     damping: float = 1e-4
 
-    def search_step(self, run: Run, workspace: Primal, lin: Linearization) -> Array | None:
+    def search_step(self, run: SolveState, workspace: Primal, lin: Linearization) -> Array | None:
         """The step at the initial damping."""
         found = model_step(workspace, lin, np.zeros(0), np.zeros(0), self.damping)
         return None if found is None else found[0]
 
-    def iterate(self, run: Run, workspace: Primal) -> Status | None:
+    def iterate(self, run: SolveState, workspace: Primal) -> Status | None:
         """Iterate to convergence."""
         none, run.lent = np.zeros(0), workspace
         damping = Damping(self.damping)
@@ -134,12 +134,12 @@ class DogLeg(LeastSquares):
         if not self.radius > 0.0:
             raise BackendError(f"{self.name}: radius must be positive, found {self.radius}")
 
-    def search_step(self, run: Run, workspace: Primal, lin: Linearization) -> Array | None:
+    def search_step(self, run: SolveState, workspace: Primal, lin: Linearization) -> Array | None:
         """The step within the first radius."""
         found = Path.at(workspace, lin)
         return None if found is None else found.step(self.radius)
 
-    def iterate(self, run: Run, workspace: Primal) -> Status | None:
+    def iterate(self, run: SolveState, workspace: Primal) -> Status | None:
         """Iterate to convergence."""
         radius, run.lent = self.radius, workspace
         while run.status is None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.answers.solver import Run, Solver
+from unifg.answers.solver import Solver, SolveState
 from unifg.answers.status import Status
 from unifg.errors import BackendError
 from unifg.program.linearization import Linearization
@@ -64,13 +64,13 @@ class Penalty(Solver):
         """The factorisation of the normal equations."""
         return Primal(program)
 
-    def search_step(self, run: Run, workspace: Primal, lin: Linearization) -> Array | None:
+    def search_step(self, run: SolveState, workspace: Primal, lin: Linearization) -> Array | None:
         """A step at the first weight and the initial damping."""
         none = np.zeros(len(run.multipliers))
         found = model_step(workspace, lin, none, np.full(len(none), self.penalty), self.damping)
         return None if found is None else found[0]
 
-    def iterate(self, run: Run, workspace: Primal) -> Status | None:
+    def iterate(self, run: SolveState, workspace: Primal) -> Status | None:
         """Minimise for one weight after the other."""
         none = np.zeros(len(run.multipliers))
         rho = self.penalty
@@ -87,7 +87,7 @@ class Penalty(Solver):
                 return settle(run, Status.STALLED if stalled else Status.STOP_RULE)
             rho = min(rho * self.penalty_growth, last)
 
-    def _minimize(self, run: Run, primal: Primal, none: Array, rho: float) -> bool:
+    def _minimize(self, run: SolveState, primal: Primal, none: Array, rho: float) -> bool:
         """Minimise for one weight; returns whether no step helped any more."""
         penalty = np.full(len(none), rho)
         damping = Damping(self.damping)
@@ -110,7 +110,7 @@ class Penalty(Solver):
                 return True
         return False
 
-    def _violated(self, run: Run) -> bool:
+    def _violated(self, run: SolveState) -> bool:
         """Whether the constraints as they are ask for a heavier weight."""
         return max(run.optimality.violation, run.optimality.complementarity) > self.tolerance
 

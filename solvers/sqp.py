@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from unifg.answers.requirements import require
-from unifg.answers.solver import Run, Solver
+from unifg.answers.solver import Solver, SolveState
 from unifg.answers.status import Status
 from unifg.errors import BackendError
 from unifg.program.linearization import Linearization
@@ -102,14 +102,14 @@ class SQP(Solver):
             tolerance=self.tolerance,
         )
 
-    def search_step(self, run: Run, workspace: Subproblems, lin: Linearization) -> Array | None:
+    def search_step(self, run: SolveState, workspace: Subproblems, lin: Linearization) -> Array | None:
         """The full step of the subproblem."""
         workspace.start(lin)
         qp = subproblem(run.program, lin, SMALLEST_DAMPING * workspace.scaling.metric, workspace.pattern)
         answer = workspace.solve(qp, run.multipliers, self._accuracy(run, workspace))
         return answer.step if np.isfinite(answer.error) else None
 
-    def iterate(self, run: Run, workspace: Subproblems) -> Status | None:
+    def iterate(self, run: SolveState, workspace: Subproblems) -> Status | None:
         """Iterate to convergence."""
         # Bounds are linear: once they hold they hold along every step, and leave the line search to the rest.
         within = run.program.within_bounds(run.values)
@@ -169,7 +169,7 @@ class SQP(Solver):
         return None
 
     def _attempt(
-        self, run: Run, workspace: Subproblems, merit: RowPrices, qp: QP
+        self, run: SolveState, workspace: Subproblems, merit: RowPrices, qp: QP
     ) -> tuple[QPAnswer, Linearization, Array, Array, float, bool] | None:
         """Solve the subproblem and search along its step; None when there is no answer or no length helps."""
         accuracy = self._accuracy(run, workspace)
@@ -180,11 +180,11 @@ class SQP(Solver):
         found = self._search(run, workspace, merit, qp, answer, accuracy)
         return None if found is None else (answer, *found)
 
-    def _bounded(self, run: Run, workspace: Subproblems, damping: float) -> float:
+    def _bounded(self, run: SolveState, workspace: Subproblems, damping: float) -> float:
         """With the exact Hessian damping must vanish with the error, or convergence would be linear."""
         return damping if self.hessian != "exact" else max(min(damping, _size(run, workspace)), SMALLEST_DAMPING)
 
-    def _accuracy(self, run: Run, workspace: Subproblems) -> float:
+    def _accuracy(self, run: SolveState, workspace: Subproblems) -> float:
         """Ask the QP for what the outer iteration can use."""
         size = _size(run, workspace)
         share = min(1e-3, size) if self.hessian == "exact" else 1e-3
@@ -198,7 +198,7 @@ class SQP(Solver):
         return max((EXACT_DECAY if self.hessian == "exact" else DAMPING_DECAY) * damping, SMALLEST_DAMPING)
 
     def _search(
-        self, run: Run, workspace: Subproblems, merit: RowPrices, qp: QP, answer: QPAnswer, accuracy: float
+        self, run: SolveState, workspace: Subproblems, merit: RowPrices, qp: QP, answer: QPAnswer, accuracy: float
     ) -> tuple[Linearization, Array, Array, float, bool] | None:
         """Where to go: linearisation, multipliers, step and its length, and whether it is a correction."""
         program, lin = run.program, run.lin
@@ -254,7 +254,7 @@ def missing_curvature(
     return missing if missing > SECANT_MATTERS * known else 0.0
 
 
-def _size(run: Run, workspace: Subproblems) -> float:
+def _size(run: SolveState, workspace: Subproblems) -> float:
     """The largest KKT number of the present iterate, in scaled units."""
     program, scaling, measured = run.program, workspace.scaling, run.optimality
     if scaling.neutral:

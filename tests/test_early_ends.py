@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.answers.solver import Run
+from unifg.answers.solver import SolveState
 from unifg.models import obstacles, unicycle
 from unifg.scenarios.manoeuvres import CASES, ManoeuvreSettings, state_problem
 from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
@@ -99,7 +99,8 @@ def test_few_iterations_follow_a_moved_goal(name: str, iterations: int, feasible
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("feasible", [True, False], ids=["rolled out", "shifted"])
 def test_little_time_follows_a_moved_goal(name: str, feasible: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Run, "seconds", property(lambda run: 1.0 * len(run.history)))  # an iteration takes a second
+    # An iteration takes a second.
+    monkeypatch.setattr(SolveState, "seconds", property(lambda run: 1.0 * len(run.history)))
 
     def drive(loop: Loop) -> Array:
         solver = BACKENDS[name](200)
@@ -187,7 +188,7 @@ class Flies(fg.Solver):
     def workspace(self, program: object) -> None:
         return None
 
-    def iterate(self, run: Run, workspace: None) -> fg.Status | None:
+    def iterate(self, run: SolveState, workspace: None) -> fg.Status | None:
         for target in (2.0, 3.0, np.inf):
             step = target - run.values.flat
             run.accept(run.program.linearize(run.program.retract(run.values, step)), run.multipliers, 1.0, 1.0)

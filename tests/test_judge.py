@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.answers.solver import Run, Solver
+from unifg.answers.solver import Solver, SolveState
 from unifg.solvers import (
     KKT,
     SQP,
@@ -45,7 +45,7 @@ class Liar(Solver):
     def workspace(self, program: Any) -> None:
         return None
 
-    def iterate(self, run: Run, workspace: Any) -> fg.Status:
+    def iterate(self, run: SolveState, workspace: Any) -> fg.Status:
         moved = run.program.retract(run.values, np.array([self.point]) - run.values.flat)
         run.accept(run.program.linearize(moved), np.array([self.multiplier]), 1.0, 1.0)
         run.status = fg.Status.CONVERGED

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from unifg.answers.optimality import infeasible_stationary, within_bounds
-from unifg.answers.solver import Run
+from unifg.answers.solver import SolveState
 from unifg.answers.status import Status
 from unifg.answers.violation import ViolationModel, descent
 from unifg.program.linearization import Linearization
@@ -30,7 +30,7 @@ FALLING = 0.9
 LESS = 1e-4  # relative decrease that tells a saddle from a minimum in a flat valley
 
 
-def settle(run: Run, status: Status) -> Status:
+def settle(run: SolveState, status: Status) -> Status:
     """End a solve that stalled: LOCALLY_INFEASIBLE at the point of least violation, else ``status`` where it is.
 
     A solve that has met its constraints somewhere has seen that they can be met: it stays where it is.
@@ -44,7 +44,7 @@ def settle(run: Run, status: Status) -> Status:
     return status
 
 
-def nearest(run: Run) -> tuple[Linearization, bool]:
+def nearest(run: SolveState) -> tuple[Linearization, bool]:
     """Where descent on the violation from the present iterate ends, and whether nothing near that violates less."""
     found = within_bounds(run.program, run.lin)
     if not infeasible_stationary(run.program, found, run.tolerance):
@@ -57,7 +57,7 @@ def nearest(run: Run) -> tuple[Linearization, bool]:
     return found, False
 
 
-def leave(run: Run) -> Status | None:
+def leave(run: SolveState) -> Status | None:
     """Where the violation is stationary: LOCALLY_INFEASIBLE, or None once the iterate was moved to violate less."""
     within = within_bounds(run.program, run.lin)
     found = _downhill(run, within)
@@ -67,7 +67,7 @@ def leave(run: Run) -> Status | None:
     return run.status
 
 
-def _downhill(run: Run, lin: Linearization) -> Linearization | None:
+def _downhill(run: SolveState, lin: Linearization) -> Linearization | None:
     """A point that violates less than a stationary one; None at a minimum.
 
     It is looked for from where the solve has been, then from beside, off a saddle, at two distances: one in the units
@@ -148,7 +148,7 @@ class Watch:
         self._patience, self._waited = PATIENCE, 0
         self._least = np.inf
 
-    def calls(self, run: Run) -> bool:
+    def calls(self, run: SolveState) -> bool:
         """Whether it is time; asked once an iteration, and after every call half as often."""
         violation = run.optimality.violation
         if violation <= run.tolerance or violation < FALLING * self._least:

@@ -41,7 +41,7 @@ import numpy as np
 from unifg.machine.jit import compiled
 from unifg.machine.links import linked, parts, run
 from unifg.program.passes import transposed_times
-from unifg.program.table import BOUND, COLUMN, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, Terms
+from unifg.program.table import BOUND, COLUMN, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
 from unifg.solvers.interior_point.state import (
     ANSWER,
     ASKED,
@@ -242,7 +242,7 @@ def _error(numbers: Array) -> float:
 
 @compiled
 def _forces(
-    terms: Terms, free: IntArray, gradient: Array, multipliers: Array, jacobian: Array, full: Array
+    terms: TermArrays, free: IntArray, gradient: Array, multipliers: Array, jacobian: Array, full: Array
 ) -> tuple[float, float]:
     """Largest force of the objective on an unknown, and of all constraints if none of them balanced another."""
     for k in range(len(full)):
@@ -255,7 +255,7 @@ def _forces(
 
 
 @compiled
-def _far_from_one(terms: Terms, jacobian: Array) -> bool:
+def _far_from_one(terms: TermArrays, jacobian: Array) -> bool:
     """Whether some row of the constraint Jacobian has its largest entry far from one."""
     fields = terms.fields
     for t in range(len(fields)):
@@ -275,7 +275,7 @@ def _far_from_one(terms: Terms, jacobian: Array) -> bool:
 
 @compiled
 def _find_units(
-    terms: Terms, jacobian: Array, row_units: Array, units: Array, row_size: Array, column_size: Array
+    terms: TermArrays, jacobian: Array, row_units: Array, units: Array, row_size: Array, column_size: Array
 ) -> None:
     """Units of rows and unknowns in which the largest entries of the constraint Jacobian are near one (Ruiz 2001).
 

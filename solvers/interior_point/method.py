@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from unifg.answers.history import Iteration
-from unifg.answers.solver import Run, Solver
+from unifg.answers.solver import Solver, SolveState
 from unifg.answers.status import Status
 from unifg.errors import BackendError
 from unifg.machine.links import memory
@@ -83,7 +83,7 @@ class InteriorPoint(Solver):
         """Structure of the KKT matrix."""
         return Workspace(program)
 
-    def iterate(self, run: Run, workspace: Workspace) -> Status | None:
+    def iterate(self, run: SolveState, workspace: Workspace) -> Status | None:
         """Iterate to convergence; where that is not to be had, to a point of least violation, or on from another."""
         counts = workspace.prepare(run, self).counts
         restarts = 0
@@ -111,7 +111,7 @@ class InteriorPoint(Solver):
                 return reason
             run.status = None
 
-    def _alone(self, run: Run, workspace: Workspace) -> Status:
+    def _alone(self, run: SolveState, workspace: Workspace) -> Status:
         """The compiled loop."""
         work = workspace.work
         interrupted = workspace.loop()
@@ -124,7 +124,7 @@ class InteriorPoint(Solver):
             run.status = ending if ending is Status.CONVERGED else Status.INTERRUPTED
         return ending
 
-    def _guided(self, run: Run, workspace: Workspace) -> Status | None:
+    def _guided(self, run: SolveState, workspace: Workspace) -> Status | None:
         """The same loop, with every evaluation made by the program and every iterate shown."""
         program, work = run.program, workspace.work
         numbers, counts = work.numbers, work.counts
@@ -231,7 +231,7 @@ class Workspace:
             return True
         return False
 
-    def prepare(self, run: Run, options: InteriorPoint) -> Work:
+    def prepare(self, run: SolveState, options: InteriorPoint) -> Work:
         """Set up one solve with the present data."""
         if not (self.program.equality == self.system.held).all():
             self._build(options.max_iterations)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, NamedTuple, get_type_hints
 import numpy as np
 
 from unifg.elimination.plan import Plan
-from unifg.program.table import Terms
+from unifg.program.table import TermArrays
 from unifg.typing import Array, IntArray
 
 # Places in Work.numbers.
@@ -124,7 +124,7 @@ class Problem(NamedTuple):
     """
 
     links: IntArray
-    terms: Terms
+    terms: TermArrays
     plan: Plan
     retraction: IntArray
     free: IntArray

@@ -18,7 +18,7 @@ from unifg.machine.jit import compiled
 from unifg.program.passes import add_constraints, times, transposed_times
 from unifg.program.program import Program
 from unifg.program.systems import KktArrays, fill
-from unifg.program.table import Terms
+from unifg.program.table import TermArrays
 from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, qp_error
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -126,7 +126,7 @@ class Polish:
 
 @compiled
 def _minimize(
-    terms: Terms,
+    terms: TermArrays,
     kkt: KktArrays,
     free: IntArray,
     hessian: Array,
@@ -226,7 +226,7 @@ def _minimize(
 
 @compiled
 def _residual(
-    terms: Terms,
+    terms: TermArrays,
     kkt: KktArrays,
     free: IntArray,
     hessian: Array,

@@ -40,7 +40,7 @@ from unifg.machine.jit import compiled
 from unifg.program import passes
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
-from unifg.program.table import COLUMN, COST, COUNT, DIFFERENCED, KIND, ROW, ROWS, WIDTH, Terms
+from unifg.program.table import COLUMN, COST, COUNT, DIFFERENCED, KIND, ROW, ROWS, WIDTH, TermArrays
 from unifg.typing import Array, IntArray
 
 
@@ -162,7 +162,7 @@ def gradient_rounding(program: Program, lin: Linearization, multipliers: Array) 
 
 @compiled
 def _add_rounding(
-    terms: Terms,
+    terms: TermArrays,
     residual: Array,
     constraints: Array,
     multipliers: Array,
@@ -193,7 +193,7 @@ def _add_rounding(
 
 @compiled
 def _measure(
-    terms: Terms,
+    terms: TermArrays,
     free: IntArray,
     slope: Array,
     constraints: Array,

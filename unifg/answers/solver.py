@@ -27,7 +27,7 @@ from unifg.typing import Array, ArrayLike
 
 logger = logging.getLogger("unifg")
 
-Start: TypeAlias = Mapping[Family, ArrayLike] | Guess | Solution
+AnyGuess: TypeAlias = Mapping[Family, ArrayLike] | Guess | Solution
 Callback: TypeAlias = Callable[[Iteration], bool | None]
 
 UNBOUNDED_COST = -1e20
@@ -53,7 +53,7 @@ class Backend(ABC):
     def solve(
         self,
         graph: Statement,
-        guess: Start,
+        guess: AnyGuess,
         *,
         data: Mapping[Data, ArrayLike] | None = None,
         check: bool = False,
@@ -110,7 +110,7 @@ class Solver(Backend):
     def solve(
         self,
         graph: Statement,
-        guess: Start,
+        guess: AnyGuess,
         *,
         data: Mapping[Data, ArrayLike] | None = None,
         duals: Mapping[str, ArrayLike] | None = None,
@@ -134,7 +134,7 @@ class Solver(Backend):
         require(program, self.name, self.constraints, self.scalar_costs)
 
     def runs_alone(self, program: Program) -> bool:
-        """Whether :meth:`iterate` evaluates the start itself and ends with :meth:`Run.conclude` when nobody watches."""
+        """Whether :meth:`iterate` evaluates the start and ends with :meth:`SolveState.conclude` when nobody watches."""
         return False
 
     @abstractmethod
@@ -142,15 +142,15 @@ class Solver(Backend):
         """What the backend keeps between solves of one structure."""
 
     @abstractmethod
-    def iterate(self, run: Run, workspace: Any) -> Status | None:
+    def iterate(self, run: SolveState, workspace: Any) -> Status | None:
         """Improve ``run`` until it has a status, or return the reason to stop."""
 
-    def search_step(self, run: Run, workspace: Any, lin: Linearization) -> Array | None:
+    def search_step(self, run: SolveState, workspace: Any, lin: Linearization) -> Array | None:
         """The backend's own tangent step for the model ``lin``, which is made of search Jacobians; None for no step."""
         raise BackendError(f"{self.name} has no search_step: set search_iterations=0")
 
 
-class Run:
+class SolveState:
     """State of one solve: the present iterate, its KKT numbers, and what has been recorded.
 
     A backend moves with :meth:`accept`; the solve is over when ``status`` is set.
@@ -398,7 +398,7 @@ class Prepared:
 
     def solve(
         self,
-        guess: Start,
+        guess: AnyGuess,
         *,
         data: Mapping[Data, ArrayLike] | None = None,
         duals: Mapping[str, ArrayLike] | None = None,
@@ -410,7 +410,8 @@ class Prepared:
         program.bind(data or {})
         values = program.values_from(guess if isinstance(guess, Mapping) else guess.values)
         carried = {} if isinstance(guess, Mapping) else guess.multipliers
-        run = Run(self.solver, program, values, self._stacked("multipliers", {**carried, **(duals or {})}), callback)
+        multipliers = self._stacked("multipliers", {**carried, **(duals or {})})
+        run = SolveState(self.solver, program, values, multipliers, callback)
         if not isinstance(guess, Mapping):
             run.penalties = self._stacked("penalties", guess.penalties)
         self._refuse_not_finite(run)
@@ -455,7 +456,7 @@ class Prepared:
             raise GraphError(f"{what} of '{name}' are not finite", term=name)
         return result
 
-    def _refuse_not_finite(self, run: Run) -> None:
+    def _refuse_not_finite(self, run: SolveState) -> None:
         if run.status is not Status.NOT_FINITE:
             return
         for term in self.program.terms:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from math import prod
 from typing import Any
 
-import numba
 import numpy as np
 
 from unifg.errors import GraphError
@@ -33,6 +33,7 @@ from unifg.kernels.steps import (
 )
 from unifg.lie import Manifold
 from unifg.machine.calls import local_matrix, local_vector, matrix, vector
+from unifg.machine.jit import written
 
 logger = logging.getLogger("unifg")
 
@@ -70,7 +71,7 @@ def per_factor(
         if isinstance(argument, int):
             shape = next(sizes)
             parts.append(_parameter(name, offset, shape))
-            offset += _product(shape)
+            offset += prod(shape)
         else:
             parts.append(f"vector({{0}}, {at}, {argument.storage})")
             slots.append((at, argument))
@@ -86,11 +87,8 @@ def per_factor(
         lines += _attached(call, slots, rows)
     else:
         lines += _differences(call, slots, rows, at, name)
-    exec(compile("\n".join(lines), f"<kernel of {name}>", "exec"), names)
     logger.info("compiling the residual '%s', once in this process", name)
-    kernel = numba.njit(error_model="numpy", fastmath=False)(
-        names["kernel"]
-    )  # nothing may be reordered: see unifg.machine.jit
+    kernel = written("kernel", lines, names, name)
     return Kernel(kernel, tuple(arguments), rows, name=name, differenced=jacobian is None)
 
 
@@ -167,11 +165,3 @@ def _differences(call: str, slots: Sequence[tuple[int, Manifold]], rows: int, st
         if turn >= 0:
             yield f"    rotation(v, {turn}, {dim}, R)"
             yield f"    to_body(R, {dim}, J, {rows}, {column})"
-
-
-def _product(shape: tuple[int, ...]) -> int:
-    """Numbers in an array."""
-    total = 1
-    for size in shape:
-        total *= size
-    return total

@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from types import FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
@@ -52,6 +52,20 @@ def in_order(function: F) -> F:
 def inlined(function: F) -> F:
     """For helpers in the innermost loops: copied into the compiled functions that call them."""
     return cast(F, numba.njit(inline="always")(function))
+
+
+def written(function: str, lines: Sequence[str], names: dict[str, Any], what: str) -> Callable[..., None]:
+    """Compile a function that is put together as source; every operation as it is written, and no cache on disk.
+
+    Args:
+        function: its name there.
+        lines: of the source.
+        names: what the source knows; the function joins them.
+        what: it is for, shown in tracebacks.
+    """
+    exec(compile("\n".join(lines), f"<{function} of {what}>", "exec"), names)
+    dispatcher = numba.njit(error_model="numpy", fastmath=False)(names[function])
+    return cast(Callable[..., None], dispatcher)
 
 
 def is_compiled(function: object) -> bool:

@@ -46,7 +46,7 @@ from unifg.program.table import (
     WHITEN,
     WHITENER,
     WIDTH,
-    Terms,
+    TermArrays,
 )
 from unifg.program.term import CompiledTerm
 from unifg.typing import Array, IntArray
@@ -117,7 +117,7 @@ def _find(program: Program, term: CompiledTerm) -> Places:
 
 
 @compiled
-def add_curvature(terms: Terms, values: Array, residual: Array, multipliers: Array, hessian: Array) -> None:
+def add_curvature(terms: TermArrays, values: Array, residual: Array, multipliers: Array, hessian: Array) -> None:
     """Add the curvature of every term with a kernel, robust costs excepted, to the entries of the normal matrix."""
     fields = terms.fields
     storage = rows = width = 1

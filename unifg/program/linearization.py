@@ -15,7 +15,7 @@ from unifg.elimination.symmetric import scatter
 from unifg.machine.jit import compiled
 from unifg.program.columns import Values
 from unifg.program.passes import times, transposed_times
-from unifg.program.table import COLUMN, COUNT, ROWS, WIDTH, Table
+from unifg.program.table import COLUMN, COUNT, ROWS, WIDTH, TermTable
 from unifg.program.term import CompiledTerm
 from unifg.typing import Array, IntArray
 
@@ -97,7 +97,7 @@ class Rows:
         length: number of entries, those of fixed variables included.
     """
 
-    def __init__(self, table: Table, terms: Sequence[CompiledTerm], costs: bool, unknowns: int) -> None:
+    def __init__(self, table: TermTable, terms: Sequence[CompiledTerm], costs: bool, unknowns: int) -> None:
         """Describe the costs or the constraints of a table."""
         self._table = table
         self._terms = terms

@@ -41,7 +41,7 @@ from unifg.program.table import (
     WHITEN,
     WHITENER,
     WIDTH,
-    Terms,
+    TermArrays,
 )
 from unifg.typing import Array, IntArray
 
@@ -95,7 +95,9 @@ def _violation(value: float, lower: float, upper: float) -> float:
 
 
 @compiled
-def evaluate(terms: Terms, values: Array, residual: Array, constraints: Array, squares: Array, scratch: Array) -> float:
+def evaluate(
+    terms: TermArrays, values: Array, residual: Array, constraints: Array, squares: Array, scratch: Array
+) -> float:
     """Whitened residuals, constraints, and squared norms of robust factors; returns the cost of the others."""
     fields, gather, sizes, parameters = terms.fields, terms.gather, terms.sizes, terms.parameters
     whiteners, active = terms.whiteners, terms.active
@@ -128,7 +130,7 @@ def evaluate(terms: Terms, values: Array, residual: Array, constraints: Array, s
 
 @compiled
 def linearize(
-    terms: Terms,
+    terms: TermArrays,
     values: Array,
     search: bool,
     residual: Array,
@@ -197,7 +199,7 @@ def linearize(
 
 @compiled
 def weigh(
-    terms: Terms,
+    terms: TermArrays,
     weights: Array,
     residual: Array,
     jacobian: Array,
@@ -256,7 +258,7 @@ def _accumulate(
 
 
 @compiled
-def add_constraints(terms: Terms, constraint_jacobian: Array, weights: Array, hessian: Array) -> None:
+def add_constraints(terms: TermArrays, constraint_jacobian: Array, weights: Array, hessian: Array) -> None:
     """Add the upper triangle of A' diag(weights) A."""
     fields, positions = terms.fields, terms.positions
     for t in range(len(fields)):
@@ -284,7 +286,7 @@ def add_constraints(terms: Terms, constraint_jacobian: Array, weights: Array, he
 
 
 @compiled
-def times(terms: Terms, costs: bool, entries: Array, other: Array, out: Array) -> None:
+def times(terms: TermArrays, costs: bool, entries: Array, other: Array, out: Array) -> None:
     """J v over the unknowns, for the rows of the costs or of the constraints."""
     fields, columns, unknowns = terms.fields, terms.columns, terms.unknown
     for t in range(len(fields)):
@@ -305,7 +307,7 @@ def times(terms: Terms, costs: bool, entries: Array, other: Array, out: Array) -
 
 
 @compiled
-def transposed_times(terms: Terms, costs: bool, entries: Array, other: Array, out: Array) -> None:
+def transposed_times(terms: TermArrays, costs: bool, entries: Array, other: Array, out: Array) -> None:
     """Add J' v to ``out`` over the full tangent space, fixed variables included."""
     fields, columns = terms.fields, terms.columns
     for t in range(len(fields)):

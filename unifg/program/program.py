@@ -25,7 +25,7 @@ from unifg.program.guess import GuessReader
 from unifg.program.linearization import Evaluation, HeldWeights, Linearization, Rows
 from unifg.program.retraction import Retraction
 from unifg.program.systems import Systems
-from unifg.program.table import ENTRY, ROW, WIDTH, Table
+from unifg.program.table import ENTRY, ROW, WIDTH, TermTable
 from unifg.program.term import CompiledTerm
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
@@ -73,7 +73,7 @@ class Program:
         self.blocks = variable[self.columns.free]
         self.normal = self._pattern(self.cost_terms + self.scalar_terms + self.constraint_terms, variable, starts)
         stacked = self.cost_terms + self.constraint_terms
-        self.table = Table(stacked, self.columns, self.normal)
+        self.table = TermTable(stacked, self.columns, self.normal)
         self.arrays = self.table.arrays
         self.least_squares = bool(self.cost_terms) and not (self.scalar_terms or self.constraint_terms)
         self.differenced = bool(self.scalar_terms or self.table.differenced)

@@ -23,7 +23,7 @@ from unifg.elimination.symmetric import Symmetric
 from unifg.machine.jit import compiled
 from unifg.program.linearization import Rows
 from unifg.program.passes import transposed_times
-from unifg.program.table import Terms
+from unifg.program.table import TermArrays
 from unifg.typing import Array, BoolArray, IntArray
 
 KEPT = 8  # structures of KKT matrices; active rows may change from solve to solve
@@ -197,7 +197,7 @@ def fill(kkt: KktArrays, hessian: Array, constraint_jacobian: Array, data: Array
 
 @compiled
 def aim(
-    terms: Terms,
+    terms: TermArrays,
     free: IntArray,
     rows: IntArray,
     gradient: Array,

@@ -29,9 +29,9 @@ from unifg.typing import Array, IntArray
     STORAGE,  # numbers that store them
     WIDTH,  # tangent columns of those that are not constants here
     KERNEL_WIDTH,  # tangent columns that the kernel writes
-    GATHER,  # first start of a variable in Terms.gather
-    SIZE,  # first storage size in Terms.sizes
-    KEEP,  # first column to keep in Terms.sizes; -1: all
+    GATHER,  # first start of a variable in TermArrays.gather
+    SIZE,  # first storage size in TermArrays.sizes
+    KEEP,  # first column to keep in TermArrays.sizes; -1: all
     PARAMETER,  # first parameter of factor 0
     PARAMETERS,  # of one factor
     SPREAD,  # from the parameters of one factor to the next; 0: shared
@@ -43,9 +43,9 @@ from unifg.typing import Array, IntArray
     WEIGHT,  # first robust weight; -1: not robust
     ROW,  # first row of the stacked residual
     ENTRY,  # first entry of the stacked Jacobian
-    COLUMN,  # first column in Terms.columns
-    POSITION,  # first place in Terms.positions
-    PART,  # first row of Terms.parts
+    COLUMN,  # first column in TermArrays.columns
+    POSITION,  # first place in TermArrays.positions
+    PART,  # first row of TermArrays.parts
     PARTS,  # of the variables; 0: linear, or without a compiled retraction
     SECOND,  # address of the kernel's second derivatives; 0: to be differenced
     DIFFERENCED,  # whether the Jacobian is made of differences
@@ -55,7 +55,7 @@ from unifg.typing import Array, IntArray
 COST, CONSTRAINT, BOUND = 0, 1, 2
 
 
-class Terms(NamedTuple):
+class TermArrays(NamedTuple):
     """What compiled loops read.
 
     Attributes:
@@ -87,8 +87,8 @@ class Terms(NamedTuple):
     upper: Array
 
 
-class Table:
-    """Builds :class:`Terms` once and renews what data can change.
+class TermTable:
+    """Builds :class:`TermArrays` once and renews what data can change.
 
     Attributes:
         arrays: for the compiled loops.
@@ -166,7 +166,7 @@ class Table:
         self.sizes = self.residuals, self.entries, self.constraints, self.constraint_entries
         counts = fields[:, COUNT]
         self._active_starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        self.arrays = Terms(
+        self.arrays = TermArrays(
             fields,
             _joined(gather),
             np.array(sizes or [0], dtype=np.int64),
