@@ -142,8 +142,9 @@ def estimate() -> Walk:
     """A lidar scan, to an estimate."""
     episode = Episode(HALL)
     dt = HALL.controller.dt
-    episode.pilot.estimate(episode.world.scan(), None, dt)
-    return _second_time(lambda: episode.pilot.estimate(episode.world.scan(), np.zeros(2), dt))
+    estimator = episode.pilot.estimator
+    estimator.update(episode.world.scan(), None, dt)
+    return _second_time(lambda: estimator.update(episode.world.scan(), np.zeros(2), dt))
 
 
 def drive() -> Walk:
