@@ -10,8 +10,9 @@ from itertools import pairwise
 import numpy as np
 
 from unifg.errors import ModelError
-from unifg.kernels.steps import FIRST, TURN, compiled_parts, move, rotation, step_for, step_of, to_body
+from unifg.kernels.steps import FIRST, OTHER, TURN, compiled_parts, move, rotation, step_for, step_of, to_body
 from unifg.lie import Manifold
+from unifg.lie.functions import functions_of
 from unifg.machine.calls import local_matrix, local_vector
 from unifg.machine.jit import compiled, in_order
 from unifg.typing import Array
@@ -118,6 +119,19 @@ def _derivatives(derivative: Callable[..., None]) -> Callable[..., None]:
     return loop
 
 
+def _moving_as_one(group: Manifold) -> Callable[..., None]:
+    """Move all of a state at once, where parts of it have retractions of their own."""
+    functions = functions_of(group)
+    assert functions is not None
+    retract = functions.retract
+
+    @compiled
+    def shift(x: Array, kind: int, start: int, width: int, direction: Array, column: int, out: Array) -> None:
+        retract(x, direction, out)
+
+    return shift
+
+
 def differences(field: CompiledField, group: Manifold) -> Callable[..., None]:
     """``dF(x, u, by_x, by_u)`` of a field by central differences.
 
@@ -126,7 +140,8 @@ def differences(field: CompiledField, group: Manifold) -> Callable[..., None]:
         group: of x, with compiled functions.
     """
     function, dim, controls, storage = field.function, field.dim, field.controls, group.storage
-    parts = tuple(tuple(part) for part in compiled_parts([group]))
+    parts = tuple(tuple(part) for part in compiled_parts([group])) or ((OTHER, 0, storage, dim, 0, -1),)
+    shift = move if parts[0][0] != OTHER else _moving_as_one(group)
 
     @in_order
     def derivative(x: Array, u: Array, by_x: Array, by_u: Array) -> None:
@@ -142,15 +157,15 @@ def differences(field: CompiledField, group: Manifold) -> Callable[..., None]:
             kind, start, size, width, column, turn = parts[part]
             for c in range(width):
                 j = column + c
-                step = step_of(x, kind, start, width, turn, c, FIRST)
+                step = step_of(x, kind, start, size, turn, c, FIRST)
                 direction[j] = step
-                move(x, kind, start, width, direction, column, moved)
+                shift(x, kind, start, width, direction, column, moved)
                 function(moved, control, ahead)
                 direction[j] = -step
-                move(x, kind, start, width, direction, column, moved)
+                shift(x, kind, start, width, direction, column, moved)
                 function(moved, control, behind)
                 direction[j] = 0.0
-                stepped = 2.0 * step if kind == TURN else (x[start + c] + step) - (x[start + c] - step)
+                stepped = 2.0 * step if kind == TURN or kind == OTHER else (x[start + c] + step) - (x[start + c] - step)
                 for i in range(dim):
                     by_x[i, j] = (ahead[i] - behind[i]) / stepped
             for k in range(start, start + size):

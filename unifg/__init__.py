@@ -28,12 +28,27 @@ from unifg.errors import (
     ScenarioError,
     UnifgError,
 )
+from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import Residual, residual
 from unifg.kernels.robust import DCS, Cauchy, GemanMcClure, Huber, Loss, Reweighted, TruncatedLeastSquares, Tukey
 from unifg.language.factors import ManifoldResidual, between, difference, prior
 from unifg.language.joint_prior import joint_prior
 from unifg.language.variables import Data, Family, Selection
-from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Manifold, Product, Rn, wrap_angle
+from unifg.lie import (
+    SE2,
+    SE3,
+    SO2,
+    SO3,
+    Axioms,
+    LieGroup,
+    Manifold,
+    ManifoldBase,
+    Product,
+    Rn,
+    check_manifold,
+    elementwise,
+    wrap_angle,
+)
 from unifg.smoothing import FixedLag, Incremental
 
 try:
@@ -47,6 +62,7 @@ __all__ = [
     "SE3",
     "SO2",
     "SO3",
+    "Axioms",
     "BackendError",
     "Cauchy",
     "Data",
@@ -61,9 +77,11 @@ __all__ = [
     "Huber",
     "Incremental",
     "Iteration",
+    "Kernel",
     "LieGroup",
     "Loss",
     "Manifold",
+    "ManifoldBase",
     "ManifoldResidual",
     "ModelError",
     "NotConverged",
@@ -84,7 +102,9 @@ __all__ = [
     "UnifgError",
     "Verdict",
     "between",
+    "check_manifold",
     "difference",
+    "elementwise",
     "joint_prior",
     "optimality",
     "prior",

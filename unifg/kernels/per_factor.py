@@ -22,6 +22,7 @@ from unifg.kernels.steps import (
     OTHER,
     TURN,
     VECTOR,
+    Part,
     largest,
     move,
     parts_of,
@@ -32,6 +33,7 @@ from unifg.kernels.steps import (
     uncertainty,
 )
 from unifg.lie import Manifold
+from unifg.lie.functions import functions_of
 from unifg.machine.calls import local_matrix, local_vector, matrix, vector
 from unifg.machine.jit import written
 
@@ -86,7 +88,7 @@ def per_factor(
     if jacobian is not None:
         lines += _attached(call, slots, rows)
     else:
-        lines += _differences(call, slots, rows, at, name)
+        lines += _differences(call, slots, rows, at, name, names)
     logger.info("compiling the residual '%s', once in this process", name)
     kernel = written("kernel", lines, names, name)
     return Kernel(kernel, tuple(arguments), rows, name=name, differenced=jacobian is None)
@@ -117,38 +119,42 @@ def _attached(call: str, slots: Sequence[tuple[int, Manifold]], rows: int) -> It
         column += manifold.dim
 
 
-def _differences(call: str, slots: Sequence[tuple[int, Manifold]], rows: int, storage: int, name: str) -> Iterator[str]:
+def _differences(
+    call: str, slots: Sequence[tuple[int, Manifold]], rows: int, storage: int, name: str, names: dict[str, Any]
+) -> Iterator[str]:
     """Central differences along every tangent direction of every variable; see :mod:`unifg.kernels.steps`."""
     manifolds = [manifold for _, manifold in slots]
     parts = parts_of(*manifolds)
+    movers = _movers(parts, name)
+    names |= {mover: function for mover, function in movers.values()}
     yield f"    moved, step = local_vector({storage}), local_vector({max(manifold.dim for manifold in manifolds)})"
     yield f"    ahead, behind, R = local_vector({rows}), local_vector({rows}), local_matrix(3, 3)"
     yield f"    found = local_matrix(3, {rows})"
     yield f"    for k in range({storage}):"
     yield "        moved[k] = v[k]"
     yield "    size = 0.0"
-    for part, leaf in parts:
-        if part.kind == OTHER:
-            raise GraphError(
-                f"{name}: {leaf.name} has no compiled retraction, which a compiled residual needs for its "
-                "derivatives; attach a compiled Jacobian, or write the residual as a batched NumPy function"
-            )
-        if part.kind == VECTOR:
-            yield f"    size = largest(v, {part.start}, {part.dim}, size)"
+    for part, _ in parts:
+        if part.kind in (VECTOR, OTHER):
+            yield f"    size = largest(v, {part.start}, {part.storage}, size)"
     yield f"    wide, estimates = step_for(size, {FIRST}), 3 if size >= {FAR} else 1"
     for part, _ in parts:
         kind, start, stored, dim, column, turn = part
         yield f"    for k in range({dim}):"
         yield "        step[k] = 0.0"
         yield f"    for d in range({dim}):"
-        yield f"        short = step_of(v, {kind}, {start}, {dim}, {turn}, d, {FIRST})"
+        yield f"        short = step_of(v, {kind}, {start}, {stored}, {turn}, d, {FIRST})"
         yield "        for e in range(estimates):"
         yield "            h = short if e == 0 else e * wide"
         for sign, target in (("", "ahead"), ("-", "behind")):
             yield f"            step[d] = {sign}h"
-            yield f"            move(v, {kind}, {start}, {dim}, step, 0, moved)"
+            if kind == OTHER:
+                here, there = (f"vector({array}, {start}, {stored})" for array in ("v", "moved"))
+                yield f"            {movers[start][0]}({here}, vector(step, 0, {dim}), {there})"
+            else:
+                yield f"            move(v, {kind}, {start}, {dim}, step, 0, moved)"
             yield f"            function({call.format('moved')}, {target})"
-        yield f"            stepped = {'2.0 * h' if kind == TURN else f'(v[{start} + d] + h) - (v[{start} + d] - h)'}"
+        stepped = "2.0 * h" if kind in (TURN, OTHER) else f"(v[{start} + d] + h) - (v[{start} + d] - h)"
+        yield f"            stepped = {stepped}"
         yield f"            for a in range({rows}):"
         yield "                found[e, a] = (ahead[a] - behind[a]) / stepped"
         yield "        step[d] = 0.0"
@@ -165,3 +171,19 @@ def _differences(call: str, slots: Sequence[tuple[int, Manifold]], rows: int, st
         if turn >= 0:
             yield f"    rotation(v, {turn}, {dim}, R)"
             yield f"    to_body(R, {dim}, J, {rows}, {column})"
+
+
+def _movers(parts: Sequence[tuple[Part, Manifold]], name: str) -> dict[int, tuple[str, Any]]:
+    """Name and function of the retraction of every part that has its own, by where the part starts."""
+    movers = {}
+    for part, leaf in parts:
+        if part.kind == OTHER:
+            functions = functions_of(leaf)
+            if functions is None:
+                raise GraphError(
+                    f"{name}: {leaf.name} has no compiled retraction, which a compiled residual needs for its "
+                    "derivatives; state it by fg.elementwise, attach a compiled Jacobian, or write the residual as a "
+                    "batched NumPy function"
+                )
+            movers[part.start] = f"retract{part.start}", functions.retract
+    return movers

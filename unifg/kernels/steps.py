@@ -27,9 +27,10 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from unifg.lie import SE2, SE3, SO2, SO3, Manifold, Rn, so3
+from unifg.lie.functions import functions_of
 from unifg.lie.product import leaves
 from unifg.lie.so2 import wrap
-from unifg.machine.calls import vector
+from unifg.machine.calls import RETRACTION, address, vector
 from unifg.machine.jit import compiled
 from unifg.typing import Array, IntArray
 
@@ -99,9 +100,20 @@ def _parts_of(keys: tuple[Hashable, ...]) -> tuple[tuple[Part, Manifold], ...]:
 
 
 def compiled_parts(manifolds: Sequence[Manifold]) -> list[Part]:
-    """The parts of several variables; nothing when one of them has no compiled retraction."""
+    """The parts of several variables; nothing when one of them moves by a retraction of its own."""
     parts = [part for part, _ in parts_of(*manifolds)]
     return [] if any(part.kind == OTHER for part in parts) else parts
+
+
+def movable_parts(manifolds: Sequence[Manifold]) -> list[tuple[int, ...]]:
+    """The parts of several variables, each with the address of its retraction, 0 for those that :func:`move` moves.
+
+    Nothing when one of them has a retraction that is not compiled.
+    """
+    found = [(part, functions_of(leaf) if part.kind == OTHER else None) for part, leaf in parts_of(*manifolds)]
+    if any(part.kind == OTHER and functions is None for part, functions in found):
+        return []
+    return [(*part, 0 if functions is None else address(functions.retract, RETRACTION)) for part, functions in found]
 
 
 def _table(root: int) -> Array:
@@ -137,13 +149,16 @@ def step_for(size: float, root: int) -> float:
 
 
 @compiled
-def step_of(v: Array, kind: int, start: int, dim: int, turn: int, axis: int, root: int) -> float:
-    """The step along one axis of a part; all axes of a position that turns have the step of its largest coordinate."""
+def step_of(v: Array, kind: int, start: int, stored: int, turn: int, axis: int, root: int) -> float:
+    """The step along one axis of a part.
+
+    All axes of a position that turns, or of a part with a retraction of its own, have the step of its largest number.
+    """
     if kind == TURN:
         return step_for(1.0, root)
-    if turn < 0:
+    if turn < 0 and kind != OTHER:
         return step_for(abs(v[start + axis]), root)
-    return step_for(largest(v, start, dim, 0.0), root)
+    return step_for(largest(v, start, stored, 0.0), root)
 
 
 @compiled
@@ -196,6 +211,6 @@ def to_body(R: Array, dim: int, J: Array, rows: int, column: int) -> None:
             J[a, column + d] = x * R[0, d] + y * R[1, d] + (z * R[2, d] if dim == 3 else 0.0)
 
 
-def as_table(parts: Sequence[Part]) -> IntArray:
-    """Rows for compiled code."""
-    return np.array(parts, dtype=np.int64).reshape(-1, len(Part._fields))
+def as_table(parts: Sequence[tuple[int, ...]]) -> IntArray:
+    """Rows of :func:`movable_parts` for compiled code."""
+    return np.array(parts, dtype=np.int64).reshape(-1, len(Part._fields) + 1)

@@ -16,6 +16,7 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.kernels.kernel import Kernel
+from unifg.kernels.per_factor import per_factor
 from unifg.kernels.residuals import Residual, residual
 from unifg.lie import LieGroup, Manifold, Rn, rn
 from unifg.lie.functions import Functions, functions_of
@@ -82,11 +83,11 @@ def _relative(group: LieGroup, functions: Functions) -> Callable[..., None]:
 
 def _deviation(group: LieGroup, functions: Functions) -> Callable[..., None]:
     """Write Log(p^-1 x) and its derivative."""
-    local, inverse_jacobian = functions.local, functions.right_jacobian_inverse
+    deviation, inverse_jacobian = functions.log_between, functions.right_jacobian_inverse
 
     @compiled
     def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-        local(p, v, r)
+        deviation(p, v, r)
         if len(J):
             inverse_jacobian(r, J)
 
@@ -140,6 +141,8 @@ class _Batched:
 
 class _Prior(_Batched):
     def __call__(self, x: Array, reference: Array) -> Array:
+        if isinstance(self.manifold, LieGroup):
+            return np.atleast_2d(self.manifold.log(self.manifold.between(reference, x)))
         return np.atleast_2d(self.manifold.local(reference, x))
 
     def jacobian(self, *arguments: Array) -> list[Array]:
@@ -148,9 +151,10 @@ class _Prior(_Batched):
 
 class _Relative(_Batched):
     def __call__(self, x: Array, y: Array, measured: Array | None = None) -> Array:
-        if measured is None:
+        if not isinstance(self.manifold, LieGroup):
             return self.manifold.local(x, y)
-        assert isinstance(self.manifold, LieGroup)
+        if measured is None:
+            return self.manifold.log(self.manifold.between(x, y))
         return self.manifold.log(self.manifold.between(measured, self.manifold.between(x, y)))
 
     def jacobian(self, *arguments: Array) -> list[Array]:
@@ -170,8 +174,23 @@ def _complete(
         return residual(Kernel(vectors, arguments, manifold.dim, name=name, linear=True))
     if isinstance(manifold, LieGroup) and functions is not None:
         return residual(Kernel(groups(manifold, functions), arguments, manifold.dim, name=name))
+    if functions is not None and not isinstance(manifold, LieGroup):
+        return _by_differences(manifold, functions, name)
     function = batched(manifold)
     return residual(function, function.derivative, name)
+
+
+def _by_differences(manifold: Manifold, functions: Functions, name: str) -> Residual:
+    """``prior`` and ``difference`` of points that cannot be composed: the local step between them."""
+    local = functions.local
+    if name == "difference":
+        return residual(per_factor(local, None, manifold.dim, (manifold, manifold), (), name))
+
+    @compiled
+    def deviation(x: Array, reference: Array, r: Array) -> None:
+        local(reference, x, r)
+
+    return residual(per_factor(deviation, None, manifold.dim, (manifold, 1), ((manifold.storage,),), name))
 
 
 def _build_prior(manifold: Manifold) -> Residual:

@@ -6,6 +6,7 @@ class that states them (:func:`elementwise`). A manifold of one's own derives fr
 :class:`LieGroup`. Conventions are collected in ``docs/conventions.md``.
 """
 
+from unifg.lie.axioms import Axioms, Breach, check_manifold
 from unifg.lie.elementwise import elementwise
 from unifg.lie.manifold import LieGroup, Manifold, ManifoldBase
 from unifg.lie.product import Component, Product, ProductGroup
@@ -20,6 +21,8 @@ __all__ = [
     "SE3",
     "SO2",
     "SO3",
+    "Axioms",
+    "Breach",
     "Component",
     "LieGroup",
     "Manifold",
@@ -27,6 +30,7 @@ __all__ = [
     "Product",
     "ProductGroup",
     "Rn",
+    "check_manifold",
     "elementwise",
     "wrap_angle",
 ]

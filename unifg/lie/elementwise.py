@@ -116,6 +116,11 @@ def stated(owner: type, name: str) -> Scalar | None:
     return found.compiled if isinstance(found, FunctionType) and hasattr(found, "compiled") else None
 
 
+def stated_in(owner: type, name: str) -> type | None:
+    """The class among the bases that states a method."""
+    return next((kind for kind in owner.__mro__ if name in vars(kind)), None)
+
+
 @cache
 def over_one(function: Scalar, given: int, *shape: int) -> One:
     """Make a batched function, (..., given) to (..., *shape), of a compiled ``function(x, out)``.

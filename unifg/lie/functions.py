@@ -14,16 +14,23 @@ from collections.abc import Callable, Hashable
 from functools import cache
 from typing import Any, cast
 
-from unifg.lie.elementwise import DIM, LAYOUTS, MATRIX, POINT, STORAGE, Scalar, stated
+from unifg.lie.derive import RULES
+from unifg.lie.elementwise import DIM, LAYOUTS, MATRIX, POINT, STORAGE, Scalar, stated, stated_in
 from unifg.lie.manifold import Manifold
 from unifg.lie.product import leaves
 from unifg.machine.calls import local_matrix, vector
 from unifg.machine.jit import compiled
 from unifg.typing import Array
 
+LOG_BETWEEN = "log_between"
+KNOWN = {**LAYOUTS, LOG_BETWEEN: LAYOUTS["local"]}
+
 
 class Functions:
     """Compiled functions of one element, by the names of the manifold's methods: ``functions.retract(x, d, out)``.
+
+    One name more, ``log_between(x, y, out)``, is Log(x^-1 y) of groups: their ``local``, but where a subclass takes
+    other steps.
 
     Attributes:
         name: of the manifold.
@@ -39,9 +46,9 @@ class Functions:
         Raises:
             AttributeError: when the manifold states none; ``hasattr`` asks.
         """
-        found = self._find(name) if name in LAYOUTS else None
+        found = self._find(name) if name in KNOWN else None
         if found is None:
-            raise AttributeError(f"{self.name} has no compiled {name}: state it by unifg.elementwise")
+            raise AttributeError(f"{self.name} has no compiled {name}: state it by fg.elementwise")
         setattr(self, name, found)
         return found
 
@@ -61,7 +68,16 @@ def _functions(manifold: Hashable) -> Functions | None:
 
 def _of_leaf(leaf: Manifold) -> Functions:
     kind = type(leaf)
-    return Functions(leaf.name, lambda name: stated(kind, name))
+
+    def find(name: str) -> Scalar | None:
+        if name != LOG_BETWEEN:
+            return stated(kind, name)
+        if stated_in(kind, "local") is stated_in(kind, "log"):
+            return stated(kind, "local")
+        between, log = stated(kind, "between"), stated(kind, "log")
+        return None if between is None or log is None else RULES["local"].make(leaf.storage, leaf.dim, between, log)
+
+    return Functions(leaf.name, find)
 
 
 Part = tuple[Manifold, Functions]
@@ -78,7 +94,7 @@ def _side_by_side(parts: list[Part]) -> Functions:
     label = "_".join(re.sub(r"\W", "_", f"{leaf.name}_{leaf.dim}") for leaf, _ in parts)
 
     def find(name: str) -> Scalar | None:
-        given, result = LAYOUTS[name]
+        given, result = KNOWN[name]
         if {POINT, MATRIX} & {*given, *result} or not (hasattr(head, name) and hasattr(tail, name)):
             return None
         places = [sizes[size] for size in (*given, result[0])]

@@ -11,12 +11,24 @@ from typing import TypeAlias
 
 import numpy as np
 
-from unifg.kernels.steps import ANGLE, ONE_SIDED, TURN, VECTOR, largest, move, rotation, step_for, step_of, to_body
+from unifg.kernels.steps import (
+    ANGLE,
+    ONE_SIDED,
+    OTHER,
+    TURN,
+    VECTOR,
+    largest,
+    move,
+    rotation,
+    step_for,
+    step_of,
+    to_body,
+)
 from unifg.kernels.steps import SECOND as TWICE
 from unifg.kernels.whitening import DIAGONAL, FULL
 from unifg.language.terms import Cost
 from unifg.lie.so2 import wrap
-from unifg.machine.calls import call_residual, matrix, vector, vector_at
+from unifg.machine.calls import call_residual, call_retraction, matrix, vector, vector_at
 from unifg.machine.jit import compiled, in_order, inlined
 from unifg.program.linearization import Linearization
 from unifg.program.passes import gather_variables
@@ -206,42 +218,42 @@ def _difference(
         step[k] = 0.0
     if twice:
         for part in range(len(parts)):
-            if parts[part, 0] == VECTOR:
-                size = largest(v, parts[part, 1], parts[part, 3], size)
+            if parts[part, 0] == VECTOR or parts[part, 0] == OTHER:
+                size = largest(v, parts[part, 1], parts[part, 2], size)
         h = step_for(size, TWICE)
         centre = _weighted(term, p, table, moved, weights, r)
     else:
         _sloped(term, p, table, moved, weights, r, J, gradient)
     for first in range(len(parts)):
-        kind, start, stored, dim, column, turn = parts[first]
+        kind, start, stored, dim, column, turn, own = parts[first]
         for c in range(column, column + dim):
             if twice:
                 both = 0.0  # w' r ahead and behind, less twice that at the centre
                 for side in range(2):
                     step[c] = h if side == 0 else -h
-                    _shift(v, kind, start, step, column, c, moved)
+                    _shift(v, kind, start, stored, dim, own, step, column, c, moved)
                     change = _weighted(term, p, table, moved, weights, r) - centre
                     both += change
                     gradient[c] = (change - gradient[c] if side == 1 else change) / (1.0 if side == 0 else -2.0 * h)
                 second[c, c] = both  # over h^2, when all have been found
                 for other in range(first + 1):
-                    its_kind, its_start, _, its_dim, its_column, _ = parts[other]
+                    its_kind, its_start, its_stored, its_dim, its_column, _, its_own = parts[other]
                     for d in range(its_column, min(its_column + its_dim, c)):
                         total = -both - second[d, d]
                         for side in range(2):
                             step[c] = step[d] = h if side == 0 else -h
-                            _shift(v, kind, start, step, column, c, moved)
-                            _shift(v, its_kind, its_start, step, its_column, d, moved)
+                            _shift(v, kind, start, stored, dim, own, step, column, c, moved)
+                            _shift(v, its_kind, its_start, its_stored, its_dim, its_own, step, its_column, d, moved)
                             total += _weighted(term, p, table, moved, weights, r) - centre
                         step[d] = 0.0
-                        _shift(v, its_kind, its_start, step, its_column, d, moved)
+                        _shift(v, its_kind, its_start, its_stored, its_dim, its_own, step, its_column, d, moved)
                         second[c, d] = second[d, c] = total / (2.0 * h * h)
             else:
-                step[c] = h = step_of(v, kind, start, dim, turn, c - column, ONE_SIDED)
-                _shift(v, kind, start, step, column, c, moved)
+                step[c] = h = step_of(v, kind, start, stored, turn, c - column, ONE_SIDED)
+                _shift(v, kind, start, stored, dim, own, step, column, c, moved)
                 _sloped(term, p, table, moved, weights, r, J, second[c])
                 at = start + c - column
-                stepped = h if kind == TURN else (v[at] + h) - v[at]
+                stepped = h if kind == TURN or kind == OTHER else (v[at] + h) - v[at]
                 for d in range(width):
                     second[c, d] = (second[c, d] - gradient[d]) / stepped
             step[c] = 0.0
@@ -251,7 +263,7 @@ def _difference(
         for c in range(width):
             second[c, c] /= h * h
     for part in range(len(parts)):
-        _, _, _, dim, column, turn = parts[part]
+        _, _, _, dim, column, turn, _ = parts[part]
         if turn >= 0:
             rotation(v, turn, dim, R)
             if twice:
@@ -262,13 +274,26 @@ def _difference(
 
 
 @inlined
-def _shift(v: Array, kind: int, start: int, step: Array, column: int, which: int, out: Array) -> None:
+def _shift(
+    v: Array,
+    kind: int,
+    start: int,
+    stored: int,
+    dim: int,
+    own: int,
+    step: Array,
+    column: int,
+    which: int,
+    out: Array,
+) -> None:
     """Write what a changed step along one direction changes of a part."""
     if kind == VECTOR:
         place = start + which - column
         out[place] = v[place] + step[which]
     elif kind == ANGLE:
         out[start] = wrap(v[start] + step[which])
+    elif kind == OTHER:
+        call_retraction(own, vector(v, start, stored), vector(step, column, dim), vector(out, start, stored))
     else:
         move(v, kind, start, 3, step, column, out)
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from unifg.elimination.symmetric import Symmetric
-from unifg.kernels.steps import Part, as_table, compiled_parts
+from unifg.kernels.steps import as_table, movable_parts
 from unifg.language.terms import Constraint, Cost
 from unifg.machine.jit import compiled
 from unifg.program.columns import Columns
@@ -107,7 +107,7 @@ class TermTable:
         self._columns = columns
         fields = np.zeros((len(terms), FIELDS), dtype=np.int64)
         gather, sizes, tangent = [], [], []
-        parts: list[Part] = []
+        parts: list[tuple[int, ...]] = []
         starts = {"gather": 0, "sizes": 0, "tangent": 0, "positions": 0, "parameters": 0, "whiteners": 0, "active": 0}
         self.residuals = self.weights = self.constraints = self.entries = self.constraint_entries = 0
         self.scratch = 1
@@ -128,7 +128,7 @@ class TermTable:
             row[ACTIVE], row[WEIGHT] = -1, -1
             row[PART] = len(parts)
             if term.kernel is not None and not term.kernel.linear:
-                parts += compiled_parts(term.kernel.manifolds)
+                parts += movable_parts(term.kernel.manifolds)
             row[PARTS] = len(parts) - row[PART]
             row[DIFFERENCED] = term.differenced
             gather.append(layout.gather.ravel())

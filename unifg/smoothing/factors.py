@@ -268,8 +268,8 @@ class Kinds:
             move, deviation = move_of(leaf), 0
             if move is None:
                 raise GraphError(
-                    f"family '{family}': {leaf.name} has no compiled retraction; a smoother takes SO2, SE2, SO3, "
-                    "SE3, Rn and their products",
+                    f"family '{family}': {leaf.name} has no compiled retraction; state it and local by "
+                    "fg.elementwise",
                     family=family,
                 )
             if move.where != ADDITION:
