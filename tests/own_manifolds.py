@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.random import Generator
 
 import unifg as fg
 from unifg.lie import se3, so3
 from unifg.lie.se2 import SE2Group
+from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike, BoolArray
 
 Batch = tuple[int, ...]
@@ -18,7 +18,7 @@ Batch = tuple[int, ...]
 # ---------------------------------------------------------------- the unit sphere, which is no group
 
 
-@njit
+@compiled
 def along(x: Array, basis: Array) -> None:
     """Two directions across x, as rows; Duff et al. 2017, *Building an orthonormal basis, revisited*."""
     sign = 1.0 if x[2] >= 0.0 else -1.0
@@ -28,7 +28,7 @@ def along(x: Array, basis: Array) -> None:
     basis[1, 0], basis[1, 1], basis[1, 2] = b, sign + x[1] * x[1] * a, -x[1]
 
 
-@njit
+@compiled
 def sphere_retract(x: Array, d: Array, out: Array) -> None:
     basis, moved = np.empty((2, 3)), np.empty(3)
     along(x, basis)
@@ -41,7 +41,7 @@ def sphere_retract(x: Array, d: Array, out: Array) -> None:
         out[i] = moved[i] / length
 
 
-@njit
+@compiled
 def sphere_local(x: Array, y: Array, out: Array) -> None:
     basis = np.empty((2, 3))
     along(x, basis)
@@ -76,7 +76,7 @@ S2 = SphereManifold()
 # ---------------------------------------------------------------- position, velocity and orientation, which turn as one
 
 
-@njit
+@compiled
 def pose(x: Array, first: int, turn: int, length: int) -> Array:
     """The vector at ``first`` and the rotation at ``turn``: an element of SE(3), or a tangent of it."""
     part = np.empty(3 + length)
@@ -84,7 +84,7 @@ def pose(x: Array, first: int, turn: int, length: int) -> Array:
     return part
 
 
-@njit
+@compiled
 def moving_exp(d: Array, out: Array) -> None:
     found = np.empty((2, 7))
     for k in range(2):
@@ -92,7 +92,7 @@ def moving_exp(d: Array, out: Array) -> None:
     out[:3], out[3:6], out[6:] = found[0, :3], found[1, :3], found[0, 3:]
 
 
-@njit
+@compiled
 def moving_log(x: Array, out: Array) -> None:
     found = np.empty((2, 6))
     for k in range(2):
@@ -100,7 +100,7 @@ def moving_log(x: Array, out: Array) -> None:
     out[:3], out[3:6], out[6:] = found[0, :3], found[1, :3], found[0, 3:]
 
 
-@njit
+@compiled
 def moving_compose(x: Array, y: Array, out: Array) -> None:
     found = np.empty((2, 7))
     for k in range(2):
@@ -108,7 +108,7 @@ def moving_compose(x: Array, y: Array, out: Array) -> None:
     out[:3], out[3:6], out[6:] = found[0, :3], found[1, :3], found[0, 3:]
 
 
-@njit
+@compiled
 def moving_inverse(x: Array, out: Array) -> None:
     found = np.empty((2, 7))
     for k in range(2):
@@ -151,7 +151,7 @@ SE23 = ExtendedPoses()
 NODES, WEIGHTS = (tuple(float(a) for a in part) for part in np.polynomial.legendre.leggauss(14))
 
 
-@njit
+@compiled
 def stretch(d: Array, out: Array) -> None:
     """The integral of e^(t sigma) Exp(t omega) over t in [0, 1], which takes rho to the position."""
     R, q = np.empty((3, 3)), np.empty(4)
@@ -163,7 +163,7 @@ def stretch(d: Array, out: Array) -> None:
         out += 0.5 * WEIGHTS[n] * math.exp(t * d[6]) * R
 
 
-@njit
+@compiled
 def similar_exp(d: Array, out: Array) -> None:
     V, q = np.empty((3, 3)), np.empty(4)
     stretch(d, V)
@@ -172,7 +172,7 @@ def similar_exp(d: Array, out: Array) -> None:
     out[:3], out[3:7], out[7] = p, q, scale
 
 
-@njit
+@compiled
 def similar_log(x: Array, out: Array) -> None:
     V, d = np.empty((3, 3)), np.zeros(7)
     turn = np.empty(3)
@@ -183,7 +183,7 @@ def similar_log(x: Array, out: Array) -> None:
     out[:] = d
 
 
-@njit
+@compiled
 def similar_compose(x: Array, y: Array, out: Array) -> None:
     px, py, pz = so3.rotate(x[3], x[4], x[5], x[6], y[0], y[1], y[2])
     q = np.empty(4)
@@ -193,7 +193,7 @@ def similar_compose(x: Array, y: Array, out: Array) -> None:
     out[3:7], out[7] = q, scale * y[7]
 
 
-@njit
+@compiled
 def similar_inverse(x: Array, out: Array) -> None:
     q = np.empty(4)
     so3.inverse(x[3:7].copy(), q)
@@ -239,14 +239,14 @@ SIM3 = Similarities()
 # ---------------------------------------------------------------- rotations with the scalar last
 
 
-@njit
+@compiled
 def last_exp(d: Array, out: Array) -> None:
     half = 0.5 * math.sqrt(d[0] ** 2 + d[1] ** 2 + d[2] ** 2)
     s = 0.5 * math.sin(half) / half if half > 1e-150 else 0.5
     out[0], out[1], out[2], out[3] = s * d[0], s * d[1], s * d[2], math.cos(half)
 
 
-@njit
+@compiled
 def last_log(x: Array, out: Array) -> None:
     length = math.sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
     scale = 2.0 * math.atan2(length, abs(x[3])) / length if length > 1e-150 else 2.0
@@ -254,7 +254,7 @@ def last_log(x: Array, out: Array) -> None:
     out[0], out[1], out[2] = scale * x[0], scale * x[1], scale * x[2]
 
 
-@njit
+@compiled
 def last_compose(x: Array, y: Array, out: Array) -> None:
     a, b, c, w = x
     e, f, g, v = y
@@ -264,7 +264,7 @@ def last_compose(x: Array, y: Array, out: Array) -> None:
     out[0], out[1], out[2], out[3] = q[0] / length, q[1] / length, q[2] / length, r / length
 
 
-@njit
+@compiled
 def last_inverse(x: Array, out: Array) -> None:
     out[0], out[1], out[2], out[3] = -x[0], -x[1], -x[2], x[3]
 
@@ -299,14 +299,14 @@ XYZW = ScalarLast()
 # ---------------------------------------------------------------- SE(2) with straight steps
 
 
-@njit
+@compiled
 def straight_retract(x: Array, d: Array, out: Array) -> None:
     c, s, theta = math.cos(x[2]), math.sin(x[2]), x[2] + d[2]
     out[0], out[1] = x[0] + c * d[0] - s * d[1], x[1] + s * d[0] + c * d[1]
     out[2] = (theta + math.pi) % (2.0 * math.pi) - math.pi
 
 
-@njit
+@compiled
 def straight_local(x: Array, y: Array, out: Array) -> None:
     c, s, px, py = math.cos(x[2]), math.sin(x[2]), y[0] - x[0], y[1] - x[1]
     turn = (y[2] - x[2] + math.pi) % (2.0 * math.pi) - math.pi

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -323,31 +324,26 @@ def _compiled_claims(m: Manifold, x: Array, y: Array, d: Array, units: Array) ->
         places = [given[:k].count(size) for k, size in enumerate(given)]
         arguments = [np.ascontiguousarray(offered[size][place]) for size, place in zip(given, places, strict=True)]
         where = dict(zip("ab", arguments, strict=False))
-        run = _Alone(function, arguments, tuple(getattr(m, size) for size in result))
-        yield _Claim(
-            f"the compiled {name} agrees with the batched one",
-            where,
-            lambda name=name, run=run: (run(), getattr(m, name)(*run.arguments)),
-            False,
-            1e-12,
-        )  # type: ignore[misc]
+        run = _Alone(function, getattr(m, name), arguments, tuple(getattr(m, size) for size in result))
+        yield _Claim(f"the compiled {name} agrees with the batched one", where, run.beside, False, 1e-12)
         yield _Claim(f"the compiled {name} leaves its arguments as they are", where, run.untouched, False, 0.0)
         for place, size in enumerate(given):
             if (size,) == result:
-                yield _Claim(
-                    f"the compiled {name} may write over argument {place}",
-                    where,
-                    lambda place=place, run=run: (run.over(place), run()),
-                    False,
-                    0.0,
-                )  # type: ignore[misc]
+                written = partial(run.over, place)
+                yield _Claim(f"the compiled {name} may write over argument {place}", where, written, False, 0.0)
 
 
 class _Alone:
     """A compiled function, run for one element after the other."""
 
-    def __init__(self, function: Callable[..., None], arguments: list[Array], shape: tuple[int, ...]) -> None:
-        self.function, self.arguments, self.shape = function, arguments, shape
+    def __init__(
+        self,
+        function: Callable[..., None],
+        batched: Callable[..., Array],
+        arguments: list[Array],
+        shape: tuple[int, ...],
+    ) -> None:
+        self.function, self.batched, self.arguments, self.shape = function, batched, arguments, shape
 
     def __call__(self) -> Array:
         out = np.full((len(self.arguments[0]), *self.shape), np.nan)
@@ -355,17 +351,20 @@ class _Alone:
             self.function(*(argument[k].copy() for argument in self.arguments), row)
         return out
 
+    def beside(self) -> tuple[Array, Array]:
+        return self(), self.batched(*self.arguments)
+
     def untouched(self) -> tuple[Array, Array]:
         copies = [argument.copy() for argument in self.arguments]
         for k in range(len(copies[0])):
             self.function(*(copy[k] for copy in copies), np.empty(self.shape))
         return np.concatenate(copies, axis=1), np.concatenate(self.arguments, axis=1)
 
-    def over(self, place: int) -> Array:
+    def over(self, place: int) -> tuple[Array, Array]:
         copies = [argument.copy() for argument in self.arguments]
         for k in range(len(copies[0])):
             self.function(*(copy[k] for copy in copies), copies[place][k])
-        return copies[place]
+        return copies[place], self()
 
 
 def _times(matrices: Array, vectors: Array) -> Array:

@@ -175,17 +175,23 @@ class LieGroup(ManifoldBase):
 
     # These follow where those are compiled.
 
-    @abstractmethod
     def adjoint(self, x: ArrayLike, /) -> Array:
         """Return the (..., dim, dim) adjoints: ``x Exp(d) x^-1 = Exp(Ad(x) d)``."""
+        raise self._missing("adjoint")
 
-    @abstractmethod
     def right_jacobian(self, d: ArrayLike, /) -> Array:
         """Return (..., dim, dim) ``Jr(d)``: ``Exp(d)^-1 Exp(d + e) = Exp(Jr(d) e)`` to first order."""
+        raise self._missing("right_jacobian")
 
-    @abstractmethod
     def right_jacobian_inverse(self, d: ArrayLike, /) -> Array:
         """Return (..., dim, dim) ``Jr(d)^-1 = I + ad/2 + ad^2/12 - ...`` in closed form."""
+        raise self._missing("right_jacobian_inverse")
+
+    def _missing(self, name: str) -> UnifgError:
+        return UnifgError(
+            f"{self.name} has no {name}: state it, or exp, log, compose and inverse by compiled functions, of which it "
+            "follows"
+        )
 
     # These follow in any case; a group states them where it can do the same with fewer calls.
 
