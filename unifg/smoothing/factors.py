@@ -268,8 +268,7 @@ class Kinds:
             move, deviation = move_of(leaf), 0
             if move is None:
                 raise GraphError(
-                    f"family '{family}': {leaf.name} has no compiled retraction; state it and local by "
-                    "fg.elementwise",
+                    f"family '{family}': {leaf.name} has no compiled retraction; state it and local by fg.elementwise",
                     family=family,
                 )
             if move.where != ADDITION:
