@@ -1,6 +1,6 @@
 """Layouts at random from guesses a user begins with, by our backends and by casadi's: discs, parkings, cylinders.
 
-    python -m benchmarks.hard_guesses [--studies STUDY ...] [--layouts K] [--each]
+    python -m benchmarks.hard_guesses [--studies STUDY ...] [--layouts K] [--each] [--no-peers]
 
 Two hundred fields of discs, a hundred parkings from two guesses, and twenty flights among cylinders. The problems are
 stated in tests/problems; the peers differentiate the same expressions exactly, and all solve the same variables, rows
@@ -238,10 +238,14 @@ def main(arguments: list[str] | None = None) -> int:
                         help=", ".join(f"'{name}'" for name in STUDIES))  # fmt: skip
     parser.add_argument("--layouts", type=int, help="of every study, instead of 200, 100, 100 and 20")
     parser.add_argument("--each", action="store_true", help="tell of every layout, too")
+    parser.add_argument("--no-peers", action="store_true", help="without IPOPT and fatrop")
     chosen = parser.parse_args(arguments)
     if chosen.layouts is not None and chosen.layouts < 1:
         parser.error(f"--layouts must be positive, found {chosen.layouts}")
-    results = {name: STUDIES[name].run(range(chosen.layouts or STUDIES[name].count)) for name in chosen.studies}
+    results = {
+        name: STUDIES[name].run(range(chosen.layouts or STUDIES[name].count), peers=not chosen.no_peers)
+        for name in chosen.studies
+    }
     parts = [render(results), *(f"### {name}\n\n{one_by_one(results[name])}" for name in results if chosen.each)]
     publish("hard-guesses", "\n\n".join(parts))
     solved = [
