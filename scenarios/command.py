@@ -26,7 +26,6 @@ from unifg import __version__
 from unifg.errors import UnifgError
 from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.options import add_options, settings_of
-from unifg.solvers import names
 
 __all__ = ["SCENARIOS", "SOLVE", "Outcome", "Scenario", "main"]
 
@@ -44,22 +43,24 @@ class Scenario:
         module: of `unifg.scenarios.commands`: its ``SETTINGS`` are a class whose fields are options, its ``run`` takes
             them and a progress, and raises KeyboardInterrupt when stopped before there is anything to write.
         summary: one line for the help.
-        solvers: names to choose from.
+        solvers: the list of `unifg.solvers.names` to choose from.
         defaults: of options, where the command line has others than the settings.
     """
 
     module: str
     summary: str
-    solvers: tuple[str, ...] = names.CONSTRAINED
+    solvers: str = "CONSTRAINED"
     defaults: Mapping[str, Any] = field(default_factory=dict)
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
         """Load the scenario and add its options."""
-        module = import_module(f"unifg.scenarios.commands.{self.module}")
+        from unifg.solvers import names
+
+        module, solvers = import_module(f"unifg.scenarios.commands.{self.module}"), getattr(names, self.solvers)
         add_options(parser, module.SETTINGS, **self.defaults)
         solver = next(f.default for f in fields(module.SETTINGS) if f.name == "solver")
-        about = f"{names.choices(self.solvers)} (default: %(default)s)"
-        parser.add_argument("--solver", choices=self.solvers, default=solver, help=about)
+        about = f"{names.choices(solvers)} (default: %(default)s)"
+        parser.add_argument("--solver", choices=solvers, default=solver, help=about)
         parser.add_argument(
             "--out", type=Path, default=Path("out"), metavar="DIR", help="folder for results (default: %(default)s)"
         )
@@ -75,6 +76,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _join_negative(list(sys.argv[1:] if argv is None else argv))
     try:
         chosen = _parser(arguments).parse_args(arguments)
+    except ModuleNotFoundError as error:  # of the scenario that is named
+        return _refuse(f"scenarios need {error.name}: pip install 'unifg[scenarios]'")
     except SystemExit as stop:  # argparse has said what is wrong, or has printed help
         return stop.code if isinstance(stop.code, int) else REFUSED
     try:
@@ -194,7 +197,7 @@ SCENARIOS = {
     "velocity-tracking": Scenario(
         "speed_tracking",
         "Forces that make a car follow a speed profile: one optimal control problem over the whole drive.",
-        names.EQUALITIES,
+        "EQUALITIES",
     ),
     "quadrotor-mpc": Scenario(
         "flights",
@@ -203,12 +206,12 @@ SCENARIOS = {
     "quadrotor-obstacles": Scenario(
         "courses",
         "A quadrotor's flight past three walls and a cylinder, optimised as a whole.",
-        names.SECOND_ORDER,
+        "SECOND_ORDER",
     ),
 }
 """Everything ``unifg run`` can run."""
 
-SOLVE = Scenario("graphs", "Solve a pose graph from a file (g2o or TORO, gzipped or not).", names.LEAST_SQUARES)
+SOLVE = Scenario("graphs", "Solve a pose graph from a file (g2o or TORO, gzipped or not).", "LEAST_SQUARES")
 """``unifg solve``."""
 
 

@@ -236,8 +236,8 @@ def test_first_interrupt_waits_for_the_end_of_the_tick(
 @pytest.mark.parametrize(
     ("words", "absent"),
     [
-        (["--help"], ("pymunk", "meshcat", "matplotlib", "unifg.scenarios.navigation")),
-        (["run", "--help"], ("pymunk", "meshcat", "matplotlib", "unifg.scenarios.navigation")),
+        (["--help"], ("pymunk", "meshcat", "matplotlib", "unifg.scenarios.navigation", "unifg.solvers")),
+        (["run", "--help"], ("pymunk", "meshcat", "matplotlib", "unifg.scenarios.navigation", "unifg.solvers")),
         (["solve", "--help"], ("pymunk", "meshcat", "matplotlib", "unifg.scenarios.navigation")),
         (["run", "navigation", "--help"], ("meshcat", "matplotlib", "unifg.scenarios.flight")),
     ],

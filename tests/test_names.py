@@ -63,8 +63,8 @@ def test_options_arrive_and_wrong_ones_are_named() -> None:
 def test_commands_offer_names_with_titles(command: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
     assert shell.main([*command, "--help"]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    known = names.LEAST_SQUARES if command == ("solve",) else shell.SCENARIOS[command[1]].solvers
-    assert names.choices(known).replace("-", "") in said.replace("- ", "").replace("-", "")
+    scenario = shell.SOLVE if command == ("solve",) else shell.SCENARIOS[command[1]]
+    assert names.choices(getattr(names, scenario.solvers)).replace("-", "") in said.replace("- ", "").replace("-", "")
 
 
 def test_a_short_name_stands_in_no_second_table() -> None:
