@@ -127,7 +127,7 @@ def recorded(
     rows = {tuple(row["key"]): row for row in lines_of(store) if any_code or row["code"] == code}
     missing = {key: job for key, job in jobs.items() if not chosen.report and (chosen.fresh or key not in rows)}
     store.parent.mkdir(parents=True, exist_ok=True)
-    with store.open("a", encoding="utf-8") as file, tqdm(total=len(missing)) as bar:
+    with store.open("a", encoding="utf-8") as file, tqdm(total=len(missing), disable=not missing) as bar:
         if file.tell() and not store.read_bytes().endswith(b"\n"):
             file.write("\n")  # a run that was killed left half a line
         for key, row in _finished(task, missing, chosen.workers):

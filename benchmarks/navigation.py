@@ -1,6 +1,7 @@
 """The campaign behind docs/navigation.md: closed-loop drives of both backends, judged against fixed limits.
 
-    python -m benchmarks.navigation [--coupling joint] [--only CASE ...] [--workers K] [--fresh] [--report]
+    python -m benchmarks.navigation [--coupling joint] [--only CASE ...] [--seeds 0:5] [--workers K] [--fresh]
+        [--report]
 
 The maps of the department and of the TurtleBot arena are looked for in ``$UNIFG_DATA`` or ``../shared/data`` beside the
 checkout; without them only the building that ships with the package is driven, and the page in docs/ is left alone.
@@ -232,6 +233,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = command(__doc__)
     campaign.options(parser)
     parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES), metavar="CASE", help="some cases")
+    parser.add_argument("--seeds", type=campaign.seeds, default=SEEDS, metavar="FIRST:END", help="fewer are no page")
     parser.add_argument("--coupling", choices=COUPLINGS, default=COUPLINGS[0])
     options = parser.parse_args(arguments)
     page = "navigation" if options.coupling == COUPLINGS[0] else f"{options.coupling}-drives"
@@ -239,9 +241,10 @@ def main(arguments: list[str] | None = None) -> int:
     if missing:
         print(f"Without maps in $UNIFG_DATA or ../shared/data these are not driven: {', '.join(missing)}.")
     chosen = [name for name in options.only if name not in missing]
-    jobs = [Drive(case, solver, options.coupling, seed) for case, seed, solver in product(chosen, SEEDS, SOLVERS)]
+    variants = product(chosen, options.seeds, SOLVERS)
+    jobs = [Drive(case, solver, options.coupling, seed) for case, seed, solver in variants]
     found = campaign.episodes("navigation", drive, jobs, options)
-    rows = [row for row in found if row["coupling"] == options.coupling]
+    rows = [row for row in found if row["coupling"] == options.coupling and row["seed"] in options.seeds]
     complete = set(product(CASES, SOLVERS, SEEDS)) <= {(row["case"], row["solver"], row["seed"]) for row in rows}
     publish(page, render(rows), {row["code"] for row in rows}, docs=complete)
     if not complete:
