@@ -16,8 +16,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
-from functools import cache
 
 import numpy as np
 
@@ -25,8 +23,8 @@ from unifg.errors import GraphError, ModelError
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import Residual, residual
 from unifg.lie import Rn
-from unifg.machine.calls import vector
 from unifg.machine.jit import compiled
+from unifg.models.profile import of_distance
 from unifg.typing import Array
 
 __all__ = [
@@ -260,53 +258,11 @@ def _potential(d: float, nearest: float) -> tuple[float, float, float]:
 
 
 @compiled
-def _root(d: float, nearest: float) -> tuple[float, float, float]:
-    """Return rho = sqrt(2 phi), rho' and rho''."""
-    value, slope, curvature = _potential(d, nearest)
+def _root(d: float, numbers: Array) -> tuple[float, float, float]:
+    """Return rho = sqrt(2 phi), rho' and rho''; the number is d0."""
+    value, slope, curvature = _potential(d, numbers[0])
     rho = math.sqrt(2.0 * value)
     return rho, slope / rho, (curvature - slope * slope / (rho * rho)) / rho
-
-
-@cache
-def _root_kernel(clearance: Callable[..., None]) -> Callable[..., None]:
-    """Write rho of a clearance, with d0 in front of its table."""
-
-    @compiled
-    def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-        clearance(v, p, vector(table, 1, len(table) - 1), r, J)
-        for a in range(len(r)):
-            value, slope, _ = _root(r[a], table[0])
-            r[a] = value
-            if len(J):
-                for d in range(J.shape[1]):
-                    J[a, d] *= slope
-
-    return kernel
-
-
-@cache
-def _root_second(clearance: Callable[..., None], second: Callable[..., None]) -> Callable[..., None]:
-    """Hessian of w' rho(d): that of the clearance under weights w rho', and rho'' times its gradients."""
-
-    @compiled
-    def kernel(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
-        rows, width = len(w), len(S)
-        rest = vector(table, 1, len(table) - 1)
-        distance, slopes, gradient = np.empty(rows), np.empty(rows), np.empty((rows, width))
-        clearance(v, p, rest, distance, gradient)
-        for a in range(rows):
-            _, slope, _ = _root(distance[a], table[0])
-            slopes[a] = w[a] * slope
-        second(v, p, rest, slopes, S)
-        for a in range(rows):
-            _, _, curvature = _root(distance[a], table[0])
-            for i in range(width):
-                pull = w[a] * curvature * gradient[a, i]
-                if pull != 0.0:
-                    for k in range(width):
-                        S[i, k] += pull * gradient[a, k]
-
-    return kernel
 
 
 def inverse_distance_root(clearance: Residual, nearest: float = 0.1) -> Residual:
@@ -322,18 +278,12 @@ def inverse_distance_root(clearance: Residual, nearest: float = 0.1) -> Residual
     Raises:
         ModelError: when ``nearest`` is not positive, or the clearance is not compiled.
     """
-    kernel = _kernel_of(clearance, nearest)
-    assert kernel.second is not None
-    return residual(
-        replace(
-            kernel,
-            function=_root_kernel(kernel.function),
-            table=np.concatenate([[nearest], kernel.table]),
-            name=f"root of 1/{kernel.name}",
-            linear=False,
-            second=_root_second(kernel.function, kernel.second),
-        )
-    )
+    if not nearest > 0.0:
+        raise ModelError(f"1/d needs a positive distance where its parabola takes over, found nearest={nearest}")
+    kernel = clearance.kernel
+    if kernel is None or kernel.second is None:
+        raise ModelError(f"1/d needs a compiled clearance with a second derivative, found '{clearance.name}'")
+    return of_distance(clearance, _root, [nearest], f"root of 1/{clearance.name}", twice=True)
 
 
 def inverse_distance(clearance: Residual, nearest: float = 0.1, weight: float = 1.0) -> Callable[..., Array]:
@@ -357,12 +307,3 @@ def inverse_distance(clearance: Residual, nearest: float = 0.1, weight: float = 
 
     potential.__name__ = f"1/{clearance.name}"
     return potential
-
-
-def _kernel_of(clearance: Residual, nearest: float) -> Kernel:
-    if not nearest > 0.0:
-        raise ModelError(f"1/d needs a positive distance where its parabola takes over, found nearest={nearest}")
-    kernel = clearance.kernel
-    if kernel is None or kernel.second is None:
-        raise ModelError(f"1/d needs a compiled clearance with a second derivative, found '{clearance.name}'")
-    return kernel

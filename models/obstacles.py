@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
-from functools import cache
-
-import numpy as np
 
 from unifg.errors import GraphError
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import Residual, residual
 from unifg.lie import SE2
-from unifg.machine.calls import vector
 from unifg.machine.jit import compiled
-from unifg.models.smooth_field import SmoothField, smooth
+from unifg.models.distance_map import SmoothField, smooth
+from unifg.models.profile import of_distance
 from unifg.typing import Array
 
 NEAR = 1e-9  # below this distance the direction to the centre is undefined; the gradient is taken as zero
@@ -101,38 +96,11 @@ def wall_distance(field: SmoothField) -> Residual:
     return residual(Kernel(_wall_distance, (SE2,), 1, field.table, "wall distance"))
 
 
-@cache
-def _short(distance: Callable[..., None]) -> Callable[..., None]:
-    """Write max(0, margin - distance), with the margin in front of the table of the distance."""
-
-    @compiled
-    def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-        distance(v, p, vector(table, 1, len(table) - 1), r, J)
-        for a in range(len(r)):
-            sign = -1.0 if r[a] < table[0] else 0.0
-            short = table[0] - r[a]
-            r[a] = 0.0 if short <= 0.0 else short  # NaN stays
-            if len(J):
-                for d in range(J.shape[1]):
-                    J[a, d] *= sign
-
-    return kernel
-
-
-class _Shortfall:
-    """The same for a distance without a kernel."""
-
-    def __init__(self, distance: Residual, margin: float) -> None:
-        self.distance = distance
-        self.margin = margin
-
-    def __call__(self, *arguments: Array) -> Array:
-        return np.maximum(self.margin - self.distance.function(*arguments), 0.0)
-
-    def jacobian(self, *arguments: Array) -> list[Array]:
-        assert self.distance.jacobian is not None
-        short = self.distance.function(*arguments) < self.margin
-        return [np.where(short[:, :, None], -block, 0.0) for block in self.distance.jacobian(*arguments)]
+@compiled
+def _short(d: float, numbers: Array) -> tuple[float, float, float]:
+    """max(0, margin - distance)."""
+    short = numbers[0] - d
+    return 0.0 if short <= 0.0 else short, -1.0 if d < numbers[0] else 0.0, 0.0  # NaN stays
 
 
 def shortfall(distance: Residual, margin: float) -> Residual:
@@ -142,10 +110,4 @@ def shortfall(distance: Residual, margin: float) -> Residual:
         distance: a residual with an attached Jacobian, such as ``disc_clearance``.
         margin: distance below which the cost begins [m]; its square is continuously differentiable there.
     """
-    name = f"{distance.name} margin"
-    if distance.kernel is not None:
-        table = np.concatenate([[margin], distance.kernel.table])
-        short = _short(distance.kernel.function)
-        return residual(replace(distance.kernel, function=short, table=table, name=name, second=None))
-    function = _Shortfall(distance, margin)
-    return residual(function, function.jacobian, name)
+    return of_distance(distance, _short, [margin], f"{distance.name} margin")

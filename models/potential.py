@@ -27,97 +27,74 @@ from dataclasses import replace
 from functools import cache
 from typing import Literal, TypeAlias
 
-import numpy as np
-
 from unifg.errors import ModelError
-from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import Residual, residual
-from unifg.machine.calls import vector
 from unifg.machine.jit import compiled
+from unifg.models.profile import first_order, of_distance
 from unifg.typing import Array
 
 SCALE = 0.075  # [m], the paper's k
 NEAR = 0.05  # [m], its mu
 FAR = 0.8  # [m], its rho
 TINY = 1e-300
+NUMBERS = 5  # that stand in front of the table of a distance
 
 Sense: TypeAlias = Literal["circulate", "aside"]
 
 
+@compiled
+def _repulsion(d: float, numbers: Array) -> tuple[float, float, float]:
+    """Return g and its slope; the numbers are scale, near, far, vortex and whether it turns aside."""
+    scale, near, far = numbers[0], numbers[1], numbers[2]
+    slope = -scale / (d * d) if near < d < far else 0.0
+    if d < near:
+        d = near
+    if d > far:
+        d = far
+    return scale * (1.0 / d - 1.0 / far), slope, 0.0
+
+
+@compiled
+def _steer(J: Array, vortex: float, aside: float) -> None:
+    """Add to derivatives along a pose, (m, 3), a multiple of the same turned a quarter to the left in the plane."""
+    for a in range(len(J)):
+        # Components along and across the body: a quarter turn there is a quarter turn in the world.
+        along, across, weight = J[a, 0], J[a, 1], vortex
+        if aside != 0.0:
+            # The tangential part of a push, as strong as the repulsion, across the body and away.
+            side = -1.0 if across > 0.0 else 1.0
+            weight = -vortex * side * along / max(math.sqrt(along * along + across * across), TINY)
+        J[a, 0] -= weight * across
+        J[a, 1] += weight * along
+
+
 @cache
-def _kernel(distance: Callable[..., None], search: bool) -> Callable[..., None]:
-    """Write g and its derivative, or what to search with; five numbers stand in front of the table of the distance."""
+def _steered(distance: Callable[..., None]) -> Callable[..., None]:
+    """Write g and what to search with."""
+    repel = first_order(distance, _repulsion, NUMBERS)
 
     @compiled
     def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-        distance(v, p, vector(table, 5, len(table) - 5), r, J)
-        scale, near, far, vortex, aside = table[0], table[1], table[2], table[3], table[4]
-        for a in range(len(r)):
-            slope = -scale / (r[a] * r[a]) if near < r[a] < far else 0.0
-            if r[a] < near:
-                r[a] = near
-            if r[a] > far:
-                r[a] = far
-            r[a] = scale * (1.0 / r[a] - 1.0 / far)
-            if len(J):
-                for d in range(J.shape[1]):
-                    J[a, d] *= slope
-                if search:
-                    # Components along and across the body: a quarter turn there is a quarter turn in the world.
-                    along, across, weight = J[a, 0], J[a, 1], vortex
-                    if aside != 0.0:
-                        # The tangential part of a push, as strong as the repulsion, across the body and away.
-                        side = -1.0 if across > 0.0 else 1.0
-                        weight = -vortex * side * along / max(math.sqrt(along * along + across * across), TINY)
-                    J[a, 0] -= weight * across
-                    J[a, 1] += weight * along
+        repel(v, p, table, r, J)
+        if len(J):
+            _steer(J, table[3], table[4])
 
     return kernel
 
 
-def _kernels(distance: Kernel, numbers: list[float], name: str) -> tuple[Kernel, Kernel]:
-    """The true kernel and the one to search with; both read one table."""
-    table = np.concatenate([numbers, distance.table])
-    true = replace(distance, function=_kernel(distance.function, False), table=table, name=name, second=None)
-    return true, replace(true, function=_kernel(distance.function, True))
+class _Search:
+    """What to search with for a distance without a kernel."""
 
+    def __init__(self, true: Residual, vortex: float, aside: float) -> None:
+        self.true, self.vortex, self.aside = true, vortex, aside
 
-class _Potential:
-    """The same for a distance without a kernel."""
-
-    def __init__(self, distance: Residual, scale: float, near: float, far: float, vortex: float, sense: Sense) -> None:
-        self.distance = distance
-        self.scale = scale
-        self.near = near
-        self.far = far
-        self.vortex = vortex
-        self.sense = sense
-
-    def __call__(self, *arguments: Array) -> Array:
-        distance = np.clip(self.distance.function(*arguments), self.near, self.far)
-        return self.scale * (1.0 / distance - 1.0 / self.far)
-
-    def jacobian(self, *arguments: Array) -> list[Array]:
-        assert self.distance.jacobian is not None
-        distance = self.distance.function(*arguments)
-        within = (distance > self.near) & (distance < self.far)
-        slope = np.where(within, -self.scale / np.clip(distance, self.near, self.far) ** 2, 0.0)
-        return [slope[:, :, None] * block for block in self.distance.jacobian(*arguments)]
-
-    def search(self, *arguments: Array) -> list[Array]:
-        """The Jacobian plus a multiple of the same turned a quarter to the left in the plane."""
-        blocks = self.jacobian(*arguments)
-        # Components along and across the body: a quarter turn there is a quarter turn in the world.
-        along, across = blocks[0][:, :, 0], blocks[0][:, :, 1]
-        weight: Array | float = self.vortex
-        if self.sense == "aside":
-            # The tangential part of a push, as strong as the repulsion, across the body and away from the obstacle.
-            side = np.where(across > 0.0, -1.0, 1.0)
-            weight = -self.vortex * side * along / np.maximum(np.hypot(along, across), TINY)
-        pose = blocks[0].copy()
-        pose[:, :, 0] -= weight * across
-        pose[:, :, 1] += weight * along
-        return [pose, *blocks[1:]]
+    def __call__(self, *arguments: Array) -> list[Array]:
+        assert self.true.jacobian is not None
+        pose, *rest = self.true.jacobian(*arguments)
+        pose = pose.copy()
+        for block in pose:
+            _steer(block, self.vortex, self.aside)
+        return [pose, *rest]
 
 
 def potential(
@@ -155,9 +132,10 @@ def potential(
         raise ModelError(
             f"potential: sense must be 'circulate', or 'aside' with a positive vortex; found {sense!r}, {vortex}"
         )
-    name = f"{distance.name} potential"
-    if distance.kernel is not None:
-        true, steered = _kernels(distance.kernel, [scale, near, far, vortex, float(sense == "aside")], name)
-        return residual(true, search=steered if vortex != 0.0 else None)
-    function = _Potential(distance, scale, near, far, vortex, sense)
-    return residual(function, function.jacobian, name, function.search if vortex != 0.0 else None)
+    aside = float(sense == "aside")
+    true = of_distance(distance, _repulsion, [scale, near, far, vortex, aside], f"{distance.name} potential")
+    if vortex == 0.0:
+        return true
+    if distance.kernel is not None and true.kernel is not None:
+        return residual(true.kernel, search=replace(true.kernel, function=_steered(distance.kernel.function)))
+    return residual(true.function, true.jacobian, true.name, _Search(true, vortex, aside))

@@ -26,9 +26,8 @@ from unifg.errors import ModelError
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import residual
 from unifg.lie import SO3, Product, Rn
-from unifg.models import quadrotor_dynamics, quadrotor_flight, quadrotor_second
-from unifg.models.quadrotor_dynamics import GRAVITY
-from unifg.models.quadrotor_field import field
+from unifg.models import quadrotor_dynamics, quadrotor_second
+from unifg.models.quadrotor_dynamics import GRAVITY, field
 from unifg.typing import Array, ArrayLike
 
 __all__ = [
@@ -196,7 +195,7 @@ def fly(
     if substeps < 1:
         raise ModelError(f"fly needs at least one substep, found {substeps}")
     reached = state.copy()
-    quadrotor_flight.integrate(reached, u, disturbance, parameters.packed, float(dt) / substeps, substeps)
+    quadrotor_dynamics.integrate(reached, u, disturbance, parameters.packed, float(dt) / substeps, substeps)
     return reached
 
 

@@ -1,4 +1,4 @@
-"""The implicit trapezoid of a quadrotor for one step at a time, with the derivatives of its defect.
+"""How a quadrotor moves, compiled: the implicit trapezoid with the derivatives of its defect, RK-MK4, and the field.
 
 With the state (p, R, v), the body rates omega and the thrust T, both held over a step of length h, and
 
@@ -15,8 +15,9 @@ from __future__ import annotations
 
 from unifg.lie import so3
 from unifg.lie.series import k_value
-from unifg.machine.calls import local_matrix
+from unifg.machine.calls import local_matrix, local_vector
 from unifg.machine.jit import compiled
+from unifg.models.compiled_field import CompiledField
 from unifg.typing import Array
 
 GRAVITY = 9.81  # [m/s^2]
@@ -211,3 +212,95 @@ def advance_all(x: Array, u: Array, h: Array, rho: Array, out: Array) -> None:
     """Advance row by row, in order: ``out`` may be ``x`` one row further on."""
     for i in range(len(out)):
         advance(x[i], u[i], h[i], rho, out[i])
+
+
+# ---------------------------------------------------------------- other integrators
+
+
+@compiled
+def integrate(x: Array, u: Array, w: Array, rho: Array, h: float, steps: int) -> None:
+    """Move the state x (10,) by steps of length h under a control, a noise and parameters that are held."""
+    half, turn, blow = local_vector(4), local_vector(4), local_vector(3)
+    middle, end = local_vector(10), local_vector(10)
+    wx, wy, wz = u[0] + w[0], u[1] + w[1], u[2] + w[2]
+    _, cosine, s = so3.half_turn(0.5 * h * wx, 0.5 * h * wy, 0.5 * h * wz)
+    so3.write(cosine, 0.5 * h * s * wx, 0.5 * h * s * wy, 0.5 * h * s * wz, half, 0)
+    so3.compose(half, half, turn)
+    for i in range(3):
+        blow[i] = rho[4 + i] + w[3 + i]
+    for _ in range(steps):
+        so3.write_product(x[3], x[4], x[5], x[6], half[0], half[1], half[2], half[3], middle, 3)
+        so3.write_product(x[3], x[4], x[5], x[6], turn[0], turn[1], turn[2], turn[3], end, 3)
+        ax, ay, az = _blown(x, u[3], rho, blow)
+        for i in range(3):
+            middle[7 + i] = x[7 + i] + 0.5 * h * (ax if i == 0 else (ay if i == 1 else az))
+        bx, by, bz = _blown(middle, u[3], rho, blow)
+        for i in range(3):
+            middle[7 + i] = x[7 + i] + 0.5 * h * (bx if i == 0 else (by if i == 1 else bz))
+        cx, cy, cz = _blown(middle, u[3], rho, blow)
+        for i in range(3):
+            end[7 + i] = x[7 + i] + h * (cx if i == 0 else (cy if i == 1 else cz))
+        dx, dy, dz = _blown(end, u[3], rho, blow)
+        # Positions: the stages' velocities are v, v + h a/2, v + h b/2 and v + h c.
+        x[0] += h * (x[7] + h * (ax + bx + cx) / 6.0)
+        x[1] += h * (x[8] + h * (ay + by + cy) / 6.0)
+        x[2] += h * (x[9] + h * (az + bz + cz) / 6.0)
+        x[7] += h * (ax + 2.0 * (bx + cx) + dx) / 6.0
+        x[8] += h * (ay + 2.0 * (by + cy) + dy) / 6.0
+        x[9] += h * (az + 2.0 * (bz + cz) + dz) / 6.0
+        for i in range(3, 7):
+            x[i] = end[i]
+
+
+@compiled
+def _blown(x: Array, thrust: float, rho: Array, blow: Array) -> tuple[float, float, float]:
+    """Acceleration of a state."""
+    a, b, c = acceleration(x, 0, thrust, rho[0], rho[1], rho[2], rho[3])
+    return a + blow[0], b + blow[1], c + blow[2]
+
+
+@compiled
+def _velocity(x: Array, u: Array, out: Array) -> None:
+    """Inputs u = (omega, T, w_omega, w_a, mass, drag, wind, updraft)."""
+    ax, ay, az = acceleration(x, 0, u[3], u[10], u[11], u[12], u[13])
+    for i in range(3):
+        out[i] = x[7 + i]
+        out[3 + i] = u[i] + u[4 + i]
+    out[6] = ax + u[14] + u[7]
+    out[7] = ay + u[15] + u[8]
+    out[8] = az + u[16] + u[9]
+
+
+@compiled
+def _derivative(x: Array, u: Array, by_x: Array, by_u: Array) -> None:
+    R = local_matrix(3, 3)
+    so3.write_matrix(x[3], x[4], x[5], x[6], R, 0)
+    thrust, per, d0, d1, d2 = u[3], 1.0 / u[10], u[11], u[12], u[13]
+    s0 = R[0, 0] * x[7] + R[1, 0] * x[8] + R[2, 0] * x[9]
+    s1 = R[0, 1] * x[7] + R[1, 1] * x[8] + R[2, 1] * x[9]
+    s2 = R[0, 2] * x[7] + R[1, 2] * x[8] + R[2, 2] * x[9]
+    t01, t02, t10, t12, t20, t21 = force_along_turn(thrust, d0, d1, d2, s0, s1, s2)
+    for i in range(9):
+        for k in range(9):
+            by_x[i, k] = 0.0
+        for k in range(17):
+            by_u[i, k] = 0.0
+    for i in range(3):
+        by_x[i, 6 + i] = by_u[3 + i, i] = by_u[3 + i, 4 + i] = by_u[6 + i, 7 + i] = by_u[6 + i, 14 + i] = 1.0
+        a, b, c = per * R[i, 0], per * R[i, 1], per * R[i, 2]
+        by_x[6 + i, 3] = b * t10 + c * t20
+        by_x[6 + i, 4] = a * t01 + c * t21
+        by_x[6 + i, 5] = a * t02 + b * t12
+        for k in range(3):
+            by_x[6 + i, 6 + k] = -(a * d0 * R[k, 0] + b * d1 * R[k, 1] + c * d2 * R[k, 2])
+        by_u[6 + i, 3] = c
+        by_u[6 + i, 10] = -per * (c * thrust - a * d0 * s0 - b * d1 * s1 - c * d2 * s2)
+        by_u[6 + i, 11], by_u[6 + i, 12], by_u[6 + i, 13] = -a * s0, -b * s1, -c * s2
+
+
+field = CompiledField(_velocity, 9, (4, 6, 1, 3, 2, 1), _derivative)
+"""``field(x, u, w, mass, drag, wind, updraft)``: F, (n, 9), for :func:`unifg.models.rkmk.integrator` on ``STATE``.
+
+The trapezoid made of it has the defect of :data:`unifg.models.quadrotor.disturbed_dynamics`, at several times the cost
+and without second derivatives; the other integrators are there to compare with.
+"""

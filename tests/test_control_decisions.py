@@ -11,8 +11,7 @@ import pytest
 import unifg as fg
 from episodes import room
 from unifg.models import unicycle
-from unifg.models.distance_map import DistanceMap
-from unifg.models.smooth_field import SmoothField
+from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.scenarios.driving.drive_control import BRAKING, LEFT_BEHIND, PATIENCE, Controller, is_behind
 from unifg.scenarios.driving.drive_joint import SharedPast, Smoother
 from unifg.scenarios.driving.drive_parts import disc_limits, predicted, wall_limits

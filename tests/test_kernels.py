@@ -18,10 +18,9 @@ from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import Residual
 from unifg.kernels.robust import Huber
 from unifg.models import lidar, unicycle
-from unifg.models.distance_map import DistanceMap
+from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.models.obstacles import disc_clearance, shortfall, wall_distance
 from unifg.models.potential import potential
-from unifg.models.smooth_field import SmoothField
 from unifg.typing import Array
 
 RNG = np.random.default_rng(23)

@@ -9,10 +9,9 @@ import pytest
 
 import unifg as fg
 from unifg.models import unicycle
-from unifg.models.distance_map import DistanceMap
+from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.models.obstacles import disc_clearance, wall_distance
 from unifg.models.potential import FAR, NEAR, SCALE, Sense, potential
-from unifg.models.smooth_field import SmoothField
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, LevenbergMarquardt
 from unifg.typing import Array
 

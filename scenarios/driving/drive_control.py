@@ -13,8 +13,7 @@ import numpy as np
 import unifg as fg
 from unifg.lie import wrap_angle
 from unifg.models import unicycle
-from unifg.models.distance_map import DistanceMap
-from unifg.models.smooth_field import SmoothField
+from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.scenarios.driving.drive_parts import DriveNow, clearance, following, motion
 from unifg.scenarios.driving.drive_settings import ControllerSettings, backend
 from unifg.scenarios.horizon.loop import Loop, Plan

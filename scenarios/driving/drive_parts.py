@@ -8,7 +8,7 @@ import numpy as np
 
 import unifg as fg
 from unifg.models import obstacles, unicycle
-from unifg.models.smooth_field import SmoothField
+from unifg.models.distance_map import SmoothField
 from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.horizon.part import Given, Gives, Now, Part
 from unifg.scenarios.seeing.tracks import Tracks, nearest
