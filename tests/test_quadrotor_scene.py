@@ -1,9 +1,7 @@
 """Pictures and numbers of flights: what is in the files, read back without a browser."""
 
-import base64
 import json
 import math
-import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from scenes import check_offline, commands_of, data_of, tracks_of, without_viewer
 from unifg.errors import ScenarioError
 from unifg.lie import SO3
 from unifg.scenarios.commands import flights as results
@@ -22,7 +21,6 @@ from unifg.scenarios.log.flight_metrics import flight_metrics, landmark_errors
 from unifg.scenarios.show import drone, shapes
 from unifg.scenarios.show.flight_plot import control, estimates, moments, overview, plot_moment
 from unifg.scenarios.show.flight_scene import first_sights, flight_scene
-from unifg.scenarios.show.recorder import viewer_script
 from unifg.scenarios.show.stage import frame_ticks
 from unifg.scenarios.show.style import css, write_figure
 from unifg.scenarios.worlds.layouts import Layout
@@ -32,7 +30,6 @@ umsgpack = pytest.importorskip("umsgpack")
 DT, HORIZON = 0.05, 20
 OFFSET = np.array([0.03, 0.0, 0.04])  # of the believed position [m]
 SHIFT = np.array([0.06, 0.08])  # of the believed landmarks [m]
-Tracks = dict[str, dict[str, list[tuple[int, Any]]]]
 
 
 def layout() -> Layout:
@@ -100,36 +97,6 @@ def page(log: FlightLog) -> str:
     return flight_scene(log).html()
 
 
-def _around(page: str) -> str:
-    script = viewer_script()
-    assert page.count(script) == 1
-    return page.replace(script, "")
-
-
-def _commands(page: str) -> list[dict[str, Any]]:
-    found = re.search(r"^const COMMANDS = (\[.*?\]);$", page, re.DOTALL | re.MULTILINE)
-    assert found
-    return [umsgpack.unpackb(base64.b64decode(text)) for text in json.loads(found.group(1))]
-
-
-def page_data(page: str) -> dict[str, Any]:
-    """What the script of a page knows."""
-    found = re.search(r"^const DATA = (.*);$", page, re.MULTILINE)
-    assert found
-    data: dict[str, Any] = json.loads(found.group(1))
-    return data
-
-
-def _tracks(commands: list[dict[str, Any]]) -> Tracks:
-    """Path to property to keys (frame, value)."""
-    tracks: Tracks = {}
-    for animation in commands[-1]["animations"]:
-        for track in animation["clip"]["tracks"]:
-            keys = [(key["time"], key["value"]) for key in track["keys"]]
-            tracks.setdefault(animation["path"].removeprefix("/meshcat/"), {})[track["name"]] = keys
-    return tracks
-
-
 def _objects(commands: list[dict[str, Any]]) -> set[str]:
     return {c["path"].removeprefix("/meshcat/") for c in commands if c["type"] == "set_object"}
 
@@ -147,12 +114,9 @@ def _shown(keys: list[tuple[int, bool]], tick: int) -> bool:
 
 
 def test_page_loads_nothing_from_outside_and_says_what_it_shows(page: str) -> None:
-    around = _around(page)
-    assert re.findall(r"(?:https?:)?//[\w.-]+\.\w+", re.sub(r'"[A-Za-z0-9+/=\s]{40,}"', "", around)) == []
-    for word in (" src=", "href=", "@import", "url(", "fetch(", "import(", "WebSocket", ".connect("):
-        assert word not in around
-    assert "default-src 'none'" in around and "@@" not in around
-    data = page_data(around)
+    check_offline(page)
+    around = without_viewer(page)
+    data = data_of(around)
     assert data["title"] == "unifg: quadrotor-mpc, made up 7" and ["solver", "ipm (sequential)"] in data["facts"]
     assert data["outcome"] == "target reached, no collision" and data["good"] is True
     assert "reach of the sensor" in [key["text"] for key in data["legend"]]
@@ -161,8 +125,8 @@ def test_page_loads_nothing_from_outside_and_says_what_it_shows(page: str) -> No
 
 def test_failure_and_foreign_names_in_the_page(log: FlightLog) -> None:
     named = replace(log, layout=replace(log.layout, name="</script><b>x"), reached=False, collisions=2)
-    around = _around(flight_scene(named).html())
-    data = page_data(around)
+    around = without_viewer(flight_scene(named).html())
+    data = data_of(around)
     assert data["outcome"] == "0.0 m short of the target, 2 collisions" and data["good"] is False
     assert "</script><b>" not in around and data["title"].endswith("</script><b>x")
 
@@ -173,11 +137,11 @@ def test_same_log_same_page(page: str, log: FlightLog, tmp_path: Path) -> None:
 
 
 def test_animation_moves_things_that_exist_and_ends_together(page: str, log: FlightLog) -> None:
-    commands = _commands(page)
+    commands = commands_of(page)
     kinds = [command["type"] for command in commands]
     assert kinds.count("set_animation") == 1 and kinds[-1] == "set_animation"
     objects = _objects(commands)
-    for path, properties in _tracks(commands).items():
+    for path, properties in tracks_of(commands).items():
         assert any(name == path or name.startswith(path + "/") for name in objects), path
         for name, keys in properties.items():
             frames = [frame for frame, _ in keys]
@@ -187,7 +151,7 @@ def test_animation_moves_things_that_exist_and_ends_together(page: str, log: Fli
 
 
 def test_drone_flies_and_leans_as_the_truth(page: str, log: FlightLog) -> None:
-    tracks = _tracks(_commands(page))
+    tracks = tracks_of(commands_of(page))
     places = np.array([value for _, value in tracks["drone"][".position"]])
     turns = np.array([value for _, value in tracks["drone"][".quaternion"]])
     np.testing.assert_allclose(places, log.truth[:, :3])
@@ -200,8 +164,8 @@ def test_drone_flies_and_leans_as_the_truth(page: str, log: FlightLog) -> None:
 
 def test_cylinders_are_faint_until_seen(page: str, log: FlightLog) -> None:
     assert first_sights(log) == [0, 10, None]
-    commands = _commands(page)
-    objects, tracks = _objects(commands), _tracks(commands)
+    commands = commands_of(page)
+    objects, tracks = _objects(commands), tracks_of(commands)
     assert "cylinders/0/unseen" not in objects and "cylinders/0/seen" not in tracks
     assert "cylinders/2/seen/body" not in objects and "cylinders/2/unseen" not in tracks
     for tick in range(log.ticks):
@@ -212,7 +176,7 @@ def test_cylinders_are_faint_until_seen(page: str, log: FlightLog) -> None:
 
 
 def test_ellipses_have_two_sigmas_and_appear_with_their_landmark(page: str, log: FlightLog) -> None:
-    tracks = _tracks(_commands(page))
+    tracks = tracks_of(commands_of(page))
     scales = dict(tracks["landmarks/1/ellipse"][".scale"])
     for tick in (10, log.ticks - 1):
         row = log.landmarks[tick]
@@ -227,13 +191,13 @@ def test_a_landmark_that_stands_still_does_not_creep(log: FlightLog) -> None:
     jumping = replace(log, landmarks=still + [moved] * (log.ticks - 20))
     commands = flight_scene(jumping).recorder.commands
     assert commands[-1]["type"] == "set_animation"
-    keys = dict(_tracks(commands)["landmarks/0"][".position"])
+    keys = dict(tracks_of(commands)["landmarks/0"][".position"])
     assert sorted(keys) == [0, 19, 20] and keys[19] == keys[0] != keys[20]  # else it would drift there for 20 ticks
 
 
 def test_horizon_and_past_of_every_frame_are_those_of_the_log(page: str, log: FlightLog) -> None:
-    commands = _commands(page)
-    tracks = _tracks(commands)
+    commands = commands_of(page)
+    tracks = tracks_of(commands)
     for tick in range(1, log.ticks):
         for name, way in (("horizon", log.plans[tick]), ("past", log.pasts[tick])):
             middle = _vertices(commands, f"frames/{tick}/{name}").reshape(-1, 3, 3).mean(axis=1)
@@ -244,8 +208,8 @@ def test_horizon_and_past_of_every_frame_are_those_of_the_log(page: str, log: Fl
 
 def test_the_flown_way_appears_piece_by_piece(page: str, log: FlightLog) -> None:
     """Each piece is hidden until the vehicle has flown it, and stays; together they are the whole way."""
-    commands = _commands(page)
-    tracks = _tracks(commands)
+    commands = commands_of(page)
+    tracks = tracks_of(commands)
     begun = [int(path.split("/")[1]) for path in tracks if path.startswith("flown/")]
     assert begun == list(range(log.ticks - 1))
     for begin in begun:
@@ -260,12 +224,12 @@ def test_the_flown_way_appears_piece_by_piece(page: str, log: FlightLog) -> None
 def test_a_flight_without_estimate_is_shown_without_it() -> None:
     plain = flight(estimated=False, movers=0)
     page = flight_scene(plain).html()
-    objects, text = _objects(_commands(page)), _around(page)
+    objects, text = _objects(commands_of(page)), without_viewer(page)
     families = {path.split("/")[0] for path in objects}
     assert not families & {"sensor", "landmarks", "movers"}
     assert not any(path.endswith(("unseen", "past", "truth")) for path in objects)
     assert {f"cylinders/{k}/seen/body" for k in range(3)} <= objects and "frames/0/horizon" in objects
-    data = page_data(text)
+    data = data_of(text)
     for words in ("reach of the sensor", "position error", "estimate + plan", "not seen yet"):
         assert words not in json.dumps([data["facts"], data["legend"], data["readouts"]])
     assert [row["name"] for row in data["readouts"]] == ["speed", "height", "clearance", "thrust", "plan"]
@@ -273,7 +237,7 @@ def test_a_flight_without_estimate_is_shown_without_it() -> None:
 
 
 def test_readouts_are_those_of_the_log(page: str, log: FlightLog) -> None:
-    rows = {row["name"]: row for row in page_data(page)["readouts"]}
+    rows = {row["name"]: row for row in data_of(page)["readouts"]}
     assert {len(row["texts"]) for row in rows.values()} == {log.ticks}
     assert rows["position error"]["texts"][0] == "5.0 cm" and rows["speed"]["texts"][0] == "2.00 m/s"
     assert (
@@ -293,12 +257,12 @@ def test_long_flights_are_thinned_and_small() -> None:
 
 def test_odd_flights_are_drawn_too(log: FlightLog) -> None:
     single = flight(1)
-    assert _commands(flight_scene(single).html())[-1]["type"] == "set_animation"
+    assert commands_of(flight_scene(single).html())[-1]["type"] == "set_animation"
     overview(single)
     estimates(single)
     control(single)
     lost = replace(log, plans=np.full_like(log.plans, np.nan), clearance=np.full(log.ticks, np.inf))
-    assert not any("horizon" in path for path in _objects(_commands(flight_scene(lost).html())))
+    assert not any("horizon" in path for path in _objects(commands_of(flight_scene(lost).html())))
     overview(lost)
     control(lost)
     empty = flight(0)

@@ -1,20 +1,18 @@
 """Scenes and plots: what is in the files, read back without a browser."""
 
-import base64
 import hashlib
-import json
 import re
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
 
 from episodes import HORIZON, episode, room
+from scenes import check_offline, commands_of, data_of, tracks_of, without_viewer
 from unifg.errors import ScenarioError
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.show.drive_plot import overview, plot_controls, plot_localisation, plot_map
@@ -27,8 +25,6 @@ from unifg.scenarios.show.style import write_figure
 
 umsgpack = pytest.importorskip("umsgpack")
 
-Commands = list[dict[str, Any]]
-
 
 @pytest.fixture(scope="module")
 def log() -> EpisodeLog:
@@ -40,62 +36,25 @@ def page(log: EpisodeLog) -> str:
     return drive_scene(log).html()
 
 
-def _commands(page: str) -> Commands:
-    found = re.search(r"^const COMMANDS = (\[.*?\]);$", page, re.DOTALL | re.MULTILINE)
-    assert found
-    return [umsgpack.unpackb(base64.b64decode(text)) for text in json.loads(found.group(1))]
-
-
-def page_data(page: str) -> dict[str, Any]:
-    """What the script of a page knows."""
-    found = re.search(r"^const DATA = (.*);$", page, re.MULTILINE)
-    assert found
-    data: dict[str, Any] = json.loads(found.group(1))
-    return data
-
-
-def _tracks(commands: Commands) -> dict[str, dict[str, list[tuple[int, Any]]]]:
-    """Path to property to keys (frame, value)."""
-    tracks: dict[str, dict[str, list[tuple[int, Any]]]] = {}
-    for animation in commands[-1]["animations"]:
-        for track in animation["clip"]["tracks"]:
-            keys = [(key["time"], key["value"]) for key in track["keys"]]
-            tracks.setdefault(animation["path"], {})[track["name"]] = keys
-    return tracks
-
-
-def _strip_viewer(page: str) -> str:
-    script = viewer_script()
-    assert page.count(script) == 1
-    return page.replace(script, "")
-
-
 def test_page_loads_nothing_from_outside(page: str) -> None:
-    around = _strip_viewer(page)
-    assert re.findall(r"(?:https?:)?//[\w.-]+\.\w+", re.sub(r'"[A-Za-z0-9+/=\s]{40,}"', "", around)) == []
-    for word in (" src=", "href=", "@import", "url(", "fetch(", "import(", "WebSocket", ".connect("):
-        assert word not in around
+    check_offline(page)
     # The viewer itself names one address, the XHTML namespace, which no browser opens.
     assert set(re.findall(r"https?://[^\"'`\s)]+", viewer_script())) == {"http://www.w3.org/1999/xhtml"}
-    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)
-    assert policy and "default-src 'none'" in policy.group(1)
-    assert "http" not in policy.group(1) and "connect-src" not in policy.group(1)
 
 
 def test_page_has_no_placeholder_left_and_says_what_it_shows(page: str, log: EpisodeLog) -> None:
-    around = _strip_viewer(page)
-    assert "@@" not in around
-    data = page_data(around)
+    around = without_viewer(page)
+    data = data_of(around)
     assert data["title"] == "unifg: navigation on room" and ["solver", "alm (sequential)"] in data["facts"]
     assert data["outcome"] == "1 of 1 goals reached, no collision" and data["good"] is True
     assert any("lidar hits" in key["text"] for key in data["legend"])
-    failed = page_data(drive_scene(replace(log, collisions=2, reached=[False])).html())
+    failed = data_of(drive_scene(replace(log, collisions=2, reached=[False])).html())
     assert failed["outcome"] == "0 of 1 goals reached, 2 collisions" and failed["good"] is False
     assert 'DATA.good ? "good" : "bad"' in around
 
 
 def test_readouts_are_those_of_the_log(page: str, log: EpisodeLog) -> None:
-    readouts = {readout["name"]: readout for readout in page_data(page)["readouts"]}
+    readouts = {readout["name"]: readout for readout in data_of(page)["readouts"]}
     assert {len(readout["texts"]) for readout in readouts.values()} == {log.ticks}
     assert readouts["speed"]["texts"][3] == "0.50 m/s" and readouts["localisation error"]["texts"][0] == "5.0 cm"
     assert readouts["clearance"]["texts"][0] == "0.60 m" and readouts["goal"]["texts"][0] == "1 of 1"
@@ -105,9 +64,9 @@ def test_readouts_are_those_of_the_log(page: str, log: EpisodeLog) -> None:
 
 def test_names_from_outside_cannot_become_markup(log: EpisodeLog) -> None:
     named = replace(log.occupancy, name="</script><b>x")
-    page = _strip_viewer(drive_scene(replace(log, occupancy=named)).html())
+    page = without_viewer(drive_scene(replace(log, occupancy=named)).html())
     assert "</script><b>" not in page and page.count("</script>") == 3
-    assert page_data(page)["title"] == "unifg: navigation on </script><b>x"
+    assert data_of(page)["title"] == "unifg: navigation on </script><b>x"
     assert "innerHTML" not in page  # what the script writes is text
 
 
@@ -130,9 +89,9 @@ def test_same_log_same_bytes_in_two_processes(page: str, tmp_path: Path, log: Ep
 
 @pytest.mark.parametrize("name", ["overview", "follow"])
 def test_views_follow_and_labels_name_what_there_is(page: str, name: str) -> None:
-    data = page_data(page)
+    data = data_of(page)
     view = next(view for view in data["views"] if view["name"] == name)
-    objects = {c["path"].split("/")[2] for c in _commands(page) if c["type"] == "set_object"}
+    objects = {c["path"].split("/")[2] for c in commands_of(page) if c["type"] == "set_object"}
     followed = {entry["follows"] for entry in [view, *data["labels"]]} - {None}
     assert followed <= objects and (view["follows"] is not None) == (name == "follow")
     assert np.shape(data["corners"]) == (8, 3)
@@ -140,22 +99,22 @@ def test_views_follow_and_labels_name_what_there_is(page: str, name: str) -> Non
 
 
 def test_animation_comes_last_and_moves_things_that_exist(page: str) -> None:
-    commands = _commands(page)
+    commands = commands_of(page)
     kinds = [command["type"] for command in commands]
     assert kinds.count("set_animation") == 1 and kinds[-1] == "set_animation"
     assert commands[-1]["options"]["play"] is True
-    objects = [command["path"] for command in commands if command["type"] == "set_object"]
-    for path in _tracks(commands):
+    objects = [c["path"].removeprefix("/meshcat/") for c in commands if c["type"] == "set_object"]
+    for path in tracks_of(commands):
         assert any(name == path or name.startswith(path + "/") for name in objects), path
 
 
 def test_every_frame_is_packed_and_shown_in_turn(page: str, log: EpisodeLog) -> None:
-    commands = _commands(page)
-    objects = {command["path"]: command["object"] for command in commands if command["type"] == "set_object"}
-    tracks = _tracks(commands)
+    commands = commands_of(page)
+    objects = {c["path"].removeprefix("/meshcat/") for c in commands if c["type"] == "set_object"}
+    tracks = tracks_of(commands)
     last = log.ticks - 1
     for tick in range(log.ticks):
-        path = f"/meshcat/frames/{tick}"
+        path = f"frames/{tick}"
         assert f"{path}/scan" in objects and f"{path}/horizon" in objects
         assert (f"{path}/detected" in objects) == (len(log.detected[tick]) > 0)
         keys = dict(tracks[path][".visible"])
@@ -167,7 +126,7 @@ def test_every_frame_is_packed_and_shown_in_turn(page: str, log: EpisodeLog) -> 
 
 
 def test_all_tracks_start_at_zero_and_end_together(page: str, log: EpisodeLog) -> None:
-    for path, properties in _tracks(_commands(page)).items():
+    for path, properties in tracks_of(commands_of(page)).items():
         for name, keys in properties.items():
             frames = [frame for frame, _ in keys]
             assert frames[0] == 0 and frames[-1] == log.ticks - 1, (path, name)
@@ -175,27 +134,27 @@ def test_all_tracks_start_at_zero_and_end_together(page: str, log: EpisodeLog) -
 
 
 def test_robot_ghost_and_movers_follow_the_log(page: str, log: EpisodeLog) -> None:
-    tracks = _tracks(_commands(page))
+    tracks = tracks_of(commands_of(page))
     for name, poses in (("robot", log.true_pose), ("estimate", log.estimate), ("odometry", log.dead_reckoning)):
-        track = tracks[f"/meshcat/{name}"]
+        track = tracks[name]
         places = np.array([value for _, value in track[".position"]])
         turns = np.array([value for _, value in track[".quaternion"]])
         np.testing.assert_allclose(places[:, :2], poses[:, :2])
         np.testing.assert_allclose(2 * np.arctan2(turns[:, 2], turns[:, 3]), poses[:, 2], atol=1e-12)
     assert log.moving().tolist() == [True, False, False, True]
-    moved = {path for path in tracks if "/obstacles/" in path}
-    assert moved == {"/meshcat/obstacles/0", "/meshcat/obstacles/3"}
+    moved = {path for path in tracks if path.startswith("obstacles/")}
+    assert moved == {"obstacles/0", "obstacles/3"}
 
 
 def test_the_trail_appears_piece_by_piece_as_the_robot_passes(page: str, log: EpisodeLog) -> None:
     """Each piece is hidden until the robot has driven it, and stays; together they are the whole way."""
-    commands = _commands(page)
+    commands = commands_of(page)
     pieces = [command for command in commands if "/trail/" in command.get("path", "") and "object" in command]
-    tracks = _tracks(commands)
+    tracks = tracks_of(commands)
     last = log.ticks - 1
     assert [int(piece["path"].rpartition("/")[2]) for piece in pieces] == list(range(last))
     for begin, piece in enumerate(pieces):
-        keys = dict(tracks[piece["path"]][".visible"])
+        keys = dict(tracks[piece["path"].removeprefix("/meshcat/")][".visible"])
         for moment in range(log.ticks):
             assert keys[max(time for time in keys if time <= moment)] is (moment > begin)
         data = piece["object"]["geometries"][0]["data"]["attributes"]["position"]["array"].data
@@ -204,7 +163,7 @@ def test_the_trail_appears_piece_by_piece_as_the_robot_passes(page: str, log: Ep
 
 
 def test_objects_are_packed_as_the_viewer_wants_them(page: str) -> None:
-    for command in _commands(page):
+    for command in commands_of(page):
         if command["type"] != "set_object":
             continue
         (geometry,) = command["object"]["geometries"]
@@ -218,7 +177,7 @@ def test_objects_are_packed_as_the_viewer_wants_them(page: str) -> None:
 
 
 def test_horizon_ends_where_the_plan_ends(page: str, log: EpisodeLog) -> None:
-    for command in _commands(page):
+    for command in commands_of(page):
         if command.get("path") == "/meshcat/frames/5/horizon":
             data = command["object"]["geometries"][0]["data"]["attributes"]["position"]["array"].data
             sides = np.frombuffer(data, dtype=np.float32).reshape(-1, 2, 3)
@@ -252,10 +211,10 @@ def test_long_episodes_are_thinned_and_small() -> None:
 
 def test_odd_episodes_are_drawn_too(log: EpisodeLog) -> None:
     single = episode(ticks=1, obstacles=0)
-    assert _commands(drive_scene(single).html())[-1]["type"] == "set_animation"
+    assert commands_of(drive_scene(single).html())[-1]["type"] == "set_animation"
     overview(single)
     lost = replace(log, horizon=np.full_like(log.horizon, np.nan), scan=np.full_like(log.scan, np.nan))
-    paths = {command.get("path") for command in _commands(drive_scene(lost).html())}
+    paths = {command.get("path") for command in commands_of(drive_scene(lost).html())}
     assert "/meshcat/frames/0/horizon" not in paths and "/meshcat/frames/0/scan" not in paths
     with pytest.raises(ScenarioError, match="no tick"):
         drive_scene(replace(log, time=log.time[:0]))
