@@ -12,7 +12,7 @@ import numpy as np
 from unifg.errors import GraphError
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
-from unifg.program.systems import KktSystem, fill
+from unifg.program.systems import KktStructure, KktSystem, fill
 from unifg.typing import Array, BoolArray, IntArray
 
 SOLVED = 1e-6  # residual of a column, in the equilibrated system, that belongs to a determined unknown
@@ -24,7 +24,7 @@ class Covariances:
     """The factorised information of a solution, to be asked repeatedly."""
 
     def __init__(self, program: Program, lin: Linearization, active: BoolArray) -> None:
-        """Factorise.
+        """Factorise, or remember what to.
 
         Args:
             program: the compiled graph.
@@ -32,16 +32,13 @@ class Covariances:
             active: (M,) rows held as equalities.
 
         Raises:
-            GraphError: when the information is singular or not finite.
+            GraphError: when the information is singular.
         """
         self._program = program
-        self._system: KktSystem | None = None
+        self._structure: KktStructure | None = None
         if active.any():
-            self._system = program.systems.kkt(active)
-            data = np.zeros(self._system.pattern.nnz)
-            fill(self._system.arrays, lin.hessian, lin.constraint_jacobian, data)
-            if not self._system.saddle.factor(data):
-                raise GraphError("the covariance does not exist: the Hessian is not finite")
+            self._structure = program.systems.structure(active)
+            self._lin, self._data = lin, np.zeros(0)
             return
         self._factorization = program.systems.normal()
         if not self._factorization.factor(lin.hessian):
@@ -54,19 +51,23 @@ class Covariances:
         """(k, k) covariance over full tangent columns, zero for fixed ones, which are known.
 
         Raises:
-            GraphError: when one of them is not determined.
+            GraphError: when one of them is not determined, or the information is not finite.
         """
         chosen = self._program.columns.unknown[columns]
         free = np.flatnonzero(chosen >= 0)
         result = np.zeros((len(columns), len(columns)))
         if not len(free):
             return result
-        block = (
-            self._factorization.inverse_block(chosen[free])
-            if self._system is None
-            else _inverse_block(self._system, chosen[free])
-        )
-        result[np.ix_(free, free)] = block
+        if self._structure is None:
+            result[np.ix_(free, free)] = self._factorization.inverse_block(chosen[free])
+            return result
+        with self._structure.borrowed() as system:
+            if not len(self._data):
+                self._data = np.zeros(system.pattern.nnz)
+                fill(system.arrays, self._lin.hessian, self._lin.constraint_jacobian, self._data)
+            if not system.load(self._data):
+                raise GraphError("the covariance does not exist: the Hessian is not finite")
+            result[np.ix_(free, free)] = _inverse_block(system, chosen[free])
         return result
 
     def blocks(self, columns: IntArray) -> Array:
@@ -75,7 +76,7 @@ class Covariances:
         Raises:
             GraphError: when one of them is not determined.
         """
-        if self._system is not None:
+        if self._structure is not None:
             return np.array([self.joint(row) for row in columns])
         chosen = self._program.columns.unknown[columns]
         _, first, node = np.unique(self._program.blocks, return_index=True, return_inverse=True)

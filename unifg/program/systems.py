@@ -7,12 +7,12 @@ elimination tree. Ordering and layout cost more than a factorisation, and are th
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
 from functools import cached_property
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from unifg.program.passes import transposed_times
 from unifg.program.table import TermArrays
 from unifg.typing import Array, BoolArray, IntArray
 
+T = TypeVar("T")
 KEPT = 8  # structures of KKT matrices; active rows may change from solve to solve
 
 
@@ -52,27 +53,36 @@ class Systems:
         """A factorisation for matrices in the pattern ``Program.normal``, to keep."""
         return self._normal.twin()
 
-    @contextmanager
-    def borrowed(self) -> Iterator[Factorization]:
+    def borrowed(self) -> AbstractContextManager[Factorization]:
         """The same for one question: its memory serves the next one too."""
-        try:
-            factorization = self._spare.pop()
-        except IndexError:
-            factorization = self.normal()
-        try:
-            yield factorization
-        finally:
-            self._spare.append(factorization)
+        return _borrowed(self._spare, self.normal)
 
     def kkt(self, held: BoolArray) -> KktSystem:
-        """The KKT matrix with some rows of the constraints (M,) held as equalities."""
-        key = np.packbits(held).tobytes()
+        """The KKT matrix with some rows of the constraints (M,) held as equalities, to keep."""
+        return KktSystem(self.structure(held))
+
+    def structure(self, held: BoolArray) -> KktStructure:
+        """What all KKT matrices with these rows held share."""
+        key = held.tobytes()
         with self._lock:
             structure = self._held.pop(key, None) or KktStructure.of(*self._asked, held)
             self._held[key] = structure  # the one used last stands last
             while len(self._held) > KEPT:
                 del self._held[next(iter(self._held))]
-        return KktSystem(structure)
+        return structure
+
+
+@contextmanager
+def _borrowed(spare: list[T], make: Callable[[], T]) -> Iterator[T]:
+    """One that nobody uses now, or a new one; it is spare again afterwards."""
+    try:
+        found = spare.pop()
+    except IndexError:
+        found = make()
+    try:
+        yield found
+    finally:
+        spare.append(found)
 
 
 class KktArrays(NamedTuple):
@@ -109,12 +119,18 @@ class KktStructure:
         factorization: of the matrix, in which every pivot of a multiplier is expected to be negative; never used but
             for its structure.
         arrays: all of :class:`KktArrays` but the plan, in its order.
+        spare: systems that nobody uses now.
     """
 
     held: BoolArray
     unknowns: int
     factorization: Factorization
     arrays: tuple[IntArray, ...]
+    spare: list[KktSystem] = field(default_factory=list)
+
+    def borrowed(self) -> AbstractContextManager[KktSystem]:
+        """A system for one question: its memory, and its factor if nobody has replaced it, serve the next one too."""
+        return _borrowed(self.spare, lambda: KktSystem(self))
 
     @staticmethod
     def of(normal: Symmetric, blocks: IntArray, constraints: Rows, held: BoolArray) -> KktStructure:
@@ -151,6 +167,7 @@ class KktSystem:
         pattern: upper triangle of the matrix, unknowns first.
         factorization: of the matrix, in which every pivot of a multiplier is expected to be negative.
         saddle: the same, for solving without a shift.
+        loaded: entries that it was factorised with by :meth:`load`.
     """
 
     def __init__(self, structure: KktStructure) -> None:
@@ -160,6 +177,16 @@ class KktSystem:
         self.factorization = structure.factorization.twin()
         self.pattern = self.factorization.pattern
         self.saddle = SaddlePoint(self.factorization, structure.unknowns)
+        self.loaded: Array | None = None
+
+    def load(self, data: Array) -> bool:
+        """Factorise ``data`` (nnz,), unless it was the last to be; False when an entry is not finite."""
+        if self.loaded is not data:
+            self.loaded = None
+            if not self.saddle.factor(data):
+                return False
+            self.loaded = data
+        return True
 
     @cached_property
     def arrays(self) -> KktArrays:
