@@ -279,3 +279,38 @@ def test_no_machine_paths() -> None:
 def test_machine_paths_are_recognised() -> None:
     assert MACHINE_PATH.search("open('" + "/home" + "/me/map.yaml')")
     assert not MACHINE_PATH.search("https://example.org/home/me and ../shared/work/map.yaml")
+
+
+# What Numba and llvmlite do not promise: modules below the surface, and the inside of what njit returns.
+PRIVATE_MODULE = re.compile(r"^(numba\.(core|extending|np|cpython|misc|experimental|typed|types)|llvmlite)(\.|$)")
+PRIVATE_NAME = re.compile(r"\.(py_func|overloads|targetoptions|get_pointer_to_function|_cache|nopython_signatures)\b")
+
+
+def private_sides(source: str) -> list[str]:
+    """List where a source reaches into Numba."""
+    modules = [f"line {line}: {name}" for line, name in imports(ast.parse(source)) if PRIVATE_MODULE.match(name)]
+    lines = enumerate(source.splitlines(), start=1)
+    return modules + [f"line {number}: {line.strip()}" for number, line in lines if PRIVATE_NAME.search(line)]
+
+
+def test_only_the_machine_knows_the_inside_of_numba() -> None:
+    wrong = {
+        name_of(path): found
+        for package, path in HOUSE
+        if room_of(module_of(package, path)) != "machine" and (found := private_sides(path.read_text(encoding="utf-8")))
+    }
+    assert wrong == {}
+    inside = [path for package, path in LIBRARY if room_of(module_of(package, path)) == "machine"]
+    assert any(private_sides(path.read_text(encoding="utf-8")) for path in inside)  # the witness sees what there is
+
+
+def test_numba_is_one_that_the_machine_knows() -> None:
+    """The range of pyproject.toml ends at the newest release that these tests have run on."""
+    from importlib.metadata import version
+
+    text = (CHECKOUT / "pyproject.toml").read_text(encoding="utf-8")
+    found = re.search(r'"numba>=(\d+)\.(\d+),<(\d+)\.(\d+)"', text)
+    assert found is not None, "pyproject.toml gives numba no range"
+    oldest, beyond = (int(found[1]), int(found[2])), (int(found[3]), int(found[4]))
+    major, minor = (int(part) for part in version("numba").split(".")[:2])
+    assert oldest <= (major, minor) < beyond

@@ -203,3 +203,32 @@ def test_console_script(clean: Path) -> None:
     for extra in EXTRAS:
         pytest.importorskip(extra)
     assert config()["project"]["version"] in run(clean / "unifg", "--version", cwd=clean)
+
+
+@pytest.mark.parametrize("installed", [False, True], ids=["not installed", "installed"])
+@pytest.mark.parametrize("links", ["text files", "missing"])
+def test_a_checkout_without_links_finds_its_side_folders(links: str, installed: bool, tmp_path: Path) -> None:
+    """Where Git or an archive makes no symbolic links, a checkout still imports everything."""
+    ignored = shutil.ignore_patterns("__pycache__", *SIDES)
+    checkout = tmp_path / "checkout"
+    shutil.copytree(CHECKOUT / "unifg", checkout / "unifg", ignore=ignored)
+    for side in SIDES:
+        shutil.copytree(CHECKOUT / side, checkout / side, ignore=shutil.ignore_patterns("__pycache__"))
+        if links == "text files":
+            (checkout / "unifg" / side).write_text(f"../{side}", encoding="utf-8")
+    paths = [sysconfig.get_paths()["purelib"], sysconfig.get_paths()["platlib"]]
+    if installed:  # as a wheel lies in an environment
+        shutil.copytree(checkout / "unifg", tmp_path / "environment" / "unifg", ignore=ignored)
+        for side in SIDES:
+            (tmp_path / "environment" / "unifg" / side).unlink(missing_ok=True)
+            shutil.copytree(checkout / side, tmp_path / "environment" / "unifg" / side)
+        paths.insert(0, str(tmp_path / "environment"))
+    asked = "import unifg, unifg.solvers.names, unifg.models, unifg.scenarios; "
+    asked += "print(*[m.__file__ for m in (unifg, unifg.solvers, unifg.models, unifg.scenarios)], sep='\\n')"
+    environment = {"PYTHONPATH": os.pathsep.join(paths), "PATH": os.environ.get("PATH", "")}
+    for cwd, home in [(checkout, checkout)] + ([(tmp_path, tmp_path / "environment" / "unifg")] if installed else []):
+        done = subprocess.run(  # -S: site would find an editable installation of this checkout
+            [sys.executable, "-S", "-c", asked], cwd=cwd, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        assert all(Path(line).is_relative_to(home) for line in done.stdout.splitlines()), done.stdout

@@ -10,7 +10,8 @@ graph.minimize(fg.between, x[0], x[1], [1.0, 0.0, 0.3], sigma=0.1)
 solution = SQP().solve(graph, {x: np.zeros((2, 3))})
 """
 
-from importlib.metadata import PackageNotFoundError, version
+from importlib import metadata as _metadata
+from pathlib import Path as _Path
 
 from unifg.answers.check import Finding, Report
 from unifg.answers.graph import Graph
@@ -49,11 +50,17 @@ from unifg.lie import (
     elementwise,
     wrap_angle,
 )
+from unifg.machine.jit import compiled
 from unifg.smoothing import FixedLag, Incremental
 
+_HERE = _Path(__file__).resolve().parent
+# Where links are lost (Windows, some archives), a checkout finds its side folders beside this one.
+if not (_HERE / "solvers" / "__init__.py").is_file() and (_HERE.parent / "solvers" / "__init__.py").is_file():
+    __path__.append(str(_HERE.parent))
+
 try:
-    __version__ = version("unifg")
-except PackageNotFoundError:  # running from a source tree that was never installed
+    __version__ = _metadata.version("unifg")
+except _metadata.PackageNotFoundError:  # running from a source tree that was never installed
     __version__ = "0.0.0"
 
 __all__ = [
@@ -103,6 +110,7 @@ __all__ = [
     "Verdict",
     "between",
     "check_manifold",
+    "compiled",
     "difference",
     "elementwise",
     "joint_prior",
@@ -111,3 +119,8 @@ __all__ = [
     "residual",
     "wrap_angle",
 ]
+
+
+def __dir__() -> list[str]:
+    """List what is public; the rooms are imported by name, as ``unifg.solvers``."""
+    return [*__all__, "__version__"]
