@@ -51,7 +51,8 @@ def views_without_references() -> None:
 @compiled
 def four(x: Array) -> float:
     store(x, 0, load(x, 4))
-    return total(splat(1.5)) + x[3]
+    found: float = total(splat(1.5)) + x[3]
+    return found
 
 
 def vectors_of_four() -> None:
