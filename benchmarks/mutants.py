@@ -92,6 +92,8 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "scenarios/driving/route.py": ("route", "navigation"),
     "scenarios/horizon/loop.py": ("control_decisions", "quadrotor_decisions", "navigation"),
     "scenarios/horizon/past.py": ("joint", "control_decisions", "quadrotor_estimator"),
+    "scenarios/log/columns.py": ("metrics",),
+    "scenarios/options.py": ("cli",),
     "scenarios/show/drive_scene.py": ("scene",),
     "scenarios/show/stage.py": ("scene", "quadrotor_scene"),
     "scenarios/worlds/placement.py": ("unforeseen",),
