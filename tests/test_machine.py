@@ -74,6 +74,23 @@ def stamps_callees() -> None:
     assert is_compiled(caller) and stamp(caller) != stamp(double)
 
 
+def test_constants_are_stamped_in_full() -> None:
+    """Arrays are compiled in; two that differ in the middle print alike."""
+
+    def reading(table: Array) -> Callable[[int], float]:
+        @compiled
+        def read(k: int) -> float:
+            return float(table[k])
+
+        return read
+
+    table, other = np.zeros(5000), np.zeros(5000)
+    other[2500] = 1e-12
+    assert repr(table) == repr(other)
+    assert stamp(reading(table)) != stamp(reading(other))
+    assert stamp(reading(table)) == stamp(reading(table.copy()))
+
+
 @in_order
 def rest(x: float, h: float) -> float:
     return (x + h) - x

@@ -19,6 +19,7 @@ from types import FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
 
@@ -127,12 +128,17 @@ def _parts(function: Any, seen: set[int]) -> Iterator[str]:
         if is_compiled(cell.cell_contents):
             yield from _parts(cell.cell_contents, seen)
         else:
-            yield f"{python.__qualname__} {cell.cell_contents!r}"
+            yield f"{python.__qualname__} {_constant(cell.cell_contents)}"
     for name in code.co_names:
         found = python.__globals__.get(name)
-        if isinstance(found, int | float | str | tuple):  # constants are compiled in
-            yield f"{name} = {found!r}"
+        if isinstance(found, int | float | str | tuple | np.ndarray):  # constants are compiled in
+            yield f"{name} = {_constant(found)}"
         candidates = [getattr(found, n, None) for n in code.co_names] if isinstance(found, ModuleType) else [found]
         for callee in candidates:
             if is_compiled(callee):
                 yield from _parts(callee, seen)
+
+
+def _constant(value: Any) -> str:
+    """A number or an array in full: printed arrays leave out digits, and large ones their middle."""
+    return f"{value.shape} {value.tobytes().hex()}" if isinstance(value, np.ndarray) else repr(value)
