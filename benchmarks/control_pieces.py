@@ -17,7 +17,6 @@ from unifg.machine.links import run
 from unifg.program import passes
 from unifg.program.curvature import add_curvature
 from unifg.solvers import InteriorPoint
-from unifg.solvers.interior_point import state
 
 REPEATS, ROUNDS = 500, 7
 
@@ -37,10 +36,10 @@ def measure(problem: Problem) -> dict[str, float]:
     workspace, program = prepared._workspace, prepared.program
     links, work = workspace.problem.links, workspace.work
     pieces: dict[str, float] = {}
-    for name, function in (("assemble, factorise, solve", state.DIRECT), ("solve again", state.STEER),
-                           ("trial: move and evaluate", state.ADVANCE), ("KKT numbers", state.MEASURE)):  # fmt: skip
-        _many(links[function], workspace._address, 3)
-        pieces[name] = _least(partial(_many, links[function], workspace._address, REPEATS)) / REPEATS
+    for name, function in (("assemble, factorise, solve", "direct"), ("solve again", "steer"),
+                           ("trial: move and evaluate", "advance"), ("KKT numbers", "measure")):  # fmt: skip
+        _many(links[0][function], workspace._address, 3)
+        pieces[name] = _least(partial(_many, links[0][function], workspace._address, REPEATS)) / REPEATS
     lin = program.linearize(solution.values)
     entries, norms = lin.hessian.copy(), np.empty(len(program.arrays.fields))
     squares, gradient = np.empty(0), lin.gradient.copy()

@@ -130,7 +130,7 @@ def test_control_c_in_the_compiled_loop_ends_it(monkeypatch: pytest.MonkeyPatch,
     undisturbed = run.solve(stated.guess)
     call = Workspace.call
 
-    def pressed(workspace: Workspace, what: int) -> None:
+    def pressed(workspace: Workspace, what: str) -> None:
         call(workspace, what)
         raise KeyboardInterrupt
 
@@ -165,7 +165,7 @@ def test_control_c_before_the_compiled_loop_is_passed_on(monkeypatch: pytest.Mon
     run = InteriorPoint(tolerance=1e-4).prepare(stated.graph)
     before = run.solve(stated.guess, check=True)
 
-    def pressed(workspace: Workspace, what: int) -> None:
+    def pressed(workspace: Workspace, what: str) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:

@@ -35,6 +35,7 @@ problem.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -43,67 +44,14 @@ from unifg.machine.links import linked, parts, run
 from unifg.program.passes import transposed_times
 from unifg.program.table import BOUND, COLUMN, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
 from unifg.solvers.interior_point.state import (
-    ANSWER,
-    ASKED,
-    BORDER,
-    COLD,
-    COMPLEMENTARITY,
     CONVERGED,
-    CORRECTED,
-    COST,
-    COST_UNIT,
-    DE,
-    DELTA,
-    DN,
-    DP,
-    DS,
-    DY,
-    ELASTIC,
-    FAILURES,
-    FILTERED,
-    FORCE,
-    GAP,
-    GAUSS_NEWTON,
-    ITERATION,
-    KEPT,
-    LAST_DELTA,
-    LEAST,
-    LIMIT,
     LIMIT_REACHED,
-    MEASURE,
-    MOST,
-    MU,
     NOT_FINITE,
-    PAID,
-    PHI,
-    RAISES,
-    RELAX,
-    RHO,
-    SCALE,
-    SCALING,
-    SHORT_STEPS,
-    SIDES,
-    SIGN,
     STALLED,
-    STATIONARITY,
-    STEP,
-    STEP_TOLERANCE,
     STOPPED,
-    TAKEN,
-    THETA,
-    THETA_LARGE,
-    THETA_SMALL,
-    TOLERANCE,
-    TRIALS,
     TRY,
     VIOLATED,
-    VIOLATION,
-    VIOLATION_TOLERANCE,
-    E,
-    N,
-    P,
-    S,
-    Y,
+    Records,
 )
 from unifg.typing import Array, IntArray
 
@@ -126,11 +74,9 @@ WARM_MU = 1e-5  # largest first mu of a start with multipliers: what is active h
 
 @compiled
 def merit(
-    numbers: Array,
-    counts: IntArray,
-    sides: Array,
-    side_row: IntArray,
-    pairs: Array,
+    now: Any,
+    sides: Records,
+    pairs: Records,
     prices: Array,
     row_units: Array,
     rows: IntArray,
@@ -141,10 +87,10 @@ def merit(
 ) -> tuple[float, float]:
     """Barrier function, and violation of sides and equality rows, after a step of what makes them elastic."""
     elastic, logarithms, product, theta = 0.0, 0.0, 1.0, 0.0
-    for k in range(counts[SIDES]):
-        s, e = sides[S, k] + alpha * sides[DS, k], sides[E, k] + alpha * sides[DE, k]
-        row = side_row[k]
-        c = sides[SIGN, k] * (constraints[row] - sides[BORDER, k])
+    for k in range(now.sides):
+        s, e = sides[k].s + alpha * sides[k].ds, sides[k].e + alpha * sides[k].de
+        row = sides[k].row
+        c = sides[k].sign * (constraints[row] - sides[k].border)
         theta += abs(c + e - s) / row_units[row]
         elastic += prices[row] * e
         product *= s * e
@@ -152,13 +98,13 @@ def merit(
             logarithms += math.log(product)
             product = 1.0
     logarithms += math.log(product)
-    if counts[ELASTIC] == 0:
+    if now.elastic == 0:
         for row in rows:
             theta += abs(constraints[row] - lower[row]) / row_units[row]
     else:
         product = 1.0
         for k in range(len(rows)):
-            row, p, n = rows[k], pairs[P, k] + alpha * pairs[DP, k], pairs[N, k] + alpha * pairs[DN, k]
+            row, p, n = rows[k], pairs[k].p + alpha * pairs[k].dp, pairs[k].n + alpha * pairs[k].dn
             theta += abs(constraints[row] - lower[row] - p + n) / row_units[row]
             elastic += prices[row] * (p + n)
             product *= p * n
@@ -166,7 +112,7 @@ def merit(
                 logarithms += math.log(product)
                 product = 1.0
         logarithms += math.log(product)
-    return cost + elastic - numbers[MU] * logarithms, theta
+    return cost + elastic - now.mu * logarithms, theta
 
 
 @compiled
@@ -183,21 +129,22 @@ def _split(c: float, rho: float, mu: float) -> tuple[float, float]:
 @linked
 def measure(address: int) -> None:
     """KKT numbers of the problem at the present iterate, and what the error of the barrier problem is made of."""
-    constraint_jacobian, constraints, counts, free = parts(address, "constraint_jacobian constraints counts free")
-    full, gradient, multipliers, numbers, side_row = parts(address, "full gradient multipliers numbers side_row")
-    pairs, prices, row_units, rows, sides = parts(address, "pairs prices row_units rows sides")
-    terms, units = parts(address, "terms units")
+    constraint_jacobian, constraints, free = parts(address, "constraint_jacobian constraints free")
+    full, gradient, multipliers, pairs, prices = parts(address, "full gradient multipliers pairs prices")
+    row_units, rows, scalars, sides, terms = parts(address, "row_units rows scalars sides terms")
+    (units,) = parts(address, "units")
+    now = scalars[0]
     lower, upper, constraints, full = terms.lower, terms.upper, constraints, full
     gap, least, most = 0.0, math.inf, -math.inf
-    for k in range(counts[SIDES]):
-        multipliers[side_row[k]] = 0.0
-    for k in range(counts[SIDES]):
-        row, y = side_row[k], sides[Y, k]
-        multipliers[row] -= sides[SIGN, k] * y
-        sy, ez = sides[S, k] * y, sides[E, k] * (prices[row] - y)
+    for k in range(now.sides):
+        multipliers[sides[k].row] = 0.0
+    for k in range(now.sides):
+        row, y = sides[k].row, sides[k].y
+        multipliers[row] -= sides[k].sign * y
+        sy, ez = sides[k].s * y, sides[k].e * (prices[row] - y)
         least, most = min(least, min(sy, ez)), max(most, max(sy, ez))
-        c = sides[SIGN, k] * (constraints[row] - sides[BORDER, k])
-        gap = max(gap, abs(c + sides[E, k] - sides[S, k]) / row_units[row])
+        c = sides[k].sign * (constraints[row] - sides[k].border)
+        gap = max(gap, abs(c + sides[k].e - sides[k].s) / row_units[row])
     for k in range(len(full)):
         full[k] = gradient[k]
     transposed_times(terms, False, constraint_jacobian, multipliers, full)
@@ -217,26 +164,26 @@ def measure(address: int) -> None:
             limit = upper[row] if multiplier > 0.0 else lower[row]
             slack = abs(value - limit) if math.isfinite(limit) else 1.0
             complementarity = max(complementarity, abs(multiplier) * slack)
-    if counts[ELASTIC] == 0:
+    if now.elastic == 0:
         for row in rows:
             gap = max(gap, abs(constraints[row] - lower[row]) / row_units[row])
     else:
         for k in range(len(rows)):
-            row, p, n = rows[k], pairs[P, k], pairs[N, k]
+            row, p, n = rows[k], pairs[k].p, pairs[k].n
             pz, nz = p * (prices[row] - multipliers[row]), n * (prices[row] + multipliers[row])
             least, most = min(least, min(pz, nz)), max(most, max(pz, nz))
             gap = max(gap, abs(constraints[row] - lower[row] - p + n) / row_units[row])
     scale = max(1.0, size / max(1, len(constraints)) / 100.0)
-    numbers[SCALE], numbers[STATIONARITY], numbers[VIOLATION] = scale, stationarity / scale, violation
-    numbers[COMPLEMENTARITY], numbers[GAP], numbers[LEAST], numbers[MOST] = complementarity / scale, gap, least, most
-    numbers[FORCE], numbers[PAID] = force / scale, paid
+    now.scale, now.stationarity, now.violation = scale, stationarity / scale, violation
+    now.complementarity, now.gap, now.least, now.most = complementarity / scale, gap, least, most
+    now.force, now.paid = force / scale, paid
 
 
 @compiled
-def _error(numbers: Array) -> float:
+def _error(now: Any) -> float:
     """Error of the barrier problem."""
-    centring = max(numbers[MOST] - numbers[MU], numbers[MU] - numbers[LEAST]) / numbers[SCALE]
-    error: float = max(max(numbers[FORCE], numbers[GAP]), centring)
+    centring = max(now.most - now.mu, now.mu - now.least) / now.scale
+    error: float = max(max(now.force, now.gap), centring)
     return error
 
 
@@ -321,12 +268,11 @@ def _find_units(
 @linked
 def begin(address: int) -> None:
     """Find the sides; choose mu, slacks and multipliers of a start that has been linearised."""
-    constraints, counts, links, multipliers, numbers = parts(address, "constraints counts links multipliers numbers")
-    constraint_jacobian, free, gradient, pairs, prices = parts(
-        address, "constraint_jacobian free gradient pairs prices"
-    )
-    full, row_units, rows, side_row, sides = parts(address, "full row_units rows side_row sides")
+    constraint_jacobian, constraints, free = parts(address, "constraint_jacobian constraints free")
+    full, gradient, links, multipliers, pairs = parts(address, "full gradient links multipliers pairs")
+    prices, row_units, rows, scalars, sides = parts(address, "prices row_units rows scalars sides")
     terms, units = parts(address, "terms units")
+    now = scalars[0]
     lower, upper = terms.lower, terms.upper
     count = 0
     for row in range(len(lower)):
@@ -334,158 +280,157 @@ def begin(address: int) -> None:
             for which in range(2):
                 limit = lower[row] if which == 0 else upper[row]
                 if math.isfinite(limit):
-                    side_row[count] = row
-                    sides[SIGN, count], sides[BORDER, count] = 1.0 - 2.0 * which, limit
+                    sides[count].row = row
+                    sides[count].sign, sides[count].border = 1.0 - 2.0 * which, limit
                     count += 1
-    counts[SIDES], counts[ELASTIC] = count, 0 if len(rows) else 1
-    numbers[COST_UNIT] = 1.0
-    if counts[SCALING] == 1:
+    now.sides, now.elastic = count, 0 if len(rows) else 1
+    now.cost_unit = 1.0
+    if now.scaling == 1:
         _find_units(terms, constraint_jacobian, row_units, units, prices, full)
         pull = 0.0
         for column in free:
             pull = max(pull, abs(gradient[column]) * units[column])
         if pull > LARGE_PULL:
-            unit = numbers[COST_UNIT] = pull / LARGE_PULL
-            numbers[RHO] *= unit
-            numbers[MU] *= unit
+            unit = now.cost_unit = pull / LARGE_PULL
+            now.rho *= unit
+            now.mu *= unit
     largest = 0.0
     for row in range(len(lower)):
         largest = max(largest, abs(multipliers[row]) * row_units[row])
     warm = largest > 0.0
-    counts[COLD] = 0 if warm else 1
-    if largest > 0.5 * numbers[RHO]:
-        numbers[RHO] = 10.0 * largest
+    now.cold = 0 if warm else 1
+    if largest > 0.5 * now.rho:
+        now.rho = 10.0 * largest
     for row in range(len(lower)):
-        prices[row] = numbers[RHO] / row_units[row]
+        prices[row] = now.rho / row_units[row]
     if warm:
         for k in range(count):
-            c = sides[SIGN, k] * (constraints[side_row[k]] - sides[BORDER, k])
-            y = min(max(-sides[SIGN, k] * multipliers[side_row[k]], 0.0), 0.9 * prices[side_row[k]])
-            sides[Y, k], sides[S, k], sides[E, k] = y, c, 0.0
-        run(links[MEASURE], (address,))
-        error = max(max(numbers[STATIONARITY], numbers[VIOLATION]), numbers[COMPLEMENTARITY])
-        numbers[MU] = max(min(0.1 * error, WARM_MU), 0.1 * numbers[TOLERANCE])
-    mu = numbers[MU]
+            c = sides[k].sign * (constraints[sides[k].row] - sides[k].border)
+            y = min(max(-sides[k].sign * multipliers[sides[k].row], 0.0), 0.9 * prices[sides[k].row])
+            sides[k].y, sides[k].s, sides[k].e = y, c, 0.0
+        run(links[0].measure, (address,))
+        error = max(max(now.stationarity, now.violation), now.complementarity)
+        now.mu = max(min(0.1 * error, WARM_MU), 0.1 * now.tolerance)
+    mu = now.mu
     for k in range(count):
-        row = side_row[k]
+        row = sides[k].row
         unit, price = row_units[row], prices[row]
-        c = sides[SIGN, k] * (constraints[row] - sides[BORDER, k])
+        c = sides[k].sign * (constraints[row] - sides[k].border)
         if warm:
-            s = max(c, min(mu / max(sides[Y, k], 1e-3 * mu / unit), FIRST_SLACK * unit))
-            y = max(sides[Y, k], mu / s)
+            s = max(c, min(mu / max(sides[k].y, 1e-3 * mu / unit), FIRST_SLACK * unit))
+            y = max(sides[k].y, mu / s)
         else:
             s = max(c, FIRST_SLACK * unit)
             y = mu / s
         y = min(y, 0.9 * price)
-        sides[Y, k], sides[S, k], sides[E, k] = y, s, mu / (price - y)
-        sides[DS, k] = sides[DE, k] = sides[DY, k] = 0.0
-    theta = merit(numbers, counts, sides, side_row, pairs, prices, row_units, rows, lower, 0.0, constraints, 0.0)[1]
-    numbers[THETA_SMALL], numbers[THETA_LARGE] = 1e-4 * max(1.0, theta), 1e4 * max(1.0, theta)
-    counts[FILTERED] = counts[FAILURES] = counts[SHORT_STEPS] = 0
-    numbers[DELTA] = numbers[LAST_DELTA] = numbers[STEP] = numbers[TAKEN] = 0.0
-    run(links[MEASURE], (address,))
+        sides[k].y, sides[k].s, sides[k].e = y, s, mu / (price - y)
+        sides[k].ds = sides[k].de = sides[k].dy = 0.0
+    theta = merit(now, sides, pairs, prices, row_units, rows, lower, 0.0, constraints, 0.0)[1]
+    now.theta_small, now.theta_large = 1e-4 * max(1.0, theta), 1e4 * max(1.0, theta)
+    now.filtered = now.failures = now.short_steps = 0
+    now.delta = now.last_delta = now.step = now.taken = 0.0
+    run(links[0].measure, (address,))
 
 
 @linked
 def test(address: int) -> None:
     """Test the iterate; if there is to be a step, lower mu and measure what the line search compares with."""
-    constraints, counts, links, log, numbers, rows = parts(address, "constraints counts links log numbers rows")
-    constraint_jacobian, free, full, gradient, kept = parts(address, "constraint_jacobian free full gradient kept")
+    constraint_jacobian, constraints, free = parts(address, "constraint_jacobian constraints free")
+    full, gradient, kept, links, log = parts(address, "full gradient kept links log")
     multipliers, pairs, prices, row_units = parts(address, "multipliers pairs prices row_units")
-    side_row, sides = parts(address, "side_row sides")
-    terms, values = parts(address, "terms values")
-    if counts[FAILURES] == 0:
-        row = log[min(counts[ITERATION], len(log) - 1)]
-        row[0], row[1], row[2] = numbers[COST], numbers[STATIONARITY], numbers[VIOLATION]
-        row[3], row[4], row[5] = numbers[COMPLEMENTARITY], numbers[STEP], numbers[TAKEN]
-        row[6], row[7], row[8] = numbers[MU], numbers[DELTA], counts[GAUSS_NEWTON]
-    tolerance = numbers[TOLERANCE]
-    worst = max(max(numbers[STATIONARITY], numbers[VIOLATION]), numbers[COMPLEMENTARITY])
-    if not math.isfinite(numbers[STATIONARITY] + numbers[VIOLATION] + numbers[COST]):
-        counts[ANSWER] = NOT_FINITE
+    rows, scalars, sides, terms, values = parts(address, "rows scalars sides terms values")
+    now = scalars[0]
+    if now.failures == 0:
+        row = log[min(now.iteration, len(log) - 1)]
+        row[0], row[1], row[2] = now.cost, now.stationarity, now.violation
+        row[3], row[4], row[5] = now.complementarity, now.step, now.taken
+        row[6], row[7], row[8] = now.mu, now.delta, now.gauss_newton
+    tolerance = now.tolerance
+    worst = max(max(now.stationarity, now.violation), now.complementarity)
+    if not math.isfinite(now.stationarity + now.violation + now.cost):
+        now.answer = NOT_FINITE
         return
-    guessed = counts[COLD] == 1 and counts[ITERATION] == 0 and counts[SIDES] > 0  # large multipliers hide forces
+    guessed = now.cold == 1 and now.iteration == 0 and now.sides > 0  # large multipliers hide forces
     if worst <= tolerance and not guessed:
-        counts[ANSWER] = CONVERGED
+        now.answer = CONVERGED
         return
     # With a larger mu, what is active has not been found, and short steps are those towards another problem's answer.
-    if numbers[STEP] < numbers[STEP_TOLERANCE] * numbers[TAKEN] and numbers[MU] <= WARM_MU:
-        if numbers[VIOLATION] < numbers[VIOLATION_TOLERANCE]:
-            counts[ANSWER] = STOPPED
+    if now.step < now.step_tolerance * now.taken and now.mu <= WARM_MU:
+        if now.violation < now.violation_tolerance:
+            now.answer = STOPPED
             return
-    if numbers[VIOLATION] <= tolerance:
-        counts[KEPT] = 1
+    if now.violation <= tolerance:
+        now.kept = 1
         for k in range(len(values)):
             kept[k] = values[k]
-    if counts[ITERATION] >= counts[LIMIT]:
-        counts[ANSWER] = LIMIT_REACHED
+    if now.iteration >= now.limit:
+        now.answer = LIMIT_REACHED
         return
-    if numbers[COST] < BOTTOMLESS * numbers[COST_UNIT] and numbers[VIOLATION] > tolerance:
-        counts[ANSWER] = STALLED  # no price holds back an objective that falls faster than violation grows
+    if now.cost < BOTTOMLESS * now.cost_unit and now.violation > tolerance:
+        now.answer = STALLED  # no price holds back an objective that falls faster than violation grows
         return
-    if counts[SHORT_STEPS] >= MOST_SHORT_STEPS and counts[ELASTIC] == 0 and numbers[VIOLATION] > tolerance:
-        run(links[RELAX], (address,))
+    if now.short_steps >= MOST_SHORT_STEPS and now.elastic == 0 and now.violation > tolerance:
+        run(links[0].relax, (address,))
     smallest = 0.1 * tolerance
     bound = False
-    if _error(numbers) <= SOLVED * numbers[MU] and numbers[VIOLATION] > tolerance:
+    if _error(now) <= SOLVED * now.mu and now.violation > tolerance:
         # Whether something is violated because its price is too low, or because it has to be. With the least mu that
         # is told by a solved problem: a step before, equalities without a price may still be on their way.
-        bound = numbers[MU] <= smallest and _error(numbers) <= tolerance
-        if numbers[MU] <= LATE_MU * min(numbers[PAID], numbers[RHO]):
-            for k in range(counts[SIDES]):
-                bound = bound or (sides[Y, k] > AT_PRICE * prices[side_row[k]] and sides[E, k] > tolerance)
-            for k in range(len(rows) if counts[ELASTIC] == 1 else 0):
-                row, away = rows[k], max(pairs[P, k], pairs[N, k])
+        bound = now.mu <= smallest and _error(now) <= tolerance
+        if now.mu <= LATE_MU * min(now.paid, now.rho):
+            for k in range(now.sides):
+                bound = bound or (sides[k].y > AT_PRICE * prices[sides[k].row] and sides[k].e > tolerance)
+            for k in range(len(rows) if now.elastic == 1 else 0):
+                row, away = rows[k], max(pairs[k].p, pairs[k].n)
                 bound = bound or (abs(multipliers[row]) > AT_PRICE * prices[row] and away > tolerance)
         if bound:
             pull, push = _forces(terms, free, gradient, multipliers, constraint_jacobian, full)
-            run(links[MEASURE], (address,))  # it was written over
-            highest = counts[RAISES] >= MOST_RAISES
-            if numbers[ASKED] < numbers[RHO] and (highest or pull <= SMALL_PULL * push):
-                numbers[ASKED], counts[ANSWER] = numbers[RHO], VIOLATED
+            run(links[0].measure, (address,))  # it was written over
+            highest = now.raises >= MOST_RAISES
+            if now.asked < now.rho and (highest or pull <= SMALL_PULL * push):
+                now.asked, now.answer = now.rho, VIOLATED
                 return
             if highest:
-                counts[ANSWER] = STALLED
+                now.answer = STALLED
                 return
-            counts[RAISES] += 1
-            numbers[RHO] *= 10.0
+            now.raises += 1
+            now.rho *= 10.0
             for row in range(len(prices)):
                 prices[row] *= 10.0
-            numbers[PAID] *= 10.0
-            run(links[RELAX], (address,))
-    while not bound and _error(numbers) <= KAPPA * numbers[MU] and numbers[MU] > smallest:
-        less = min(0.2 * numbers[MU], numbers[MU] ** 1.5)
-        numbers[MU] = less if less > tolerance else smallest
-        counts[FILTERED] = 0
-    cost, lower = numbers[COST], terms.lower
-    phi, theta = merit(numbers, counts, sides, side_row, pairs, prices, row_units, rows, lower, cost, constraints, 0.0)
-    numbers[PHI], numbers[THETA] = phi, theta
-    counts[TRIALS], counts[CORRECTED], counts[ANSWER] = 0, 0, TRY
+            now.paid *= 10.0
+            run(links[0].relax, (address,))
+    while not bound and _error(now) <= KAPPA * now.mu and now.mu > smallest:
+        less = min(0.2 * now.mu, now.mu**1.5)
+        now.mu = less if less > tolerance else smallest
+        now.filtered = 0
+    cost, lower = now.cost, terms.lower
+    phi, theta = merit(now, sides, pairs, prices, row_units, rows, lower, cost, constraints, 0.0)
+    now.phi, now.theta = phi, theta
+    now.trials, now.corrected, now.answer = 0, 0, TRY
 
 
 @linked
 def relax(address: int) -> None:
     """Make the equalities elastic: what the iterate violates is paid for, and the path to the answer begins anew."""
-    constraints, counts, links, multipliers, numbers = parts(address, "constraints counts links multipliers numbers")
-    pairs, prices, row_units, rows, side_row = parts(address, "pairs prices row_units rows side_row")
-    sides, terms = parts(address, "sides terms")
-    counts[ELASTIC], counts[FILTERED], counts[FAILURES], counts[SHORT_STEPS] = 1, 0, 0, 0
-    numbers[DELTA] = numbers[LAST_DELTA] = 0.0
-    mu = numbers[MU] = max(numbers[MU], RELAXED_MU * min(numbers[PAID], numbers[RHO]))
-    for k in range(counts[SIDES]):
-        row = side_row[k]
-        c = sides[SIGN, k] * (constraints[row] - sides[BORDER, k])
+    constraints, links, multipliers, pairs = parts(address, "constraints links multipliers pairs")
+    prices, row_units, rows, scalars, sides = parts(address, "prices row_units rows scalars sides")
+    (terms,) = parts(address, "terms")
+    now = scalars[0]
+    now.elastic, now.filtered, now.failures, now.short_steps = 1, 0, 0, 0
+    now.delta = now.last_delta = 0.0
+    mu = now.mu = max(now.mu, RELAXED_MU * min(now.paid, now.rho))
+    for k in range(now.sides):
+        row = sides[k].row
+        c = sides[k].sign * (constraints[row] - sides[k].border)
         s, e = _split(c, prices[row], mu)
-        sides[S, k], sides[E, k], sides[Y, k] = s, e, mu / s
-        sides[DS, k] = sides[DE, k] = sides[DY, k] = 0.0
+        sides[k].s, sides[k].e, sides[k].y = s, e, mu / s
+        sides[k].ds = sides[k].de = sides[k].dy = 0.0
     for k in range(len(rows)):
         row = rows[k]
         p, n = _split(constraints[row] - terms.lower[row], 2.0 * prices[row], mu)
         # p (price - multiplier) = mu and n (price + multiplier) = mu
         multipliers[row] = prices[row] - mu / p if p > n else mu / n - prices[row]
-        pairs[P, k], pairs[N, k], pairs[DP, k], pairs[DN, k] = p, n, 0.0, 0.0
-    run(links[MEASURE], (address,))
-    theta = merit(numbers, counts, sides, side_row, pairs, prices, row_units, rows, terms.lower, 0.0, constraints, 0.0)[
-        1
-    ]
-    numbers[THETA_LARGE] = max(numbers[THETA_LARGE], 1e4 * max(1.0, theta))
+        pairs[k].p, pairs[k].n, pairs[k].dp, pairs[k].dn = p, n, 0.0, 0.0
+    run(links[0].measure, (address,))
+    theta = merit(now, sides, pairs, prices, row_units, rows, terms.lower, 0.0, constraints, 0.0)[1]
+    now.theta_large = max(now.theta_large, 1e4 * max(1.0, theta))

@@ -10,47 +10,7 @@ import math
 from unifg.elimination.plan import NEGATIVE
 from unifg.machine.links import holds, linked, parts, run
 from unifg.program.passes import add_constraints, times, transposed_times
-from unifg.solvers.interior_point.state import (
-    AGAIN,
-    ALPHA,
-    ALPHA_DUAL,
-    ANSWER,
-    BORDER,
-    COLD,
-    COST_UNIT,
-    DE,
-    DELTA,
-    DN,
-    DP,
-    DS,
-    DY,
-    ELASTIC,
-    EXACT,
-    FACTOR,
-    FAILURES,
-    GAUSS_NEWTON,
-    ITERATION,
-    LAST_DELTA,
-    MU,
-    RELAX,
-    REST,
-    SIDES,
-    SIGN,
-    SINGULAR,
-    SLOPE,
-    SOLVE,
-    STEER,
-    TAKEN,
-    TOLERANCE,
-    TRY,
-    VIOLATION,
-    WEIGHT,
-    E,
-    N,
-    P,
-    S,
-    Y,
-)
+from unifg.solvers.interior_point.state import AGAIN, SINGULAR, TRY
 
 FIRST_SHIFT, LARGEST_SHIFT, FIRST_GROWTH, SHIFT_GROWTH, SHIFT_DECAY = 1e-4, 1e20, 100.0, 8.0, 3.0
 DUAL_SHIFT = 1e-9
@@ -61,31 +21,32 @@ LEAST_SHARE = 0.2  # of the second derivatives, before they are left out
 @linked
 def direct(address: int) -> None:
     """Factorise with the right inertia and find the Newton step and how far it may be taken."""
-    constraint_jacobian, constraints, counts = parts(address, "constraint_jacobian constraints counts")
-    curvature, data, doubles, entries, free, hessian = parts(address, "curvature data doubles entries free hessian")
-    links, numbers, plan, rests, row_weights, rows = parts(address, "links numbers plan rests row_weights rows")
-    pairs, prices, shift, side_row, sides = parts(address, "pairs prices shift side_row sides")
-    multipliers, row_units, step, terms = parts(address, "multipliers row_units step terms")
+    constraint_jacobian, constraints = parts(address, "constraint_jacobian constraints")
+    curvature, data, doubles, entries, free = parts(address, "curvature data doubles entries free")
+    hessian, links, multipliers, pairs, plan = parts(address, "hessian links multipliers pairs plan")
+    prices, rests, row_units, row_weights = parts(address, "prices rests row_units row_weights")
+    rows, scalars, shift, sides, step, terms = parts(address, "rows scalars shift sides step terms")
     (units,) = parts(address, "units")
+    now = scalars[0]
     n, equalities, normal = len(free), len(rows), len(hessian)
     for row in range(len(row_weights)):
         row_weights[row] = 0.0
-    for k in range(counts[SIDES]):
-        row, y = side_row[k], sides[Y, k]
-        weight = 1.0 / (sides[S, k] / y + sides[E, k] / (prices[row] - y))
-        sides[WEIGHT, k] = weight
+    for k in range(now.sides):
+        row, y = sides[k].row, sides[k].y
+        weight = 1.0 / (sides[k].s / y + sides[k].e / (prices[row] - y))
+        sides[k].weight = weight
         row_weights[row] += weight
-        sides[REST, k] = sides[SIGN, k] * (constraints[row] - sides[BORDER, k]) + sides[E, k] - sides[S, k]
-    dual, unit = DUAL_SHIFT / numbers[COST_UNIT], numbers[COST_UNIT]
+        sides[k].rest = sides[k].sign * (constraints[row] - sides[k].border) + sides[k].e - sides[k].s
+    dual, unit = DUAL_SHIFT / now.cost_unit, now.cost_unit
     for k in range(equalities):
         row = rows[k]
         rests[row], shift[n + k] = constraints[row] - terms.lower[row], -dual * row_units[row] ** 2
-        if counts[ELASTIC] == 1:
-            p, q, multiplier = pairs[P, k], pairs[N, k], multipliers[row]
+        if now.elastic == 1:
+            p, q, multiplier = pairs[k].p, pairs[k].n, multipliers[row]
             rests[row] += q - p
             shift[n + k] -= p / (prices[row] - multiplier) + q / (prices[row] + multiplier)
     # Second derivatives need multipliers, and those of a cold start mean little.
-    exact = counts[EXACT] == 1 and counts[FAILURES] < 2 and (counts[ITERATION] > 0 or counts[COLD] == 0)
+    exact = now.exact == 1 and now.failures < 2 and (now.iteration > 0 or now.cold == 0)
     share = 1.0 if exact else 0.0  # of the second derivatives
     for k in range(normal):
         data[k] = curvature[k] if share > 0.0 else hessian[k]
@@ -94,17 +55,17 @@ def direct(address: int) -> None:
     add_constraints(terms, constraint_jacobian, row_weights, data)
     for k in range(len(doubles) // 2):
         data[doubles[2 * k]] += data[doubles[2 * k + 1]]
-    delta = numbers[DELTA] if counts[FAILURES] > 0 else 0.0
+    delta = now.delta if now.failures > 0 else 0.0
     # Less of the second derivatives may mean less curvature, and a step that was cut very short had too little.
-    blend = numbers[TAKEN] > SHORT or counts[ITERATION] == 0
-    counts[ANSWER] = TRY
+    blend = now.taken > SHORT or now.iteration == 0
+    now.answer = TRY
     while True:
-        counts[GAUSS_NEWTON] = 1 if share == 0.0 else 0
+        now.gauss_newton = 1 if share == 0.0 else 0
         for k in range(n):
             shift[k] = delta * unit / units[free[k]] ** 2
-        factorised = holds(links[FACTOR], (plan, data, shift))
+        factorised = holds(links[0].factor, (plan, data, shift))
         if factorised and plan.state[NEGATIVE] == equalities:
-            run(links[STEER], (address,))
+            run(links[0].steer, (address,))
             largest = 0.0
             for k in range(n + equalities):
                 largest = max(largest, abs(step[k]))
@@ -117,36 +78,37 @@ def direct(address: int) -> None:
             share = less
             continue
         if delta == 0.0:
-            last = numbers[LAST_DELTA]
+            last = now.last_delta
             delta = FIRST_SHIFT if last == 0.0 else max(1e-12, last / SHIFT_DECAY)
         else:
-            delta *= FIRST_GROWTH if numbers[LAST_DELTA] == 0.0 else SHIFT_GROWTH
+            delta *= FIRST_GROWTH if now.last_delta == 0.0 else SHIFT_GROWTH
         if delta > LARGEST_SHIFT:
-            counts[ANSWER] = SINGULAR
-            if counts[ELASTIC] == 0 and numbers[VIOLATION] > numbers[TOLERANCE]:
-                run(links[RELAX], (address,))
-                counts[ANSWER] = AGAIN
+            now.answer = SINGULAR
+            if now.elastic == 0 and now.violation > now.tolerance:
+                run(links[0].relax, (address,))
+                now.answer = AGAIN
             return
-    numbers[DELTA] = delta
+    now.delta = delta
     if delta > 0.0:
-        numbers[LAST_DELTA] = delta
+        now.last_delta = delta
 
 
 @linked
 def steer(address: int) -> None:
     """Solve for the residuals in ``rests`` and REST: the step, those of the sides, the slope, and both lengths."""
-    constraint_jacobian, counts, free, full = parts(address, "constraint_jacobian counts free full")
-    gradient, links, numbers, plan, rests, right = parts(address, "gradient links numbers plan rests right")
-    row_terms, rows, side_row, sides, step = parts(address, "row_terms rows side_row sides step")
-    multipliers, pairs, prices, spread, terms = parts(address, "multipliers pairs prices spread terms")
-    mu, elastic = numbers[MU], counts[ELASTIC] == 1
+    constraint_jacobian, free, full, gradient = parts(address, "constraint_jacobian free full gradient")
+    links, multipliers, pairs, plan, prices = parts(address, "links multipliers pairs plan prices")
+    rests, right, row_terms, rows, scalars = parts(address, "rests right row_terms rows scalars")
+    sides, spread, step, terms = parts(address, "sides spread step terms")
+    now = scalars[0]
+    mu, elastic = now.mu, now.elastic == 1
     n = len(free)
     for row in range(len(row_terms)):
         row_terms[row] = 0.0
-    for k in range(counts[SIDES]):
-        row, y = side_row[k], sides[Y, k]
-        r = sides[REST, k] + sides[S, k] - sides[E, k] + mu / (prices[row] - y) - mu / y
-        row_terms[row] += sides[SIGN, k] * sides[WEIGHT, k] * r
+    for k in range(now.sides):
+        row, y = sides[k].row, sides[k].y
+        r = sides[k].rest + sides[k].s - sides[k].e + mu / (prices[row] - y) - mu / y
+        row_terms[row] += sides[k].sign * sides[k].weight * r
     for k in range(len(full)):
         spread[k] = full[k]
     transposed_times(terms, False, constraint_jacobian, row_terms, spread)
@@ -157,36 +119,36 @@ def steer(address: int) -> None:
         right[n + k] = -rests[row]
         if elastic:
             over, under = prices[row] - multipliers[row], prices[row] + multipliers[row]
-            right[n + k] += pairs[N, k] - pairs[P, k] + mu / over - mu / under
-    run(links[SOLVE], (plan, right, step))
+            right[n + k] += pairs[k].n - pairs[k].p + mu / over - mu / under
+    run(links[0].solve, (plan, right, step))
     times(terms, False, constraint_jacobian, step, row_terms)
     slope = 0.0
     for k in range(n):
         slope += gradient[free[k]] * step[k]
     limit = max(0.99, 1.0 - mu)
     primal = dual = 0.0  # inverse step lengths
-    for k in range(counts[SIDES]):
-        s, e, y = sides[S, k], sides[E, k], sides[Y, k]
-        row = side_row[k]
+    for k in range(now.sides):
+        s, e, y = sides[k].s, sides[k].e, sides[k].y
+        row = sides[k].row
         z = prices[row] - y
-        move = sides[SIGN, k] * row_terms[row]
-        r = sides[REST, k] + s - e + mu / z - mu / y
-        dy = -(move + r) * sides[WEIGHT, k]
+        move = sides[k].sign * row_terms[row]
+        r = sides[k].rest + s - e + mu / z - mu / y
+        dy = -(move + r) * sides[k].weight
         ds = mu / y - s - s / y * dy
         de = mu / z - e + e / z * dy
-        sides[DY, k], sides[DS, k], sides[DE, k] = dy, ds, de
+        sides[k].dy, sides[k].ds, sides[k].de = dy, ds, de
         slope += prices[row] * de - mu * (ds / s + de / e)
         primal = max(primal, max(-ds / s, -de / e))
         dual = max(dual, max(-dy / y, dy / z))
     if elastic:
         for k in range(len(rows)):
-            row, p, q, move = rows[k], pairs[P, k], pairs[N, k], step[n + k]
+            row, p, q, move = rows[k], pairs[k].p, pairs[k].n, step[n + k]
             over, under = prices[row] - multipliers[row], prices[row] + multipliers[row]
             dp, dn = mu / over - p + p / over * move, mu / under - q - q / under * move
-            pairs[DP, k], pairs[DN, k] = dp, dn
+            pairs[k].dp, pairs[k].dn = dp, dn
             slope += prices[row] * (dp + dn) - mu * (dp / p + dn / q)
             primal = max(primal, max(-dp / p, -dn / q))
             dual = max(dual, max(move / over, -move / under))
-    numbers[SLOPE] = slope
-    numbers[ALPHA] = min(1.0, limit / primal) if primal > 0.0 else 1.0
-    numbers[ALPHA_DUAL] = min(1.0, limit / dual) if dual > 0.0 else 1.0
+    now.slope = slope
+    now.alpha = min(1.0, limit / primal) if primal > 0.0 else 1.0
+    now.alpha_dual = min(1.0, limit / dual) if dual > 0.0 else 1.0

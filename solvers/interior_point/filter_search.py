@@ -9,64 +9,7 @@ import math
 
 from unifg.machine.links import linked, parts, run
 from unifg.solvers.interior_point.barrier import merit
-from unifg.solvers.interior_point.state import (
-    ACCEPT,
-    ACCEPTED,
-    AGAIN,
-    ALPHA,
-    ALPHA_DUAL,
-    ANSWER,
-    BORDER,
-    CORRECT,
-    CORRECTED,
-    COST_UNIT,
-    DE,
-    DELTA,
-    DESCENT,
-    DN,
-    DP,
-    DS,
-    DY,
-    ELASTIC,
-    FAILURES,
-    FILTER,
-    FILTERED,
-    ITERATION,
-    MU,
-    PHI,
-    RELAX,
-    REST,
-    RESTORE,
-    SAVED_ALPHA,
-    SAVED_DE,
-    SAVED_DN,
-    SAVED_DP,
-    SAVED_DS,
-    SAVED_DUAL,
-    SAVED_DY,
-    SAVED_SLOPE,
-    SHORT_STEPS,
-    SIDES,
-    SIGN,
-    SLOPE,
-    STALLED,
-    STEER,
-    STEP,
-    TAKEN,
-    THETA,
-    THETA_LARGE,
-    THETA_SMALL,
-    TOLERANCE,
-    TRIAL_COST,
-    TRIALS,
-    TRY,
-    VIOLATION,
-    E,
-    N,
-    P,
-    S,
-    Y,
-)
+from unifg.solvers.interior_point.state import ACCEPTED, AGAIN, FILTER, STALLED, TRY
 
 ARMIJO = 1e-4
 GAMMA_THETA, GAMMA_PHI = 1e-5, 1e-8
@@ -78,19 +21,18 @@ SHORT_STEP = 0.05  # length of one
 @linked
 def judge(address: int) -> None:
     """Filter test of a trial point: accept it, shorten the step, correct it, or ask for another direction."""
-    counts, filter, links, numbers, rows, side_row = parts(address, "counts filter links numbers rows side_row")
-    pairs, prices, row_units, sides, terms = parts(address, "pairs prices row_units sides terms")
+    filter, links, pairs, prices, row_units = parts(address, "filter links pairs prices row_units")
+    rows, scalars, sides, terms = parts(address, "rows scalars sides terms")
+    now = scalars[0]
     (constraints,) = parts(address, "trial_constraints")
-    alpha, theta, phi, slope = numbers[ALPHA], numbers[THETA], numbers[PHI], numbers[SLOPE]
-    cost, lower = numbers[TRIAL_COST], terms.lower
-    phi_trial, theta_trial = merit(
-        numbers, counts, sides, side_row, pairs, prices, row_units, rows, lower, cost, constraints, alpha
-    )
+    alpha, theta, phi, slope = now.alpha, now.theta, now.phi, now.slope
+    cost, lower = now.trial_cost, terms.lower
+    phi_trial, theta_trial = merit(now, sides, pairs, prices, row_units, rows, lower, cost, constraints, alpha)
     finite = math.isfinite(phi_trial) and math.isfinite(theta_trial)
     slack = 1e-13 * max(1.0, abs(phi))
-    switch = slope < 0.0 and alpha * (-slope / numbers[COST_UNIT]) ** 2.3 > theta**1.1 and theta <= numbers[THETA_SMALL]
+    switch = slope < 0.0 and alpha * (-slope / now.cost_unit) ** 2.3 > theta**1.1 and theta <= now.theta_small
     armijo = phi_trial <= phi + ARMIJO * alpha * slope + slack
-    good = finite and theta_trial <= numbers[THETA_LARGE]
+    good = finite and theta_trial <= now.theta_large
     if good:
         if switch:
             good = armijo
@@ -98,108 +40,111 @@ def judge(address: int) -> None:
             good = theta_trial <= (1.0 - GAMMA_THETA) * theta or phi_trial <= phi - GAMMA_PHI * theta + slack
             good = good or theta_trial <= 1e-12
     if good:
-        for k in range(counts[FILTERED]):
+        for k in range(now.filtered):
             if theta_trial >= filter[k, 0] and phi_trial >= filter[k, 1] + slack:
                 good = theta_trial <= 1e-12 and good and armijo
     if good:
-        counts[DESCENT] = switch and armijo
-        run(links[ACCEPT], (address,))
-        counts[ANSWER] = ACCEPTED
+        now.descent = switch and armijo
+        run(links[0].accept, (address,))
+        now.answer = ACCEPTED
         return
-    counts[TRIALS] += 1
-    counts[ANSWER] = TRY
-    if counts[TRIALS] == 1 and finite and theta_trial >= theta:
-        run(links[CORRECT], (address,))
+    now.trials += 1
+    now.answer = TRY
+    if now.trials == 1 and finite and theta_trial >= theta:
+        run(links[0].correct, (address,))
         return
-    if counts[CORRECTED] == 1:
-        run(links[RESTORE], (address,))
-    numbers[ALPHA] *= 0.5
-    if counts[TRIALS] > HALVINGS:
-        counts[FAILURES] += 1
-        numbers[DELTA] = max(1e-3, 100.0 * numbers[DELTA])
-        counts[ANSWER] = AGAIN
-        if counts[FAILURES] > (MOST_FAILURES if counts[ELASTIC] == 1 else FEW_FAILURES):
-            if counts[ELASTIC] == 1 or numbers[VIOLATION] <= numbers[TOLERANCE]:
-                counts[ANSWER] = STALLED
+    if now.corrected == 1:
+        run(links[0].restore, (address,))
+    now.alpha *= 0.5
+    if now.trials > HALVINGS:
+        now.failures += 1
+        now.delta = max(1e-3, 100.0 * now.delta)
+        now.answer = AGAIN
+        if now.failures > (MOST_FAILURES if now.elastic == 1 else FEW_FAILURES):
+            if now.elastic == 1 or now.violation <= now.tolerance:
+                now.answer = STALLED
             else:
-                run(links[RELAX], (address,))
+                run(links[0].relax, (address,))
 
 
 @linked
 def correct(address: int) -> None:
     """Solve again for the constraints as the trial found them, and keep the step in case this does not help."""
-    counts, links, numbers, rests, rows, saved = parts(address, "counts links numbers rests rows saved")
-    pairs, side_row, sides, step, terms = parts(address, "pairs side_row sides step terms")
+    links, pairs, rests, rows, saved, scalars = parts(address, "links pairs rests rows saved scalars")
+    sides, step, terms = parts(address, "sides step terms")
+    now = scalars[0]
     (constraints,) = parts(address, "trial_constraints")
-    alpha = numbers[ALPHA]
+    alpha = now.alpha
     for k in range(len(step)):
         saved[k] = step[k]
-    numbers[SAVED_SLOPE], numbers[SAVED_ALPHA], numbers[SAVED_DUAL] = numbers[SLOPE], alpha, numbers[ALPHA_DUAL]
-    for k in range(counts[SIDES]):
-        sides[SAVED_DY, k], sides[SAVED_DS, k], sides[SAVED_DE, k] = sides[DY, k], sides[DS, k], sides[DE, k]
-        c = sides[SIGN, k] * (constraints[side_row[k]] - sides[BORDER, k])
-        s, e = sides[S, k] + alpha * sides[DS, k], sides[E, k] + alpha * sides[DE, k]
-        sides[REST, k] = alpha * sides[REST, k] + c + e - s
+    now.saved_slope, now.saved_alpha, now.saved_dual = now.slope, alpha, now.alpha_dual
+    for k in range(now.sides):
+        sides[k].saved_dy, sides[k].saved_ds, sides[k].saved_de = sides[k].dy, sides[k].ds, sides[k].de
+        c = sides[k].sign * (constraints[sides[k].row] - sides[k].border)
+        s, e = sides[k].s + alpha * sides[k].ds, sides[k].e + alpha * sides[k].de
+        sides[k].rest = alpha * sides[k].rest + c + e - s
     for k in range(len(rows)):
         row = rows[k]
         rests[row] = alpha * rests[row] + constraints[row] - terms.lower[row]
-        if counts[ELASTIC] == 1:
-            pairs[SAVED_DP, k], pairs[SAVED_DN, k] = pairs[DP, k], pairs[DN, k]
-            rests[row] += pairs[N, k] + alpha * pairs[DN, k] - pairs[P, k] - alpha * pairs[DP, k]
-    run(links[STEER], (address,))
-    numbers[SLOPE] = numbers[SAVED_SLOPE]
-    counts[CORRECTED] = 1
+        if now.elastic == 1:
+            pairs[k].saved_dp, pairs[k].saved_dn = pairs[k].dp, pairs[k].dn
+            rests[row] += pairs[k].n + alpha * pairs[k].dn - pairs[k].p - alpha * pairs[k].dp
+    run(links[0].steer, (address,))
+    now.slope = now.saved_slope
+    now.corrected = 1
 
 
 @linked
 def restore(address: int) -> None:
     """Go back to the step before its correction."""
-    counts, numbers, pairs, saved, sides, step = parts(address, "counts numbers pairs saved sides step")
+    pairs, saved, scalars, sides, step = parts(address, "pairs saved scalars sides step")
+    now = scalars[0]
     for k in range(len(step)):
         step[k] = saved[k]
-    numbers[ALPHA], numbers[ALPHA_DUAL] = numbers[SAVED_ALPHA], numbers[SAVED_DUAL]
-    for k in range(counts[SIDES]):
-        sides[DY, k], sides[DS, k], sides[DE, k] = sides[SAVED_DY, k], sides[SAVED_DS, k], sides[SAVED_DE, k]
-    if counts[ELASTIC] == 1:
-        for k in range(pairs.shape[1]):
-            pairs[DP, k], pairs[DN, k] = pairs[SAVED_DP, k], pairs[SAVED_DN, k]
-    counts[CORRECTED] = 0
+    now.alpha, now.alpha_dual = now.saved_alpha, now.saved_dual
+    for k in range(now.sides):
+        sides[k].dy, sides[k].ds, sides[k].de = sides[k].saved_dy, sides[k].saved_ds, sides[k].saved_de
+    if now.elastic == 1:
+        for k in range(len(pairs)):
+            pairs[k].dp, pairs[k].dn = pairs[k].saved_dp, pairs[k].saved_dn
+    now.corrected = 0
 
 
 @linked
 def accept(address: int) -> None:
     """Move multipliers and slacks and, unless the step was one of descent, remember where it came from."""
-    counts, filter, free, multipliers, numbers, rows = parts(address, "counts filter free multipliers numbers rows")
-    pairs, prices, side_row, sides, step = parts(address, "pairs prices side_row sides step")
+    filter, free, multipliers, pairs, prices = parts(address, "filter free multipliers pairs prices")
+    rows, scalars, sides, step = parts(address, "rows scalars sides step")
     (trial_constraints,) = parts(address, "trial_constraints")
-    alpha, dual, n = numbers[ALPHA], numbers[ALPHA_DUAL], len(free)
-    mu = numbers[MU]
+    now = scalars[0]
+    alpha, dual, n = now.alpha, now.alpha_dual, len(free)
+    mu = now.mu
     total = 0.0
     for k in range(n):
         total += step[k] ** 2
-    elastic = counts[ELASTIC] == 1
+    elastic = now.elastic == 1
     for k in range(len(rows)):
         row = rows[k]
         multipliers[row] += (dual if elastic else alpha) * step[n + k]
         if elastic:
-            for which in range(2):
-                pairs[P + which, k] += alpha * pairs[DP + which, k]
-            over, under = 1e-10 * mu / pairs[P, k], 1e-10 * mu / pairs[N, k]
+            pairs[k].p += alpha * pairs[k].dp
+            pairs[k].n += alpha * pairs[k].dn
+            over, under = 1e-10 * mu / pairs[k].p, 1e-10 * mu / pairs[k].n
             multipliers[row] = min(max(multipliers[row], under - prices[row]), prices[row] - over)
-            pairs[DP, k] = pairs[DN, k] = 0.0
-    for k in range(counts[SIDES]):
-        s, e = sides[S, k] + alpha * sides[DS, k], sides[E, k] + alpha * sides[DE, k]
-        c = sides[SIGN, k] * (trial_constraints[side_row[k]] - sides[BORDER, k])
+            pairs[k].dp = pairs[k].dn = 0.0
+    for k in range(now.sides):
+        s, e = sides[k].s + alpha * sides[k].ds, sides[k].e + alpha * sides[k].de
+        c = sides[k].sign * (trial_constraints[sides[k].row] - sides[k].border)
         s = max(s, c + e)  # a longer slack costs nothing
-        y = sides[Y, k] + dual * sides[DY, k]
+        y = sides[k].y + dual * sides[k].dy
         y = min(max(y, 1e-10 * mu / s), 1e10 * mu / s)  # eq. 16
-        sides[Y, k], sides[S, k], sides[E, k] = min(y, prices[side_row[k]] - 1e-10 * mu / e), s, e
-        sides[DS, k] = sides[DE, k] = 0.0
-    if counts[DESCENT] == 0 and counts[FILTERED] < FILTER:
-        filter[counts[FILTERED], 0] = (1.0 - GAMMA_THETA) * numbers[THETA]
-        filter[counts[FILTERED], 1] = numbers[PHI] - GAMMA_PHI * numbers[THETA]
-        counts[FILTERED] += 1
-    numbers[STEP], numbers[TAKEN] = alpha * math.sqrt(total), alpha
-    counts[SHORT_STEPS] = counts[SHORT_STEPS] + 1 if alpha < SHORT_STEP else 0
-    counts[ITERATION] += 1
-    counts[FAILURES] = 0
+        sides[k].y, sides[k].s, sides[k].e = min(y, prices[sides[k].row] - 1e-10 * mu / e), s, e
+        sides[k].ds = sides[k].de = 0.0
+    if now.descent == 0 and now.filtered < FILTER:
+        filter[now.filtered, 0] = (1.0 - GAMMA_THETA) * now.theta
+        filter[now.filtered, 1] = now.phi - GAMMA_PHI * now.theta
+        now.filtered += 1
+    now.step, now.taken = alpha * math.sqrt(total), alpha
+    now.short_steps = now.short_steps + 1 if alpha < SHORT_STEP else 0
+    now.iteration += 1
+    now.failures = 0

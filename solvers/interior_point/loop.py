@@ -14,41 +14,8 @@ from unifg.program import passes
 from unifg.program.curvature import add_curvature
 from unifg.program.retraction import retract_parts
 from unifg.solvers.interior_point import barrier, direction, filter_search
-from unifg.solvers.interior_point.state import (
-    ACCEPT,
-    ACCEPTED,
-    ADVANCE,
-    AGAIN,
-    ALPHA,
-    ANSWER,
-    BEGIN,
-    COLD,
-    CORRECT,
-    COST,
-    CURVE,
-    DIRECT,
-    EVALUATE,
-    EXACT,
-    FACTOR,
-    GOING_ON,
-    ITERATION,
-    JUDGE,
-    LINEARIZE,
-    LINKS,
-    LOOP,
-    MEASURE,
-    RELAX,
-    RESTORE,
-    RETRACT,
-    SOLVE,
-    STEER,
-    TEST,
-    TRIAL_COST,
-    TRY,
-    Problem,
-    Work,
-)
-from unifg.typing import Array, IntArray
+from unifg.solvers.interior_point.state import ACCEPTED, AGAIN, LINKS, TRY, Problem, Records, Work
+from unifg.typing import Array
 
 
 @compiled
@@ -74,17 +41,19 @@ def fill(target: Array, number: float) -> None:
 @linked
 def advance(address: int) -> None:
     """Move to the trial and evaluate it."""
-    free, links, move, numbers, retraction = parts(address, "free links move numbers retraction")
-    scratch, spread, squares, step, terms, trial = parts(address, "scratch spread squares step terms trial")
-    trial_constraints, trial_residual, values = parts(address, "trial_constraints trial_residual values")
-    alpha = numbers[ALPHA]
+    free, links, move, retraction, scalars = parts(address, "free links move retraction scalars")
+    scratch, spread, squares, step, terms = parts(address, "scratch spread squares step terms")
+    trial, trial_constraints, trial_residual = parts(address, "trial trial_constraints trial_residual")
+    (values,) = parts(address, "values")
+    now = scalars[0]
+    alpha = now.alpha
     for k in range(len(free)):
         move[k] = alpha * step[k]
     copy(values, trial)
     fill(spread, 0.0)
-    run(links[RETRACT], (retraction, free, move, spread, values, trial))
-    numbers[TRIAL_COST] = number(
-        links[EVALUATE],
+    run(links[0].retract, (retraction, free, move, spread, values, trial))
+    now.trial_cost = number(
+        links[0].evaluate,
         (terms, trial, trial_residual, trial_constraints, squares, scratch),
     )
 
@@ -92,17 +61,19 @@ def advance(address: int) -> None:
 @linked
 def loop(address: int) -> None:
     """Iterate from ``work.values``, which is moved, to one of the endings."""
-    constraint_jacobian, constraints, counts = parts(address, "constraint_jacobian constraints counts")
-    curvature, gradient, hessian, jacobian, links = parts(address, "curvature gradient hessian jacobian links")
-    multipliers, norms, numbers, residual, scratch = parts(address, "multipliers norms numbers residual scratch")
-    squares, terms, trial, values = parts(address, "squares terms trial values")
-    moved, started = True, counts[GOING_ON] == 1
+    constraint_jacobian, constraints = parts(address, "constraint_jacobian constraints")
+    curvature, gradient, hessian, jacobian = parts(address, "curvature gradient hessian jacobian")
+    links, multipliers, norms, residual = parts(address, "links multipliers norms residual")
+    scalars, scratch, squares, terms, trial = parts(address, "scalars scratch squares terms trial")
+    (values,) = parts(address, "values")
+    now = scalars[0]
+    moved, started = True, now.going_on == 1
     while True:
         if moved:
             fill(gradient, 0.0)
             fill(hessian, 0.0)
-            numbers[COST] = number(
-                links[LINEARIZE],
+            now.cost = number(
+                links[0].linearize,
                 (
                     terms,
                     values,
@@ -118,26 +89,26 @@ def loop(address: int) -> None:
                     scratch,
                 ),
             )
-            run(links[MEASURE if started else BEGIN], (address,))
+            run(links[0].measure if started else links[0].begin, (address,))
             started = True
-        run(links[TEST], (address,))
-        if counts[ANSWER] == TRY:
-            if counts[EXACT] == 1 and (counts[ITERATION] > 0 or counts[COLD] == 0):
+        run(links[0].test, (address,))
+        if now.answer == TRY:
+            if now.exact == 1 and (now.iteration > 0 or now.cold == 0):
                 copy(hessian, curvature)
-                run(links[CURVE], (terms, values, residual, multipliers, curvature))
-            run(links[DIRECT], (address,))
-        while counts[ANSWER] == TRY:
-            run(links[ADVANCE], (address,))
-            run(links[JUDGE], (address,))
-        moved = counts[ANSWER] == ACCEPTED
+                run(links[0].curve, (terms, values, residual, multipliers, curvature))
+            run(links[0].direct, (address,))
+        while now.answer == TRY:
+            run(links[0].advance, (address,))
+            run(links[0].judge, (address,))
+        moved = now.answer == ACCEPTED
         if moved:
             copy(trial, values)
-        elif counts[ANSWER] != AGAIN:
+        elif now.answer != AGAIN:
             return
 
 
 @cache
-def addresses() -> IntArray:
+def addresses() -> Records:
     """Compile everything for the arrays that ``memory`` has seen, and say where it stands."""
     problem, work = memory.kind
     kinds = {**dict(zip(Problem._fields, problem, strict=True)), **dict(zip(Work._fields, work, strict=True))}
@@ -145,29 +116,31 @@ def addresses() -> IntArray:
     terms, scratch = kinds["terms"], kinds["scratch"]
     linearized = [residual, kinds["jacobian"], constraints, kinds["constraint_jacobian"], kinds["squares"]]
     linearized += [kinds["norms"], kinds["gradient"], kinds["hessian"], scratch]
-    links = np.zeros(LINKS, dtype=np.int64)
-    links[FACTOR] = link(factor, TRUTH, kinds["plan"], kinds["data"], vector)
-    links[SOLVE] = link(solve, NOTHING, kinds["plan"], vector, vector)
-    links[LINEARIZE] = link(passes.linearize, NUMBER, terms, values, TRUTH, *linearized)
-    links[EVALUATE] = link(passes.evaluate, NUMBER, terms, values, residual, constraints, kinds["squares"], scratch)
-    links[CURVE] = link(add_curvature, NOTHING, terms, values, residual, constraints, kinds["hessian"])
-    links[RETRACT] = link(
+    links = np.zeros(1, LINKS)
+    links[0]["factor"] = link(factor, TRUTH, kinds["plan"], kinds["data"], vector)
+    links[0]["solve"] = link(solve, NOTHING, kinds["plan"], vector, vector)
+    links[0]["linearize"] = link(passes.linearize, NUMBER, terms, values, TRUTH, *linearized)
+    links[0]["evaluate"] = link(
+        passes.evaluate, NUMBER, terms, values, residual, constraints, kinds["squares"], scratch
+    )
+    links[0]["curve"] = link(add_curvature, NOTHING, terms, values, residual, constraints, kinds["hessian"])
+    links[0]["retract"] = link(
         retract_parts, NOTHING, kinds["retraction"], kinds["free"], vector, kinds["spread"], values, values
     )
     functions = {
-        BEGIN: barrier.begin,
-        MEASURE: barrier.measure,
-        TEST: barrier.test,
-        JUDGE: filter_search.judge,
-        CORRECT: filter_search.correct,
-        RELAX: barrier.relax,
-        RESTORE: filter_search.restore,
-        ACCEPT: filter_search.accept,
-        DIRECT: direction.direct,
-        STEER: direction.steer,
-        ADVANCE: advance,
-        LOOP: loop,
+        "begin": barrier.begin,
+        "measure": barrier.measure,
+        "test": barrier.test,
+        "judge": filter_search.judge,
+        "correct": filter_search.correct,
+        "relax": barrier.relax,
+        "restore": filter_search.restore,
+        "accept": filter_search.accept,
+        "direct": direction.direct,
+        "steer": direction.steer,
+        "advance": advance,
+        "loop": loop,
     }
-    for place, function in functions.items():
-        links[place] = link(function, NOTHING, ADDRESS)
+    for name, function in functions.items():
+        links[0][name] = link(function, NOTHING, ADDRESS)
     return links

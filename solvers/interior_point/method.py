@@ -85,11 +85,11 @@ class InteriorPoint(Solver):
 
     def iterate(self, run: SolveState, workspace: Workspace) -> Status | None:
         """Iterate to convergence; where that is not to be had, to a point of least violation, or on from another."""
-        counts = workspace.prepare(run, self).counts
+        now = workspace.prepare(run, self).scalars[0]
         restarts = 0
         while True:
             reason = self._alone(run, workspace) if run.alone else self._guided(run, workspace)
-            if counts[state.ANSWER] not in STUCK or run.status not in (None, Status.ITERATION_LIMIT):
+            if now["answer"] not in STUCK or run.status not in (None, Status.ITERATION_LIMIT):
                 return reason
             if run.optimality.violation <= run.tolerance:
                 return reason
@@ -100,10 +100,10 @@ class InteriorPoint(Solver):
                     run.begin_at(found)
                     run.status = Status.LOCALLY_INFEASIBLE
                     return run.status
-            if restarts == RESTARTS or counts[state.ITERATION] >= self.max_iterations or run.out_of_time:
+            if restarts == RESTARTS or now["iteration"] >= self.max_iterations or run.out_of_time:
                 return reason
-            if counts[state.ANSWER] == state.VIOLATED:  # the price was too low
-                counts[state.GOING_ON] = 1
+            if now["answer"] == state.VIOLATED:  # the price was too low
+                now["going_on"] = 1
             elif run.has_been_feasible or _largest(run.program.violation(found.constraints)) <= run.tolerance:
                 workspace.begin_at(run.least_violated.flat if run.has_been_feasible else found.values.flat, self)
                 restarts += 1
@@ -115,11 +115,11 @@ class InteriorPoint(Solver):
         """The compiled loop."""
         work = workspace.work
         interrupted = workspace.loop()
-        lin, iterations = workspace.found(), int(work.counts[state.ITERATION])
-        if work.counts[state.KEPT] and work.numbers[state.VIOLATION] > run.tolerance:
+        lin, iterations = workspace.found(), int(work.scalars[0]["iteration"])
+        if work.scalars[0]["kept"] and work.scalars[0]["violation"] > run.tolerance:
             run.begin_at(run.program.linearize(run.program.columns.view(work.kept.copy())))
         run.conclude(lin, work.multipliers.copy(), iterations, _history(work, lin.norms, run.seconds))
-        ending = ENDINGS[int(work.counts[state.ANSWER])]
+        ending = ENDINGS[int(work.scalars[0]["answer"])]
         if interrupted:
             run.status = ending if ending is Status.CONVERGED else Status.INTERRUPTED
         return ending
@@ -127,7 +127,7 @@ class InteriorPoint(Solver):
     def _guided(self, run: SolveState, workspace: Workspace) -> Status | None:
         """The same loop, with every evaluation made by the program and every iterate shown."""
         program, work = run.program, workspace.work
-        numbers, counts = work.numbers, work.counts
+        now = work.scalars[0]
         lin = run.lin
         if not np.array_equal(lin.values.flat, work.values):
             run.begin_at(program.linearize(program.columns.view(work.values.copy())))
@@ -135,29 +135,29 @@ class InteriorPoint(Solver):
             if run.status is not None:
                 return None
         workspace.take(lin)
-        workspace.call(state.MEASURE if counts[state.GOING_ON] else state.BEGIN)
+        workspace.call("measure" if now["going_on"] else "begin")
         while True:
-            workspace.call(state.TEST)
-            if counts[state.ANSWER] == state.TRY:
+            workspace.call("test")
+            if now["answer"] == state.TRY:
                 if self.hessian == "exact":
                     work.curvature[:] = lagrangian_hessian(program, lin, work.multipliers)
-                workspace.call(state.DIRECT)
-            while counts[state.ANSWER] == state.TRY:
-                values = program.retract(lin.values, numbers[state.ALPHA] * work.step[: program.size])
+                workspace.call("direct")
+            while now["answer"] == state.TRY:
+                values = program.retract(lin.values, now["alpha"] * work.step[: program.size])
                 found = program.evaluate(values, lin.weights)
-                numbers[state.TRIAL_COST], work.trial_constraints[:] = found.cost, found.constraints
-                workspace.call(state.JUDGE)
-            if counts[state.ANSWER] == state.AGAIN:
+                now["trial_cost"], work.trial_constraints[:] = found.cost, found.constraints
+                workspace.call("judge")
+            if now["answer"] == state.AGAIN:
                 if run.out_of_time:
                     return Status.TIME_LIMIT
                 continue
-            if counts[state.ANSWER] != state.ACCEPTED:
-                return ENDINGS[int(counts[state.ANSWER])]
+            if now["answer"] != state.ACCEPTED:
+                return ENDINGS[int(now["answer"])]
             lin = program.linearize(values)
             workspace.take(lin)
-            workspace.call(state.MEASURE)
-            details = _details(numbers[state.MU], numbers[state.DELTA], counts[state.GAUSS_NEWTON])
-            run.accept(lin, work.multipliers.copy(), float(numbers[state.STEP]), float(numbers[state.TAKEN]), **details)
+            workspace.call("measure")
+            details = _details(now["mu"], now["delta"], now["gauss_newton"])
+            run.accept(lin, work.multipliers.copy(), float(now["step"]), float(now["taken"]), **details)
             if run.status is not None:
                 return None
 
@@ -194,7 +194,7 @@ class Workspace:
             data=len(plan.slots),
         )
         self.problem = Problem(
-            np.zeros(state.LINKS, dtype=np.int64),
+            np.zeros(1, state.LINKS),
             program.arrays,
             plan,
             program.retraction.parts,
@@ -212,9 +212,9 @@ class Workspace:
         self._words = memory.describe((self.problem, self.work))
         self._address = self._words.ctypes.data
 
-    def call(self, function: int) -> None:
+    def call(self, function: str) -> None:
         """Run one of the linked functions."""
-        call(self.problem.links[function], self._address)
+        call(self.problem.links[0][function], self._address)
 
     def loop(self) -> bool:
         """Run the whole solve; returns whether control-C was pressed, which Python learns when it is over.
@@ -222,11 +222,11 @@ class Workspace:
         Raises:
             KeyboardInterrupt: when it was pressed before the solve had begun.
         """
-        self.work.counts[state.ANSWER] = NO_ANSWER
+        self.work.scalars[0]["answer"] = NO_ANSWER
         try:
-            self.call(state.LOOP)
+            self.call("loop")
         except KeyboardInterrupt:
-            if self.work.counts[state.ANSWER] == NO_ANSWER:
+            if self.work.scalars[0]["answer"] == NO_ANSWER:
                 raise
             return True
         return False
@@ -239,15 +239,15 @@ class Workspace:
             self.work = self.work._replace(log=np.zeros((options.max_iterations + 2, 9)))
             self._describe()
         work = self.work
-        numbers, counts = work.numbers, work.counts
+        now = work.scalars[0]
         # The test of least squares has no absolute tolerance.
-        numbers[state.TOLERANCE] = 0.0 if run.program.least_squares else run.tolerance
-        numbers[state.ASKED], counts[state.SCALING] = 0.0, options.scaling
-        numbers[state.STEP_TOLERANCE] = options.step_tolerance
-        numbers[state.VIOLATION_TOLERANCE] = options.violation_tolerance
-        counts[state.ITERATION], counts[state.KEPT], counts[state.RAISES] = 0, 0, 0
+        now["tolerance"] = 0.0 if run.program.least_squares else run.tolerance
+        now["asked"], now["scaling"] = 0.0, options.scaling
+        now["step_tolerance"] = options.step_tolerance
+        now["violation_tolerance"] = options.violation_tolerance
+        now["iteration"], now["kept"], now["raises"] = 0, 0, 0
         work.row_units[:] = work.units[:] = 1.0
-        counts[state.LIMIT], counts[state.EXACT] = options.max_iterations, options.hessian == "exact"
+        now["limit"], now["exact"] = options.max_iterations, options.hessian == "exact"
         self.begin_at(run.values.flat, options)
         work.multipliers[:] = run.multipliers
         return work
@@ -256,8 +256,8 @@ class Workspace:
         """Go on from other values, about whose multipliers nothing is known."""
         work = self.work
         work.values[:], work.multipliers[:] = values, 0.0
-        work.numbers[state.MU], work.counts[state.GOING_ON] = options.barrier, 0
-        work.numbers[state.RHO] = options.price * 10.0 ** int(work.counts[state.RAISES])
+        work.scalars[0]["mu"], work.scalars[0]["going_on"] = options.barrier, 0
+        work.scalars[0]["rho"] = options.price * 10.0 ** int(work.scalars[0]["raises"])
 
     def found(self) -> Linearization:
         """The linearisation at which the compiled loop ended."""
@@ -266,7 +266,7 @@ class Workspace:
         program.retraction.fix(values)
         return Linearization(
             values,
-            float(work.numbers[state.COST]),
+            float(work.scalars[0]["cost"]),
             work.residual.copy(),
             work.jacobian.copy(),
             work.constraints.copy(),
@@ -279,7 +279,7 @@ class Workspace:
     def take(self, lin: Linearization) -> None:
         """Copy a linearisation to where the compiled functions look for it."""
         work = self.work
-        work.numbers[state.COST], work.values[:] = lin.cost, lin.values.flat
+        work.scalars[0]["cost"], work.values[:] = lin.cost, lin.values.flat
         work.residual[:], work.jacobian[:] = lin.residual, lin.jacobian
         work.constraints[:], work.constraint_jacobian[:] = lin.constraints, lin.constraint_jacobian
         work.gradient[:], work.hessian[:] = lin.gradient, lin.hessian
@@ -287,7 +287,7 @@ class Workspace:
 
 def _history(work: Work, norms: dict[str, float], seconds: float) -> Callable[[], list[Iteration]]:
     """Rows of the compiled loop, made when somebody asks for them; nobody took the time of single iterations."""
-    log = work.log[: int(work.counts[state.ITERATION]) + 1].copy()
+    log = work.log[: int(work.scalars[0]["iteration"]) + 1].copy()
 
     def rows() -> list[Iteration]:
         last, made = len(log) - 1, []

@@ -2,109 +2,109 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, NamedTuple, get_type_hints
+from typing import Annotated, Any, NamedTuple, TypeAlias, get_type_hints
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unifg.elimination.plan import Plan
 from unifg.program.table import TermArrays
 from unifg.typing import Array, IntArray
 
-# Places in Work.numbers.
-(
-    MU,
-    RHO,
-    TOLERANCE,
-    THETA,  # sum of |h| and |c + e - s| at the present iterate
-    PHI,  # barrier function there
-    SLOPE,  # its derivative along the step
-    ALPHA,  # primal step length under trial
-    ALPHA_DUAL,
-    THETA_SMALL,
-    THETA_LARGE,
-    DELTA,  # shift of the Hessian's diagonal that the present direction needed
-    LAST_DELTA,  # the last one that was not zero
-    COST,
-    STATIONARITY,
-    VIOLATION,
-    COMPLEMENTARITY,
-    GAP,  # largest |h| and |c + e - s|
-    LEAST,  # smallest product of a slack and its multiplier
-    MOST,  # largest
-    SCALE,  # of stationarity and complementarity
-    STEP,  # norm of the last step taken
-    TAKEN,  # its length
-    TRIAL_COST,
-    SAVED_SLOPE,  # of the step that a correction replaces
-    SAVED_ALPHA,
-    SAVED_DUAL,
-    ASKED,  # price at which it was asked whether the violation is the least
-    PAID,  # largest violation of a row times its price
-    FORCE,  # stationarity in the units of the unknowns
-    COST_UNIT,  # what the objective is measured in
-    STEP_TOLERANCE,  # norm of a full step below which to stop, once the violation is small enough
-    VIOLATION_TOLERANCE,
-    FLOATS,
-) = range(33)
-# Places in Work.counts.
-(
-    ANSWER,  # of the last call, one of the words below
-    SIDES,  # how many there are
-    ITERATION,
-    LIMIT,
-    EXACT,  # whether to use second derivatives
-    FILTERED,  # pairs in the filter
-    TRIALS,
-    CORRECTED,  # whether the trial is a second-order correction
-    FAILURES,  # line searches in a row that found nothing
-    GAUSS_NEWTON,  # whether the present direction used the Gauss-Newton Hessian
-    COLD,  # whether the start had no multipliers
-    DESCENT,  # whether the last trial was accepted because it lowers the barrier function
-    ELASTIC,  # whether equalities are elastic, as inequalities always are
-    GOING_ON,  # whether slacks and multipliers are there: the solve goes on where it was
-    KEPT,  # whether an iterate kept all constraints
-    SHORT_STEPS,  # in a row
-    SCALING,  # whether units are to be found
-    RAISES,  # of the prices
-    INTEGERS,
-) = range(19)
-# Rows of Work.sides.
-(
-    SIGN,  # +1 for a lower limit, -1 for an upper one
-    BORDER,  # the limit
-    Y,  # multiplier, between 0 and rho
-    S,  # slack
-    E,  # elastic variable
-    DY,
-    DS,
-    DE,
-    REST,  # c + e - s of the present iterate, with corrections
-    WEIGHT,  # what the side adds to the Hessian
-    SAVED_DY,
-    SAVED_DS,
-    SAVED_DE,
-    SIDE_ROWS,
-) = range(14)
+Records: TypeAlias = NDArray[np.void]
 
-# Rows of Work.pairs: what makes an equality row elastic, h = p - n.
-(
-    P,
-    N,
-    DP,
-    DN,
-    SAVED_DP,
-    SAVED_DN,
-    PAIR_ROWS,
-) = range(7)
+# Scalars.
+NOW = np.dtype(
+    [
+        ("mu", np.float64),
+        ("rho", np.float64),
+        ("tolerance", np.float64),
+        ("theta", np.float64),  # sum of |h| and |c + e - s| at the present iterate
+        ("phi", np.float64),  # barrier function there
+        ("slope", np.float64),  # its derivative along the step
+        ("alpha", np.float64),  # primal step length under trial
+        ("alpha_dual", np.float64),
+        ("theta_small", np.float64),
+        ("theta_large", np.float64),
+        ("delta", np.float64),  # shift of the Hessian's diagonal that the present direction needed
+        ("last_delta", np.float64),  # the last one that was not zero
+        ("cost", np.float64),
+        ("stationarity", np.float64),
+        ("violation", np.float64),
+        ("complementarity", np.float64),
+        ("gap", np.float64),  # largest |h| and |c + e - s|
+        ("least", np.float64),  # smallest product of a slack and its multiplier
+        ("most", np.float64),  # largest
+        ("scale", np.float64),  # of stationarity and complementarity
+        ("step", np.float64),  # norm of the last step taken
+        ("taken", np.float64),  # its length
+        ("trial_cost", np.float64),
+        ("saved_slope", np.float64),  # of the step that a correction replaces
+        ("saved_alpha", np.float64),
+        ("saved_dual", np.float64),
+        ("asked", np.float64),  # price at which it was asked whether the violation is the least
+        ("paid", np.float64),  # largest violation of a row times its price
+        ("force", np.float64),  # stationarity in the units of the unknowns
+        ("cost_unit", np.float64),  # what the objective is measured in
+        ("step_tolerance", np.float64),  # norm of a full step below which to stop, once the violation is small enough
+        ("violation_tolerance", np.float64),
+        ("answer", np.int64),  # of the last call, one of the words below
+        ("sides", np.int64),  # how many there are
+        ("iteration", np.int64),
+        ("limit", np.int64),
+        ("exact", np.int64),  # whether to use second derivatives
+        ("filtered", np.int64),  # pairs in the filter
+        ("trials", np.int64),
+        ("corrected", np.int64),  # whether the trial is a second-order correction
+        ("failures", np.int64),  # line searches in a row that found nothing
+        ("gauss_newton", np.int64),  # whether the present direction used the Gauss-Newton Hessian
+        ("cold", np.int64),  # whether the start had no multipliers
+        ("descent", np.int64),  # whether the last trial was accepted because it lowers the barrier function
+        ("elastic", np.int64),  # whether equalities are elastic, as inequalities always are
+        ("going_on", np.int64),  # whether slacks and multipliers are there: the solve goes on where it was
+        ("kept", np.int64),  # whether an iterate kept all constraints
+        ("short_steps", np.int64),  # in a row
+        ("scaling", np.int64),  # whether units are to be found
+        ("raises", np.int64),  # of the prices
+    ]
+)
+# A finite limit of an inequality row.
+SIDE = np.dtype(
+    [
+        ("row", np.int64),  # of the constraints
+        ("sign", np.float64),  # +1 for a lower limit, -1 for an upper one
+        ("border", np.float64),  # the limit
+        ("y", np.float64),  # multiplier, between 0 and rho
+        ("s", np.float64),  # slack
+        ("e", np.float64),  # elastic variable
+        ("dy", np.float64),
+        ("ds", np.float64),
+        ("de", np.float64),
+        ("rest", np.float64),  # c + e - s of the present iterate, with corrections
+        ("weight", np.float64),  # what the side adds to the Hessian
+        ("saved_dy", np.float64),
+        ("saved_ds", np.float64),
+        ("saved_de", np.float64),
+    ]
+)
+# What makes an equality row elastic, h = p - n.
+PAIR = np.dtype(
+    [
+        ("p", np.float64),
+        ("n", np.float64),
+        ("dp", np.float64),
+        ("dn", np.float64),
+        ("saved_dp", np.float64),
+        ("saved_dn", np.float64),
+    ]
+)
+# Addresses of compiled functions.
+FUNCTIONS = "factor solve linearize evaluate curve retract"
+FUNCTIONS += " begin measure test direct steer advance judge correct restore accept relax loop"
+LINKS = np.dtype([(name, np.int64) for name in FUNCTIONS.split()])
 
 # What a call answers.
 TRY, ACCEPTED, AGAIN, CONVERGED, LIMIT_REACHED, SINGULAR, STALLED, NOT_FINITE, VIOLATED, STOPPED = range(10)
-# Places in Problem.links.
-(
-    FACTOR, SOLVE, LINEARIZE, EVALUATE, CURVE, RETRACT, BEGIN, MEASURE, TEST, DIRECT, STEER, ADVANCE, JUDGE, CORRECT,
-    RESTORE, ACCEPT, RELAX, LOOP, LINKS,
-) = range(19)  # fmt: skip
-
 FILTER = 400  # pairs of theta and phi that are remembered
 
 
@@ -112,7 +112,7 @@ class Problem(NamedTuple):
     """What one structure needs and no iteration changes.
 
     Attributes:
-        links: addresses of compiled functions, by the names above.
+        links: (1,) addresses of compiled functions.
         terms: of the program.
         plan: elimination of the KKT matrix, whose entries come in the order of ``Work.data``.
         retraction: its parts.
@@ -123,7 +123,7 @@ class Problem(NamedTuple):
         doubles: (D, 2) places in ``Work.data`` that mean one entry of the matrix: the second is added to the first.
     """
 
-    links: IntArray
+    links: Records
     terms: TermArrays
     plan: Plan
     retraction: IntArray
@@ -138,10 +138,9 @@ class Work(NamedTuple):
     """What the method remembers; each array with its shape, whose words :func:`empty_work` is told.
 
     Attributes:
-        numbers, counts: scalars, by the names above.
-        sides: (SIDE_ROWS, 2 M) one column for each finite limit of an inequality row.
-        side_row: (2 M,) its row.
-        pairs: (PAIR_ROWS, E) one column for each equality row.
+        scalars: (1,) of `NOW`.
+        sides: (2 M,) one for each finite limit of an inequality row.
+        pairs: (E,) one for each equality row.
         prices: (M,) of the elastic variables of a row.
         row_units, units: (M,) what a row, and (width,) what an unknown, is measured in.
         kept: stored values of the last iterate that kept all constraints.
@@ -165,11 +164,9 @@ class Work(NamedTuple):
         log: (iterations, 9) history.
     """
 
-    numbers: Annotated[Array, FLOATS]
-    counts: Annotated[IntArray, INTEGERS]
-    sides: Annotated[Array, SIDE_ROWS, "sides"]
-    side_row: Annotated[IntArray, "sides"]
-    pairs: Annotated[Array, PAIR_ROWS, "equalities"]
+    scalars: Annotated[Records, NOW, 1]
+    sides: Annotated[Records, SIDE, "sides"]
+    pairs: Annotated[Records, PAIR, "equalities"]
     prices: Annotated[Array, "rows"]
     row_units: Annotated[Array, "rows"]
     units: Annotated[Array, "width"]
@@ -207,6 +204,6 @@ def empty_work(**sizes: int) -> Work:
     """Arrays of the shapes that :class:`Work` gives them, all zero; ``sizes`` says what the words in them mean."""
     arrays: dict[str, Any] = {}
     for name, hint in get_type_hints(Work, include_extras=True).items():
-        shape = [sizes[size] if isinstance(size, str) else size for size in hint.__metadata__]
-        arrays[name] = np.zeros(shape, dtype=np.int64 if hint.__origin__ == IntArray else np.float64)
+        kind, *shape = hint.__metadata__ if hint.__origin__ == Records else (np.float64, *hint.__metadata__)
+        arrays[name] = np.zeros([sizes.get(size, size) for size in shape], dtype=kind)
     return Work(**arrays)
