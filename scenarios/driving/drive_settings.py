@@ -98,9 +98,9 @@ def backend(name: str, settings: ControllerSettings, patience: int = 1) -> fg.So
         BackendError: for an unknown name.
     """
     early = {"step_tolerance": settings.step_tolerance, "violation_tolerance": 0.5 * settings.feasible}
-    own: dict[str, dict[str, float]] = {
+    own: dict[str, dict[str, float | str]] = {
         "sqp": {**early, "max_iterations": 10 * patience},
         "alm": {**early, "max_iterations": 18 * patience, "penalty": PENALTY},
-        "ipm": {"max_iterations": 25 * patience},
+        "ipm": {**early, "max_iterations": 25 * patience, "hessian": "gauss-newton"},
     }
     return names.backend(name, tolerance=settings.tolerance, **own.get(name, {}))
