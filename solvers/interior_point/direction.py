@@ -98,7 +98,7 @@ def steer(address: int) -> None:
     """Solve for the residuals in ``rests`` and REST: the step, those of the sides, the slope, and both lengths."""
     constraint_jacobian, free, full, gradient = parts(address, "constraint_jacobian free full gradient")
     links, multipliers, pairs, plan, prices = parts(address, "links multipliers pairs plan prices")
-    rests, right, row_terms, rows, scalars = parts(address, "rests right row_terms rows scalars")
+    rests, right, row_terms, rows, scalars, unequal = parts(address, "rests right row_terms rows scalars unequal")
     sides, spread, step, terms = parts(address, "sides spread step terms")
     now = scalars[0]
     mu, elastic = now.mu, now.elastic == 1
@@ -121,7 +121,7 @@ def steer(address: int) -> None:
             over, under = prices[row] - multipliers[row], prices[row] + multipliers[row]
             right[n + k] += pairs[k].n - pairs[k].p + mu / over - mu / under
     run(links[0].solve, (plan, right, step))
-    times(terms, False, constraint_jacobian, step, row_terms)
+    times(terms, False, constraint_jacobian, step, row_terms, unequal)
     slope = 0.0
     for k in range(n):
         slope += gradient[free[k]] * step[k]

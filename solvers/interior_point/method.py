@@ -22,11 +22,12 @@ from unifg.program.curvature import lagrangian_hessian
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.program.systems import stacked
+from unifg.program.table import COST, COUNT, KIND, ROW, ROWS
 from unifg.solvers.globalize.least_violation import nearest
 from unifg.solvers.interior_point import state
 from unifg.solvers.interior_point.loop import addresses, call
 from unifg.solvers.interior_point.state import Problem, Work, empty_work
-from unifg.typing import Array
+from unifg.typing import Array, IntArray
 
 ENDINGS = {
     state.CONVERGED: Status.CONVERGED,
@@ -203,9 +204,15 @@ class Workspace:
             arrays.rows,
             arrays.entries,
             doubles,
+            np.array([self._unequal(row) for row in program.arrays.fields], dtype=np.int64),
         )
         self._describe()
         self.problem.links[:] = addresses()
+
+    def _unequal(self, term: IntArray) -> bool:
+        """Whether a row of the table is a term with inequality rows."""
+        rows = slice(term[ROW], term[ROW] + term[COUNT] * term[ROWS])
+        return term[KIND] != COST and not self.program.equality[rows].all()
 
     def _describe(self) -> None:
         """Tell compiled code where the arrays are."""

@@ -121,6 +121,7 @@ class Problem(NamedTuple):
         rows: (E,) equality rows.
         entries: entries of the constraint Jacobian behind those of the Hessian in ``Work.data``.
         doubles: (D, 2) places in ``Work.data`` that mean one entry of the matrix: the second is added to the first.
+        unequal: (T,) whether a term has inequality rows.
     """
 
     links: Records
@@ -132,6 +133,7 @@ class Problem(NamedTuple):
     rows: IntArray
     entries: IntArray
     doubles: IntArray
+    unequal: IntArray
 
 
 class Work(NamedTuple):

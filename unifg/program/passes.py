@@ -265,45 +265,55 @@ def add_constraints(terms: TermArrays, constraint_jacobian: Array, weights: Arra
         term = fields[t]
         if term[KIND] == COST:
             continue
-        m, width = term[ROWS], term[WIDTH]
-        for i in range(term[COUNT]):
-            row = term[ROW] + i * m
-            for a in range(m):
-                w = weights[row + a]
-                if w == 0.0:
-                    continue
-                entry = term[ENTRY] + (i * m + a) * width
-                at = term[POSITION] + i * (width * (width + 1) // 2)
-                for d in range(width):
-                    scaled = w * constraint_jacobian[entry + d]
-                    for e in range(d + 1):
-                        where = positions[at + e]
-                        if where >= 0:
-                            hessian[where] += scaled * constraint_jacobian[entry + e]
-                        elif where != -1:
-                            hessian[-2 - where] += 2.0 * scaled * constraint_jacobian[entry + e]
-                    at += d + 1
+        m, width, row, entry, start = term[ROWS], term[WIDTH], term[ROW], term[ENTRY], term[POSITION]
+        if term[KIND] == BOUND:
+            for i in range(term[COUNT]):
+                if positions[start + i] >= 0:
+                    slope = constraint_jacobian[entry + i]
+                    hessian[positions[start + i]] += weights[row + i] * slope * slope
+            continue
+        for _ in range(term[COUNT]):
+            for _ in range(m):
+                w, at = weights[row], start
+                if w != 0.0:
+                    for d in range(width):
+                        scaled = w * constraint_jacobian[entry + d]
+                        for e in range(d + 1):
+                            where = positions[at + e]
+                            if where >= 0:
+                                hessian[where] += scaled * constraint_jacobian[entry + e]
+                            elif where != -1:
+                                hessian[-2 - where] += 2.0 * scaled * constraint_jacobian[entry + e]
+                        at += d + 1
+                entry += width
+                row += 1
+            start += width * (width + 1) // 2
 
 
 @compiled
-def times(terms: TermArrays, costs: bool, entries: Array, other: Array, out: Array) -> None:
-    """J v over the unknowns, for the rows of the costs or of the constraints."""
+def times(
+    terms: TermArrays, costs: bool, entries: Array, other: Array, out: Array, chosen: IntArray | None = None
+) -> None:
+    """J v over the unknowns, for the rows of the costs or of the constraints; of ``chosen`` (T,) terms, if given."""
     fields, columns, unknowns = terms.fields, terms.columns, terms.unknown
     for t in range(len(fields)):
         term = fields[t]
         if (term[KIND] == COST) != costs:
             continue
-        m, width = term[ROWS], term[WIDTH]
-        for i in range(term[COUNT]):
-            column = term[COLUMN] + i * width
-            for a in range(m):
-                entry = term[ENTRY] + (i * m + a) * width
+        if chosen is not None and chosen[t] == 0:
+            continue
+        m, width, row, entry, column = term[ROWS], term[WIDTH], term[ROW], term[ENTRY], term[COLUMN]
+        for _ in range(term[COUNT]):
+            for _ in range(m):
                 total = 0.0
                 for d in range(width):
                     unknown = unknowns[columns[column + d]]
                     if unknown >= 0:
                         total += entries[entry + d] * other[unknown]
-                out[term[ROW] + i * m + a] = total
+                out[row] = total
+                entry += width
+                row += 1
+            column += width
 
 
 @compiled
@@ -314,12 +324,17 @@ def transposed_times(terms: TermArrays, costs: bool, entries: Array, other: Arra
         term = fields[t]
         if (term[KIND] == COST) != costs:
             continue
-        m, width = term[ROWS], term[WIDTH]
-        for i in range(term[COUNT]):
-            column = term[COLUMN] + i * width
-            for a in range(m):
-                scale = other[term[ROW] + i * m + a]
+        m, width, row, entry, column = term[ROWS], term[WIDTH], term[ROW], term[ENTRY], term[COLUMN]
+        if term[KIND] == BOUND:
+            for i in range(term[COUNT]):
+                out[columns[column + i]] += other[row + i] * entries[entry + i]
+            continue
+        for _ in range(term[COUNT]):
+            for _ in range(m):
+                scale = other[row]
                 if scale != 0.0:
-                    entry = term[ENTRY] + (i * m + a) * width
                     for d in range(width):
                         out[columns[column + d]] += scale * entries[entry + d]
+                entry += width
+                row += 1
+            column += width
