@@ -23,7 +23,6 @@ from benchmarks.casadi_peer import Staged, available
 from benchmarks.report import command, listing, machine, publish, table, words
 from problems import disc_fields, parkings
 from problems.cylinders import flight
-from unifg.solvers import InteriorPoint
 from unifg.solvers.names import backends
 
 PEERS = ("ipopt", "fatrop")
@@ -181,7 +180,7 @@ def parking_peer(kind: parkings.Guess, plugin: str) -> Solve:
     return solve
 
 
-ALONE = {"ipm": InteriorPoint()}
+ALONE = backends("ipm")
 CYLINDERS = Study(20, cylinders, backends("ipm", "sqp", "alm"), cylinder_peer, ("ipopt",), aimed=False)
 STUDIES = {
     "discs": Study(200, field, ALONE, field_peer),
