@@ -205,14 +205,12 @@ def test_refusals_name_term_and_family() -> None:
     smoother, other = Incremental(), Incremental()
     x, y = smoother.variables("x", fg.SE2), other.variables("y", fg.SE2)
     v = smoother.variables("v", fg.Rn(2))
-    with pytest.raises(GraphError, match="no compiled residual"):
-        smoother.minimize(lambda pose: pose, x[0], sigma=1.0)
+    with pytest.raises(GraphError, match=r"returned shape \(1, 3, 1\)"):
+        smoother.minimize(lambda pose: pose[:, :, None], x[0], sigma=1.0)
     with pytest.raises(GraphError, match="belongs to another graph"):
         smoother.minimize(fg.prior, y[0], np.zeros(3), sigma=1.0)
-    with pytest.raises(GraphError, match="variable on SE2"):
+    with pytest.raises(GraphError, match="of between is SE2; found"):
         smoother.minimize(fg.between, x[0], v[0], np.zeros(3), sigma=1.0)
-    with pytest.raises(GraphError, match="twice in one factor"):
-        smoother.minimize(fg.between, x[1], x[1], np.zeros(3), sigma=1.0)
     with pytest.raises(GraphError, match="not finite"):
         smoother.minimize(fg.prior, x[0], [np.nan, 0.0, 0.0], sigma=1.0)
     with pytest.raises(GraphError, match="negative eigenvalue"):

@@ -86,7 +86,8 @@ def add_products(
         source: offset of the upper triangle of J'J with J'r as one more column, in rows of ``width + 1``.
         width: columns of J.
         slots: variables of the factor.
-        rows: (slots,) row of the front where each begins; one that occurs twice counts as the sum of both.
+        rows: (slots,) row of the front where each begins; where two overlap their columns are
+            added.
         dims: (slots,) columns of each.
         front: offset of the front.
         stride: length of its rows.
@@ -105,21 +106,22 @@ def add_products(
             other = column + dim
             for t in range(s + 1, slots):
                 beside, wide = get(rows, t), get(dims, t)
-                if row < beside:
+                if row + dim <= beside:
                     at = front + (row + i) * stride + beside
                     for k in range(0, wide, 4):
                         passed = blend(load(numbers, source + other + k), zero, wide - k)
                         store(numbers, at + k, plus(load(numbers, at + k), 1.0, passed))
-                elif row > beside:
+                elif beside + wide <= row:
                     at = front + beside * stride + row + i
                     for k in range(wide):
                         put(numbers, at, get(numbers, at) + get(numbers, source + other + k))
                         at += stride
                 else:
                     for k in range(wide):
-                        at = front + (row + i) * stride + row + k if i < k else front + (row + k) * stride + row + i
+                        a, b = row + i, beside + k
+                        at = front + (a * stride + b if a < b else b * stride + a)
                         entry = get(numbers, source + other + k)
-                        put(numbers, at, get(numbers, at) + (2.0 * entry if i == k else entry))
+                        put(numbers, at, get(numbers, at) + (2.0 * entry if a == b else entry))
                 other += wide
             source += width + 1
         column += dim

@@ -8,9 +8,10 @@ from central differences along the right perturbation of every variable, in comp
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
+from functools import lru_cache
 from math import prod
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -48,7 +49,7 @@ def per_factor(
     shapes: Sequence[tuple[int, ...]],
     name: str,
 ) -> Kernel:
-    """Write, compile and wrap the loop body that calls ``function``.
+    """Write, compile and wrap the loop body that calls ``function``; once for all terms that use it alike.
 
     Args:
         function: compiled, ``function(*arguments, r)``.
@@ -61,6 +62,18 @@ def per_factor(
     Raises:
         GraphError: when a manifold has no compiled retraction, or a parameter more than two axes.
     """
+    return _compiled(function, jacobian, rows, tuple(arguments), tuple(shapes), name)
+
+
+@lru_cache(maxsize=256)
+def _compiled(
+    function: Any,
+    jacobian: Any,
+    rows: int,
+    arguments: tuple[Hashable, ...],
+    shapes: tuple[tuple[int, ...], ...],
+    name: str,
+) -> Kernel:
     names: dict[str, Any] = {"function": function, "jacobian": jacobian, "vector": vector, "matrix": matrix}
     names |= {"local_vector": local_vector, "local_matrix": local_matrix}
     names |= {"step_of": step_of, "step_for": step_for, "largest": largest, "uncertainty": uncertainty, "np": np}
@@ -69,7 +82,7 @@ def per_factor(
     at = offset = 0
     parts: list[str] = []  # of the call, {} standing for the array the variables are read from
     slots: list[tuple[int, Manifold]] = []
-    for argument in arguments:
+    for argument in cast(tuple[Manifold | int, ...], arguments):
         if isinstance(argument, int):
             shape = next(sizes)
             parts.append(_parameter(name, offset, shape))
@@ -91,7 +104,7 @@ def per_factor(
         lines += _differences(call, slots, rows, at, name, names)
     logger.info("compiling the residual '%s', once in this process", name)
     kernel = written("kernel", lines, names, name)
-    return Kernel(kernel, tuple(arguments), rows, name=name, differenced=jacobian is None)
+    return Kernel(kernel, cast(tuple[Manifold | int, ...], arguments), rows, name=name, differenced=jacobian is None)
 
 
 def _parameter(name: str, offset: int, shape: tuple[int, ...]) -> str:

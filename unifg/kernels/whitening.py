@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from math import sqrt
+
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.machine.jit import inlined
+from unifg.machine.jit import compiled, inlined
 from unifg.typing import Array
 
 DIAGONAL, FULL = 2, 4  # kinds of W; 1 is added when every factor has its own
@@ -93,3 +95,35 @@ def square_roots(name: str, information: Array, count: int, size: int) -> Array:
         roots = np.sqrt(np.maximum(eigenvalues, 0.0))[..., :, None] * np.swapaxes(vectors, -1, -2)
         return np.asarray(np.linalg.qr(roots, mode="r"))
     return np.ascontiguousarray(np.swapaxes(lower, -1, -2))
+
+
+@compiled
+def whiten_rows(kind: int, whiteners: Array, residual: Array, jacobian: Array) -> None:
+    """Whiten (n, m) residuals and (n, m, D) Jacobians, or (0, m, D) where they are not wanted, in place."""
+    flat = whiteners.ravel()
+    for i in range(len(residual)):
+        whiten(kind, flat, 0, i, residual[i], jacobian[i] if len(jacobian) else np.empty((0, 0)))
+
+
+@compiled
+def quick_roots(information: Array, out: Array) -> bool:
+    """Upper triangular W with W'W of (n, m, m) matrices into (n, m m); False unless all are positive definite."""
+    count, m = len(information), information.shape[1]
+    for k in range(count):
+        for i in range(m):
+            for j in range(m):
+                a, b = information[k, i, j], information[k, j, i]
+                if not abs(a - b) <= 1e-9 * abs(b):
+                    return False
+                out[k, i * m + j] = a if j >= i else 0.0
+        for i in range(m):
+            pivot = out[k, i * m + i]
+            if not 1e-13 * information[k, i, i] < pivot < np.inf:
+                return False
+            root = sqrt(pivot)
+            for j in range(i, m):
+                out[k, i * m + j] /= root
+            for a in range(i + 1, m):
+                for b in range(a, m):
+                    out[k, a * m + b] -= out[k, i * m + a] * out[k, i * m + b]
+    return True

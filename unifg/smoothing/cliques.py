@@ -72,8 +72,8 @@ def add_factor(memory: Address, f: int, place: IntArray, clique: Record, rows: I
     lists, variables, factor = state.lists, state.variables, state.factors[f]
     kind = state.types[factor.type]
     for s in range(kind.slots):
-        variable = variables[get(lists, factor.variables + s)]
-        rows[s], dims[s] = place[variable.local], variable.dim
+        slot = state.slots[kind.slot + s]
+        rows[s], dims[s] = place[variables[get(lists, factor.variables + s)].local] + slot.tangent, slot.dim
     add_products(
         address(state.numbers), factor.data + kind.numbers, kind.width, kind.slots, rows, dims, clique.front,
         clique.stride, clique.size,

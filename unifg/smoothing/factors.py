@@ -1,29 +1,39 @@
-"""From what a user states to the numbers compiled code reads: types of factors, whitening, robust losses."""
+"""From what a user states to the numbers compiled code reads: types of factors, and the parts of manifolds.
+
+A statement is a cost like those of a graph, and the first of its kind is compiled as a graph compiles it
+(:class:`unifg.program.term.CompiledTerm`), with the same demands and messages. After that the kernel is known, and the
+next statement only lays out its numbers.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import isfinite, sqrt
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import isfinite
 from typing import Any
 
 import numpy as np
 
 from unifg.errors import GraphError
 from unifg.kernels.kernel import Kernel, side_by_side
-from unifg.kernels.per_factor import per_factor
 from unifg.kernels.residuals import Residual
-from unifg.kernels.robust import Form, Loss, form_of
-from unifg.kernels.whitening import DIAGONAL, FULL, reciprocals, square_roots
+from unifg.kernels.robust import QUADRATIC, Form, Loss, form_of
+from unifg.kernels.whitening import DIAGONAL, FULL, quick_roots, reciprocals, square_roots
 from unifg.language.factors import prior
 from unifg.language.statement import AnyResidual, complete
-from unifg.language.variables import as_selection, is_variable
+from unifg.language.terms import Cost, Parameter, prepare_arguments
+from unifg.language.variables import Data, Family, Selection
 from unifg.lie import Manifold
 from unifg.lie.moving import ADDITION, move_of
 from unifg.lie.product import leaves
-from unifg.machine.jit import compiled, is_compiled
+from unifg.program.columns import Columns
+from unifg.program.term import CompiledTerm
 from unifg.smoothing.families import GrowingFamily
-from unifg.smoothing.state import SLOTS_MAX
-from unifg.typing import Array, ArrayLike, BoolArray, IntArray
+from unifg.smoothing.state import BY_PYTHON
+from unifg.typing import Array, BoolArray, IntArray
+
+PLAIN: Form = (QUADRATIC, 0.0, 0.0)
+NOBODY = np.zeros(0, dtype=np.int64)
 
 
 @dataclass(eq=False)
@@ -34,8 +44,10 @@ class Staged:
         kind: number of their type.
         families: of their variables, in order.
         members: (n,) for each family, or one number where all factors share it.
-        data: (n, numbers) parameters, whitener, parameter of the loss.
+        data: (n, numbers) parameters and whitener.
         name: for messages.
+        term: what evaluates them, where that is Python.
+        items: (n,) their numbers within it.
     """
 
     kind: int
@@ -43,74 +55,56 @@ class Staged:
     members: list[IntArray | int]
     data: Array
     name: str
+    term: CompiledTerm | None = None
+    items: IntArray = field(default_factory=lambda: NOBODY)
 
     def keep(self, wanted: BoolArray) -> None:
         """Leave out the others."""
         self.members = [m if isinstance(m, int) else m[wanted] for m in self.members]
         self.data = self.data[wanted]
+        self.items = self.items[wanted] if len(self.items) else self.items
 
 
 class Types:
-    """The types of factors of one smoother: a kernel, how it is whitened, its loss.
+    """The types of factors of one smoother: a kernel, what it reads, how it is whitened, its loss.
 
     Attributes:
         fields: one row for each type, as TYPE has them.
+        slots: one row for each variable of each type, as SLOT has them.
         scratch: numbers that any of them needs while it is evaluated.
     """
 
     def __init__(self) -> None:
         """Know none."""
         self.fields: list[tuple[float, ...]] = []
+        self.slots: list[tuple[int, ...]] = []
         self.scratch = 8
         self._numbers: dict[tuple[Any, ...], int] = {}
-        self._kernels: dict[tuple[Any, ...], Kernel] = {}
+        self._kernels: dict[tuple[Any, ...], tuple[Kernel, Residual]] = {}
 
     def stage(
         self,
         function: AnyResidual,
         arguments: tuple[Any, ...],
-        sigma: ArrayLike | None,
-        information: ArrayLike | None,
+        sigma: Parameter | None,
+        information: Parameter | None,
         robust: Loss | None,
+        active: Any,
+        given: str | None,
     ) -> Staged:
         """Check a statement and lay out its numbers.
 
         Raises:
             GraphError: naming the term and what does not fit.
         """
-        wrapped = complete(function, arguments)
-        name = wrapped.name
+        wrapped = complete(function, arguments, given)
+        name = given or wrapped.name
         if sigma is not None and information is not None:
             raise GraphError(f"term '{name}': give sigma or information, not both", term=name)
-        kernel = self._kernel(wrapped, arguments)
-        if len(arguments) != len(kernel.arguments):
-            raise GraphError(
-                f"term '{name}': {kernel.name} takes {len(kernel.arguments)} arguments, found {len(arguments)}",
-                term=name,
-            )
+        normal, active, count = prepare_arguments(name, arguments, active)
+        selections = [argument for argument in normal if isinstance(argument, Selection)]
         families: list[GrowingFamily] = []
-        chosen: list[IntArray] = []
-        filled = []
-        for place, (argument, expected) in enumerate(zip(arguments, kernel.arguments, strict=True)):
-            if isinstance(expected, int | tuple):
-                if is_variable(argument):
-                    raise GraphError(f"term '{name}': argument {place} is a parameter, not a variable", term=name)
-                filled.append(argument)
-                continue
-            if not is_variable(argument):
-                raise GraphError(
-                    f"term '{name}': argument {place} is a variable on {expected.name}, found a constant: give it a "
-                    "member and a prior",
-                    term=name,
-                )
-            selection = as_selection(argument)
-            if selection.component is not None or selection.manifold != expected:
-                raise GraphError(
-                    f"term '{name}': argument {place} is a whole variable on {expected.name}, found {selection!r} on "
-                    f"{selection.manifold.name}",
-                    term=name,
-                    family=selection.family.name,
-                )
+        for selection in selections:
             if not isinstance(selection.family, GrowingFamily):
                 raise GraphError(
                     f"term '{name}': family '{selection.family.name}' belongs to another graph",
@@ -118,135 +112,138 @@ class Types:
                     family=selection.family.name,
                 )
             families.append(selection.family)
-            chosen.append(selection.indices)
-            filled.append(np.empty((1, expected.storage)))
-        count = max(len(indices) for indices in chosen)
-        if any(len(indices) not in (1, count) for indices in chosen):
-            lengths = [len(indices) for indices in chosen]
-            raise GraphError(f"term '{name}': the number of factors is unclear: selections of {lengths}", term=name)
-        members: list[IntArray | int] = [int(c[0]) if len(c) == 1 else c for c in chosen]
-        for k, (family, other) in enumerate(zip(families, members, strict=True)):
-            for before in range(k):
-                if families[before] is family and np.any(members[before] == other):
-                    raise GraphError(
-                        f"term '{name}': the same member of '{family.name}' twice in one factor", term=name
-                    )
+        members = [int(s.indices[0]) if len(s) == 1 else s.indices for s in selections]
+        form = form_of(robust)
+        key = self._key(wrapped, normal)
+        known = self._kernels.get(key) if form is not None else None
+        if known is None:
+            term = _compiled(Cost(name, wrapped, _by_itself(normal), None, count, sigma, information, robust))
+            if term.kernel is None or form is None or len(term.kernel.manifolds) > len(selections):
+                rest = np.zeros((count, 0))
+                kind = self._kind(None, (0, 0, 0, term.size), selections, (), *PLAIN)
+                staged = Staged(kind, families, members, rest, name, term, np.arange(count))
+                return _active(staged, active)
+            known = self._kernels[key] = term.kernel, wrapped
+        kernel, form = known[0], form or PLAIN
+        values = [argument.value if isinstance(argument, Data) else argument for argument in normal]
+        filled = [np.empty((1, a.manifold.storage)) if isinstance(a, Selection) else a for a in values]
         try:
             _, parameters, rows = kernel.split(filled, count)
         except GraphError as error:
             raise GraphError(f"term '{name}': {error}", term=name) from None
         if rows > 1 and count == 1:
             raise GraphError(f"term '{name}': its parameters speak of {rows} factors, its variables of one", term=name)
-        shapes = [parameter.shape[1:] for parameter in parameters]
+        shapes = tuple([parameter.shape[1:] for parameter in parameters])
         size = kernel.size(shapes)
         whitening, whitener = 0, np.zeros((1, 0))
         if sigma is not None:
-            whitening, whitener = DIAGONAL, reciprocals(name, np.asarray(sigma, dtype=np.float64), count, size)
+            whitening, whitener = DIAGONAL, reciprocals(name, _numbers(sigma), count, size)
         elif information is not None:
-            given = np.array(information, dtype=np.float64, ndmin=3, order="C")
-            whitener = np.empty((len(given), size * size))
-            if given.shape[1:] != (size, size) or len(given) not in (1, count) or not upper_roots(given, whitener):
-                roots = square_roots(name, np.asarray(information, dtype=np.float64), count, size)
+            stack = np.array(_numbers(information), ndmin=3, order="C")
+            whitener = np.empty((len(stack), size * size))
+            if stack.shape[1:] != (size, size) or len(stack) not in (1, count) or not quick_roots(stack, whitener):
+                roots = square_roots(name, _numbers(information), count, size)
                 whitener = roots.reshape(len(roots), size * size)
             whitening = FULL
-        form = form_of(robust)
-        if form is None:
-            raise GraphError(
-                f"term '{name}': {type(robust).__name__} has no compiled form; a smoother takes Huber, Cauchy, Tukey, "
-                "GemanMcClure, DCS and TruncatedLeastSquares",
-                term=name,
-            )
         data = side_by_side([*parameters, whitener], count)
         if not isfinite(data.sum()):
             index = int(np.argwhere(~np.isfinite(data))[0, 0])
             raise GraphError(f"term '{name}': a parameter of factor {index} is not finite", term=name, index=index)
-        key = (id(kernel), tuple(shapes), whitening, form)
-        kind = self._numbers.get(key)
-        if kind is None:
-            kind = self._numbers[key] = self._add(kernel, size, data.shape[1], whitener.shape[1], whitening, form)
-        return Staged(kind, families, members, data, name)
+        counts = data.shape[1] - whitener.shape[1], data.shape[1], whitening, size
+        kind = self._kind(kernel, counts, selections, shapes, *form)
+        return _active(Staged(kind, families, members, data, name), active)
 
-    def _add(self, kernel: Kernel, size: int, numbers: int, whitener: int, whitening: int, form: Form) -> int:
-        """Describe a new type; the kernel is kept, because compiled code knows only where it stands."""
-        manifolds = kernel.manifolds
-        if len(manifolds) > SLOTS_MAX:
-            raise GraphError(f"{kernel.name}: {len(manifolds)} variables in one factor, at most {SLOTS_MAX} here")
-        width = sum(manifold.dim for manifold in manifolds)
-        parameters = numbers - whitener
-        self._kernels[(id(kernel),)] = kernel
-        self.scratch = max(self.scratch, sum(manifold.storage for manifold in manifolds) + size * (1 + width) + 8)
-        loss, first, second = form
+    def _kind(
+        self,
+        kernel: Kernel | None,
+        counts: tuple[int, int, int, int],
+        selections: Sequence[Selection],
+        shapes: tuple[tuple[int, ...], ...],
+        loss: int,
+        first: float,
+        second: float,
+    ) -> int:
+        """Number of a type; kernels are kept, because compiled code knows only where they stand."""
+        parameters, numbers, whitening, size = counts
+        reads = tuple([(s.storage.start, s.manifold.storage, s.tangent.start, s.manifold.dim) for s in selections])
+        key = id(kernel), counts, reads, shapes, loss, first, second
+        kind = self._numbers.get(key)
+        if kind is not None:
+            return kind
+        width = sum(read[3] for read in reads)
+        storage = sum(read[1] for read in reads) + max(s.family.manifold.storage for s in selections)
+        self.scratch = max(self.scratch, storage + size * (1 + width) + 8)
+        where, table = (0, NOBODY) if kernel is None else (kernel.address, kernel.table)
         self.fields.append(
             (
-                kernel.address,
-                size,
-                len(manifolds),
-                width,
-                parameters,
-                kernel.table.ctypes.data,
-                kernel.table.size,
-                whitening,
-                loss,
-                numbers,
-                first,
-                second,
+                where, size, len(self.slots), len(reads), width, parameters, table.ctypes.data, table.size, whitening,
+                loss, numbers, first, second,
             )
-        )
+        )  # fmt: skip
+        self.slots += reads
+        self._numbers[key] = len(self.fields) - 1
         return len(self.fields) - 1
 
-    def _kernel(self, wrapped: Residual, arguments: tuple[Any, ...]) -> Kernel:
-        """The residual of one factor in compiled form."""
-        if wrapped.kernel is not None:
-            return wrapped.kernel
-        if not is_compiled(wrapped.function):
-            raise GraphError(
-                f"term '{wrapped.name}' has no compiled residual: a smoother calls its factors from compiled code. "
-                "Write the residual of one factor with numba.njit and pass fg.residual(function, rows=m)",
-                term=wrapped.name,
-            )
-        kinds: list[Manifold | int] = []
-        shapes = []
-        for argument in arguments:
-            if is_variable(argument):
-                kinds.append(as_selection(argument).manifold)
-                continue
-            shape = np.shape(argument)
-            shapes.append(shape[1:] if len(shape) > 1 else shape)
-            kinds.append(len(shapes[-1]))
-        key = (id(wrapped.function), id(wrapped.jacobian), tuple(kinds), tuple(shapes))
-        if key not in self._kernels:
-            self._kernels[key] = per_factor(
-                wrapped.function, wrapped.jacobian, wrapped.rows, kinds, shapes, wrapped.name
-            )
-        return self._kernels[key]
+    def _key(self, wrapped: Residual, arguments: Sequence[Any]) -> tuple[Any, ...]:
+        """What makes statements share a kernel."""
+        kernel = wrapped.kernel
+        expected = kernel.arguments if kernel is not None else ()
+        parts: list[Any] = [
+            id(kernel) if kernel is not None else (id(wrapped.function), id(wrapped.jacobian), wrapped.rows)
+        ]
+        for place, argument in enumerate(arguments):
+            if isinstance(argument, Selection):
+                parts.append(argument.manifold)
+            elif kernel is not None and place < len(expected):
+                axes = expected[place]
+                parts.append(axes if isinstance(axes, int | tuple) else "constant")
+            elif wrapped.rows:
+                shape = argument.value.shape if isinstance(argument, Data) else np.shape(argument)
+                each = argument.each if isinstance(argument, Data) else len(shape) > 1
+                parts.append(shape[1:] if each else shape)
+        return tuple(parts)
 
 
-@compiled
-def upper_roots(information: Array, out: Array) -> bool:
-    """Upper triangular W with W'W of (n, m, m) matrices into (n, m m); False unless all are positive definite."""
-    count, m = len(information), information.shape[1]
-    for k in range(count):
-        for i in range(m):
-            for j in range(m):
-                a, b = information[k, i, j], information[k, j, i]
-                if not abs(a - b) <= 1e-9 * abs(b):
-                    return False
-                out[k, i * m + j] = a if j >= i else 0.0
-        for i in range(m):
-            pivot = out[k, i * m + i]
-            if not 1e-13 * information[k, i, i] < pivot < np.inf:
-                return False
-            root = sqrt(pivot)
-            for j in range(i, m):
-                out[k, i * m + j] /= root
-            for a in range(i + 1, m):
-                for b in range(a, m):
-                    out[k, a * m + b] -= out[k, i * m + a] * out[k, i * m + b]
-    return True
+def _by_itself(arguments: Sequence[Any]) -> tuple[Any, ...]:
+    """The same arguments with a family for each selection that has as many members as the selection."""
+    result = []
+    for argument in arguments:
+        if isinstance(argument, Selection):
+            family = Family(argument.family.name, argument.family.manifold, len(argument))
+            result.append(Selection(family, np.arange(len(argument)), argument.component))
+        else:
+            result.append(argument)
+    return tuple(result)
 
 
-class Kinds:
-    """The parts of a smoother's manifolds, as compiled code reads them."""
+def _compiled(cost: Cost) -> CompiledTerm:
+    """Compile a statement; refuse a function that changes its arguments or leaves rows out, looking at identities."""
+    families = [selection.family for selection in cost.selections]
+    columns = Columns(families, ())
+    term = CompiledTerm(cost, columns)
+    identities = {family: np.tile(family.manifold.identity(), (family.count, 1)) for family in families}
+    term.require_clean(columns.values(identities))
+    return term
+
+
+def _active(staged: Staged, active: Any) -> Staged:
+    """Leave out what is not active: nothing can switch it on later."""
+    if active is not None:
+        staged.keep(np.asarray(active.value if isinstance(active, Data) else active, dtype=bool))
+    return staged
+
+
+def _numbers(parameter: Parameter) -> Array:
+    """The present value of a parameter."""
+    return np.asarray(parameter.value if isinstance(parameter, Data) else parameter, dtype=np.float64)
+
+
+class Parts:
+    """The parts of a smoother's manifolds, as compiled code reads them.
+
+    Attributes:
+        fields: one row for each part, as PART has them.
+    """
 
     def __init__(self) -> None:
         """Know none."""
@@ -254,29 +251,25 @@ class Kinds:
         self._known: list[tuple[Manifold, tuple[int, int]]] = []
         self._kept: list[Any] = []  # addresses are good for as long as the functions live
 
-    def of(self, manifold: Manifold, family: str) -> tuple[int, int]:
-        """First part of a manifold, and how many it has.
-
-        Raises:
-            GraphError: when it has no compiled retraction.
-        """
+    def of(self, manifold: Manifold) -> tuple[int, int]:
+        """First part of a manifold, and how many it has; the whole is one part where NumPy has to move it."""
         for known, place in self._known:
             if known == manifold:
                 return place
-        first = len(self.fields)
+        rows: list[tuple[int, ...]] = []
         for leaf, storage, tangent in leaves(manifold):
-            move, deviation = move_of(leaf), 0
-            if move is None:
-                raise GraphError(
-                    f"family '{family}': {leaf.name} has no compiled retraction; state it and local by fg.elementwise",
-                    family=family,
-                )
-            if move.where != ADDITION:
-                kernel = prior.on(leaf).kernel
-                assert kernel is not None
-                self._kept += [move.function, kernel]
-                deviation = kernel.address
-            self.fields.append((move.where, deviation, storage, leaf.storage, tangent, leaf.dim))
-        place = first, len(self.fields) - first
+            move, kernel = move_of(leaf), prior.on(leaf).kernel
+            if move is None or kernel is None:
+                rows = [(BY_PYTHON, BY_PYTHON, 0, manifold.storage, 0, manifold.dim)]
+                break
+            self._kept += [move.function, kernel]
+            deviation = 0 if move.where == ADDITION else kernel.address
+            rows.append((move.where, deviation, storage, leaf.storage, tangent, leaf.dim))
+        place = len(self.fields), len(rows)
+        self.fields += rows
         self._known.append((manifold, place))
         return place
+
+    def by_python(self, place: tuple[int, int]) -> bool:
+        """Whether NumPy moves a manifold."""
+        return self.fields[place[0]][0] == BY_PYTHON

@@ -113,6 +113,7 @@ class FixedLag(Smoother):
         for v in leaving.tolist():
             family = self._order[int(self._state.variables["family"][v])]
             family.forget(int(self._state.variables["member"][v]))
+        self._batches.forget(self._state)
         return self._effort()
 
     def window(self, variable: Variable) -> Selection:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from math import sqrt
 
+import numpy as np
+
 from unifg.kernels.robust import QUADRATIC, value_of, weight_of
 from unifg.kernels.whitening import whiten
 from unifg.lie.moving import move_point
 from unifg.machine.calls import call_residual, matrix, vector, vector_at
 from unifg.machine.jit import compiled
 from unifg.machine.vectors import Address, get, load, plus, put, splat, store
-from unifg.smoothing.state import FRESH, LINEAR, Record, opened
-from unifg.typing import Array
+from unifg.smoothing.state import BY_PYTHON, FRESH, LINEAR, Record, opened
+from unifg.typing import Array, IntArray
 
 
 @compiled
@@ -21,37 +23,37 @@ def length_of(kind: Record) -> int:
 
 
 @compiled
-def retract(memory: Address, v: int, step: int, out: Array, at: int) -> None:
-    """Write the linearisation point of a variable, moved by the step that stands at ``step``, to ``out[at:]``."""
+def retract(memory: Address, v: int, out: Array, at: int) -> None:
+    """Write the estimate of a variable, its linearisation point moved by its step, to ``out[at:]``."""
     state = opened(memory)
     numbers, variable = state.numbers, state.variables[v]
+    value, step = variable.value, variable.value + variable.storage
     for p in range(variable.part, variable.part + variable.parts):
         part = state.parts[p]
-        move_point(
-            part.retraction, numbers, variable.value + part.start, part.storage, numbers, step + part.tangent,
-            part.dim, out, at + part.start,
-        )  # fmt: skip
+        if part.retraction == BY_PYTHON:
+            for k in range(part.storage):
+                out[at + k] = numbers[step + 3 * variable.dim + k]
+        else:
+            move_point(
+                part.retraction, numbers, value + part.start, part.storage, numbers, step + part.tangent, part.dim,
+                out, at + part.start,
+            )  # fmt: skip
 
 
 @compiled
 def linearize(memory: Address, f: int, scratch: Array) -> None:
-    """Evaluate a factor at the linearisation points of its variables.
-
-    What is kept are the rows of ``[J'J, J'r]``, upper triangle: smaller than J for tall residuals, and ready to be
-    added to a front any number of times. The scales of the diagonals follow.
-    """
+    """Evaluate a factor at the linearisation points of its variables, and keep what :func:`keep` keeps."""
     state = opened(memory)
     numbers, lists, variables, factor = state.numbers, state.lists, state.variables, state.factors[f]
     kind = state.types[factor.type]
-    m, width, data, at = kind.rows, kind.width, factor.data, 0
+    m, data, at = kind.rows, factor.data, 0
     for s in range(kind.slots):
-        variable = variables[lists[factor.variables + s]]
-        value = variable.value
-        for k in range(variable.storage):
+        slot = state.slots[kind.slot + s]
+        value = variables[lists[factor.variables + s]].value + slot.start
+        for k in range(slot.storage):
             scratch[at + k] = numbers[value + k]
-        at += variable.storage
-    r, J = vector(scratch, at, m), matrix(scratch, at + m, m, width)
-    products = data + kind.numbers
+        at += slot.storage
+    r, J = vector(scratch, at, m), matrix(scratch, at + m, m, kind.width)
     call_residual(
         kind.address,
         vector(scratch, 0, at),
@@ -66,11 +68,24 @@ def linearize(memory: Address, f: int, scratch: Array) -> None:
         for a in range(m):
             squared += r[a] * r[a]
         root = sqrt(weight_of(kind.loss, kind.first, kind.second, squared))
-        for k in range(at, at + m + m * width):
+        for k in range(at, at + m + m * kind.width):
             scratch[k] *= root
+    keep(memory, f, scratch, at)
+
+
+@compiled
+def keep(memory: Address, f: int, scratch: Array, at: int) -> None:
+    """Keep of a residual and a Jacobian, which stand in ``scratch[at:]``, the upper triangle of ``[J'J, J'r]``.
+
+    That is smaller than J for tall residuals, and ready to be added to a front any number of times. The scales of the
+    diagonals follow.
+    """
+    state = opened(memory)
+    numbers, factor = state.numbers, state.factors[f]
+    kind = state.types[factor.type]
+    m, width, products, zero = kind.rows, kind.width, factor.data + kind.numbers, splat(0.0)
     if factor.state != FRESH:
-        _count(memory, factor, products, -1.0)
-    zero = splat(0.0)
+        _count(memory, f, products, -1.0)
     for i in range(width):
         row, total = products + i * (width + 1), 0.0
         for j in range(i, width, 4):  # the last lanes reach into the next row, which is written after this one
@@ -82,35 +97,67 @@ def linearize(memory: Address, f: int, scratch: Array) -> None:
         for a in range(m):
             total += get(scratch, at + m + a * width + i) * get(scratch, at + a)
         put(numbers, row + width, total)
-    _count(memory, factor, products, 1.0)
+    _count(memory, f, products, 1.0)
     factor.state = LINEAR
 
 
 @compiled
-def _count(memory: Address, factor: Record, products: int, sign: float) -> None:
+def _count(memory: Address, f: int, products: int, sign: float) -> None:
     """Add the diagonal of J'J to the scales of the variables of a factor."""
     state = opened(memory)
-    numbers, lists, variables, kind = state.numbers, state.lists, state.variables, state.types[factor.type]
+    numbers, lists, variables, factor = state.numbers, state.lists, state.variables, state.factors[f]
+    kind = state.types[factor.type]
     for s in range(kind.slots):
-        variable = variables[lists[factor.variables + s]]
-        dim = variable.dim
-        scale = variable.value + variable.storage + 2 * dim
-        for d in range(dim):
+        variable, slot = variables[lists[factor.variables + s]], state.slots[kind.slot + s]
+        scale = variable.value + variable.storage + 2 * variable.dim + slot.tangent
+        for d in range(slot.dim):
             put(numbers, scale + d, get(numbers, scale + d) + sign * get(numbers, products))
             products += kind.width + 2
 
 
 @compiled
-def cost_of(memory: Address, f: int, scratch: Array) -> float:
-    """1/2 rho(|W r|^2) of a factor at the estimates of its variables."""
+def waiting(memory: Address) -> IntArray:
+    """Factors that Python has to evaluate before the next elimination."""
     state = opened(memory)
-    numbers, lists, variables, factor = state.numbers, state.lists, state.variables, state.factors[f]
+    counters, factors, types = state.counters[0], state.factors, state.types
+    result, count = np.empty(counters.factor_end, np.int64), 0
+    for f in range(counters.factor_end):
+        if factors[f].used and factors[f].state != LINEAR and types[factors[f].type].address == 0:
+            result[count] = f
+            count += 1
+    return result[:count]
+
+
+@compiled
+def take_in(memory: Address, chosen: IntArray, residual: Array, jacobian: Array) -> None:
+    """Keep what Python has evaluated: (n, m) and (n, m, D), whitened and weighted."""
+    state = opened(memory)
+    counters, scratch = state.counters[0], np.empty(state.counters[0].scratch)
+    m, width = residual.shape[1], jacobian.shape[2]
+    for i in range(len(chosen)):
+        for a in range(m):
+            scratch[a] = residual[i, a]
+            for d in range(width):
+                scratch[m + a * width + d] = jacobian[i, a, d]
+        keep(memory, chosen[i], scratch, 0)
+    counters.linearized += len(chosen)
+
+
+@compiled
+def cost_of(memory: Address, f: int, scratch: Array) -> float:
+    """1/2 rho(|W r|^2) of a factor at the estimates of its variables; 0 where Python has to evaluate it."""
+    state = opened(memory)
+    numbers, lists, factor = state.numbers, state.lists, state.factors[f]
     kind = state.types[factor.type]
+    if kind.address == 0:
+        return 0.0
     m, data, at = kind.rows, factor.data, 0
     for s in range(kind.slots):
-        v = lists[factor.variables + s]
-        retract(memory, v, variables[v].value + variables[v].storage, scratch, at)
-        at += variables[v].storage
+        slot = state.slots[kind.slot + s]
+        retract(memory, lists[factor.variables + s], scratch, at)
+        for k in range(slot.storage if slot.start else 0):
+            scratch[at + k] = scratch[at + slot.start + k]
+        at += slot.storage
     r, none = vector(scratch, at, m), matrix(scratch, 0, 0, 0)
     call_residual(
         kind.address,

@@ -77,6 +77,8 @@ def _drop(memory: Address, v: int, frozen: int) -> None:
         kind, at = types[factors[f].type], factors[f].variables
         slots = kind.slots
         link = lists[at + slots + slot]
+        if factors[f].used == 0:
+            continue  # gone already: the variable occurs in it twice
         for s in range(slots):
             w = lists[at + s]
             if w != v:
@@ -90,7 +92,7 @@ def _drop(memory: Address, v: int, frozen: int) -> None:
         _discard(memory, c)
     else:
         _unite(memory, c)
-    give_numbers(memory, variables[v].storage + 3 * variables[v].dim, variables[v].value)
+    give_numbers(memory, variables[v].length, variables[v].value)
     variables[v].alive, variables[v].clique = 0, -1
     variables[v].next = counters.variable_free
     counters.variable_free = v

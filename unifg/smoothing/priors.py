@@ -11,7 +11,7 @@ from unifg.machine.calls import call_residual, matrix, vector
 from unifg.machine.jit import compiled
 from unifg.machine.vectors import Address
 from unifg.smoothing.linear import retract
-from unifg.smoothing.state import opened
+from unifg.smoothing.state import BY_PYTHON, opened
 from unifg.typing import Array
 
 
@@ -22,7 +22,7 @@ def relinearize(memory: Address, v: int, scratch: Array) -> None:
     numbers, variable = state.numbers, state.variables[v]
     value, storage, dim = variable.value, variable.storage, variable.dim
     at = v - v  # zero, of which compiled code does not know it: functions are compiled anew for a literal
-    retract(memory, v, value + storage, scratch, at)
+    retract(memory, v, scratch, at)
     if variable.frozen == 2:
         c = state.counters[0].priors
         while c >= 0:
@@ -63,14 +63,17 @@ def _rewrite(memory: Address, c: int, v: int, scratch: Array) -> None:
             continue
         start, first = storage + width, row + tangent
         J, moved = matrix(scratch, start, width, width), start + width * width
-        call_residual(
-            where,
-            vector(scratch, at, length),
-            vector(numbers, value + at, length),
-            vector(scratch, 0, 0),
-            vector(scratch, storage, width),
-            J,
-        )
+        if where == BY_PYTHON:
+            J = matrix(numbers, step + 3 * dim + storage, width, width)
+        else:
+            call_residual(
+                where,
+                vector(scratch, at, length),
+                vector(numbers, value + at, length),
+                vector(scratch, 0, 0),
+                vector(scratch, storage, width),
+                J,
+            )
         for i in range(clique.pivot_rows, size + 1):
             if first <= i < first + width:
                 continue

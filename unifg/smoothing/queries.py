@@ -8,7 +8,7 @@ from unifg.machine.jit import compiled
 from unifg.machine.vectors import Address
 from unifg.smoothing.linear import cost_of, length_of, retract
 from unifg.smoothing.memory import grown, more, take_list, take_numbers
-from unifg.smoothing.state import FRESH, SLOTS_MAX, opened
+from unifg.smoothing.state import BY_PYTHON, FRESH, SLOTS_MAX, opened
 from unifg.smoothing.tree import paths
 from unifg.typing import Array, IntArray
 
@@ -41,7 +41,10 @@ def add_variables(
     state = opened(memory)
     variables, counters = state.variables, state.counters[0]
     count, storage = values.shape
-    longer = more(state.numbers, counters.numbers_end, count * (2 * (storage + 3 * dim) + 16))
+    length = storage + 3 * dim
+    if state.parts[part].retraction == BY_PYTHON:
+        length += storage + dim * dim
+    longer = more(state.numbers, counters.numbers_end, count * (2 * length + 16))
     state = grown(memory, np.empty(0, np.int64), longer)
     numbers = state.numbers
     for k in range(count):
@@ -51,10 +54,10 @@ def add_variables(
         else:
             v = counters.variable_end
             counters.variable_end = v + 1
-        variable, at = variables[v], take_numbers(memory, storage + 3 * dim)
+        variable, at = variables[v], take_numbers(memory, length)
         variable.part, variable.parts, variable.dim, variable.storage, variable.value = part, parts, dim, storage, at
         variable.clique, variable.place, variable.link, variable.mark, variable.changed = -1, 0, -1, 0, 0
-        variable.frozen, variable.candidate, variable.alive = 0, 0, 1
+        variable.frozen, variable.candidate, variable.alive, variable.length = 0, 0, 1, length
         variable.sequence, variable.family, variable.member = counters.sequences, family, first + k
         counters.sequences += 1
         variable.next = counters.new_variables
@@ -64,13 +67,26 @@ def add_variables(
             numbers[at + i] = values[k, i]
         for i in range(3 * dim):
             numbers[at + storage + i] = 0.0
+        for i in range(length - storage - 3 * dim):
+            numbers[at + storage + 3 * dim + i] = values[k, i] if i < storage else 0.0
         out[k] = v
     return longer
 
 
 @compiled
-def add_factors(memory: Address, kind: int, touched: IntArray, data: Array) -> tuple[IntArray, Array]:
-    """Add factors of one type: (n, slots) variables, (n, numbers) numbers; returns longer arenas, or nothing."""
+def add_factors(
+    memory: Address, kind: int, touched: IntArray, data: Array, batch: int, items: IntArray
+) -> tuple[IntArray, Array]:
+    """Add factors of one type and return longer arenas, or nothing.
+
+    Args:
+        memory: address of the description of the smoother's arrays.
+        kind: number of the type.
+        touched: (n, slots) variables.
+        data: (n, numbers).
+        batch: number of the statement, where Python evaluates it.
+        items: their numbers there, or nothing.
+    """
     state = opened(memory)
     factors, counters, variables = state.factors, state.counters[0], state.variables
     count, slots = touched.shape
@@ -89,6 +105,7 @@ def add_factors(memory: Address, kind: int, touched: IntArray, data: Array) -> t
             counters.factor_end = f + 1
         factor, at, where = factors[f], take_numbers(memory, length), take_list(memory, 2 * slots)
         factor.type, factor.variables, factor.data, factor.state, factor.used = kind, where, at, FRESH, 1
+        factor.batch, factor.item = batch, items[k] if len(items) else k
         for i in range(size):
             numbers[at + i] = data[k, i]
         for s in range(slots):
@@ -112,7 +129,7 @@ def estimates(memory: Address, chosen: IntArray, points: bool, out: Array) -> No
             for i in range(storage):
                 out[k * storage + i] = state.numbers[value + i]
         else:
-            retract(memory, v, value + storage, out, k * storage)
+            retract(memory, v, out, k * storage)
 
 
 @compiled

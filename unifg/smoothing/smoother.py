@@ -4,21 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import isfinite
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
 from unifg.errors import GraphError
 from unifg.kernels.robust import Loss
 from unifg.language.statement import AnyResidual
-from unifg.language.variables import Selection, Variable, as_selection
+from unifg.language.terms import Parameter
+from unifg.language.variables import Data, Selection, Variable, as_selection
 from unifg.lie import Manifold
 from unifg.machine.borrow import described
-from unifg.smoothing.factors import Kinds, Staged, Types
+from unifg.smoothing.batched import Batch, Batches, move_by_python
+from unifg.smoothing.factors import Parts, Staged, Types
 from unifg.smoothing.families import GrowingFamily
 from unifg.smoothing.queries import add_factors, add_variables, estimates, joint_covariance, total_cost
-from unifg.smoothing.state import MADE, PART, TYPE, Records, State, empty_state
-from unifg.smoothing.update import update_tree
+from unifg.smoothing.state import MADE, PART, SLOT, TYPE, Records, State, empty_state
+from unifg.smoothing.tree import give_up
+from unifg.smoothing.update import begin, renew, update_tree
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 NONE = np.empty(0, dtype=np.int64)
@@ -69,7 +72,10 @@ class Smoother:
         self.every = every
         self.wildfire = wildfire
         self._types = Types()
-        self._kinds = Kinds()
+        self._parts = Parts()
+        self._batches = Batches()
+        self._by_python: list[GrowingFamily] = []  # families that NumPy moves
+        self._data: dict[str, Data] = {}
         self._staged: list[Staged] = []
         self._words = np.zeros(2 * len(State._fields), dtype=np.int64)
         self._memory = self._words.ctypes.data
@@ -88,44 +94,67 @@ class Smoother:
 
         Args:
             name: unique within the smoother.
-            manifold: SO2, SE2, SO3, SE3, Rn or a product of them.
+            manifold: any, also a product; the library's own, and others stated by compiled functions, are quicker.
             keep: members never leave a fixed lag.
 
         Raises:
-            GraphError: when the name is taken, or the manifold has no compiled retraction.
+            GraphError: when the name is taken.
         """
         if name in self.families:
             raise GraphError(f"family '{name}' exists already: choose another name", family=name)
-        parts = self._kinds.of(manifold, name)
+        parts = self._parts.of(manifold)
         self._types.scratch = max(self._types.scratch, manifold.storage + manifold.dim * (2 * manifold.dim + 1) + 8)
         family = GrowingFamily(name, manifold, len(self._order), parts, keep)
-        self._hold(self._state._replace(parts=np.array(self._kinds.fields, dtype=PART)))
+        self._hold(self._state._replace(parts=np.array(self._parts.fields, dtype=PART)))
+        if self._parts.by_python(parts):
+            self._by_python.append(family)
         self.families[name] = family
         self._order.append(family)
         return family
+
+    def data(self, name: str, value: ArrayLike, *, each: bool = False) -> Data:
+        """Declare an array for the factors stated with it, which take the value it has then.
+
+        Args:
+            name: shown in messages.
+            value: numbers or booleans.
+            each: whether the first axis runs over the factors; otherwise all share it.
+
+        Raises:
+            GraphError: when the name is taken.
+        """
+        if name in self._data:
+            raise GraphError(f"data '{name}' exists already: choose another name")
+        self._data[name] = Data(name, value, each)
+        return self._data[name]
 
     def minimize(
         self,
         function: AnyResidual,
         *arguments: Any,
-        sigma: ArrayLike | None = None,
-        information: ArrayLike | None = None,
+        sigma: Parameter | None = None,
+        information: Parameter | None = None,
         robust: Loss | None = None,
+        active: Any = None,
+        name: str | None = None,
     ) -> None:
         """State factors 1/2 |r|^2 weighted by the information matrix; they count from the next update on.
 
         Args:
-            function: ``fg.prior``, ``fg.between``, or any residual in compiled form.
-            *arguments: members (which may get their values in the next update) and parameters; arrays of members
+            function: any residual that a graph takes. In compiled form (those of unifg, kernels, functions of one
+                factor compiled by Numba) it costs microseconds, as a batched NumPy function some hundred.
+            *arguments: members (which may get their values in the next update), data and constants; arrays of members
                 state one factor for each.
             sigma: standard deviations, scalar, (m,) or (n, m), in the residual's units.
             information: (m, m) or (n, m, m) symmetric positive semi-definite.
-            robust: Huber, Cauchy, Tukey, GemanMcClure or DCS loss; its weight is found when a factor is linearised.
+            robust: loss on the squared whitened norm; its weight is found when a factor is linearised.
+            active: (n,) booleans; factors that are not active are left out.
+            name: for messages; defaults to the function's name.
 
         Raises:
-            GraphError: when arguments do not fit, or the residual has no compiled form.
+            GraphError: when arguments do not fit.
         """
-        staged = self._types.stage(function, arguments, sigma, information, robust)
+        staged = self._types.stage(function, arguments, sigma, information, robust, active, name)
         for family in staged.families:
             if self.families.get(family.name) is not family:
                 raise GraphError(
@@ -134,6 +163,28 @@ class Smoother:
                     family=family.name,
                 )
         self._staged.append(staged)
+
+    def minimize_scalar(self, *arguments: Any, **options: Any) -> NoReturn:
+        """Refused: see the message."""
+        self._refuse("minimize_scalar", "a cost that is no square", "state it as squares with minimize")
+
+    def constrain(self, *arguments: Any, **options: Any) -> NoReturn:
+        """Refused: see the message."""
+        self._refuse("constrain", "a constraint", "state what is measured with minimize and a small sigma")
+
+    def bound(self, *arguments: Any, **options: Any) -> NoReturn:
+        """Refused: see the message."""
+        self._refuse("bound", "a constraint", "state a cost that grows outside of the bounds with minimize")
+
+    def fix(self, *arguments: Any, **options: Any) -> NoReturn:
+        """Refused: see the message."""
+        self._refuse("fix", "a fixed variable", "give the value as a constant to its factors, or as a prior")
+
+    def _refuse(self, method: str, what: str, instead: str) -> NoReturn:
+        raise GraphError(
+            f"{type(self).__name__}.{method}: {what} is nothing a smoother can take, whose steps are those of least "
+            f"squares: {instead}, or solve the whole as a fg.Graph"
+        )
 
     def estimate(self, variable: Variable) -> Array:
         """(n, storage) estimates of a family or selection.
@@ -182,7 +233,7 @@ class Smoother:
     @property
     def cost(self) -> float:
         """Sum of 1/2 rho(|W r|^2) over all factors at the estimates; half of what is often called chi2."""
-        return float(total_cost(self._memory))
+        return float(total_cost(self._memory)) + self._batches.cost(self._state, self._memory)
 
     def __len__(self) -> int:
         """Number of factors that count."""
@@ -204,7 +255,9 @@ class Smoother:
             self._move(NONE, numbers)
             family.grow(out)
         for item in self._staged:
-            lists, numbers = add_factors(self._memory, item.kind, _touched(item), item.data)
+            touched = _touched(item)
+            number = self._batches.add(_batch(item, touched)) if item.term is not None else 0
+            lists, numbers = add_factors(self._memory, item.kind, touched, item.data, number, item.items)
             self._move(lists, numbers)
         self._staged.clear()
         for _ in range(iterations):
@@ -228,7 +281,17 @@ class Smoother:
         """One pass over the tree."""
         state = self._state
         now = self.relinearize if (state.counters["updates"][0] + 1) % self.every == 0 else np.inf
-        failed, lists, numbers = update_tree(self._memory, now, self.relinearize, self.wildfire, self._chronological)
+        rest = self.relinearize, self.wildfire, self._chronological
+        if self._batches:
+            chain = begin(self._memory, now)
+            try:
+                self._batches.linearize(state, self._memory)
+            except BaseException:
+                give_up(self._memory, 0)  # the chain is lost; factors are kept
+                raise
+            failed, lists, numbers = renew(self._memory, chain, *rest)
+        else:
+            failed, lists, numbers = update_tree(self._memory, now, *rest)
         self._move(lists, numbers)
         if failed >= 0:
             family = self._order[int(state.variables["family"][failed])]
@@ -239,6 +302,8 @@ class Smoother:
                 family=family.name,
                 index=member,
             )
+        for family in self._by_python:
+            move_by_python(self._state, family, self._chronological)
 
     def _checked(self, family: GrowingFamily, value: ArrayLike) -> tuple[GrowingFamily, Array]:
         """Values of new members as (n, storage)."""
@@ -301,6 +366,8 @@ class Smoother:
             grown["factors"] = longer(state.factors, factor_end + factors)
         if clique_end + variable_end + variables + 1 > len(state.cliques):
             grown["cliques"] = longer(state.cliques, clique_end + variable_end + variables + 1)
+        if len(self._types.slots) > len(state.slots):
+            grown["slots"] = np.array(self._types.slots, dtype=SLOT)
         if len(self._types.fields) > len(state.types):
             grown["types"] = longer(state.types, len(self._types.fields))
         if grown:
@@ -356,6 +423,18 @@ def _touched(item: Staged) -> IntArray:
         return np.array([[f.row(m if isinstance(m, int) else int(m[0])) for f, m in pairs]])
     columns = [np.broadcast_to(f.row(m) if isinstance(m, int) else f.rows(m), (len(item.data),)) for f, m in pairs]
     return np.stack(columns, axis=1).astype(np.int64)
+
+
+def _batch(item: Staged, touched: IntArray) -> Batch:
+    """The statement of staged factors, with the variables of those that are left."""
+    assert item.term is not None
+    rows, values = [], []
+    for slot, selection in enumerate(item.term.term.selections):
+        own = np.full(len(selection), -1)
+        own[item.items if len(own) > 1 else slice(None)] = touched[:, slot] if len(own) > 1 else touched[0, slot]
+        rows.append(own)
+        values.append(np.tile(selection.family.manifold.identity(), (len(own), 1)))
+    return Batch(item.term, rows, values)
 
 
 def longer(table: Records, rows: int) -> Records:

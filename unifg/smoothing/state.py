@@ -35,6 +35,7 @@ VARIABLE = _record(
     "value",  # where its numbers stand: linearisation point, step, step last passed downwards, scale of its diagonal
     "clique",  # in which it is eliminated; -1: none yet
     "place",  # first row in the front of that clique
+    "length",  # of its numbers
     "link",  # first of the chain of its factors, factor * SLOTS_MAX + slot
     "mark",  # number of the update that re-eliminates it
     "local",  # its number within that update
@@ -50,16 +51,23 @@ VARIABLE = _record(
     stamp=np.float64,  # age: the older are eliminated first when the order is chronological
 )
 PART = _record(
-    "retraction",  # address; 0: a vector
-    "deviation",  # address of the residual of a prior
+    "retraction",  # address; 0: a vector; BY_PYTHON: the estimate follows the numbers of the variable
+    "deviation",  # address of the residual of a prior; BY_PYTHON: its derivative follows the estimate
     "start",  # first number of its storage
     "storage",
     "tangent",  # first number of its step
     "dim",
 )
+SLOT = _record(  # what a factor reads of one of its variables
+    "start",  # in its storage
+    "storage",
+    "tangent",  # in its tangent space
+    "dim",
+)
 TYPE = _record(  # of factors
-    "address",  # of the kernel
+    "address",  # of the kernel; 0: evaluated by Python
     "rows",
+    "slot",  # first slot in State.slots
     "slots",  # variables
     "width",  # tangent columns
     "parameters",  # numbers that the kernel takes
@@ -78,6 +86,8 @@ FACTOR = _record(
     "state",  # FRESH, LINEAR or STALE
     "next",  # in the chain of new factors, or of free rows
     "used",
+    "batch",  # number of the statement it belongs to, where Python evaluates it
+    "item",  # its number there
 )
 CLIQUE = _record(
     "list",  # where its variables stand in State.lists, pivots first
@@ -119,6 +129,7 @@ CHAINS = (
     "variable_free", "factor_free", "clique_free", "new_variables", "new_factors", "candidates", "priors", "failed",
 )  # fmt: skip
 
+BY_PYTHON = -1  # in the place of an address
 FRESH, LINEAR, STALE = range(3)  # never linearised; as it should be; at an old point
 SLOTS_MAX = 1 << 20  # more variables than any factor has
 CLASSES = 160  # of blocks in an arena
@@ -131,6 +142,7 @@ class State(NamedTuple):
         variables: VARIABLE.
         factors: FACTOR.
         types: TYPE.
+        slots: SLOT, of all types.
         parts: PART, of all manifolds.
         cliques: CLIQUE.
         counters: (1,) COUNTERS.
@@ -142,6 +154,7 @@ class State(NamedTuple):
     variables: Records
     factors: Records
     types: Records
+    slots: Records
     parts: Records
     cliques: Records
     counters: Records
@@ -151,7 +164,7 @@ class State(NamedTuple):
 
 
 _INTEGERS, _FLOATS = np.dtype(np.int64), np.dtype(np.float64)
-_open = opener(State, (VARIABLE, FACTOR, TYPE, PART, CLIQUE, COUNTERS, _INTEGERS, _INTEGERS, _FLOATS))
+_open = opener(State, (VARIABLE, FACTOR, TYPE, SLOT, PART, CLIQUE, COUNTERS, _INTEGERS, _INTEGERS, _FLOATS))
 
 
 @inlined
@@ -170,6 +183,7 @@ def empty_state() -> State:
         np.zeros(rows, dtype=VARIABLE),
         np.zeros(rows, dtype=FACTOR),
         np.zeros(8, dtype=TYPE),
+        np.zeros(0, dtype=SLOT),
         np.zeros(0, dtype=PART),
         np.zeros(2 * rows, dtype=CLIQUE),
         counters,

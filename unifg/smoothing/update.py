@@ -214,10 +214,14 @@ def _elements(memory: Address, orphans: IntArray, inside: IntArray) -> tuple[Int
     for k in range(len(inside)):
         factor = factors[inside[k]]
         for s in range(types[factor.type].slots):
-            pool[length] = variables[lists[factor.variables + s]].local
-            length += 1
+            local, known = variables[lists[factor.variables + s]].local, False
+            for q in range(pointer[first + k], length):
+                known = known or pool[q] == local
+            if not known:
+                pool[length] = local
+                length += 1
         pointer[first + k + 1] = length
-    return pool, pointer
+    return pool[:length], pointer
 
 
 @compiled

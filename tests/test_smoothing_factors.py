@@ -1,0 +1,371 @@
+"""Smoothers take what a graph takes: every residual, weight and loss, against a batch solve of the same graph."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.errors import GraphError
+from unifg.smoothing import FixedLag, Incremental
+from unifg.solvers import LevenbergMarquardt
+from unifg.typing import Array
+
+COUNT = 8
+STEP = np.array([0.5, 0.05, 0.2])
+
+
+class Everyday:
+    """A loss of a user's own: rho(s) = 2 (sqrt(1 + s) - 1)."""
+
+    held = False
+
+    def value(self, squared: Array) -> Array:
+        return 2.0 * (np.sqrt(1.0 + squared) - 1.0)
+
+    def weight(self, squared: Array) -> Array:
+        return 1.0 / np.sqrt(1.0 + squared)
+
+
+def seen(pose: Array, point: Array, measured: Any) -> Array:
+    """A point in the frame of the pose, batched."""
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    dx, dy = point[:, 0] - pose[:, 0], point[:, 1] - pose[:, 1]
+    r: Array = np.stack([c * dx + s * dy, c * dy - s * dx], axis=1) - measured
+    return r
+
+
+def seen_jacobian(pose: Array, point: Array, measured: Any) -> list[Array]:
+    r = seen(pose, point, 0.0)
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    by_pose = np.zeros((len(r), 2, 3))
+    by_pose[:, 0, 0] = by_pose[:, 1, 1] = -1.0
+    by_pose[:, 0, 2], by_pose[:, 1, 2] = r[:, 1], -r[:, 0]
+    return [by_pose, np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=1)]
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def seen_once(pose: Array, point: Array, measured: Array, r: Array) -> None:
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    dx, dy = point[0] - pose[0], point[1] - pose[1]
+    r[0] = c * dx + s * dy - measured[0]
+    r[1] = c * dy - s * dx - measured[1]
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def seen_once_jacobian(pose: Array, point: Array, measured: Array, by_pose: Array, by_point: Array) -> None:
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    dx, dy = point[0] - pose[0], point[1] - pose[1]
+    by_pose[:] = 0.0
+    by_pose[0, 0] = by_pose[1, 1] = -1.0
+    by_pose[0, 2], by_pose[1, 2] = c * dy - s * dx, -(c * dx + s * dy)
+    by_point[0, 0], by_point[0, 1], by_point[1, 0], by_point[1, 1] = c, s, -s, c
+
+
+RESIDUALS: dict[str, Any] = {
+    "numpy": seen,
+    "numpy with derivatives": fg.residual(seen, seen_jacobian),
+    "njit": fg.residual(seen_once, rows=2),
+    "njit with derivatives": fg.residual(seen_once, seen_once_jacobian, rows=2),
+}
+LOSSES: dict[str, Any] = {
+    "none": None,
+    "Huber": fg.Huber(1.0),
+    "Cauchy": fg.Cauchy(1.5),
+    "Tukey": fg.Tukey(6.0),
+    "DCS": fg.DCS(2.0),
+    "GemanMcClure": fg.GemanMcClure(3.0),
+    "TruncatedLeastSquares": fg.TruncatedLeastSquares(4.0, 0.5),
+    "Reweighted": fg.Reweighted(lambda s: 1.0 / (1.0 + 0.1 * s)),
+    "a user's own": Everyday(),
+}
+rng = np.random.default_rng(5)
+POINTS = rng.uniform(-2.0, 2.0, (3, 2))
+POSES = np.cumsum(np.tile(STEP, (COUNT, 1)), axis=0)
+NOISE = 0.05 * rng.standard_normal((COUNT, 3))
+SIGHTINGS = np.concatenate([seen(np.repeat(POSES[k : k + 1], 3, axis=0), POINTS, 0.0) for k in range(COUNT)])
+SIGHTINGS += 0.05 * rng.standard_normal(SIGHTINGS.shape)
+SIGHTINGS[4] += 0.2  # some of them doubtful
+SIGHTINGS[16] -= 0.25
+ROOT = rng.uniform(-5.0, 5.0, (COUNT * 3, 2, 2))
+WEIGHTS: dict[str, Callable[[slice], dict[str, Any]]] = {
+    "scalar sigma": lambda own: {"sigma": 0.1},
+    "sigma of rows": lambda own: {"sigma": [0.1, 0.2]},
+    "sigma of factors": lambda own: {"sigma": 0.1 + 0.01 * np.abs(SIGHTINGS[own])},
+    "information": lambda own: {"information": np.array([[80.0, 20.0], [20.0, 60.0]])},
+    "information of factors": lambda own: {"information": 40.0 * np.eye(2) + ROOT[own] @ ROOT[own].transpose(0, 2, 1)},
+    "singular information": lambda own: {"information": np.array([[50.0, 50.0], [50.0, 50.0]])},
+    "nothing": lambda own: {},
+}
+
+
+def state_pose(statement: Any, x: Any, points: Any, k: int, residual: Any, weights: Any, robust: Any) -> None:
+    """What arrives with one pose: odometry, and what is seen of three points."""
+    if k == 0:
+        statement.minimize(fg.prior, x[0], POSES[0], sigma=0.01)
+        statement.minimize(fg.prior, points[np.arange(3)], POINTS, sigma=0.5)
+    else:
+        moved = fg.SE2.compose(fg.SE2.between(POSES[k - 1], POSES[k]), fg.SE2.exp(NOISE[k]))
+        statement.minimize(fg.between, x[k - 1], x[k], moved, sigma=[0.05, 0.05, 0.03])
+    own = slice(3 * k, 3 * k + 3)
+    statement.minimize(residual, x[k], points[np.arange(3)], SIGHTINGS[own], robust=robust, **WEIGHTS[weights](own))
+
+
+@cache
+def batch(weights: str, loss: str) -> tuple[Array, Array, float]:
+    """Poses, points and cost of the optimum; all kinds of the residual have the same."""
+    graph, residual, robust = fg.Graph(), RESIDUALS["numpy with derivatives"], LOSSES[loss]
+    x, points = graph.variables("x", fg.SE2, COUNT), graph.variables("points", fg.Rn(2), 3)
+    for k in range(COUNT):
+        state_pose(graph, x, points, k, residual, weights, robust)
+    guess = {x: POSES, points: POINTS}
+    solution = LevenbergMarquardt(tolerance=1e-13, max_iterations=300).solve(graph, guess)
+    return solution[x], solution[points], solution.cost
+
+
+def smoothed(smoother: Any, residual: Any, weights: str, robust: Any) -> tuple[Array, Array, float]:
+    """The same, pose by pose."""
+    x, points = smoother.variables("x", fg.SE2), smoother.variables("points", fg.Rn(2))
+    for k in range(COUNT):
+        state_pose(smoother, x, points, k, residual, weights, robust)
+        smoother.update({x: POSES[k], points: POINTS} if k == 0 else {x: POSES[k]})
+    smoother.update(iterations=40)
+    return smoother.estimate(x), smoother.estimate(points), smoother.cost
+
+
+def make(kind: str) -> Any:
+    if kind == "incremental":
+        return Incremental(relinearize=0.0, wildfire=0.0)
+    return FixedLag(COUNT, relinearize=0.0, wildfire=0.0)
+
+
+def agree(kind: str, residual: str, weights: str, loss: str) -> None:
+    poses, points, cost = batch(weights, loss)
+    found = smoothed(make(kind), RESIDUALS[residual], weights, LOSSES[loss])
+    np.testing.assert_allclose(found[0], poses, atol=1e-8)
+    np.testing.assert_allclose(found[1], points, atol=1e-8)
+    assert found[2] == pytest.approx(cost, rel=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["incremental", "fixed lag"])
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("residual", RESIDUALS)
+def test_every_residual_with_every_loss(kind: str, residual: str, loss: str) -> None:
+    agree(kind, residual, "information of factors", loss)
+
+
+@pytest.mark.parametrize("kind", ["incremental", "fixed lag"])
+@pytest.mark.parametrize("weights", WEIGHTS)
+@pytest.mark.parametrize("residual", ["numpy", "njit"])
+def test_every_weight(kind: str, residual: str, weights: str) -> None:
+    agree(kind, residual, weights, "Cauchy" if residual == "njit" else "none")
+
+
+BODY = fg.Product(pose=fg.SE2, velocity=fg.Rn(2))
+
+
+def advance(pose: Array, velocity: Array, after: Array, dt: float) -> Array:
+    """Where a velocity of the body leads."""
+    step = np.concatenate([dt * velocity, np.zeros((len(velocity), 1))], axis=1)
+    return fg.SE2.local(fg.SE2.compose(pose, fg.SE2.exp(step)), after)
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def steady(velocity: Array, body: Array, later: Array, r: Array) -> None:
+    """A component, the whole it belongs to, and another whole in one factor."""
+    r[0] = later[3] - velocity[0] + 0.1 * body[3]
+    r[1] = later[4] - velocity[1] + 0.1 * body[2]
+
+
+def total(*numbers: Array) -> Array:
+    return np.asarray(sum(numbers)) - 1.0
+
+
+def several(statement: Any, x: Any, y: Any, each: Any) -> None:
+    """Components, wholes beside them, constants in the place of variables, a member twice, twenty variables, data."""
+    steps = np.arange(COUNT - 1)
+    statement.minimize(fg.prior, x[0].pose, POSES[0], sigma=0.1)
+    statement.minimize(fg.prior, x.velocity[np.arange(COUNT)], [0.5, 0.1], sigma=0.4)
+    statement.minimize(advance, x[steps].pose, x[steps].velocity, x[steps + 1].pose, 0.9, sigma=[0.1, 0.2, 0.3])
+    statement.minimize(fg.residual(steady, rows=2), x[steps].velocity, x[steps], x[steps + 1], sigma=0.2)
+    statement.minimize(fg.between, POSES[2] + 0.1, x[5].pose, STEP, sigma=0.3)
+    statement.minimize(fg.difference, x[3].velocity, x[3].velocity, sigma=0.1)
+    statement.minimize(total, y[0], y[0], y[1], sigma=0.5, name="a member twice")
+    statement.minimize(total, *[y[k] for k in range(20)], sigma=0.5, robust=fg.Huber(1.0), name="twenty")
+    statement.minimize(lambda v, m: v - m, y[np.arange(20)], each, sigma=1.0, name="data", active=np.arange(20) != 7)
+    statement.minimize(fg.prior, y[7], [0.3], sigma=2.0)
+
+
+@pytest.mark.parametrize("kind", ["incremental", "fixed lag"])
+def test_components_constants_repetitions_and_many_variables(kind: str) -> None:
+    values = np.concatenate([POSES, np.ones((COUNT, 2))], axis=1)
+    numbers = np.linspace(-1.0, 1.0, 20)[:, None]
+    graph, smoother = fg.Graph(), make(kind) if kind == "incremental" else FixedLag(20, relinearize=0.0, wildfire=0.0)
+    x, y = graph.variables("x", BODY, COUNT), graph.variables("y", fg.Rn(1), 20)
+    several(graph, x, y, graph.data("each", numbers, each=True))
+    solution = LevenbergMarquardt(tolerance=1e-13, max_iterations=200).solve(graph, {x: values, y: numbers})
+    u, v = smoother.variables("x", BODY), smoother.variables("y", fg.Rn(1))
+    smoother.minimize(fg.prior, u[np.arange(COUNT)], values, sigma=1e9)  # names the members: slices have none yet
+    smoother.minimize(fg.prior, v[np.arange(20)], numbers, sigma=1e9)
+    smoother.update({u: values, v: numbers})
+    several(smoother, u, v, smoother.data("each", numbers, each=True))
+    smoother.update(iterations=30)
+    np.testing.assert_allclose(smoother.estimate(u), solution[x], atol=1e-8)
+    np.testing.assert_allclose(smoother.estimate(v), solution[y], atol=1e-8)
+    assert smoother.cost == pytest.approx(solution.cost, rel=1e-8)
+    np.testing.assert_allclose(smoother.covariance(u[3].velocity), solution.covariance(x[3].velocity), rtol=1e-6)
+
+
+class Sphere(fg.Manifold):
+    """Directions as unit vectors, moved by NumPy alone; no group."""
+
+    name, storage, dim = "S2", 3, 2
+
+    def identity(self) -> Array:
+        return np.array([0.0, 0.0, 1.0])
+
+    def _basis(self, x: Array) -> Array:
+        """(..., 3, 2) axes of the tangent plane."""
+        axis = np.where(np.abs(x[..., :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+        first = np.cross(x, axis)
+        first /= np.linalg.norm(first, axis=-1, keepdims=True)
+        return np.stack([first, np.cross(x, first)], axis=-1)
+
+    def retract(self, x: Any, d: Any, /) -> Array:
+        x, d = np.asarray(x, dtype=float), np.asarray(d, dtype=float)
+        length = np.linalg.norm(d, axis=-1, keepdims=True)
+        along = np.einsum("...ij,...j->...i", self._basis(x), d)
+        moved: Array = np.cos(length) * x + np.sinc(length / np.pi) * along
+        return np.asarray(moved / np.linalg.norm(moved, axis=-1, keepdims=True))
+
+    def local(self, x: Any, y: Any, /) -> Array:
+        x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+        along = np.einsum("...ij,...i->...j", self._basis(x), np.broadcast_to(y, np.broadcast_shapes(x.shape, y.shape)))
+        sine = np.linalg.norm(along, axis=-1, keepdims=True)
+        angle = np.arctan2(sine, (x * y).sum(axis=-1, keepdims=True))
+        return np.asarray(along * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-300), 1.0))
+
+    def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
+        found = rng.standard_normal((*shape, 3))
+        return np.asarray(found / np.linalg.norm(found, axis=-1, keepdims=True))
+
+    def is_valid(self, x: Any, /) -> Any:
+        return np.abs(np.linalg.norm(np.asarray(x), axis=-1) - 1.0) < 1e-6
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sphere)
+
+    def __hash__(self) -> int:
+        return hash(Sphere)
+
+
+@pytest.mark.parametrize("kind", ["incremental", "fixed lag"])
+def test_a_manifold_that_only_numpy_moves(kind: str) -> None:
+    sphere, generator = Sphere(), np.random.default_rng(2)
+    truth = sphere.retract(np.array([0.6, 0.0, 0.8]), 0.3 * generator.standard_normal((COUNT, 2)))
+    measured = sphere.retract(truth, 0.05 * generator.standard_normal((COUNT, 2)))
+    guess = sphere.retract(truth, 0.4 * generator.standard_normal((COUNT, 2)))
+
+    def turned(first: Array, second: Array, difference: Array) -> Array:
+        return second - first - difference
+
+    graph, smoother = fg.Graph(), make(kind)
+    x, y = graph.variables("x", sphere, COUNT), smoother.variables("x", sphere)
+    for k in range(COUNT):
+        for statement, family in ((graph, x), (smoother, y)):
+            statement.minimize(fg.prior, family[k], measured[k], sigma=0.1)
+            if k:
+                statement.minimize(turned, family[k - 1], family[k], truth[k] - truth[k - 1], sigma=0.02)
+        smoother.update({y: guess[k]})
+    smoother.update(iterations=30)
+    solution = LevenbergMarquardt(tolerance=1e-13, max_iterations=200).solve(graph, {x: guess})
+    np.testing.assert_allclose(smoother.estimate(y), solution[x], atol=1e-8)
+    assert smoother.cost == pytest.approx(solution.cost, rel=1e-8)
+
+
+def drive_window(smoother: Any, residual: Any, robust: Any, manifold: Any = fg.SE2) -> tuple[Array, int]:
+    """Twice as many poses as the window holds, poor first guesses, loops within it; what is left at the end."""
+    generator = np.random.default_rng(3)
+    x = smoother.variables("x", manifold)
+    for k in range(30):
+        smoother.minimize(fg.prior, x[k], np.append(STEP[:2] * k, 0.0), sigma=0.3 if k else 0.01)
+        for other in [o for o in (k - 1, k - 4) if o >= 0]:
+            noise = 0.02 * generator.standard_normal(2)
+            smoother.minimize(residual, x[other], x[k], noise + STEP[:2] * (k - other), sigma=0.1, robust=robust)
+        smoother.update({x: np.append(STEP[:2] * k, 0.0) + 0.3 * generator.standard_normal(3)}, iterations=2)
+    smoother.update(iterations=3)
+    return smoother.estimate(smoother.window(x)), len(smoother._batches._held)
+
+
+def place_from(pose: Array, other: Array, measured: Any) -> Array:
+    return seen(pose, other[:, :2], measured)
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def place_from_once(pose: Array, other: Array, measured: Array, r: Array) -> None:
+    seen_once(pose, other, measured, r)
+
+
+class Plain(fg.Manifold):
+    """SE2 without compiled functions."""
+
+    name, storage, dim = "plain SE2", 3, 3
+    identity, retract, local = (staticmethod(getattr(fg.SE2, name)) for name in ("identity", "retract", "local"))
+    random, is_valid = staticmethod(fg.SE2.random), staticmethod(fg.SE2.is_valid)
+
+
+@pytest.mark.parametrize("fixed_points", [False, True])
+def test_windows_forget_alike_whoever_evaluates(fixed_points: bool) -> None:
+    """Marginalised factors of NumPy functions, losses of a user's own and manifolds that NumPy moves count the same."""
+
+    def window() -> FixedLag:
+        return FixedLag(9, relinearize=0.0, wildfire=0.0, fixed_points=fixed_points)
+
+    for compiled, by_python in ((None, fg.Reweighted(np.ones_like)), (fg.Cauchy(2.0), fg.Cauchy(2.0))):
+        wanted, none = drive_window(window(), fg.residual(place_from_once, rows=2), compiled)
+        found, held = drive_window(window(), fg.residual(place_from), by_python)
+        np.testing.assert_allclose(found, wanted, atol=1e-8)
+        assert none == 0 and 0 < held < 90
+        found, _ = drive_window(window(), fg.residual(place_from), by_python, Plain())
+        np.testing.assert_allclose(found, wanted, atol=1e-7)
+
+
+def test_a_function_that_fails_loses_nothing() -> None:
+    smoother, calls = Incremental(relinearize=0.0), [0]
+
+    def moody(value: Array) -> Array:
+        calls[0] += 1
+        if value[0, 0] > 5.0 and calls[0] < 10**6:
+            raise ValueError("not today")
+        return value - 6.0
+
+    y = smoother.variables("y", fg.Rn(1))
+    smoother.minimize(fg.prior, y[0], [1.0], sigma=1.0)
+    smoother.update({y: [1.0]})
+    smoother.minimize(moody, y[1], sigma=1.0)
+    smoother.minimize(fg.between, y[0], y[1], [5.0], sigma=1.0)
+    with pytest.raises(ValueError, match="not today"):
+        smoother.update({y: [7.0]})
+    with pytest.raises(GraphError, match="last update failed"):
+        smoother.covariance(y)
+    calls[0] = 10**6
+    smoother.update()
+    np.testing.assert_allclose(smoother.estimate(y), [[1.0], [6.0]], atol=1e-9)
+    twin = copy.deepcopy(smoother)
+    twin.minimize(fg.prior, twin.families["y"][0], [4.0], sigma=1.0)
+    twin.update()
+    assert twin.estimate(twin.families["y"])[0, 0] > 1.5 and smoother.estimate(y)[0, 0] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("method", ["constrain", "bound", "fix", "minimize_scalar"])
+def test_what_is_no_least_squares_is_refused(method: str) -> None:
+    smoother = FixedLag(3)
+    x = smoother.variables("x", fg.Rn(1))
+    with pytest.raises(GraphError, match=rf"FixedLag\.{method}: .* or solve the whole as a fg\.Graph"):
+        getattr(smoother, method)(x[0])
