@@ -132,7 +132,7 @@ def test_a_recorder_copies_and_wants_every_column_once() -> None:
     assert statistics(log) == {"tick_ms": {"p50": 2.0, "p99": 2.0, "max": 2.0}, "steps": {"mean": 3.0, "max": 3}}
     assert columns(log)["place"].unit == "m" and "name" not in columns(log)
     for wrong in ({**row, "seen": []}, {**row, "seen": [], "place": place, "more": 1}):
-        with pytest.raises(TypeError, match=r"place|more"):
+        with pytest.raises(ScenarioError, match=r"place|more"):
             recorder.add(**wrong)
     with pytest.raises(ValueError, match="reshape"):
         recorder.add(place=np.zeros(3), seen=[], **row)

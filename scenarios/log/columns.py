@@ -13,6 +13,8 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from unifg.errors import ScenarioError
+
 __all__ = ["Column", "Recorder", "column", "columns", "ragged", "words"]
 
 L = TypeVar("L")
@@ -89,10 +91,10 @@ class Recorder(Generic[L]):
             row: a value for every column.
 
         Raises:
-            TypeError: a column is missing, or there is none of that name.
+            ScenarioError: a column is missing, or there is none of that name.
         """
         if wrong := sorted(row.keys() ^ self._columns.keys()):
-            raise TypeError(f"a tick of {self._log.__name__} needs every column once, look at: {', '.join(wrong)}")
+            raise ScenarioError(f"a tick of {self._log.__name__} needs every column once, look at: {', '.join(wrong)}")
         for name, value in row.items():
             self._entries[name].append(self._columns[name].entry(value))
 
