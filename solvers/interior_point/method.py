@@ -26,7 +26,7 @@ from unifg.program.table import COST, COUNT, KIND, ROW, ROWS
 from unifg.solvers.globalize.least_violation import nearest
 from unifg.solvers.interior_point import state
 from unifg.solvers.interior_point.loop import addresses, call
-from unifg.solvers.interior_point.state import Problem, Work, empty_work
+from unifg.solvers.interior_point.state import Fields, Problem, empty_work
 from unifg.typing import Array, IntArray
 
 ENDINGS = {
@@ -86,7 +86,7 @@ class InteriorPoint(Solver):
 
     def iterate(self, run: SolveState, workspace: Workspace) -> Status | None:
         """Iterate to convergence; where that is not to be had, to a point of least violation, or on from another."""
-        now = workspace.prepare(run, self).scalars[0]
+        now = workspace.prepare(run, self)
         restarts = 0
         while True:
             reason = self._alone(run, workspace) if run.alone else self._guided(run, workspace)
@@ -114,21 +114,21 @@ class InteriorPoint(Solver):
 
     def _alone(self, run: SolveState, workspace: Workspace) -> Status:
         """The compiled loop."""
-        work = workspace.work
+        work, now = workspace.work, workspace.now
         interrupted = workspace.loop()
-        lin, iterations = workspace.found(), int(work.scalars[0]["iteration"])
-        if work.scalars[0]["kept"] and work.scalars[0]["violation"] > run.tolerance:
+        lin, iterations = workspace.found(), now["iteration"]
+        log = work.log[: iterations + 1].copy()
+        if now["kept"] and now["violation"] > run.tolerance:
             run.begin_at(run.program.linearize(run.program.columns.view(work.kept.copy())))
-        run.conclude(lin, work.multipliers.copy(), iterations, _history(work, lin.norms, run.seconds))
-        ending = ENDINGS[int(work.scalars[0]["answer"])]
+        run.conclude(lin, work.multipliers.copy(), iterations, _history(log, lin.norms, run.seconds))
+        ending = ENDINGS[now["answer"]]
         if interrupted:
             run.status = ending if ending is Status.CONVERGED else Status.INTERRUPTED
         return ending
 
     def _guided(self, run: SolveState, workspace: Workspace) -> Status | None:
         """The same loop, with every evaluation made by the program and every iterate shown."""
-        program, work = run.program, workspace.work
-        now = work.scalars[0]
+        program, work, now = run.program, workspace.work, workspace.now
         lin = run.lin
         if not np.array_equal(lin.values.flat, work.values):
             run.begin_at(program.linearize(program.columns.view(work.values.copy())))
@@ -153,12 +153,12 @@ class InteriorPoint(Solver):
                     return Status.TIME_LIMIT
                 continue
             if now["answer"] != state.ACCEPTED:
-                return ENDINGS[int(now["answer"])]
+                return ENDINGS[now["answer"]]
             lin = program.linearize(values)
             workspace.take(lin)
             workspace.call("measure")
             details = _details(now["mu"], now["delta"], now["gauss_newton"])
-            run.accept(lin, work.multipliers.copy(), float(now["step"]), float(now["taken"]), **details)
+            run.accept(lin, work.multipliers.copy(), now["step"], now["taken"], **details)
             if run.status is not None:
                 return None
 
@@ -208,6 +208,7 @@ class Workspace:
         )
         self._describe()
         self.problem.links[:] = addresses()
+        self._links, self.now = Fields(self.problem.links), Fields(self.work.scalars)
 
     def _unequal(self, term: IntArray) -> bool:
         """Whether a row of the table is a term with inequality rows."""
@@ -221,7 +222,7 @@ class Workspace:
 
     def call(self, function: str) -> None:
         """Run one of the linked functions."""
-        call(self.problem.links[0][function], self._address)
+        call(self._links[function], self._address)
 
     def loop(self) -> bool:
         """Run the whole solve; returns whether control-C was pressed, which Python learns when it is over.
@@ -229,27 +230,26 @@ class Workspace:
         Raises:
             KeyboardInterrupt: when it was pressed before the solve had begun.
         """
-        self.work.scalars[0]["answer"] = NO_ANSWER
+        self.now["answer"] = NO_ANSWER
         try:
             self.call("loop")
         except KeyboardInterrupt:
-            if self.work.scalars[0]["answer"] == NO_ANSWER:
+            if self.now["answer"] == NO_ANSWER:
                 raise
             return True
         return False
 
-    def prepare(self, run: SolveState, options: InteriorPoint) -> Work:
-        """Set up one solve with the present data."""
+    def prepare(self, run: SolveState, options: InteriorPoint) -> Fields:
+        """Set up one solve with the present data; returns the scalars."""
         if not (self.program.equality == self.system.held).all():
             self._build(options.max_iterations)
         if len(self.work.log) < options.max_iterations + 2:
             self.work = self.work._replace(log=np.zeros((options.max_iterations + 2, 9)))
             self._describe()
-        work = self.work
-        now = work.scalars[0]
+        work, now = self.work, self.now
         # The test of least squares has no absolute tolerance.
         now["tolerance"] = 0.0 if run.program.least_squares else run.tolerance
-        now["asked"], now["scaling"] = 0.0, options.scaling
+        now["asked"], now["scaling"] = 0.0, bool(options.scaling)
         now["step_tolerance"] = options.step_tolerance
         now["violation_tolerance"] = options.violation_tolerance
         now["iteration"], now["kept"], now["raises"] = 0, 0, 0
@@ -257,14 +257,14 @@ class Workspace:
         now["limit"], now["exact"] = options.max_iterations, options.hessian == "exact"
         self.begin_at(run.values.flat, options)
         work.multipliers[:] = run.multipliers
-        return work
+        return now
 
     def begin_at(self, values: Array, options: InteriorPoint) -> None:
         """Go on from other values, about whose multipliers nothing is known."""
-        work = self.work
+        work, now = self.work, self.now
         work.values[:], work.multipliers[:] = values, 0.0
-        work.scalars[0]["mu"], work.scalars[0]["going_on"] = options.barrier, 0
-        work.scalars[0]["rho"] = options.price * 10.0 ** int(work.scalars[0]["raises"])
+        now["mu"], now["going_on"] = options.barrier, 0
+        now["rho"] = options.price * 10.0 ** now["raises"]
 
     def found(self) -> Linearization:
         """The linearisation at which the compiled loop ended."""
@@ -273,7 +273,7 @@ class Workspace:
         program.retraction.fix(values)
         return Linearization(
             values,
-            float(work.scalars[0]["cost"]),
+            self.now["cost"],
             work.residual.copy(),
             work.jacobian.copy(),
             work.constraints.copy(),
@@ -286,15 +286,14 @@ class Workspace:
     def take(self, lin: Linearization) -> None:
         """Copy a linearisation to where the compiled functions look for it."""
         work = self.work
-        work.scalars[0]["cost"], work.values[:] = lin.cost, lin.values.flat
+        self.now["cost"], work.values[:] = lin.cost, lin.values.flat
         work.residual[:], work.jacobian[:] = lin.residual, lin.jacobian
         work.constraints[:], work.constraint_jacobian[:] = lin.constraints, lin.constraint_jacobian
         work.gradient[:], work.hessian[:] = lin.gradient, lin.hessian
 
 
-def _history(work: Work, norms: dict[str, float], seconds: float) -> Callable[[], list[Iteration]]:
+def _history(log: Array, norms: dict[str, float], seconds: float) -> Callable[[], list[Iteration]]:
     """Rows of the compiled loop, made when somebody asks for them; nobody took the time of single iterations."""
-    log = work.log[: int(work.scalars[0]["iteration"]) + 1].copy()
 
     def rows() -> list[Iteration]:
         last, made = len(log) - 1, []
