@@ -273,6 +273,12 @@ def _difference(
                 _bend(R, dim, gradient, second, column)
 
 
+@compiled
+def _retract(own: int, v: Array, start: int, stored: int, step: Array, column: int, dim: int, out: Array) -> None:
+    """Move a part by a retraction of its own: rare, and no code in the loops over all others."""
+    call_retraction(own, vector(v, start, stored), vector(step, column, dim), vector(out, start, stored))
+
+
 @inlined
 def _shift(
     v: Array,
@@ -293,7 +299,7 @@ def _shift(
     elif kind == ANGLE:
         out[start] = wrap(v[start] + step[which])
     elif kind == OTHER:
-        call_retraction(own, vector(v, start, stored), vector(step, column, dim), vector(out, start, stored))
+        _retract(own, v, start, stored, step, column, dim, out)
     else:
         move(v, kind, start, 3, step, column, out)
 
