@@ -28,7 +28,7 @@ from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
 from unifg.typing import Array
 
-SOLVERS = ("alm", "sqp")
+SOLVERS = ("ipm", "sqp", "alm")
 SEEDS = range(5)
 DEPARTMENT, ARENA = "dis-B1-2011-09-27.yaml", "turtlebot3_world.yaml"
 

@@ -60,7 +60,7 @@ class NavigationSettings:
     goals: tuple[tuple[float, float, float], ...] | None = option(
         None, text=pose, metavar="X,Y,TH", flag="goal", many=True
     )
-    solver: str = "sqp"
+    solver: str = "ipm"
     coupling: str = option("sequential", choices=("sequential", "joint"))
     obstacles: int = option(0, metavar="K")
     seed: int = option(0, metavar="S")

@@ -167,7 +167,7 @@ def test_covariance_counts_the_past_alone(field: DistanceMap) -> None:
     assert everything.shape == (3 * window.length + 3,) * 2
 
 
-@pytest.mark.parametrize("solver", ["sqp", "alm"])
+@pytest.mark.parametrize("solver", ["ipm", "sqp", "alm"])
 def test_joint_episode_reaches_its_goal(solver: str) -> None:
     settings = NavigationSettings(start=HERE, goals=(THERE,), coupling="joint", solver=solver, obstacles=1, seed=1)
     metrics = episode_metrics(run_navigation(settings))

@@ -27,7 +27,7 @@ from unifg.scenarios.worlds.plane import World
 from unifg.typing import Array
 
 RADIUS = 0.17
-SOLVERS = ("alm", "sqp")
+SOLVERS = ("ipm", "sqp", "alm")
 
 # Seven metres of the long corridor, and eight metres out of an office's door and around the corner.
 CORRIDOR = NavigationSettings(start=(6.5, 14.0, 0.0), goals=((13.5, 14.1, 0.0),))
