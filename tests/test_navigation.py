@@ -342,3 +342,10 @@ def test_department_map_is_planned_end_to_end(shared_data: Path) -> None:
     route = Route(occupancy, field, start, goal, RADIUS)
     assert field.distance(route.path[:, :2]).min() > RADIUS
     assert 30.0 < path_length(route.path) < 45.0
+
+
+def test_a_drive_plans_with_the_backend_that_the_page_names() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "navigation.md").read_text(encoding="utf-8")
+    row = next(line for line in page.splitlines() if line.startswith("| `--solver"))
+    assert f"`{NavigationSettings().solver}`" in row.split("|")[2]
+    assert NavigationSettings().solver == SOLVERS[0]
