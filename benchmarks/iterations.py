@@ -19,28 +19,9 @@ from benchmarks.report import command, listing, machine, publish, table, words
 from problems.control import Driver, Problem
 from problems.cylinders import SPEED
 from problems.known import PROBLEMS, Guess
-from unifg.solvers import (
-    KKT,
-    SQP,
-    AugmentedLagrangian,
-    DogLeg,
-    GaussNewton,
-    InteriorPoint,
-    LevenbergMarquardt,
-    Penalty,
-)
+from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint, names
 
-BACKENDS: dict[str, fg.Solver] = {
-    "GN": GaussNewton(),
-    "LM": LevenbergMarquardt(),
-    "dog-leg": DogLeg(),
-    "KKT": KKT(),
-    "penalty": Penalty(),
-    "AL": AugmentedLagrangian(),
-    "SQP": SQP(),
-    "SQP, exact": SQP(hessian="exact"),
-    "interior point": InteriorPoint(),
-}
+BACKENDS = {**names.backends(*names.LEAST_SQUARES, *names.EQUALITIES), "sqp, exact": SQP(hessian="exact")}
 FLIGHTS: dict[str, fg.Solver] = {
     "`AugmentedLagrangian`": AugmentedLagrangian(),
     'the same, `hessian="gauss-newton"`': AugmentedLagrangian(hessian="gauss-newton"),
