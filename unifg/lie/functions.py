@@ -14,7 +14,7 @@ from collections.abc import Callable, Hashable
 from functools import cache
 from typing import Any, cast
 
-from unifg.lie.derive import RULES
+from unifg.lie.consequences import RULES
 from unifg.lie.elementwise import DIM, LAYOUTS, MATRIX, POINT, STORAGE, Scalar, stated, stated_in
 from unifg.lie.manifold import Manifold
 from unifg.lie.product import leaves

@@ -13,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from unifg.errors import UnifgError
-from unifg.lie.derive import RULES, STEP
+from unifg.lie.consequences import RULES, STEP
 from unifg.lie.elementwise import method, stated
 from unifg.typing import Array, ArrayLike, BoolArray
 
@@ -126,7 +126,7 @@ class LieGroup(ManifoldBase):
     ``Exp(d + e) = Exp(d) Exp(Jr(d) e) = Exp(Jl(d) e) Exp(d)`` to first order in e.
 
     A subclass states ``identity``, ``random`` and, by compiled functions, ``exp``, ``log``, ``compose`` and
-    ``inverse``: all else follows (:mod:`unifg.lie.derive`), and is stated only where a closed form is quicker. What is
+    ``inverse``: all else follows (``lie/consequences.py``), and is stated only where a closed form is quicker. What is
     stated as an ordinary method is run by NumPy, and so is what follows from it; adjoint and Jacobians then have to be
     stated.
 

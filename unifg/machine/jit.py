@@ -74,6 +74,11 @@ def is_compiled(function: object) -> bool:
     return isinstance(function, Dispatcher)
 
 
+def source_of(function: Any) -> FunctionType:
+    """The function in Python of a compiled one; any other as it is."""
+    return cast(FunctionType, getattr(function, "py_func", function))
+
+
 class _Cache(FunctionCache):  # type: ignore[misc]
     """A cache that asks for the stamp of the function and of everything it calls, and says when it has to wait."""
 
@@ -112,7 +117,7 @@ def stamp(function: Any) -> str:
 
 def _parts(function: Any, seen: set[int]) -> Iterator[str]:
     """What identifies a function: its name, its file's date and size, the numbers it closes over, its callees."""
-    python: FunctionType = getattr(function, "py_func", function)
+    python = source_of(function)
     if id(python) in seen:
         return
     seen.add(id(python))

@@ -1,0 +1,353 @@
+"""The groups on symbols: what their compiled functions compute, every decision as a choice between two expressions.
+
+Where a function of the angle has 0/0 at zero, the choice is between the closed form and a power series of the *squared*
+angle. It falls at a third of a turn's radian, not near zero: derivatives of the closed form lose a power of the angle
+each, of the series none, so that second derivatives keep their digits everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from unifg.kernels.derive.symbols import UFUNCS, Symbol, TraceError, choose, symbols
+from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Manifold, Product, Rn
+
+Numbers = Sequence[Any]
+SWITCH = 0.25  # squared angle [rad^2]
+TERMS = 10
+
+_sqrt, _sin, _cos, _arctan2, _rint = (UFUNCS[name] for name in ("sqrt", "sin", "cos", "arctan2", "rint"))
+
+
+def wrap(angle: Any) -> Any:
+    """The angle in [-pi, pi]; it moves as the angle does."""
+    return angle - 2.0 * math.pi * _rint(angle * (0.5 / math.pi))
+
+
+def moved(manifold: Manifold, point: Numbers, step: Numbers) -> list[Any]:
+    """A point moved by a small step, exact to second order: what derivatives along the retraction need.
+
+    Raises:
+        TraceError: for a manifold that is none of those here.
+    """
+    if isinstance(manifold, Product):
+        result: list[Any] = []
+        for part in manifold.components.values():
+            result += moved(part.manifold, point[part.storage], step[part.tangent])
+        return result
+    if isinstance(manifold, Rn) or manifold == SO2:
+        return [x + d for x, d in zip(point, step, strict=True)]
+    if manifold == SE2:
+        c, s = _cos(point[2]), _sin(point[2])
+        x, y = step[0] - 0.5 * step[2] * step[1], step[1] + 0.5 * step[2] * step[0]
+        return [point[0] + (c * x - s * y), point[1] + (s * x + c * y), point[2] + step[2]]
+    if manifold == SO3:
+        return _turned(point, step)
+    if manifold == SE3:
+        v, w = step[:3], step[3:]
+        bent = [a + 0.5 * b for a, b in zip(v, _cross(w, v), strict=True)]
+        along = _rotate(point[3:], bent)
+        return [*(p + a for p, a in zip(point[:3], along, strict=True)), *_turned(point[3:], w)]
+    raise TraceError(f"a variable lies on {manifold.name}, whose retraction is not known here")
+
+
+def _turned(q: Numbers, w: Numbers) -> list[Any]:
+    square = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    return _product(q, [1.0 - 0.125 * square, 0.5 * w[0], 0.5 * w[1], 0.5 * w[2]])
+
+
+# ---------------------------------------------------------------- functions of the squared angle
+
+
+def _series(square: Any, coefficients: Numbers, closed: Callable[[Any], Any]) -> Any:
+    """A power series near zero, the closed form beyond."""
+    near = UFUNCS["less"](square, SWITCH)
+    total: Any = coefficients[-1]
+    for coefficient in reversed(coefficients[:-1]):
+        total = total * square + coefficient
+    return choose(near, total, closed(choose(near, 1.0, square)))
+
+
+def sinc(square: Any) -> Any:
+    """sin(t) / t of t^2."""
+    return _series(
+        square, [(-1.0) ** k / math.factorial(2 * k + 1) for k in range(TERMS)], lambda s: _sin(_sqrt(s)) / _sqrt(s)
+    )
+
+
+def cosine(square: Any) -> Any:
+    """cos(t) of t^2."""
+    return _series(square, [(-1.0) ** k / math.factorial(2 * k) for k in range(TERMS)], lambda s: _cos(_sqrt(s)))
+
+
+def versine(square: Any) -> Any:
+    """(1 - cos(t)) / t^2 of t^2."""
+    return _series(
+        square, [(-1.0) ** k / math.factorial(2 * k + 2) for k in range(TERMS)], lambda s: (1.0 - _cos(_sqrt(s))) / s
+    )
+
+
+def sine_rest(square: Any) -> Any:
+    """(t - sin(t)) / t^3 of t^2."""
+    return _series(
+        square,
+        [(-1.0) ** k / math.factorial(2 * k + 3) for k in range(TERMS)],
+        lambda s: (1.0 - _sin(_sqrt(s)) / _sqrt(s)) / s,
+    )
+
+
+def half_cotangent(square: Any) -> Any:
+    """(t / 2) cot(t / 2) of t^2: 1 - sum |B_2k| t^2k / (2k)!."""
+    bernoulli = [1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510, 43867 / 798, 174611 / 330]
+    coefficients = [1.0, *(-b / math.factorial(2 * k) for k, b in enumerate(bernoulli, 1))]
+    return _series(square, coefficients, lambda s: 0.5 * _sqrt(s) * _cos(0.5 * _sqrt(s)) / _sin(0.5 * _sqrt(s)))
+
+
+def log_factor(w: Any, square: Any) -> Any:
+    """2 atan2(n, w) / n of n^2, w the real part of a quaternion and n the norm of the others; 2 atan(n / w) / n near 0.
+
+    With z = (n / w)^2 the series of atan(sqrt z) / sqrt z converges for z < 1 and is used below a hundredth.
+    """
+    ratio = square / (w * w)
+    near = UFUNCS["less"](ratio, 0.01)
+    total: Any = 1.0 / (2 * TERMS - 1) * (-1.0) ** (TERMS - 1)
+    for k in range(TERMS - 2, -1, -1):
+        total = total * ratio + (-1.0) ** k / (2 * k + 1)
+    safe = choose(near, 1.0, square)
+    return choose(near, 2.0 * total / w, 2.0 * _arctan2(_sqrt(safe), w) / _sqrt(safe))
+
+
+# ---------------------------------------------------------------- vectors and quaternions
+
+
+def _cross(a: Numbers, b: Numbers) -> list[Any]:
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def _dot(a: Numbers, b: Numbers) -> Any:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _product(p: Numbers, q: Numbers) -> list[Any]:
+    w, x, y, z = p
+    v, a, b, c = q
+    return [
+        w * v - x * a - y * b - z * c,
+        w * a + x * v + y * c - z * b,
+        w * b - x * c + y * v + z * a,
+        w * c + x * b - y * a + z * v,
+    ]
+
+
+def _rotate(q: Numbers, p: Numbers) -> list[Any]:
+    u = q[1:]
+    twice = [2.0 * c for c in _cross(u, p)]
+    return [a + (q[0] * b + c) for a, b, c in zip(p, twice, _cross(u, twice), strict=True)]
+
+
+def _conjugate(q: Numbers) -> list[Any]:
+    return [q[0], -q[1], -q[2], -q[3]]
+
+
+def _upright(q: Numbers) -> list[Any]:
+    """The one of a quaternion and its negative whose real part is not negative."""
+    below = UFUNCS["less"](q[0], 0.0)
+    return [choose(below, -a, a) for a in q]
+
+
+# ---------------------------------------------------------------- the groups, one element at a time
+
+
+def _so3_exp(w: Numbers) -> list[Any]:
+    square = 0.25 * _dot(w, w)
+    half = 0.5 * sinc(square)
+    return _upright([cosine(square), half * w[0], half * w[1], half * w[2]])
+
+
+def _so3_log(q: Numbers) -> list[Any]:
+    q = _upright(q)
+    factor = log_factor(q[0], _dot(q[1:], q[1:]))
+    return [factor * a for a in q[1:]]
+
+
+def _so3_matrix(q: Numbers) -> list[list[Any]]:
+    columns = [_rotate(q, e) for e in ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])]
+    return [[columns[j][i] for j in range(3)] for i in range(3)]
+
+
+def _se2_exp(d: Numbers) -> list[Any]:
+    square = d[2] * d[2]
+    a, b = sinc(square), versine(square) * d[2]
+    return [a * d[0] - b * d[1], b * d[0] + a * d[1], wrap(d[2])]
+
+
+def _se2_log(x: Numbers) -> list[Any]:
+    angle = wrap(x[2])
+    a, b = half_cotangent(angle * angle), 0.5 * angle
+    return [a * x[0] + b * x[1], a * x[1] - b * x[0], angle]
+
+
+def _turn(angle: Any, p: Numbers) -> list[Any]:
+    c, s = _cos(angle), _sin(angle)
+    return [c * p[0] - s * p[1], s * p[0] + c * p[1]]
+
+
+def _se3_exp(d: Numbers) -> list[Any]:
+    v, w = d[:3], d[3:]
+    square = _dot(w, w)
+    b, c = versine(square), sine_rest(square)
+    once = _cross(w, v)
+    twice = _cross(w, once)
+    return [*(v[i] + b * once[i] + c * twice[i] for i in range(3)), *_so3_exp(w)]
+
+
+def _se3_log(x: Numbers) -> list[Any]:
+    p, w = x[:3], _so3_log(x[3:])
+    square = _dot(w, w)
+    once = _cross(w, p)
+    twice = _cross(w, once)
+    near = UFUNCS["less"](square, SWITCH)
+    safe = choose(near, 1.0, square)
+    bernoulli = [1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510, 43867 / 798, 174611 / 330]
+    total: Any = 0.0
+    for k in range(len(bernoulli), 0, -1):
+        total = total * square + bernoulli[k - 1] / math.factorial(2 * k)
+    k_value = choose(near, total, (1.0 - half_cotangent(safe)) / safe)
+    return [*(p[i] - 0.5 * once[i] + k_value * twice[i] for i in range(3)), *w]
+
+
+def _se3_act(x: Numbers, p: Numbers) -> list[Any]:
+    return [a + b for a, b in zip(x[:3], _rotate(x[3:], p), strict=True)]
+
+
+_Function = Callable[..., list[Any]]
+FORMS: dict[str, dict[str, _Function]] = {
+    "SO2": {
+        "exp": lambda d: [wrap(d[0])],
+        "log": lambda x: [wrap(x[0])],
+        "compose": lambda x, y: [wrap(x[0] + y[0])],
+        "inverse": lambda x: [wrap(-x[0])],
+        "act": lambda x, p: _turn(x[0], p),
+    },
+    "SE2": {
+        "exp": _se2_exp,
+        "log": _se2_log,
+        "compose": lambda x, y: [*(a + b for a, b in zip(x[:2], _turn(x[2], y[:2]), strict=True)), wrap(x[2] + y[2])],
+        "inverse": lambda x: [*(-a for a in _turn(-x[2], x[:2])), wrap(-x[2])],
+        "between": lambda x, y: [*_turn(-x[2], [y[0] - x[0], y[1] - x[1]]), wrap(y[2] - x[2])],
+        "act": lambda x, p: [a + b for a, b in zip(x[:2], _turn(x[2], p), strict=True)],
+    },
+    "SO3": {
+        "exp": _so3_exp,
+        "log": _so3_log,
+        "compose": lambda x, y: _upright(_product(x, y)),
+        "inverse": lambda x: _upright(_conjugate(x)),
+        "act": _rotate,
+    },
+    "SE3": {
+        "exp": _se3_exp,
+        "log": _se3_log,
+        "compose": lambda x, y: [*_se3_act(x, y[:3]), *_upright(_product(x[3:], y[3:]))],
+        "inverse": lambda x: [*(-a for a in _rotate(_conjugate(x[3:]), x[:3])), *_upright(_conjugate(x[3:]))],
+        "between": lambda x, y: [
+            *_rotate(_conjugate(x[3:]), [b - a for a, b in zip(x[:3], y[:3], strict=True)]),
+            *_upright(_product(_conjugate(x[3:]), y[3:])),
+        ],
+        "act": _se3_act,
+    },
+}
+"""Group, operation -> what it computes of single elements."""
+MATRICES: dict[str, Callable[[Numbers], list[list[Any]]]] = {
+    "SO3": _so3_matrix,
+    "SO2": lambda x: [[_cos(x[0]), -_sin(x[0])], [_sin(x[0]), _cos(x[0])]],
+}
+
+
+class Symbolic:
+    """A group whose methods take symbols; numbers go to the group itself."""
+
+    def __init__(self, group: LieGroup) -> None:
+        """Stand in for a group."""
+        self._group = group
+
+    def __getattr__(self, name: str) -> Any:
+        """An operation on symbols, or what the group has of that name."""
+        plain = getattr(self._group, name)
+        if not callable(plain) or name.startswith("_"):
+            return plain
+
+        def operation(*arguments: Any) -> Any:
+            if not any(_symbolic(argument) for argument in arguments):
+                return plain(*arguments)
+            return _over(self._group, name, [_rows(argument) for argument in arguments])
+
+        return operation
+
+
+def _symbolic(argument: Any) -> bool:
+    return isinstance(argument, Symbol) or (isinstance(argument, np.ndarray) and argument.dtype == object)
+
+
+def _rows(argument: Any) -> Any:
+    return np.asarray(argument, dtype=object)
+
+
+def _over(group: LieGroup, name: str, arguments: list[Any]) -> Any:
+    """An operation of every element of its arguments, broadcast over their leading axes."""
+    one = _operation(group, name)
+    shape = np.broadcast_shapes(*(argument.shape[:-1] for argument in arguments))
+    full = [np.broadcast_to(argument, (*shape, argument.shape[-1])) for argument in arguments]
+    results = [np.array(one(*(list(part[index]) for part in full)), dtype=object) for index in np.ndindex(shape)]
+    stacked = symbols((*shape, *results[0].shape))
+    for index, result in zip(np.ndindex(shape), results, strict=True):
+        stacked[index] = result
+    return stacked
+
+
+def _operation(group: LieGroup, name: str) -> Callable[..., Any]:
+    """What a group does with single elements."""
+    if isinstance(group, Rn):
+        table: dict[str, Callable[..., Any]] = {
+            "exp": lambda d: d,
+            "log": lambda x: x,
+            "compose": lambda x, y: [a + b for a, b in zip(x, y, strict=True)],
+            "inverse": lambda x: [-a for a in x],
+        }
+    elif isinstance(group, Product):
+        return _of_product(group, name)
+    else:
+        table = dict(FORMS.get(group.name, {}))
+        if name == "matrix" and group.name in MATRICES:
+            return MATRICES[group.name]
+    if name == "retract" and table:
+        return lambda x, d: table["compose"](x, table["exp"](d))
+    if name == "local" and table:
+        between = table.get("between") or (lambda x, y: table["compose"](table["inverse"](x), y))
+        return lambda x, y: table["log"](between(x, y))
+    if name == "between" and table and "between" not in table:
+        return lambda x, y: table["compose"](table["inverse"](x), y)
+    if name not in table:
+        raise TraceError(f"calls {group.name}.{name}, which has no form here that can be traced")
+    return table[name]
+
+
+def _of_product(group: Product, name: str) -> Callable[..., Any]:
+    places = {"exp": "t", "log": "s", "inverse": "s", "compose": "ss", "between": "ss", "local": "ss", "retract": "st"}
+    if name not in places:
+        raise TraceError(f"calls {group.name}.{name}, which has no form here that can be traced")
+
+    def operation(*arguments: Numbers) -> list[Any]:
+        result: list[Any] = []
+        for part in group.components.values():
+            cut = [
+                argument[part.storage if place == "s" else part.tangent]
+                for argument, place in zip(arguments, places[name], strict=True)
+            ]
+            result += _operation(part.manifold, name)(*cut)  # type: ignore[arg-type]
+        return result
+
+    return operation

@@ -1,0 +1,60 @@
+"""The operations of a tape: numbers for compiled passes, names for people, and what each computes."""
+
+from __future__ import annotations
+
+from enum import IntEnum, auto
+
+
+class Op(IntEnum):
+    """What a node of a tape computes from its arguments a, b, c."""
+
+    CONSTANT = 0
+    VARIABLE = auto()  # a-th number of the variables' storage
+    PARAMETER = auto()  # a-th parameter
+    WEIGHT = auto()  # a-th weight of the rows
+    TANGENT = auto()  # a-th tangent coordinate, zero once everything is differentiated
+    NEGATE = auto()
+    ADD = auto()
+    SUBTRACT = auto()
+    MULTIPLY = auto()
+    DIVIDE = auto()
+    SQRT = auto()
+    SIN = auto()
+    COS = auto()
+    TAN = auto()
+    ARCSIN = auto()
+    ARCCOS = auto()
+    ARCTAN = auto()
+    ARCTAN2 = auto()
+    SINH = auto()
+    COSH = auto()
+    TANH = auto()
+    EXP = auto()
+    EXPM1 = auto()
+    LOG = auto()
+    LOG1P = auto()
+    POWER = auto()
+    ABSOLUTE = auto()
+    SIGN = auto()
+    FLOOR = auto()
+    RINT = auto()
+    MINIMUM = auto()
+    MAXIMUM = auto()
+    LESS = auto()
+    LESS_EQUAL = auto()
+    EQUAL = auto()
+    AND = auto()
+    OR = auto()
+    NOT = auto()
+    SELECT = auto()  # b where a, else c
+
+
+LEAVES = (Op.CONSTANT, Op.VARIABLE, Op.PARAMETER, Op.WEIGHT, Op.TANGENT)
+UNARY = frozenset(
+    {
+        Op.NEGATE, Op.SQRT, Op.SIN, Op.COS, Op.TAN, Op.ARCSIN, Op.ARCCOS, Op.ARCTAN, Op.SINH, Op.COSH, Op.TANH,
+        Op.EXP, Op.EXPM1, Op.LOG, Op.LOG1P, Op.ABSOLUTE, Op.SIGN, Op.FLOOR, Op.RINT, Op.NOT,
+    }
+)  # fmt: skip
+TRUTHS = frozenset({Op.LESS, Op.LESS_EQUAL, Op.EQUAL, Op.AND, Op.OR, Op.NOT})
+"""Their values are 0 or 1."""

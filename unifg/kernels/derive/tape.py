@@ -1,0 +1,282 @@
+"""The tape: expressions of numbers as rows of integers, each stated once and simplified where that costs no digit.
+
+A node is an operation and the nodes it takes, all of which stand before it. Two nodes never say the same. What is
+simplified holds for every finite number: x + 0, 1 x, x - x, constants among themselves, a choice between equals.
+Products with zero are zero, whatever the other factor, as in any exact differentiation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+
+from unifg.kernels.derive.operations import UNARY, Op
+
+NUMPY = {
+    Op.NEGATE: np.negative, Op.ADD: np.add, Op.SUBTRACT: np.subtract, Op.MULTIPLY: np.multiply, Op.DIVIDE: np.divide,
+    Op.SQRT: np.sqrt, Op.SIN: np.sin, Op.COS: np.cos, Op.TAN: np.tan, Op.ARCSIN: np.arcsin, Op.ARCCOS: np.arccos,
+    Op.ARCTAN: np.arctan, Op.ARCTAN2: np.arctan2, Op.SINH: np.sinh, Op.COSH: np.cosh, Op.TANH: np.tanh,
+    Op.EXP: np.exp, Op.EXPM1: np.expm1, Op.LOG: np.log, Op.LOG1P: np.log1p, Op.POWER: np.power,
+    Op.ABSOLUTE: np.absolute, Op.SIGN: np.sign, Op.FLOOR: np.floor, Op.RINT: np.rint, Op.MINIMUM: np.minimum,
+    Op.MAXIMUM: np.maximum, Op.LESS: np.less, Op.LESS_EQUAL: np.less_equal, Op.EQUAL: np.equal,
+    Op.AND: np.logical_and, Op.OR: np.logical_or, Op.NOT: np.logical_not,
+}  # fmt: skip
+"""What each operation computes, as NumPy does."""
+
+_COMMUTES = frozenset({Op.ADD, Op.MULTIPLY, Op.EQUAL, Op.AND, Op.OR})
+
+
+class Tape:
+    """Nodes in the order they were stated.
+
+    Attributes:
+        op: operation of each node.
+        a, b, c: nodes it takes; of a variable, a parameter, a weight or a tangent coordinate, a is its place.
+        value: of constants.
+    """
+
+    def __init__(self) -> None:
+        """Nothing is stated yet."""
+        self.op: list[int] = []
+        self.a: list[int] = []
+        self.b: list[int] = []
+        self.c: list[int] = []
+        self.value: list[float] = []
+        self._found: dict[tuple[int, int, int, int], int] = {}
+        self._constants: dict[tuple[float, float], int] = {}
+        self.zero = self.constant(0.0)
+        self.one = self.constant(1.0)
+        self.minus_one = self.constant(-1.0)
+
+    def __len__(self) -> int:
+        """How many nodes there are."""
+        return len(self.op)
+
+    # ---------------------------------------------------------------- leaves
+
+    def constant(self, value: float) -> int:
+        """A number."""
+        key = (value, math.copysign(1.0, value))
+        found = self._constants.get(key)
+        if found is None:
+            found = self._constants[key] = self._append(Op.CONSTANT, -1, -1, -1, value)
+        return found
+
+    def leaf(self, op: Op, place: int) -> int:
+        """A variable, a parameter, a weight or a tangent coordinate."""
+        return self._node(op, place)
+
+    def is_constant(self, i: int) -> bool:
+        """Whether a node is a number."""
+        return self.op[i] == Op.CONSTANT
+
+    # ---------------------------------------------------------------- operations
+
+    def apply(self, op: int, a: int, b: int = -1, c: int = -1) -> int:
+        """The node of an operation: a simpler one, or one that is there already, where that says the same."""
+        simple = _SIMPLER.get(op)
+        if simple is not None:
+            return simple(self, a, b, c)
+        kind = self.op
+        if kind[a] == Op.CONSTANT and (b < 0 or kind[b] == Op.CONSTANT):
+            return self._fold(op, a, b)
+        if op in _COMMUTES and b < a:
+            a, b = b, a
+        return self._node(op, a, b, c)
+
+    def add(self, a: int, b: int) -> int:
+        """The sum."""
+        if a == self.zero:
+            return b
+        if b == self.zero:
+            return a
+        op = self.op
+        first, second = op[a], op[b]
+        if first == Op.CONSTANT and second == Op.CONSTANT:
+            return self._fold(Op.ADD, a, b)
+        if second == Op.NEGATE:
+            return self.subtract(a, self.a[b])
+        if first == Op.NEGATE:
+            return self.subtract(b, self.a[a])
+        if first == Op.SELECT and second == Op.SELECT and self.a[a] == self.a[b]:
+            parts = (self.b[a], self.b[b], self.c[a], self.c[b])
+            if self.zero in parts[:2] and self.zero in parts[2:]:
+                return self.select(self.a[a], self.add(*parts[:2]), self.add(*parts[2:]))
+        return self._node(Op.ADD, a, b) if a < b else self._node(Op.ADD, b, a)
+
+    def subtract(self, a: int, b: int) -> int:
+        """The difference."""
+        if b == self.zero:
+            return a
+        if a == self.zero:
+            return self.negate(b)
+        if a == b:
+            return self.zero
+        if self.op[a] == Op.CONSTANT and self.op[b] == Op.CONSTANT:
+            return self._fold(Op.SUBTRACT, a, b)
+        if self.op[b] == Op.NEGATE:
+            return self.add(a, self.a[b])
+        return self._node(Op.SUBTRACT, a, b)
+
+    def negate(self, a: int) -> int:
+        """The opposite."""
+        op = self.op[a]
+        if op == Op.CONSTANT:
+            return self.constant(-self.value[a]) if a != self.zero else a
+        if op == Op.NEGATE:
+            return self.a[a]
+        if op == Op.SUBTRACT:
+            return self._node(Op.SUBTRACT, self.b[a], self.a[a])
+        return self._node(Op.NEGATE, a)
+
+    def multiply(self, a: int, b: int) -> int:
+        """The product."""
+        if a == self.zero or b == self.zero:
+            return self.zero
+        if a == self.one:
+            return b
+        if b == self.one:
+            return a
+        if a == self.minus_one:
+            return self.negate(b)
+        if b == self.minus_one:
+            return self.negate(a)
+        op = self.op
+        if op[a] == Op.CONSTANT and op[b] == Op.CONSTANT:
+            return self._fold(Op.MULTIPLY, a, b)
+        if op[a] == Op.NEGATE:
+            return self.negate(self.multiply(self.a[a], b))
+        if op[b] == Op.NEGATE:
+            return self.negate(self.multiply(a, self.a[b]))
+        return self._node(Op.MULTIPLY, a, b) if a < b else self._node(Op.MULTIPLY, b, a)
+
+    def divide(self, a: int, b: int) -> int:
+        """The quotient."""
+        if b == self.one or a == self.zero:
+            return a
+        if b == self.minus_one:
+            return self.negate(a)
+        if self.op[a] == Op.CONSTANT and self.op[b] == Op.CONSTANT:
+            return self._fold(Op.DIVIDE, a, b)
+        return self._node(Op.DIVIDE, a, b)
+
+    def power(self, a: int, b: int) -> int:
+        """The power a^b; small whole powers and the root as products."""
+        if self.op[b] == Op.CONSTANT:
+            if self.op[a] == Op.CONSTANT:
+                return self._fold(Op.POWER, a, b)
+            exponent = self.value[b]
+            if exponent == 0.5:
+                return self.apply(Op.SQRT, a)
+            if exponent == int(exponent) and abs(exponent) <= 4:
+                product = self.one
+                for _ in range(abs(int(exponent))):
+                    product = self.multiply(product, a)
+                return product if exponent >= 0 else self.divide(self.one, product)
+        return self._node(Op.POWER, a, b)
+
+    def select(self, condition: int, a: int, b: int) -> int:
+        """The first where the condition holds, else the second."""
+        if a == b:
+            return a
+        if self.op[condition] == Op.CONSTANT:
+            return a if self.value[condition] != 0.0 else b
+        if self.op[condition] == Op.NOT:
+            return self.select(self.a[condition], b, a)
+        return self._node(Op.SELECT, condition, a, b)
+
+    def scaled(self, a: int, partial: int) -> int:
+        """A derivative times a partial derivative; not of what is not chosen: its partial may be infinite."""
+        if self.op[a] == Op.SELECT:
+            condition, b, c = self.a[a], self.b[a], self.c[a]
+            if c == self.zero:
+                return self.select(condition, self.scaled(b, partial), c)
+            if b == self.zero:
+                return self.select(condition, b, self.scaled(c, partial))
+        return self.multiply(a, partial)
+
+    # ---------------------------------------------------------------- whole tapes
+
+    def live(self, outputs: Iterable[int]) -> list[int]:
+        """Nodes that the outputs depend on, in order."""
+        needed = set(outputs)
+        waiting = list(needed)
+        op, takes = self.op, (self.a, self.b, self.c)
+        while waiting:
+            i = waiting.pop()
+            if op[i] <= Op.TANGENT:
+                continue
+            for column in takes:
+                j = column[i]
+                if j >= 0 and j not in needed:
+                    needed.add(j)
+                    waiting.append(j)
+        return sorted(needed)
+
+    def at_rest(self, outputs: Sequence[int]) -> tuple[Tape, list[int]]:
+        """A new tape of the outputs with every tangent coordinate zero, and the outputs on it."""
+        new = Tape()
+        place: dict[int, int] = {}
+        for i in self.live(outputs):
+            op, a = self.op[i], self.a[i]
+            if op == Op.CONSTANT:
+                place[i] = new.constant(self.value[i])
+            elif op == Op.TANGENT:
+                place[i] = new.zero
+            elif op <= Op.TANGENT:
+                place[i] = new._node(op, a)
+            else:
+                b, c = self.b[i], self.c[i]
+                place[i] = new.apply(op, place[a], place[b] if b >= 0 else -1, place[c] if c >= 0 else -1)
+        return new, [place[i] for i in outputs]
+
+    def evaluate(self, outputs: Sequence[int], variables: Sequence[float], parameters: Sequence[float]) -> list[float]:
+        """Run the tape in Python: slow, for tests and messages."""
+        given = {Op.VARIABLE: variables, Op.PARAMETER: parameters}
+        found: dict[int, float] = {}
+        with np.errstate(all="ignore"):
+            for i in self.live(outputs):
+                op, a, b = self.op[i], self.a[i], self.b[i]
+                if op == Op.CONSTANT:
+                    found[i] = self.value[i]
+                elif op <= Op.TANGENT:
+                    found[i] = float(given[Op(op)][a])
+                elif op == Op.SELECT:
+                    found[i] = found[b] if found[a] != 0.0 else found[self.c[i]]
+                else:
+                    arguments = (found[a],) if op in UNARY else (found[a], found[b])
+                    found[i] = float(NUMPY[Op(op)](*arguments))
+        return [found[i] for i in outputs]
+
+    def _fold(self, op: int, a: int, b: int) -> int:
+        arguments = (self.value[a],) if b < 0 else (self.value[a], self.value[b])
+        with np.errstate(all="ignore"):
+            return self.constant(float(NUMPY[Op(op)](*arguments)))
+
+    def _node(self, op: int, a: int, b: int = -1, c: int = -1) -> int:
+        key = (op, a, b, c)
+        found = self._found.get(key)
+        if found is None:
+            found = self._found[key] = self._append(op, a, b, c, 0.0)
+        return found
+
+    def _append(self, op: int, a: int, b: int, c: int, value: float) -> int:
+        self.op.append(op)
+        self.a.append(a)
+        self.b.append(b)
+        self.c.append(c)
+        self.value.append(value)
+        return len(self.op) - 1
+
+
+_SIMPLER: dict[int, Callable[[Tape, int, int, int], int]] = {
+    Op.ADD: lambda t, a, b, c: t.add(a, b),
+    Op.SUBTRACT: lambda t, a, b, c: t.subtract(a, b),
+    Op.NEGATE: lambda t, a, b, c: t.negate(a),
+    Op.MULTIPLY: lambda t, a, b, c: t.multiply(a, b),
+    Op.DIVIDE: lambda t, a, b, c: t.divide(a, b),
+    Op.POWER: lambda t, a, b, c: t.power(a, b),
+    Op.SELECT: lambda t, a, b, c: t.select(a, b, c),
+}

@@ -1,0 +1,256 @@
+"""Running a function once on numbers that are not known yet.
+
+The function is what a user writes: batched NumPy, called with one factor, or a Numba function of one factor that writes
+its residual into its last argument. What it refers to is looked at before it runs: NumPy's constructors make arrays
+that may hold symbols, ``math`` does what NumPy does, and functions it calls are run in the same way. Nothing outside
+changes.
+"""
+
+from __future__ import annotations
+
+import builtins
+import math
+import sys
+from collections.abc import Callable, Sequence
+from types import CellType, FunctionType, ModuleType
+from typing import Any
+
+import numpy as np
+
+from unifg.kernels.derive.groups import Symbolic, wrap
+from unifg.kernels.derive.symbols import UFUNCS, Symbol, Symbols, TraceError, _plain, symbols, wrapped
+from unifg.lie import LieGroup, so2, wrap_angle
+from unifg.machine.jit import is_compiled, source_of
+
+
+def run(function: Callable[..., Any], arguments: Sequence[Any], rows: int = 0) -> Any:
+    """Call a function with symbols.
+
+    Args:
+        function: batched, or compiled for one factor.
+        arguments: arrays of symbols, as the function takes them.
+        rows: of a compiled function, m; it is given an array of that length to write into.
+
+    Returns:
+        (1, m) what the batched function returns, or (m,) what the compiled one writes.
+
+    Raises:
+        TraceError: the function does what cannot be traced; the message says what and in which line.
+    """
+    try:
+        if is_compiled(function):
+            written = symbols((rows,))
+            _Rebound().function(function)(*arguments, written)
+            return written
+        return _Rebound().callable(function)(*arguments)
+    except TraceError as error:
+        raise TraceError(f"{_line(function)}{error}") from None
+    except RecursionError:
+        raise TraceError(f"{_line(function)}calls itself too often") from None
+    except Exception as error:  # whatever a foreign function makes of an array of objects
+        raise TraceError(f"{_line(function)}{type(error).__name__}: {error}") from error
+
+
+def _line(function: Callable[..., Any]) -> str:
+    """The innermost line of the user's own code that was running."""
+    trace, own = sys.exc_info()[2], ""
+    inside = __name__.rpartition(".")[0]
+    while trace is not None:
+        code, names = trace.tb_frame.f_code, trace.tb_frame.f_globals
+        module = str(names.get("__name__", ""))
+        if not module.startswith((inside, "numpy")):
+            own = f"{code.co_filename}:{trace.tb_lineno}: "
+        trace = trace.tb_next
+    return own
+
+
+class _Rebound:
+    """Functions whose names for NumPy and ``math`` mean versions that know symbols."""
+
+    def __init__(self) -> None:
+        self._seen: dict[int, Any] = {}
+        self._kept: list[Any] = []  # ids stay theirs
+
+    def callable(self, thing: Any) -> Any:
+        """A callable, rebound as far as it is written in Python."""
+        if isinstance(thing, FunctionType) or is_compiled(thing):
+            return self.function(thing)
+        inner = getattr(thing, "func", None)
+        if inner is not None and hasattr(thing, "keywords"):  # functools.partial
+            return type(thing)(self.callable(inner), *thing.args, **thing.keywords)
+        return thing
+
+    def function(self, function: Any) -> Any:
+        """A copy of a function with other names in reach."""
+        python: FunctionType = source_of(function)
+        found = self._seen.get(id(python))
+        if found is not None:
+            return found
+        names = _Names(python.__globals__, self)
+        copy = FunctionType(python.__code__, names, python.__name__, python.__defaults__, None)
+        cells = tuple(CellType() for _ in python.__closure__ or ())
+        copy = FunctionType(python.__code__, names, python.__name__, python.__defaults__, cells or None)
+        copy.__kwdefaults__ = python.__kwdefaults__
+        self._seen[id(python)] = copy
+        self._kept.append(python)
+        for cell, original in zip(cells, python.__closure__ or (), strict=True):
+            try:
+                cell.cell_contents = self.thing(original.cell_contents)
+            except ValueError:  # not assigned yet
+                continue
+        for name in python.__code__.co_names:
+            if name in python.__globals__:
+                names[name] = self.thing(python.__globals__[name])
+        return copy
+
+    def thing(self, thing: Any) -> Any:
+        """What a name means while a function is traced."""
+        if thing is np:
+            return NUMPY
+        if thing is math:
+            return MATH
+        if isinstance(thing, LieGroup):
+            return Symbolic(thing)
+        if thing is so2.wrap or thing is wrap_angle:
+            return _wrapped
+        if is_compiled(thing):
+            return self.function(thing)
+        if isinstance(thing, ModuleType) and thing.__name__.partition(".")[0] == "unifg":
+            return _House(thing, self)
+        if isinstance(thing, FunctionType):
+            module = str(thing.__module__ or "")
+            return thing if module.partition(".")[0] == "numpy" else self.function(thing)
+        return CONSTRUCTORS.get(_identity(thing), thing) if callable(thing) else thing
+
+
+class _Names(dict[str, Any]):
+    """Globals of a rebound function."""
+
+    def __init__(self, names: dict[str, Any], rebound: _Rebound) -> None:
+        super().__init__(names)
+        self["__builtins__"] = {
+            **vars(builtins),
+            "abs": abs,
+            "max": _greatest,
+            "min": _least,
+            "float": _float,
+            "sum": _sum,
+        }
+
+
+def _wrapped(angle: Any) -> Any:
+    return wrap(angle) if isinstance(angle, Symbol | float) else wrapped(np.frompyfunc(wrap, 1, 1)(_plain(angle)))
+
+
+def _identity(thing: Any) -> int:
+    return id(thing)
+
+
+def _float(value: Any = 0.0) -> Any:
+    return value if isinstance(value, Symbol) else float(value)
+
+
+def _greatest(*values: Any, **options: Any) -> Any:
+    return _fold("maximum", builtins.max, values, options)
+
+
+def _least(*values: Any, **options: Any) -> Any:
+    return _fold("minimum", builtins.min, values, options)
+
+
+def _fold(name: str, plain: Callable[..., Any], values: tuple[Any, ...], options: dict[str, Any]) -> Any:
+    items = list(values[0]) if len(values) == 1 else list(values)
+    if options or not any(isinstance(item, Symbol | Symbols) for item in items):
+        return plain(*values, **options)
+    total = items[0]
+    for item in items[1:]:
+        total = getattr(np, name)(total, item) if isinstance(item, Symbols) else UFUNCS[name](total, item)
+    return total
+
+
+def _sum(values: Any, start: Any = 0) -> Any:
+    total = start
+    for item in values:
+        total = total + item
+    return total
+
+
+# ---------------------------------------------------------------- NumPy and math, as far as they look at entries
+
+
+def _array(values: Any, *arguments: Any, **options: Any) -> Any:
+    if isinstance(values, Symbols):
+        return values.copy()
+    if isinstance(values, Symbol):
+        return symbols((), values)
+    plain = np.array(values, dtype=object)
+    if any(isinstance(item, Symbol) for item in plain.flat):
+        return wrapped(plain)
+    return np.array(values, *arguments, **options)
+
+
+def _as_array(values: Any, *arguments: Any, **options: Any) -> Any:
+    return values if isinstance(values, Symbols) else _array(values, *arguments, **options)
+
+
+def _filled(value: float) -> Callable[..., Any]:
+    def make(shape: Any, *arguments: Any, **options: Any) -> Any:
+        return symbols(tuple(shape) if isinstance(shape, list | tuple) else (int(shape),), value)
+
+    return make
+
+
+def _full(shape: Any, value: Any, *arguments: Any, **options: Any) -> Any:
+    return symbols(tuple(shape) if isinstance(shape, list | tuple) else (int(shape),), value)
+
+
+def _eye(*arguments: Any, **options: Any) -> Any:
+    return wrapped(np.eye(*arguments, **options).astype(object))
+
+
+class _Proxy(ModuleType):
+    """A module some of whose names mean something else."""
+
+    def __init__(self, module: ModuleType, names: dict[str, Any]) -> None:
+        super().__init__(module.__name__)
+        self._module, self._names = module, names
+
+    def __getattr__(self, name: str) -> Any:
+        names = self.__dict__["_names"]
+        return names[name] if name in names else getattr(self.__dict__["_module"], name)
+
+
+class _House(_Proxy):
+    """A module of this library, whose functions and groups take symbols."""
+
+    def __init__(self, module: ModuleType, rebound: _Rebound) -> None:
+        super().__init__(module, {})
+        self._rebound = rebound
+
+    def __getattr__(self, name: str) -> Any:
+        return self.__dict__["_rebound"].thing(getattr(self.__dict__["_module"], name))
+
+
+_MAKERS = {
+    "array": _array, "asarray": _as_array, "asanyarray": _as_array, "ascontiguousarray": _as_array,
+    "zeros": _filled(0.0), "empty": _filled(0.0), "ones": _filled(1.0), "full": _full, "eye": _eye, "identity": _eye,
+    "atleast_1d": lambda a: _as_array(a) if np.ndim(a) else _as_array(a).reshape(1),
+}  # fmt: skip
+NUMPY = _Proxy(np, _MAKERS)
+CONSTRUCTORS = {id(getattr(np, name)): made for name, made in _MAKERS.items()}
+_MATH = {"fabs": "absolute", "pow": "power", "asin": "arcsin", "acos": "arccos", "atan": "arctan", "atan2": "arctan2"}
+
+
+def _mathematical(name: str) -> Callable[..., Any]:
+    scalar, plain = UFUNCS[_MATH.get(name, name)], getattr(math, name)
+
+    def function(*arguments: Any) -> Any:
+        return scalar(*arguments) if any(isinstance(a, Symbol) for a in arguments) else plain(*arguments)
+
+    return function
+
+
+MATH = _Proxy(
+    math,
+    {name: _mathematical(name) for name in dir(math) if _MATH.get(name, name) in UFUNCS and name not in ("remainder",)},
+)
