@@ -395,3 +395,11 @@ def test_random_expressions(seed: int) -> None:
     answers = [[np.asarray(part) for part in theirs(v, q)] for v, q in zip(x, weights, strict=True)]
     compared(J, np.array([a[0] for a in answers]))
     compared(curved(expression, x, np.zeros((1, 0)), weights), np.array([a[1] for a in answers]))
+
+
+def test_a_function_that_closes_over_numbers() -> None:
+    mass, gains = 2.0, np.array([1.0, -3.0])
+    expression = traced(lambda x: mass * x @ gains[:, None], (Rn(2),))
+    r, J = evaluated(expression, np.array([[1.0, 2.0]]), np.zeros((1, 0)))
+    np.testing.assert_array_equal(r, [[-10.0]])
+    np.testing.assert_array_equal(J, [[[2.0, -6.0]]])

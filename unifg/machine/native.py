@@ -16,7 +16,6 @@ from typing import Any
 import llvmlite.binding as binding
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.core.registry import cpu_target
 
 POINTER = str(ir.DoubleType().as_pointer())
@@ -67,10 +66,12 @@ def _frame(arguments: tuple[Any, ...]) -> tuple[str, str, str]:
     nothing = ir.Constant(ir.IntType(64), 0)
     arrays = context.call_conv.decode_arguments(builder, arguments, function)
     for k, (given, array) in enumerate(zip(arguments, arrays, strict=True)):
-        proxy = cgutils.create_struct_proxy(given)(context, builder, array)
-        builder.gep(proxy.data, [nothing], name=f"data{k}")
-        for axis, length in enumerate(cgutils.unpack_tuple(builder, proxy.shape, given.ndim)):
-            builder.add(length, nothing, name=f"shape{k}_{axis}")
+        # Read from what was passed: an array put together in memory first costs more than short functions do.
+        fields = context.data_model_manager[given]
+        builder.gep(builder.extract_value(array, fields.get_field_position("data")), [nothing], name=f"data{k}")
+        shape = builder.extract_value(array, fields.get_field_position("shape"))
+        for axis in range(given.ndim):
+            builder.add(builder.extract_value(shape, axis), nothing, name=f"shape{k}_{axis}")
     builder.comment(_MARK)
     context.call_conv.return_value(builder, context.get_dummy_value())
     head, brace, text = str(function).partition("{")

@@ -87,7 +87,6 @@ class _Rebound:
         if found is not None:
             return found
         names = _Names(python.__globals__, self)
-        copy = FunctionType(python.__code__, names, python.__name__, python.__defaults__, None)
         cells = tuple(CellType() for _ in python.__closure__ or ())
         copy = FunctionType(python.__code__, names, python.__name__, python.__defaults__, cells or None)
         copy.__kwdefaults__ = python.__kwdefaults__
