@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from unifg.kernels.derive.operations import Op
+from unifg.kernels.derive.operations import STEADY, Op
 from unifg.kernels.derive.tape import Tape
 
 Partials = list[tuple[int, int]]
@@ -29,20 +29,43 @@ def jacobian(tape: Tape, outputs: Sequence[int], width: int) -> dict[tuple[int, 
     return swept[0] if lengths[0] < lengths[1] else swept[1]
 
 
-def gradient(tape: Tape, outputs: Sequence[int]) -> dict[int, int]:
-    """Derivative of the sum of weights times outputs by every tangent coordinate where it is not zero."""
+def gradient(tape: Tape, outputs: Sequence[int], rows: Sequence[bool]) -> dict[int, int]:
+    """Derivative of the sum of weights times some outputs by every tangent coordinate where it is not zero."""
     weighted = tape.zero
     for row, output in enumerate(outputs):
-        weighted = tape.add(weighted, tape.multiply(tape.leaf(Op.WEIGHT, row), output))
+        if rows[row]:
+            weighted = tape.add(weighted, tape.multiply(tape.leaf(Op.WEIGHT, row), output))
     return _by_tangent(tape, _adjoints(tape, weighted))
 
 
 def hessian(tape: Tape, outputs: Sequence[int], width: int) -> dict[tuple[int, int], int]:
     """Second derivatives of the sum of weights times outputs: those on and above the diagonal that are not zero."""
-    first = gradient(tape, outputs)
+    first = gradient(tape, outputs, bent(tape, outputs))
     slopes = [first.get(k, tape.zero) for k in range(width)]
     entries = _forwards(tape, slopes, width)
     return {(j, k): node for (j, k), node in entries.items() if j <= k}
+
+
+def bent(tape: Tape, outputs: Sequence[int]) -> list[bool]:
+    """Which outputs have second derivatives: those that are not made of linear pieces."""
+    degree = dict[int, int]()  # 0 constant, 1 made of linear pieces, 2 neither
+    for i in tape.live(outputs):
+        op, a, b = tape.op[i], tape.a[i], tape.b[i]
+        if op <= Op.TANGENT or op in STEADY:
+            degree[i] = 1 if op == Op.TANGENT else 0
+        elif op == Op.SELECT:
+            degree[i] = max(degree[b], degree[tape.c[i]])
+        elif op in (Op.ADD, Op.SUBTRACT, Op.MINIMUM, Op.MAXIMUM):
+            degree[i] = max(degree[a], degree[b])
+        elif op in (Op.NEGATE, Op.ABSOLUTE):
+            degree[i] = degree[a]
+        elif op == Op.MULTIPLY:
+            degree[i] = min(2, degree[a] + degree[b])
+        elif op in (Op.DIVIDE, Op.FMOD):
+            degree[i] = 2 if degree[b] else degree[a]
+        else:
+            degree[i] = 2 if degree[a] or (b >= 0 and degree[b]) else 0
+    return [degree[output] == 2 for output in outputs]
 
 
 def _forwards(tape: Tape, outputs: Sequence[int], width: int) -> dict[tuple[int, int], int]:
@@ -112,11 +135,11 @@ def _by_tangent(tape: Tape, adjoint: dict[int, int]) -> dict[int, int]:
 
 
 def _dependence(tape: Tape, live: Sequence[int]) -> dict[int, int]:
-    """For every node, the tangent coordinates it depends on, as bits."""
+    """For every node, the tangent coordinates it moves with, as bits."""
     depends = dict[int, int]()
     for i in live:
         op = tape.op[i]
-        if op <= Op.TANGENT:
+        if op <= Op.TANGENT or op in STEADY:
             depends[i] = 1 << tape.a[i] if op == Op.TANGENT else 0
         else:
             bits = depends[tape.a[i]] if op != Op.SELECT else 0
@@ -153,6 +176,12 @@ def _partials(tape: Tape, i: int) -> Partials:
         lower = t.power(a, t.subtract(b, one))
         found = [(a, t.multiply(b, lower))]
         return found if t.is_constant(b) else [*found, (b, t.multiply(i, t.apply(Op.LOG, a)))]
+    if op == Op.FMOD:
+        ratio = t.divide(a, b)
+        whole = t.multiply(t.apply(Op.SIGN, ratio), t.apply(Op.FLOOR, t.apply(Op.ABSOLUTE, ratio)))
+        return [(a, one)] if t.is_constant(b) else [(a, one), (b, t.negate(whole))]
+    if op in STEADY:
+        return []
     if op in (Op.MINIMUM, Op.MAXIMUM):  # of equals the first moves
         first = t.apply(Op.LESS_EQUAL, *((a, b) if op == Op.MINIMUM else (b, a)))
         return [(a, t.select(first, one, t.zero)), (b, t.select(first, t.zero, one))]
@@ -192,4 +221,4 @@ def _slope(t: Tape, op: int, i: int, a: int) -> int:
         return t.divide(one, t.add(one, a))
     if op == Op.ABSOLUTE:
         return t.apply(Op.SIGN, a)
-    return t.zero  # sign, floor, rint and truth values
+    raise AssertionError(f"no derivative of {Op(op).name}")

@@ -14,7 +14,7 @@ _LIBRARY = {  # functions of the C library, and those that processors know
     Op.TAN: "tan", Op.ARCSIN: "asin", Op.ARCCOS: "acos", Op.ARCTAN: "atan", Op.ARCTAN2: "atan2", Op.SINH: "sinh",
     Op.COSH: "cosh", Op.TANH: "tanh", Op.EXPM1: "expm1", Op.LOG1P: "log1p", Op.POWER: "pow", Op.SIN: "sin",
     Op.COS: "cos", Op.EXP: "exp", Op.LOG: "log", Op.SQRT: "llvm.sqrt.f64", Op.ABSOLUTE: "llvm.fabs.f64",
-    Op.FLOOR: "llvm.floor.f64", Op.RINT: "llvm.rint.f64",
+    Op.FLOOR: "llvm.floor.f64", Op.RINT: "llvm.rint.f64", Op.FMOD: "fmod",
 }  # fmt: skip
 _COMPARISONS = {Op.LESS: "olt", Op.LESS_EQUAL: "ole", Op.EQUAL: "oeq"}
 _ONE, _MINUS, _ZERO = number(1.0), number(-1.0), number(0.0)
@@ -97,6 +97,17 @@ class _Line:
         elif op == Op.SELECT:
             condition, x, y = self._truth(a), self._number(b), self._number(tape.c[i])
             self.write(f"{name} = select i1 {condition}, double {x}, double {y}")
+        elif op == Op.GATHER:  # whatever the index is, the number read lies in the tables
+            last, x = number(float(self._tape.size - 1)), self._number(a)
+            self.write(
+                f"{name}_l = fcmp ogt double {x}, {_ZERO}",
+                f"{name}_m = select i1 {name}_l, double {x}, double {_ZERO}",
+                f"{name}_u = fcmp olt double {name}_m, {last}",
+                f"{name}_k = select i1 {name}_u, double {name}_m, double {last}",
+                f"{name}_i = fptosi double {name}_k to i64",
+                f"{name}_p = getelementptr inbounds double, {POINTER} %data2, i64 {name}_i",
+                f"{name} = load double, {POINTER} {name}_p",
+            )
         else:
             x, y = self._number(a), "" if b < 0 else self._number(b)
             if op in _INSTRUCTIONS:

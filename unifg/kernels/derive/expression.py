@@ -9,16 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from unifg.kernels.derive.calculus import hessian, jacobian
+from unifg.kernels.derive.calculus import bent, hessian, jacobian
 from unifg.kernels.derive.emit import residual_code, second_code
-from unifg.kernels.derive.groups import moved
 from unifg.kernels.derive.operations import Op
+from unifg.kernels.derive.symbolic import moved
 from unifg.kernels.derive.symbols import Symbol, TraceError, node_of, symbols
 from unifg.kernels.derive.tape import Tape
-from unifg.kernels.derive.trace import run
+from unifg.kernels.derive.trace import Rebound, run
 from unifg.kernels.kernel import Argument
 from unifg.machine.jit import is_compiled
 from unifg.machine.native import Native
+from unifg.typing import Array
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,21 @@ class Expression:
     rows: tuple[int, ...]
     width: int
     name: str
+
+    @cached_property
+    def linear_rows(self) -> tuple[bool, ...]:
+        """Which rows have no second derivatives, being linear in the tangent coordinates or made of linear pieces."""
+        return tuple(not row for row in bent(self.tape, self.rows))
+
+    @property
+    def linear(self) -> bool:
+        """Whether no row has second derivatives: there is no need for :meth:`second`."""
+        return all(self.linear_rows) or not self.curvature
+
+    @cached_property
+    def table(self) -> Array:
+        """Numbers that look-ups read, flat: what the kernel is given as its table."""
+        return np.concatenate([np.zeros(0), *self.tape.tables])
 
     @cached_property
     def slopes(self) -> dict[tuple[int, int], int]:
@@ -73,7 +89,7 @@ def traced(function: Callable[..., Any], arguments: Sequence[Argument], rows: in
     Raises:
         TraceError: the function does what cannot be traced, or returns another shape.
     """
-    tape, given = Tape(), []
+    tape, rebound, given = Tape(), Rebound(), []
     stored = shared = width = 0
     single = is_compiled(function)
     for argument in arguments:
@@ -89,10 +105,10 @@ def traced(function: Callable[..., Any], arguments: Sequence[Argument], rows: in
             point = [Symbol(tape, tape.leaf(Op.VARIABLE, stored + k)) for k in range(argument.storage)]
             step = [Symbol(tape, tape.leaf(Op.TANGENT, width + k)) for k in range(argument.dim)]
             array = symbols((argument.storage,))
-            array[:] = moved(argument, point, step)
+            array[:] = moved(argument, point, step, rebound.callable)
             given.append(array if single else array[None])
             stored, width = stored + argument.storage, width + argument.dim
-    result = np.asarray(run(function, given, rows), dtype=object)
+    result = np.asarray(run(function, given, tape, rebound, rows), dtype=object)
     if not single and (result.ndim != 2 or len(result) != 1):
         raise TraceError(f"returns an array of shape {result.shape} for one factor, expected (1, m)")
     return Expression(tape, tuple(node_of(tape, entry) for entry in result.ravel()), width, name or "residual")

@@ -1,22 +1,25 @@
 """The groups on symbols: what their compiled functions compute, every decision as a choice between two expressions.
 
 Where a function of the angle has 0/0 at zero, the choice is between the closed form and a power series of the *squared*
-angle. It falls at a third of a turn's radian, not near zero: derivatives of the closed form lose a power of the angle
-each, of the series none, so that second derivatives keep their digits everywhere.
+angle. It falls at half a radian, not near zero: derivatives of the closed form lose a power of the angle each, of the
+series none, so that second derivatives keep their digits everywhere.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, cast
 
 import numpy as np
 
-from unifg.kernels.derive.symbols import UFUNCS, Symbol, TraceError, choose, symbols
-from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Manifold, Product, Rn
+from unifg.kernels.derive.symbols import UFUNCS, choose
+from unifg.lie import SE2, SE3, SO2, SO3, Manifold, Rn
 
 Numbers = Sequence[Any]
+TWO_PI = 2.0 * math.pi
+LEADING = float(np.float32(TWO_PI))  # so short that its multiples are exact, and the rest
+TRAILING = TWO_PI - LEADING
 SWITCH = 0.25  # squared angle [rad^2]
 TERMS = 10
 
@@ -24,21 +27,15 @@ _sqrt, _sin, _cos, _arctan2, _rint = (UFUNCS[name] for name in ("sqrt", "sin", "
 
 
 def wrap(angle: Any) -> Any:
-    """The angle in [-pi, pi]; it moves as the angle does."""
-    return angle - 2.0 * math.pi * _rint(angle * (0.5 / math.pi))
+    """The angle in [-pi, pi), moving as the angle does; of one within a turn bit for bit what SO(2) makes of it."""
+    whole = _rint(angle * (1.0 / TWO_PI))
+    rest = choose(UFUNCS["less"](abs(angle), TWO_PI), angle, (angle - whole * LEADING) - whole * TRAILING)
+    above, below = UFUNCS["less_equal"](math.pi, rest), UFUNCS["less"](rest, -math.pi)
+    return rest - choose(above, TWO_PI, choose(below, -TWO_PI, 0.0))
 
 
-def moved(manifold: Manifold, point: Numbers, step: Numbers) -> list[Any]:
-    """A point moved by a small step, exact to second order: what derivatives along the retraction need.
-
-    Raises:
-        TraceError: for a manifold that is none of those here.
-    """
-    if isinstance(manifold, Product):
-        result: list[Any] = []
-        for part in manifold.components.values():
-            result += moved(part.manifold, point[part.storage], step[part.tangent])
-        return result
+def moved_closed(manifold: Manifold, point: Numbers, step: Numbers) -> list[Any] | None:
+    """A point moved by a small step, exact to second order; None for a manifold that is none of those here."""
     if isinstance(manifold, Rn) or manifold == SO2:
         return [x + d for x, d in zip(point, step, strict=True)]
     if manifold == SE2:
@@ -52,7 +49,7 @@ def moved(manifold: Manifold, point: Numbers, step: Numbers) -> list[Any]:
         bent = [a + 0.5 * b for a, b in zip(v, _cross(w, v), strict=True)]
         along = _rotate(point[3:], bent)
         return [*(p + a for p, a in zip(point[:3], along, strict=True)), *_turned(point[3:], w)]
-    raise TraceError(f"a variable lies on {manifold.name}, whose retraction is not known here")
+    return None
 
 
 def _turned(q: Numbers, w: Numbers) -> list[Any]:
@@ -224,16 +221,15 @@ def _se3_act(x: Numbers, p: Numbers) -> list[Any]:
     return [a + b for a, b in zip(x[:3], _rotate(x[3:], p), strict=True)]
 
 
-_Function = Callable[..., list[Any]]
-FORMS: dict[str, dict[str, _Function]] = {
-    "SO2": {
+FORMS: dict[Hashable, dict[str, Callable[..., list[Any]]]] = {
+    SO2: {
         "exp": lambda d: [wrap(d[0])],
         "log": lambda x: [wrap(x[0])],
         "compose": lambda x, y: [wrap(x[0] + y[0])],
         "inverse": lambda x: [wrap(-x[0])],
         "act": lambda x, p: _turn(x[0], p),
     },
-    "SE2": {
+    SE2: {
         "exp": _se2_exp,
         "log": _se2_log,
         "compose": lambda x, y: [*(a + b for a, b in zip(x[:2], _turn(x[2], y[:2]), strict=True)), wrap(x[2] + y[2])],
@@ -241,14 +237,14 @@ FORMS: dict[str, dict[str, _Function]] = {
         "between": lambda x, y: [*_turn(-x[2], [y[0] - x[0], y[1] - x[1]]), wrap(y[2] - x[2])],
         "act": lambda x, p: [a + b for a, b in zip(x[:2], _turn(x[2], p), strict=True)],
     },
-    "SO3": {
+    SO3: {
         "exp": _so3_exp,
         "log": _so3_log,
         "compose": lambda x, y: _upright(_product(x, y)),
         "inverse": lambda x: _upright(_conjugate(x)),
         "act": _rotate,
     },
-    "SE3": {
+    SE3: {
         "exp": _se3_exp,
         "log": _se3_log,
         "compose": lambda x, y: [*_se3_act(x, y[:3]), *_upright(_product(x[3:], y[3:]))],
@@ -261,93 +257,42 @@ FORMS: dict[str, dict[str, _Function]] = {
     },
 }
 """Group, operation -> what it computes of single elements."""
-MATRICES: dict[str, Callable[[Numbers], list[list[Any]]]] = {
-    "SO3": _so3_matrix,
-    "SO2": lambda x: [[_cos(x[0]), -_sin(x[0])], [_sin(x[0]), _cos(x[0])]],
+_VECTORS: dict[str, Callable[..., list[Any]]] = {
+    "exp": list,
+    "log": list,
+    "compose": lambda x, y: [a + b for a, b in zip(x, y, strict=True)],
+    "inverse": lambda x: [-a for a in x],
+    "between": lambda x, y: [b - a for a, b in zip(x, y, strict=True)],
+    "act": lambda x, p: [a + b for a, b in zip(x, p, strict=True)],
+}
+MATRICES: dict[Hashable, Callable[[Numbers], list[list[Any]]]] = {
+    SO3: _so3_matrix,
+    SO2: lambda x: [[_cos(x[0]), -_sin(x[0])], [_sin(x[0]), _cos(x[0])]],
+    SE2: lambda x: [[_cos(x[2]), -_sin(x[2]), x[0]], [_sin(x[2]), _cos(x[2]), x[1]], [0.0, 0.0, 1.0]],
+    SE3: lambda x: [
+        *([*row, p] for row, p in zip(_so3_matrix(x[3:]), x[:3], strict=True)),
+        [0.0, 0.0, 0.0, 1.0],
+    ],
 }
 
-
-class Symbolic:
-    """A group whose methods take symbols; numbers go to the group itself."""
-
-    def __init__(self, group: LieGroup) -> None:
-        """Stand in for a group."""
-        self._group = group
-
-    def __getattr__(self, name: str) -> Any:
-        """An operation on symbols, or what the group has of that name."""
-        plain = getattr(self._group, name)
-        if not callable(plain) or name.startswith("_"):
-            return plain
-
-        def operation(*arguments: Any) -> Any:
-            if not any(_symbolic(argument) for argument in arguments):
-                return plain(*arguments)
-            return _over(self._group, name, [_rows(argument) for argument in arguments])
-
-        return operation
+KINDS = {type(group) for group in (SO2, SE2, SO3, SE3)}
 
 
-def _symbolic(argument: Any) -> bool:
-    return isinstance(argument, Symbol) or (isinstance(argument, np.ndarray) and argument.dtype == object)
-
-
-def _rows(argument: Any) -> Any:
-    return np.asarray(argument, dtype=object)
-
-
-def _over(group: LieGroup, name: str, arguments: list[Any]) -> Any:
-    """An operation of every element of its arguments, broadcast over their leading axes."""
-    one = _operation(group, name)
-    shape = np.broadcast_shapes(*(argument.shape[:-1] for argument in arguments))
-    full = [np.broadcast_to(argument, (*shape, argument.shape[-1])) for argument in arguments]
-    results = [np.array(one(*(list(part[index]) for part in full)), dtype=object) for index in np.ndindex(shape)]
-    stacked = symbols((*shape, *results[0].shape))
-    for index, result in zip(np.ndindex(shape), results, strict=True):
-        stacked[index] = result
-    return stacked
-
-
-def _operation(group: LieGroup, name: str) -> Callable[..., Any]:
-    """What a group does with single elements."""
-    if isinstance(group, Rn):
-        table: dict[str, Callable[..., Any]] = {
-            "exp": lambda d: d,
-            "log": lambda x: x,
-            "compose": lambda x, y: [a + b for a, b in zip(x, y, strict=True)],
-            "inverse": lambda x: [-a for a in x],
-        }
-    elif isinstance(group, Product):
-        return _of_product(group, name)
+def closed_form(manifold: Manifold, name: str) -> Callable[..., Any] | None:
+    """What a manifold does with single elements, where that is written here."""
+    if isinstance(manifold, Rn):
+        forms = _VECTORS
+    elif type(manifold) in KINDS:
+        forms = FORMS[cast(Hashable, manifold)]
+        if name == "matrix":
+            return MATRICES[cast(Hashable, manifold)]
     else:
-        table = dict(FORMS.get(group.name, {}))
-        if name == "matrix" and group.name in MATRICES:
-            return MATRICES[group.name]
-    if name == "retract" and table:
-        return lambda x, d: table["compose"](x, table["exp"](d))
-    if name == "local" and table:
-        between = table.get("between") or (lambda x, y: table["compose"](table["inverse"](x), y))
-        return lambda x, y: table["log"](between(x, y))
-    if name == "between" and table and "between" not in table:
-        return lambda x, y: table["compose"](table["inverse"](x), y)
-    if name not in table:
-        raise TraceError(f"calls {group.name}.{name}, which has no form here that can be traced")
-    return table[name]
-
-
-def _of_product(group: Product, name: str) -> Callable[..., Any]:
-    places = {"exp": "t", "log": "s", "inverse": "s", "compose": "ss", "between": "ss", "local": "ss", "retract": "st"}
-    if name not in places:
-        raise TraceError(f"calls {group.name}.{name}, which has no form here that can be traced")
-
-    def operation(*arguments: Numbers) -> list[Any]:
-        result: list[Any] = []
-        for part in group.components.values():
-            cut = [
-                argument[part.storage if place == "s" else part.tangent]
-                for argument, place in zip(arguments, places[name], strict=True)
-            ]
-            result += _operation(part.manifold, name)(*cut)  # type: ignore[arg-type]
-        return result
-
-    return operation
+        return None
+    compose, inverse, between = forms["compose"], forms["inverse"], forms.get("between")
+    if name == "retract":
+        return lambda x, d: compose(x, forms["exp"](d))
+    if name == "between":
+        return between or (lambda x, y: compose(inverse(x), y))
+    if name == "local":
+        return lambda x, y: forms["log"](between(x, y) if between else compose(inverse(x), y))
+    return forms.get(name)

@@ -34,6 +34,7 @@ class Op(IntEnum):
     LOG = auto()
     LOG1P = auto()
     POWER = auto()
+    FMOD = auto()  # what whole multiples of b leave of a, with the sign of a
     ABSOLUTE = auto()
     SIGN = auto()
     FLOOR = auto()
@@ -47,14 +48,15 @@ class Op(IntEnum):
     OR = auto()
     NOT = auto()
     SELECT = auto()  # b where a, else c
+    GATHER = auto()  # the a-th number of the tables
 
 
-LEAVES = (Op.CONSTANT, Op.VARIABLE, Op.PARAMETER, Op.WEIGHT, Op.TANGENT)
 UNARY = frozenset(
     {
         Op.NEGATE, Op.SQRT, Op.SIN, Op.COS, Op.TAN, Op.ARCSIN, Op.ARCCOS, Op.ARCTAN, Op.SINH, Op.COSH, Op.TANH,
         Op.EXP, Op.EXPM1, Op.LOG, Op.LOG1P, Op.ABSOLUTE, Op.SIGN, Op.FLOOR, Op.RINT, Op.NOT,
+        Op.GATHER,
     }
 )  # fmt: skip
-TRUTHS = frozenset({Op.LESS, Op.LESS_EQUAL, Op.EQUAL, Op.AND, Op.OR, Op.NOT})
-"""Their values are 0 or 1."""
+STEADY = frozenset({Op.SIGN, Op.FLOOR, Op.RINT, Op.LESS, Op.LESS_EQUAL, Op.EQUAL, Op.AND, Op.OR, Op.NOT, Op.GATHER})
+"""Constant but where they jump: they have no derivatives."""

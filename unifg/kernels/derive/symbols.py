@@ -59,6 +59,11 @@ class Symbol:
         """Say which."""
         return f"<number {self.node} of a trace>"
 
+    @classmethod
+    def of(cls, tape: Tape, node: int) -> Any:
+        """The number of a node, where it is known, or its symbol."""
+        return tape.value[node] if tape.is_constant(node) else cls(tape, node)
+
     def __pos__(self) -> Symbol:
         """The same."""
         return self
@@ -81,8 +86,10 @@ class Symbol:
 
     # ---------------------------------------------------------------- what cannot be traced
 
-    def __bool__(self) -> NoReturn:
-        """Nobody knows."""
+    def __bool__(self) -> bool:
+        """Ask who follows every way through the code; in other code nobody knows."""
+        if self.tape.decide is not None:
+            return self.tape.decide(self.node)
         raise TraceError("asks whether a number holds that is not known yet; write np.where(condition, a, b) for `if`")
 
     def __float__(self) -> NoReturn:
@@ -109,20 +116,20 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
         """Do what the ufunc does, entry by entry."""
         out = options.pop("out", None)
         if ufunc is np.matmul and method == "__call__":
-            result = matmul(*(_plain(item) for item in inputs))
+            result = matmul(*(plain(item) for item in inputs))
         elif (scalar := UFUNCS.get(ufunc.__name__)) is None:
             raise TraceError(f"calls np.{ufunc.__name__}, which has no derivative here")
         elif method == "__call__":
             if options.pop("where", True) is not True:
                 raise TraceError(f"calls np.{ufunc.__name__} with where=; use np.where on the result")
             options.pop("dtype", None), options.pop("casting", None)
-            result = np.frompyfunc(scalar, ufunc.nin, 1)(*(_plain(item) for item in inputs))
+            result = np.frompyfunc(scalar, ufunc.nin, 1)(*(plain(item) for item in inputs))
         elif method in ("reduce", "accumulate") and ufunc.nin == 2:
-            result = _reduced(scalar, method, _plain(inputs[0]), *inputs[1:], **options)
+            result = _reduced(scalar, method, plain(inputs[0]), *inputs[1:], **options)
         else:
             raise TraceError(f"calls np.{ufunc.__name__}.{method}")
         if out is not None:
-            _plain(out[0])[...] = result
+            plain(out[0])[...] = result
             return out[0]
         return wrapped(result)
 
@@ -168,6 +175,11 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
         return np.rint(self)
 
 
+def holds_symbols(array: Any) -> bool:
+    """Whether an array holds numbers that are not known."""
+    return isinstance(array, np.ndarray) and array.dtype == object and any(isinstance(x, Symbol) for x in array.flat)
+
+
 def wrapped(result: Any) -> Any:
     """An array of objects as symbols; anything else as it is."""
     if isinstance(result, np.ndarray):
@@ -189,7 +201,8 @@ def node_of(tape: Tape, value: Any) -> int:
     return value.node if isinstance(value, Symbol) else tape.constant(float(value))
 
 
-def _plain(item: Any) -> Any:
+def plain(item: Any) -> Any:
+    """An array of symbols as NumPy sees an array of objects."""
     return item.view(np.ndarray) if isinstance(item, Symbols) else item
 
 
@@ -203,7 +216,7 @@ def _apply(op: Op, *arguments: Any) -> Any:
         with np.errstate(all="ignore"):
             return NUMPY[op](*arguments)
     node = tape.apply(op, *(node_of(tape, item) for item in arguments))
-    return tape.value[node] if tape.is_constant(node) and op != Op.SELECT else Symbol(tape, node)
+    return Symbol.of(tape, node)
 
 
 def _operation(op: Op) -> Callable[..., Any]:
@@ -215,17 +228,18 @@ def choose(condition: Any, a: Any, b: Any) -> Any:
     if not isinstance(condition, Symbol):
         return a if condition else b
     tape = condition.tape
-    node = tape.select(condition.node, node_of(tape, a), node_of(tape, b))
-    return tape.value[node] if tape.is_constant(node) else Symbol(tape, node)
+    return Symbol.of(tape, tape.select(condition.node, node_of(tape, a), node_of(tape, b)))
 
 
 def _remainder(a: Any, b: Any) -> Any:
-    return a - _apply(Op.FLOOR, _apply(Op.DIVIDE, a, b)) * b
+    """With the sign of the divisor."""
+    rest = _apply(Op.FMOD, a, b)
+    other = _apply(Op.LESS, rest * b, 0.0)
+    return choose(other, rest + b, rest)
 
 
-def _fmod(a: Any, b: Any) -> Any:
-    ratio = _apply(Op.DIVIDE, a, b)
-    return a - _apply(Op.SIGN, ratio) * _apply(Op.FLOOR, _apply(Op.ABSOLUTE, ratio)) * b
+def _floor_divide(a: Any, b: Any) -> Any:
+    return _apply(Op.RINT, _apply(Op.DIVIDE, a - _remainder(a, b), b))
 
 
 def _hypot(a: Any, b: Any) -> Any:
@@ -281,9 +295,9 @@ UFUNCS: dict[str, Callable[..., Any]] = {
     "ceil": lambda a: -_apply(Op.FLOOR, -a),
     "trunc": lambda a: _apply(Op.SIGN, a) * _apply(Op.FLOOR, _apply(Op.ABSOLUTE, a)),
     "rint": _operation(Op.RINT),
-    "floor_divide": lambda a, b: _apply(Op.FLOOR, _apply(Op.DIVIDE, a, b)),
+    "floor_divide": _floor_divide,
     "remainder": _remainder,
-    "fmod": _fmod,
+    "fmod": _operation(Op.FMOD),
     "minimum": _operation(Op.MINIMUM),
     "maximum": _operation(Op.MAXIMUM),
     "fmin": _operation(Op.MINIMUM),
@@ -304,6 +318,8 @@ UFUNCS: dict[str, Callable[..., Any]] = {
     "invert": _operation(Op.NOT),
 }
 """What the ufuncs of NumPy do with single entries, by name."""
+for _name, _scalar in UFUNCS.items():  # NumPy asks the entries of plain arrays of objects for methods of these names
+    setattr(Symbol, _name, (lambda scalar: lambda *arguments: scalar(*arguments))(_scalar))
 
 
 def _reduced(scalar: Callable[..., Any], method: str, array: Any, axis: Any = 0, **options: Any) -> Any:
@@ -343,7 +359,7 @@ _Pick = np.frompyfunc(choose, 3, 1)
 
 
 def _objects(array: Any) -> Any:
-    return np.asarray(_plain(array) if isinstance(array, np.ndarray) else array, dtype=object)
+    return np.asarray(plain(array) if isinstance(array, np.ndarray) else array, dtype=object)
 
 
 def matmul(a: Any, b: Any) -> Any:

@@ -2,7 +2,8 @@
 
 A node is an operation and the nodes it takes, all of which stand before it. Two nodes never say the same. What is
 simplified holds for every finite number: x + 0, 1 x, x - x, constants among themselves, a choice between equals.
-Products with zero are zero, whatever the other factor, as in any exact differentiation.
+Products with zero are zero, whatever the other factor, as in any exact differentiation, and the square of a root is
+what stands under it.
 """
 
 from __future__ import annotations
@@ -13,12 +14,13 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from unifg.kernels.derive.operations import UNARY, Op
+from unifg.typing import Array
 
 NUMPY = {
     Op.NEGATE: np.negative, Op.ADD: np.add, Op.SUBTRACT: np.subtract, Op.MULTIPLY: np.multiply, Op.DIVIDE: np.divide,
     Op.SQRT: np.sqrt, Op.SIN: np.sin, Op.COS: np.cos, Op.TAN: np.tan, Op.ARCSIN: np.arcsin, Op.ARCCOS: np.arccos,
     Op.ARCTAN: np.arctan, Op.ARCTAN2: np.arctan2, Op.SINH: np.sinh, Op.COSH: np.cosh, Op.TANH: np.tanh,
-    Op.EXP: np.exp, Op.EXPM1: np.expm1, Op.LOG: np.log, Op.LOG1P: np.log1p, Op.POWER: np.power,
+    Op.EXP: np.exp, Op.EXPM1: np.expm1, Op.LOG: np.log, Op.LOG1P: np.log1p, Op.POWER: np.power, Op.FMOD: np.fmod,
     Op.ABSOLUTE: np.absolute, Op.SIGN: np.sign, Op.FLOOR: np.floor, Op.RINT: np.rint, Op.MINIMUM: np.minimum,
     Op.MAXIMUM: np.maximum, Op.LESS: np.less, Op.LESS_EQUAL: np.less_equal, Op.EQUAL: np.equal,
     Op.AND: np.logical_and, Op.OR: np.logical_or, Op.NOT: np.logical_not,
@@ -35,6 +37,8 @@ class Tape:
         op: operation of each node.
         a, b, c: nodes it takes; of a variable, a parameter, a weight or a tangent coordinate, a is its place.
         value: of constants.
+        tables: flat arrays that look-ups read, side by side.
+        decide: settles conditions while code that decides is run, see :mod:`unifg.kernels.derive.branches`.
     """
 
     def __init__(self) -> None:
@@ -44,6 +48,8 @@ class Tape:
         self.b: list[int] = []
         self.c: list[int] = []
         self.value: list[float] = []
+        self.tables: list[Array] = []
+        self.decide: Callable[[int], bool] | None = None
         self._found: dict[tuple[int, int, int, int], int] = {}
         self._constants: dict[tuple[float, float], int] = {}
         self.zero = self.constant(0.0)
@@ -68,6 +74,21 @@ class Tape:
         """A variable, a parameter, a weight or a tangent coordinate."""
         return self._node(op, place)
 
+    def table(self, numbers: Array) -> int:
+        """Where a flat array begins among the tables; it is kept once."""
+        begin = 0
+        for known in self.tables:
+            if known is numbers:
+                return begin
+            begin += len(known)
+        self.tables.append(numbers)
+        return begin
+
+    @property
+    def size(self) -> int:
+        """How many numbers the tables hold."""
+        return sum(len(known) for known in self.tables)
+
     def is_constant(self, i: int) -> bool:
         """Whether a node is a number."""
         return self.op[i] == Op.CONSTANT
@@ -80,7 +101,7 @@ class Tape:
         if simple is not None:
             return simple(self, a, b, c)
         kind = self.op
-        if kind[a] == Op.CONSTANT and (b < 0 or kind[b] == Op.CONSTANT):
+        if kind[a] == Op.CONSTANT and (b < 0 or kind[b] == Op.CONSTANT) and op != Op.GATHER:
             return self._fold(op, a, b)
         if op in _COMMUTES and b < a:
             a, b = b, a
@@ -146,6 +167,13 @@ class Tape:
         op = self.op
         if op[a] == Op.CONSTANT and op[b] == Op.CONSTANT:
             return self._fold(Op.MULTIPLY, a, b)
+        for root, other in ((a, b), (b, a)):
+            if op[root] == Op.SQRT:  # whose square has derivatives at zero, as the root has not
+                if other == root:
+                    return self.a[root]
+                if op[other] == Op.MULTIPLY and root in (self.a[other], self.b[other]):
+                    rest = self.b[other] if self.a[other] == root else self.a[other]
+                    return self.multiply(rest, self.a[root])
         if op[a] == Op.NEGATE:
             return self.negate(self.multiply(self.a[a], b))
         if op[b] == Op.NEGATE:
@@ -218,6 +246,7 @@ class Tape:
     def at_rest(self, outputs: Sequence[int]) -> tuple[Tape, list[int]]:
         """A new tape of the outputs with every tangent coordinate zero, and the outputs on it."""
         new = Tape()
+        new.tables = self.tables
         place: dict[int, int] = {}
         for i in self.live(outputs):
             op, a = self.op[i], self.a[i]
@@ -233,8 +262,9 @@ class Tape:
         return new, [place[i] for i in outputs]
 
     def evaluate(self, outputs: Sequence[int], variables: Sequence[float], parameters: Sequence[float]) -> list[float]:
-        """Run the tape in Python: slow, for tests and messages."""
+        """Run the tape in Python, all tangent coordinates zero and all weights one: slow, for small things."""
         given = {Op.VARIABLE: variables, Op.PARAMETER: parameters}
+        tables = np.concatenate([np.zeros(0), *self.tables])
         found: dict[int, float] = {}
         with np.errstate(all="ignore"):
             for i in self.live(outputs):
@@ -242,7 +272,9 @@ class Tape:
                 if op == Op.CONSTANT:
                     found[i] = self.value[i]
                 elif op <= Op.TANGENT:
-                    found[i] = float(given[Op(op)][a])
+                    found[i] = float(given[Op(op)][a]) if op in given else float(op == Op.WEIGHT)
+                elif op == Op.GATHER:
+                    found[i] = float(tables[int(found[a])]) if 0 <= found[a] < len(tables) else np.nan
                 elif op == Op.SELECT:
                     found[i] = found[b] if found[a] != 0.0 else found[self.c[i]]
                 else:

@@ -17,18 +17,24 @@ from typing import Any
 
 import numpy as np
 
-from unifg.kernels.derive.groups import Symbolic, wrap
-from unifg.kernels.derive.symbols import UFUNCS, Symbol, Symbols, TraceError, _plain, symbols, wrapped
-from unifg.lie import LieGroup, so2, wrap_angle
+from unifg.kernels.derive.branches import every_way
+from unifg.kernels.derive.groups import wrap
+from unifg.kernels.derive.symbolic import Symbolic
+from unifg.kernels.derive.symbols import UFUNCS, Symbol, Symbols, TraceError, node_of, plain, symbols, wrapped
+from unifg.kernels.derive.tape import Tape
+from unifg.lie import ManifoldBase, Product, so2, wrap_angle
+from unifg.machine import calls
 from unifg.machine.jit import is_compiled, source_of
 
 
-def run(function: Callable[..., Any], arguments: Sequence[Any], rows: int = 0) -> Any:
+def run(function: Callable[..., Any], arguments: Sequence[Any], tape: Tape, rebound: Rebound, rows: int = 0) -> Any:
     """Call a function with symbols.
 
     Args:
-        function: batched, or compiled for one factor.
+        function: batched, or compiled for one factor; that may decide on values, and is run every way.
         arguments: arrays of symbols, as the function takes them.
+        tape: of the symbols.
+        rebound: makes functions that take symbols.
         rows: of a compiled function, m; it is given an array of that length to write into.
 
     Returns:
@@ -38,11 +44,16 @@ def run(function: Callable[..., Any], arguments: Sequence[Any], rows: int = 0) -
         TraceError: the function does what cannot be traced; the message says what and in which line.
     """
     try:
-        if is_compiled(function):
+        made = rebound.callable(function)
+        if not is_compiled(function):
+            return made(*arguments)
+
+        def once() -> list[int]:
             written = symbols((rows,))
-            _Rebound().function(function)(*arguments, written)
-            return written
-        return _Rebound().callable(function)(*arguments)
+            made(*(argument.copy() if isinstance(argument, Symbols) else argument for argument in arguments), written)
+            return [node_of(tape, entry) for entry in written]
+
+        return [Symbol.of(tape, node) for node in every_way(tape, once)]
     except TraceError as error:
         raise TraceError(f"{_line(function)}{error}") from None
     except RecursionError:
@@ -52,8 +63,9 @@ def run(function: Callable[..., Any], arguments: Sequence[Any], rows: int = 0) -
 
 
 def _line(function: Callable[..., Any]) -> str:
-    """The innermost line of the user's own code that was running."""
-    trace, own = sys.exc_info()[2], ""
+    """The innermost line of the user's own code that was running, or where the function begins."""
+    code = getattr(source_of(function), "__code__", None)
+    trace, own = sys.exc_info()[2], "" if code is None else f"{code.co_filename}:{code.co_firstlineno}: "
     inside = __name__.rpartition(".")[0]
     while trace is not None:
         code, names = trace.tb_frame.f_code, trace.tb_frame.f_globals
@@ -64,10 +76,11 @@ def _line(function: Callable[..., Any]) -> str:
     return own
 
 
-class _Rebound:
+class Rebound:
     """Functions whose names for NumPy and ``math`` mean versions that know symbols."""
 
     def __init__(self) -> None:
+        """Nothing is rebound yet."""
         self._seen: dict[int, Any] = {}
         self._kept: list[Any] = []  # ids stay theirs
 
@@ -88,8 +101,9 @@ class _Rebound:
             return found
         names = _Names(python.__globals__, self)
         cells = tuple(CellType() for _ in python.__closure__ or ())
-        copy = FunctionType(python.__code__, names, python.__name__, python.__defaults__, cells or None)
-        copy.__kwdefaults__ = python.__kwdefaults__
+        defaults = None if python.__defaults__ is None else tuple(map(self.thing, python.__defaults__))
+        copy = FunctionType(python.__code__, names, python.__name__, defaults, cells or None)
+        copy.__kwdefaults__ = {key: self.thing(value) for key, value in (python.__kwdefaults__ or {}).items()}
         self._seen[id(python)] = copy
         self._kept.append(python)
         for cell, original in zip(cells, python.__closure__ or (), strict=True):
@@ -108,14 +122,18 @@ class _Rebound:
             return NUMPY
         if thing is math:
             return MATH
-        if isinstance(thing, LieGroup):
-            return Symbolic(thing)
+        if id(thing) in BORROWED:
+            return BORROWED[id(thing)]
+        if isinstance(thing, ManifoldBase | Product):
+            return Symbolic(thing, self.callable)
         if thing is so2.wrap or thing is wrap_angle:
             return _wrapped
         if is_compiled(thing):
             return self.function(thing)
         if isinstance(thing, ModuleType) and thing.__name__.partition(".")[0] == "unifg":
             return _House(thing, self)
+        if type(thing) in (tuple, list):
+            return type(thing)(map(self.thing, thing))
         if isinstance(thing, FunctionType):
             module = str(thing.__module__ or "")
             return thing if module.partition(".")[0] == "numpy" else self.function(thing)
@@ -125,7 +143,7 @@ class _Rebound:
 class _Names(dict[str, Any]):
     """Globals of a rebound function."""
 
-    def __init__(self, names: dict[str, Any], rebound: _Rebound) -> None:
+    def __init__(self, names: dict[str, Any], rebound: Rebound) -> None:
         super().__init__(names)
         self["__builtins__"] = {
             **vars(builtins),
@@ -138,7 +156,7 @@ class _Names(dict[str, Any]):
 
 
 def _wrapped(angle: Any) -> Any:
-    return wrap(angle) if isinstance(angle, Symbol | float) else wrapped(np.frompyfunc(wrap, 1, 1)(_plain(angle)))
+    return wrap(angle) if isinstance(angle, Symbol | float) else wrapped(np.frompyfunc(wrap, 1, 1)(plain(angle)))
 
 
 def _identity(thing: Any) -> int:
@@ -222,7 +240,7 @@ class _Proxy(ModuleType):
 class _House(_Proxy):
     """A module of this library, whose functions and groups take symbols."""
 
-    def __init__(self, module: ModuleType, rebound: _Rebound) -> None:
+    def __init__(self, module: ModuleType, rebound: Rebound) -> None:
         super().__init__(module, {})
         self._rebound = rebound
 
@@ -235,6 +253,13 @@ _MAKERS = {
     "zeros": _filled(0.0), "empty": _filled(0.0), "ones": _filled(1.0), "full": _full, "eye": _eye, "identity": _eye,
     "atleast_1d": lambda a: _as_array(a) if np.ndim(a) else _as_array(a).reshape(1),
 }  # fmt: skip
+# Views and arrays on the stack, as compiled functions of this library take them.
+BORROWED: dict[int, Callable[..., Any]] = {
+    id(calls.local_vector): lambda length: symbols((length,)),
+    id(calls.local_matrix): lambda rows, columns: symbols((rows, columns)),
+    id(calls.vector): lambda array, start, length: array[start : start + length],
+    id(calls.matrix): lambda array, start, rows, columns: array[start : start + rows * columns].reshape(rows, columns),
+}
 NUMPY = _Proxy(np, _MAKERS)
 CONSTRUCTORS = {id(getattr(np, name)): made for name, made in _MAKERS.items()}
 _MATH = {"fabs": "absolute", "pow": "power", "asin": "arcsin", "acos": "arccos", "atan": "arctan", "atan2": "arctan2"}

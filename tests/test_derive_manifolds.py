@@ -1,0 +1,310 @@
+"""Tracing on manifolds of one's own, and of functions that decide: against closed forms that are known."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from test_derive import compared, curved, evaluated, packed, points
+from unifg.kernels.derive.expression import traced
+from unifg.kernels.derive.symbols import TraceError
+from unifg.kernels.kernel import Argument
+from unifg.lie import SE2, SO2, SO3, Rn
+from unifg.typing import Array, ArrayLike
+
+# ---------------------------------------------------------------- groups of one's own
+
+
+@fg.compiled
+def quaternion_exp(d: Array, out: Array) -> None:
+    theta = math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    if theta < 1e-8:  # first order: no second derivative to be had here
+        out[0] = 1.0
+        scale = 0.5
+    else:
+        out[0] = math.cos(0.5 * theta)
+        scale = math.sin(0.5 * theta) / theta
+    for i in range(3):
+        out[1 + i] = scale * d[i]
+
+
+@fg.compiled
+def quaternion_log(q: Array, out: Array) -> None:
+    length = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    if length < 1e-9:
+        scale = 2.0 / q[0]
+    elif q[0] < 0.0:
+        scale = -2.0 * math.atan2(length, -q[0]) / length
+    else:
+        scale = 2.0 * math.atan2(length, q[0]) / length
+    for i in range(3):
+        out[i] = scale * q[1 + i]
+
+
+@fg.compiled
+def quaternion_product(p: Array, q: Array, out: Array) -> None:
+    w = p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3]
+    x = p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2]
+    y = p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1]
+    z = p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0]
+    sign = -1.0 if w < 0.0 else 1.0
+    out[0], out[1], out[2], out[3] = sign * w, sign * x, sign * y, sign * z
+
+
+@fg.compiled
+def quaternion_inverse(q: Array, out: Array) -> None:
+    out[0] = q[0]
+    for i in range(1, 4):
+        out[i] = -q[i]
+
+
+class Turns(fg.LieGroup):
+    name, storage, dim = "Turns", 4, 3
+    exp = fg.elementwise(quaternion_exp)
+    log = fg.elementwise(quaternion_log)
+    compose = fg.elementwise(quaternion_product)
+    inverse = fg.elementwise(quaternion_inverse)
+
+    def identity(self) -> Array:
+        return np.array([1.0, 0.0, 0.0, 0.0])
+
+    def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
+        return SO3.random(rng, shape)
+
+
+class Complex(fg.LieGroup):
+    """Unit complex numbers, by NumPy."""
+
+    name, storage, dim = "Complex", 2, 1
+
+    def identity(self) -> Array:
+        return np.array([1.0, 0.0])
+
+    def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
+        return self.exp(rng.uniform(-np.pi, np.pi, (*shape, 1)))
+
+    def exp(self, d: ArrayLike, /) -> Array:
+        d = np.asarray(d, dtype=np.float64)
+        return np.concatenate([np.cos(d), np.sin(d)], axis=-1)
+
+    def log(self, x: ArrayLike, /) -> Any:
+        x = np.asarray(x, dtype=np.float64)
+        return np.arctan2(x[..., 1:], x[..., :1])
+
+    def compose(self, x: ArrayLike, y: ArrayLike, /) -> Any:
+        x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+        real = x[..., 0] * y[..., 0] - x[..., 1] * y[..., 1]
+        return np.stack([real, x[..., 0] * y[..., 1] + x[..., 1] * y[..., 0]], axis=-1)
+
+    def inverse(self, x: ArrayLike, /) -> Any:
+        return np.asarray(x) * np.array([1.0, -1.0])
+
+
+@fg.compiled
+def pose_compose(a: Array, b: Array, out: Array) -> None:
+    c, s = a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
+    x, y = a[2] + a[0] * b[2] - a[1] * b[3], a[3] + a[1] * b[2] + a[0] * b[3]
+    out[0], out[1], out[2], out[3] = c, s, x, y
+
+
+@fg.compiled
+def pose_inverse(a: Array, out: Array) -> None:
+    c, s, x, y = a[0], a[1], a[2], a[3]
+    out[0], out[1], out[2], out[3] = c, -s, -c * x - s * y, s * x - c * y
+
+
+@fg.compiled
+def pose_exp(d: Array, out: Array) -> None:
+    t = d[2]
+    if abs(t) < 1e-4:
+        a, b = 1.0 - t * t / 6.0, 0.5 * t
+    else:
+        a, b = math.sin(t) / t, (1.0 - math.cos(t)) / t
+    out[0], out[1], out[2], out[3] = math.cos(t), math.sin(t), a * d[0] - b * d[1], b * d[0] + a * d[1]
+
+
+@fg.compiled
+def pose_log(a: Array, out: Array) -> None:
+    t = math.atan2(a[1], a[0])
+    k = 1.0 - t * t / 12.0 if abs(t) < 1e-4 else 0.5 * t / math.tan(0.5 * t)
+    out[0], out[1], out[2] = k * a[2] + 0.5 * t * a[3], k * a[3] - 0.5 * t * a[2], t
+
+
+class Poses(fg.LieGroup):
+    """SE(2) with its matrix's entries for an angle, (c, s, x, y)."""
+
+    name, storage, dim = "Poses", 4, 3
+
+    def identity(self) -> Array:
+        return np.array([1.0, 0.0, 0.0, 0.0])
+
+    def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
+        return from_se2(SE2.random(rng, shape))
+
+    exp = fg.elementwise(pose_exp)
+    log = fg.elementwise(pose_log)
+    compose = fg.elementwise(pose_compose)
+    inverse = fg.elementwise(pose_inverse)
+
+
+def from_se2(x: Array) -> Array:
+    return np.concatenate([np.cos(x[..., 2:]), np.sin(x[..., 2:]), x[..., :2]], axis=-1)
+
+
+TURNS, COMPLEX, POSES = Turns(), Complex(), Poses()
+TWINS: dict[str, tuple[Any, Any, Any]] = {  # of the user's, of the library, and from there to here
+    "compiled with branches": (TURNS, SO3, lambda x: x),
+    "by NumPy": (COMPLEX, SO2, lambda x: np.concatenate([np.cos(x), np.sin(x)], axis=-1)),
+    "compiled, other storage": (POSES, SE2, from_se2),
+    "product": (
+        fg.Product(a=TURNS, v=Rn(2), b=POSES),
+        fg.Product(a=SO3, v=Rn(2), b=SE2),
+        lambda x: np.concatenate([x[..., :6], from_se2(x[..., 6:])], axis=-1),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TWINS)
+def test_a_group_of_ones_own_has_the_derivatives_of_its_twin(name: str) -> None:
+    """Same group, other numbers: residuals, Jacobians and Hessians in tangent coordinates are the same."""
+    mine, known, carried = TWINS[name]
+    rng = np.random.default_rng(3)
+    x = known.random(rng, (6,))
+    # The closed forms above lose digits near zero, each derivative more of them: keep away from it.
+    y = known.retract(x, rng.uniform(0.6, 0.9, (6, known.dim)) * rng.choice([-1.0, 1.0], (6, known.dim)))
+    w = rng.normal(size=(6, known.dim))
+    answers = []
+    for group, values in ((mine, (carried(x), carried(y))), (known, (x, y))):
+        expression = traced(lambda x, y, group=group: group.local(x, y), (group, group), name=name)
+        variables, parameters = packed((group, group), values)
+        r, J = evaluated(expression, variables, parameters)
+        np.testing.assert_allclose(r, group.local(*values), rtol=0, atol=1e-13)
+        answers.append((r, J, curved(expression, variables, parameters, w)))
+    for found, expected in zip(*answers, strict=True):
+        compared(found, expected)
+
+
+# ---------------------------------------------------------------- a manifold that is no group
+
+
+def sphere_retraction(terms: int) -> Any:
+    @fg.compiled
+    def retract(x: Array, d: Array, out: Array) -> None:
+        n = math.sqrt(d[0] * d[0] + d[1] * d[1])
+        if n < 1e-7:
+            c = 1.0 - 0.5 * n * n if terms > 1 else 1.0
+            s = 1.0
+        else:
+            c, s = math.cos(n), math.sin(n) / n
+        # Two directions across x: from the axis that it is least along.
+        if abs(x[0]) < 0.6:
+            a0, a1, a2 = 0.0, x[2], -x[1]
+        else:
+            a0, a1, a2 = -x[2], 0.0, x[0]
+        length = math.sqrt(a0 * a0 + a1 * a1 + a2 * a2)
+        a0, a1, a2 = a0 / length, a1 / length, a2 / length
+        b0, b1, b2 = x[1] * a2 - x[2] * a1, x[2] * a0 - x[0] * a2, x[0] * a1 - x[1] * a0
+        out[0] = c * x[0] + s * (d[0] * a0 + d[1] * b0)
+        out[1] = c * x[1] + s * (d[0] * a1 + d[1] * b1)
+        out[2] = c * x[2] + s * (d[0] * a2 + d[1] * b2)
+
+    return retract
+
+
+class Directions(fg.ManifoldBase):
+    name, storage, dim = "Directions", 3, 2
+    retract = fg.elementwise(sphere_retraction(2))
+
+    def local(self, x: ArrayLike, y: ArrayLike, /) -> Array:
+        raise NotImplementedError
+
+    def identity(self) -> Array:
+        return np.array([1.0, 0.0, 0.0])
+
+    def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Any:
+        x = rng.normal(size=(*shape, 3))
+        return x / np.linalg.norm(x, axis=-1, keepdims=True)
+
+
+class Careless(Directions):
+    name = "Careless"
+    retract = fg.elementwise(sphere_retraction(1))
+
+
+def test_a_manifold_is_moved_along_its_retraction() -> None:
+    """On the unit sphere w'x bends by -w'x in every direction: points move along great circles."""
+    manifold = Directions()
+    x = manifold.random(np.random.default_rng(0), (12,))
+    w = np.random.default_rng(1).normal(size=(12, 3))
+    expression = traced(lambda x: x, (manifold,))
+    r, J = evaluated(expression, x, np.zeros((1, 0)))
+    np.testing.assert_array_equal(r, x)
+    np.testing.assert_allclose(np.swapaxes(J, 1, 2) @ J, np.broadcast_to(np.eye(2), (12, 2, 2)), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(np.einsum("ni,nij->nj", x, J), 0.0, rtol=0, atol=1e-14)
+    S = curved(expression, x, np.zeros((1, 0)), w)
+    np.testing.assert_allclose(S, -np.sum(w * x, axis=1)[:, None, None] * np.eye(2), rtol=0, atol=1e-14)
+
+
+def test_a_retraction_too_short_for_second_derivatives_is_refused() -> None:
+    with pytest.raises(TraceError, match=r"Careless, whose retraction .* terms up to the second"):
+        traced(lambda x: x, (Careless(),))
+
+
+# ---------------------------------------------------------------- functions that decide
+
+
+@fg.compiled
+def branching(x: Array, y: Array, r: Array) -> None:
+    total = 0.0
+    for k in range(3):
+        if x[k] > y[k]:
+            total += x[k] * x[k] * y[k]
+        elif x[k] > 0.0:
+            total -= math.sin(x[k])
+        else:
+            total += y[k]
+    r[0] = total
+    r[1] = total * total if total > 0.5 else total
+
+
+def test_a_compiled_function_may_decide_on_values() -> None:
+    arguments: tuple[Argument, ...] = (Rn(3), Rn(3))
+    x, y = points(arguments, 200)
+    expression = traced(branching, arguments, rows=2)
+    variables, parameters = packed(arguments, (x, y))
+    r, J = evaluated(expression, variables, parameters)
+    expected = np.empty((200, 2))
+    for k in range(200):
+        branching(x[k], y[k], expected[k])
+    np.testing.assert_allclose(r, expected, rtol=1e-15, atol=1e-15)
+    smooth = traced(  # the same as a formula
+        lambda x, y: np.stack([(t := np.sum(np.where(x > y, x * x * y, np.where(x > 0, -np.sin(x), y)), axis=1)),
+                               np.where(t > 0.5, t * t, t)], axis=1), arguments,
+    )  # fmt: skip
+    compared(J, evaluated(smooth, variables, parameters)[1])
+    w = np.random.default_rng(0).normal(size=(200, 2))
+    compared(curved(expression, variables, parameters, w), curved(smooth, variables, parameters, w))
+
+
+@fg.compiled
+def endless(x: Array, r: Array) -> None:
+    value = x[0]
+    while value > 1e-3:
+        value *= 0.5
+    r[0] = value
+
+
+@fg.compiled
+def forked(x: Array, r: Array) -> None:
+    r[0] = 0.0
+    for k in range(12):
+        if x[0] > k:
+            r[0] += x[0] * k
+
+
+@pytest.mark.parametrize(("function", "words"), [(endless, "without end"), (forked, "more than 64 ways")])
+def test_what_decides_too_often_is_said(function: Any, words: str) -> None:
+    with pytest.raises(TraceError, match=rf"test_derive_manifolds\.py:\d+: decides .*{words}"):
+        traced(function, (Rn(1),), rows=1)
