@@ -42,14 +42,14 @@ def measure(problem: Problem) -> dict[str, float]:
         pieces[name] = _least(partial(_many, links[0][function], workspace._address, REPEATS)) / REPEATS
     lin = program.linearize(solution.values)
     entries, norms = lin.hessian.copy(), np.empty(len(program.arrays.fields))
-    squares, gradient = np.empty(0), lin.gradient.copy()
+    squares, weights, gradient = lin.squares.copy(), lin.weights.copy(), lin.gradient.copy()
     calls: dict[str, Callable[[], object]] = {
         "linearise *": lambda: passes.linearize(
             program.arrays, lin.values.flat, False, lin.residual, lin.jacobian, lin.constraints,
-            lin.constraint_jacobian, squares, norms, gradient, entries, program.scratch,
+            lin.constraint_jacobian, squares, weights, norms, gradient, entries, program.scratch,
         ),
         "second derivatives *": lambda: add_curvature(
-            program.arrays, lin.values.flat, lin.residual, work.multipliers, entries
+            program.arrays, lin.values.flat, lin.residual, lin.weights, work.multipliers, entries
         ),
         "factorise *": lambda: factor(workspace.problem.plan, work.data, work.shift),
         "solve *": lambda: solve(workspace.problem.plan, work.right, work.step),

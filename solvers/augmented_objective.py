@@ -122,7 +122,7 @@ class Primal:
     def trial(self, lin: Linearization, step: Array) -> tuple[Values, Evaluation | Linearization]:
         """Values after ``step`` and what they cost, with the weights of ``lin`` held."""
         values = self.program.retract(lin.values, step)
-        if self.hopeful and not lin.weights:
+        if self.hopeful and not self.program.table.holding:
             self.hopeful, self.reached = False, self.program.linearize(values)
             return values, self.reached
         return values, self.program.evaluate(values, lin.weights)

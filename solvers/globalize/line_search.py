@@ -61,7 +61,7 @@ def search(
     program = merit.program
     values = program.retract(lin.values, step)
     reached = program.linearize(values) if eager else None
-    trial: Point = program.evaluate(values, lin.weights) if reached is None or lin.weights else reached
+    trial: Point = program.evaluate(values, lin.weights) if reached is None or program.table.holding else reached
     if merit.accepts(trial, here, slope, 1.0, slack):
         reached = program.linearize(values) if reached is None else reached
         if reached.finite:

@@ -11,7 +11,7 @@ from unifg.elimination.substitution import solve
 from unifg.machine.jit import compiled
 from unifg.machine.links import ADDRESS, NOTHING, NUMBER, TRUTH, link, linked, memory, number, parts, run
 from unifg.program import passes
-from unifg.program.curvature import add_curvature
+from unifg.program.curvature import add_curvature, add_losses
 from unifg.program.retraction import retract_parts
 from unifg.solvers.interior_point import barrier, direction, filter_search
 from unifg.solvers.interior_point.state import ACCEPTED, AGAIN, LINKS, TRY, Problem, Records, Work
@@ -42,7 +42,7 @@ def fill(target: Array, number: float) -> None:
 def advance(address: int) -> None:
     """Move to the trial and evaluate it."""
     free, links, move, retraction, scalars = parts(address, "free links move retraction scalars")
-    scratch, spread, squares, step, terms = parts(address, "scratch spread squares step terms")
+    scratch, spread, squares, step, terms, weights = parts(address, "scratch spread squares step terms weights")
     trial, trial_constraints, trial_residual = parts(address, "trial trial_constraints trial_residual")
     (values,) = parts(address, "values")
     now = scalars[0]
@@ -54,7 +54,7 @@ def advance(address: int) -> None:
     run(links[0].retract, (retraction, free, move, spread, values, trial))
     now.trial_cost = number(
         links[0].evaluate,
-        (terms, trial, trial_residual, trial_constraints, squares, scratch),
+        (terms, trial, trial_residual, trial_constraints, squares, weights, False, scratch),
     )
 
 
@@ -65,7 +65,7 @@ def loop(address: int) -> None:
     curvature, gradient, hessian, jacobian = parts(address, "curvature gradient hessian jacobian")
     links, multipliers, norms, residual = parts(address, "links multipliers norms residual")
     scalars, scratch, squares, terms, trial = parts(address, "scalars scratch squares terms trial")
-    (values,) = parts(address, "values")
+    values, weights = parts(address, "values weights")
     now = scalars[0]
     moved, started = True, now.going_on == 1
     while True:
@@ -83,6 +83,7 @@ def loop(address: int) -> None:
                     constraints,
                     constraint_jacobian,
                     squares,
+                    weights,
                     norms,
                     gradient,
                     hessian,
@@ -95,7 +96,9 @@ def loop(address: int) -> None:
         if now.answer == TRY:
             if now.exact == 1 and (now.iteration > 0 or now.cold == 0):
                 copy(hessian, curvature)
-                run(links[0].curve, (terms, values, residual, multipliers, curvature))
+                run(links[0].curve, (terms, values, residual, weights, multipliers, curvature))
+                if len(weights):
+                    run(links[0].bend, (terms, residual, jacobian, squares, weights, curvature))
             run(links[0].direct, (address,))
         while now.answer == TRY:
             run(links[0].advance, (address,))
@@ -115,15 +118,28 @@ def addresses() -> Records:
     values, residual, constraints, vector = (kinds[name] for name in ("values", "residual", "constraints", "step"))
     terms, scratch = kinds["terms"], kinds["scratch"]
     linearized = [residual, kinds["jacobian"], constraints, kinds["constraint_jacobian"], kinds["squares"]]
-    linearized += [kinds["norms"], kinds["gradient"], kinds["hessian"], scratch]
+    linearized += [kinds["weights"], kinds["norms"], kinds["gradient"], kinds["hessian"], scratch]
     links = np.zeros(1, LINKS)
     links[0]["factor"] = link(factor, TRUTH, kinds["plan"], kinds["data"], vector)
     links[0]["solve"] = link(solve, NOTHING, kinds["plan"], vector, vector)
     links[0]["linearize"] = link(passes.linearize, NUMBER, terms, values, TRUTH, *linearized)
     links[0]["evaluate"] = link(
-        passes.evaluate, NUMBER, terms, values, residual, constraints, kinds["squares"], scratch
+        passes.evaluate,
+        NUMBER,
+        terms,
+        values,
+        residual,
+        constraints,
+        kinds["squares"],
+        kinds["weights"],
+        TRUTH,
+        scratch,
     )
-    links[0]["curve"] = link(add_curvature, NOTHING, terms, values, residual, constraints, kinds["hessian"])
+    links[0]["curve"] = link(
+        add_curvature, NOTHING, terms, values, residual, kinds["weights"], constraints, kinds["hessian"]
+    )
+    robust = kinds["squares"], kinds["weights"]
+    links[0]["bend"] = link(add_losses, NOTHING, terms, residual, kinds["jacobian"], *robust, kinds["hessian"])
     links[0]["retract"] = link(
         retract_parts, NOTHING, kinds["retraction"], kinds["free"], vector, kinds["spread"], values, values
     )

@@ -281,6 +281,8 @@ class Workspace:
             work.gradient.copy(),
             work.hessian.copy(),
             program.norms(work.norms),
+            work.weights.copy(),
+            squares=work.squares.copy(),
         )
 
     def take(self, lin: Linearization) -> None:

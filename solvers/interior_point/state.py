@@ -99,7 +99,7 @@ PAIR = np.dtype(
     ]
 )
 # Addresses of compiled functions.
-FUNCTIONS = "factor solve linearize evaluate curve retract"
+FUNCTIONS = "factor solve linearize evaluate curve bend retract"
 FUNCTIONS += " begin measure test direct steer advance judge correct restore accept relax loop"
 LINKS = np.dtype([(name, np.int64) for name in FUNCTIONS.split()])
 
@@ -153,7 +153,8 @@ class Work(NamedTuple):
         residual, jacobian, constraints, constraint_jacobian, gradient, hessian: as in a linearisation.
         curvature: ``hessian`` with second derivatives, where they are used.
         trial_residual, trial_constraints: at a trial.
-        squares, norms: not used, but written.
+        squares, weights: of robust factors, as in a linearisation.
+        norms: of the terms; not used, but written.
         multipliers: (M,) of the rows, positive at an upper limit.
         rests: (M,) residuals of equality rows, with corrections.
         row_weights, row_terms: (M,) what the sides of a row add to the Hessian and to the gradient.
@@ -188,6 +189,7 @@ class Work(NamedTuple):
     trial_residual: Annotated[Array, "residuals"]
     trial_constraints: Annotated[Array, "rows"]
     squares: Annotated[Array, "robust"]
+    weights: Annotated[Array, "robust"]
     norms: Annotated[Array, "terms"]
     multipliers: Annotated[Array, "rows"]
     rests: Annotated[Array, "rows"]

@@ -3,8 +3,8 @@
 A loss enters Gauss-Newton through its weight rho'(s) (iteratively reweighted least squares); the gradient
 rho'(s) J' r is the true one, so the KKT check judges the robust problem itself.
 
-The formulas of the shipped losses stand in :func:`value_of` and :func:`weight_of`, for one number and compiled; the
-classes apply them to arrays. They are compiled without liberties, so that NaN stays NaN and nothing is reordered.
+The formulas of the shipped losses stand in :func:`value_of`, :func:`weight_of` and :func:`bend_of`, for one number and
+compiled; the classes apply them to arrays. They are compiled without liberties, so that NaN stays NaN and nothing is reordered.
 """
 
 from __future__ import annotations
@@ -336,6 +336,27 @@ def weight_of(kind: int, first: float, second: float, squared: float) -> float:
         between = first * sqrt(second * (second + 1.0) / squared) - second
         return 0.0 if between < 0.0 else 1.0 if between > 1.0 else between
     return 1.0
+
+
+@in_order
+def bend_of(kind: int, first: float, second: float, squared: float) -> float:
+    """rho''(s) of the shipped losses, from inside at an edge."""
+    if kind == HUBER:
+        return 0.0 if squared <= first * first else -0.5 * first / (squared * sqrt(squared))
+    if kind == CAUCHY:
+        return -1.0 / (first * (1.0 + squared / first) * (1.0 + squared / first))
+    if kind == TUKEY:
+        return 0.0 if squared > first else -2.0 / first * (1.0 - squared / first)
+    if kind == SCALED:
+        whole = first + squared
+        return 0.0 if squared <= first else -8.0 * (first / whole) * (first / whole) / whole
+    if kind == GEMAN_MCCLURE:
+        whole = first + squared
+        return -2.0 * (first / whole) * (first / whole) / whole
+    if kind == TRUNCATED and second != np.inf:
+        slope = first * sqrt(second * (second + 1.0) / squared) if squared > 0.0 else np.inf
+        return -0.5 * slope / squared if 0.0 < slope - second < 1.0 else 0.0
+    return 0.0
 
 
 @in_order

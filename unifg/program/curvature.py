@@ -1,16 +1,18 @@
 """The Hessian of the Lagrangian: what Gauss-Newton leaves out is sum of w_a times the Hessian of r_a, for every factor.
 
-The weights w are the multipliers of constraints and the whitened residuals of costs, carried back through the
-whitening. The Hessian is that of t -> r(x Exp(t)), symmetric. A kernel that does not come with it has its Jacobian
+The weights w are the multipliers of constraints and the whitened residuals of costs, times their robust weights, carried
+back through the whitening. A robust weight has a slope of its own (:func:`add_losses`). The Hessian is that of t -> r(x Exp(t)), symmetric. A kernel that does not come with it has its Jacobian
 differenced along every tangent direction; where that is made of differences itself, the residual is differenced twice.
 """
 
 from __future__ import annotations
 
+from math import sqrt
 from typing import TypeAlias
 
 import numpy as np
 
+from unifg.kernels.robust import bend_of
 from unifg.kernels.steps import (
     ANGLE,
     ONE_SIDED,
@@ -39,9 +41,12 @@ from unifg.program.table import (
     COST,
     COUNT,
     DIFFERENCED,
+    ENTRY,
     KEEP,
     KERNEL_WIDTH,
     KIND,
+    LOSS,
+    LOSS_AT,
     PARAMETER,
     PARAMETERS,
     PART,
@@ -69,7 +74,7 @@ Places: TypeAlias = tuple[IntArray, IntArray, IntArray, Array, IntArray]
 def lagrangian_hessian(program: Program, lin: Linearization, multipliers: Array) -> Array:
     """Hessian of the objective plus multipliers' g, in the order of ``Program.normal``.
 
-    Robust costs keep their Gauss-Newton part; terms evaluated by NumPy are differenced in batches.
+    Terms evaluated by NumPy are differenced in batches. Weights of losses whose formulas are Python count as constant.
 
     Args:
         program: the compiled graph.
@@ -77,7 +82,9 @@ def lagrangian_hessian(program: Program, lin: Linearization, multipliers: Array)
         multipliers: (M,).
     """
     entries = lin.hessian + lin.concavity if len(lin.concavity) else lin.hessian.copy()
-    add_curvature(program.arrays, lin.values.flat, lin.residual, multipliers, entries)
+    add_curvature(program.arrays, lin.values.flat, lin.residual, lin.weights, multipliers, entries)
+    if program.table.robust:
+        add_losses(program.arrays, lin.residual, lin.jacobian, lin.squares, lin.weights, entries)
     for term in program.batched:
         _add(program, term, lin, multipliers, entries)
     return entries
@@ -86,7 +93,7 @@ def lagrangian_hessian(program: Program, lin: Linearization, multipliers: Array)
 def constraint_curvature(program: Program, lin: Linearization, multipliers: Array) -> Array:
     """Hessian of multipliers' g alone, in the order of ``Program.normal``; arguments as above."""
     entries = np.zeros(program.normal.nnz)
-    add_curvature(program.arrays, lin.values.flat, np.zeros(len(lin.residual)), multipliers, entries)
+    add_curvature(program.arrays, lin.values.flat, np.zeros(len(lin.residual)), lin.weights, multipliers, entries)
     for term in program.batched:
         if not isinstance(term.term, Cost):
             _add(program, term, lin, multipliers, entries)
@@ -96,9 +103,10 @@ def constraint_curvature(program: Program, lin: Linearization, multipliers: Arra
 def _add(program: Program, term: CompiledTerm, lin: Linearization, multipliers: Array, entries: Array) -> None:
     """Second derivatives of a term without a kernel."""
     if isinstance(term.term, Cost):
-        if term.term.robust is not None:
-            return
         weights = term.carry_back(program.rows_of(term, lin.residual, lin.constraints))
+        if term.term.robust is not None:
+            start = int(term.place[WEIGHT])
+            weights = weights * np.sqrt(lin.weights[start : start + term.count, None])
     else:
         weights = program.rows_of(term, lin.residual, multipliers)
     second = term.second_derivatives(lin.values, weights)
@@ -129,8 +137,19 @@ def _find(program: Program, term: CompiledTerm) -> Places:
 
 
 @compiled
-def add_curvature(terms: TermArrays, values: Array, residual: Array, multipliers: Array, hessian: Array) -> None:
-    """Add the curvature of every term with a kernel, robust costs excepted, to the entries of the normal matrix."""
+def add_curvature(
+    terms: TermArrays, values: Array, residual: Array, robust: Array, multipliers: Array, hessian: Array
+) -> None:
+    """Add the curvature of every term with a kernel to the entries of the normal matrix.
+
+    Args:
+        terms: of the program.
+        values: stored ones.
+        residual: as linearised, whitened and scaled by the square roots of robust weights.
+        robust: those weights.
+        multipliers: (M,) of the constraint rows.
+        hessian: entries to add to.
+    """
     fields = terms.fields
     storage = rows = width = 1
     for t in range(len(fields)):
@@ -141,7 +160,7 @@ def add_curvature(terms: TermArrays, values: Array, residual: Array, multipliers
     J, second, R = np.empty(rows * width), np.empty(width * width), np.empty((3, 3))
     for t in range(len(fields)):
         term = fields[t]
-        if term[PARTS] == 0 or term[ADDRESS] == 0 or (term[KIND] == COST and term[WEIGHT] >= 0):
+        if term[PARTS] == 0 or term[ADDRESS] == 0:
             continue
         m, full, table = term[ROWS], term[KERNEL_WIDTH], vector_at(term[TABLE], term[TABLE_SIZE])
         S = matrix(second, 0, full, full)
@@ -151,6 +170,10 @@ def add_curvature(terms: TermArrays, values: Array, residual: Array, multipliers
             at = term[ROW] + i * m
             if term[KIND] == COST:
                 carry_back(term, i, terms.whiteners, vector(residual, at, m), weights)
+                if term[WEIGHT] >= 0:
+                    root = sqrt(robust[term[WEIGHT] + i])
+                    for a in range(m):
+                        weights[a] *= root
             else:
                 for a in range(m):
                     weights[a] = multipliers[at + a]
@@ -167,6 +190,43 @@ def add_curvature(terms: TermArrays, values: Array, residual: Array, multipliers
                 parts = terms.parts[term[PART] : term[PART] + term[PARTS]]
                 _difference(parts, term, p, table, v, moved, step, weights, r, gradient, J, R, S)
             _write(terms.sizes, terms.positions, term, i, S, hessian)
+
+
+@compiled
+def add_losses(
+    terms: TermArrays, residual: Array, jacobian: Array, squares: Array, robust: Array, hessian: Array
+) -> None:
+    """Add 2 rho''(s) J'r r'J of every robust factor, r and J without the root of its weight that they carry here."""
+    fields, positions, parameters = terms.fields, terms.positions, terms.parameters
+    width = 1
+    for t in range(len(fields)):
+        width = max(width, fields[t, WIDTH])
+    slope = np.empty(width)
+    for t in range(len(fields)):
+        term = fields[t]
+        if term[LOSS] <= 0:
+            continue
+        m, width, at = term[ROWS], term[WIDTH], term[POSITION]
+        first, second = parameters[term[LOSS_AT]], parameters[term[LOSS_AT] + 1]
+        for i in range(term[COUNT]):
+            weight, squared = robust[term[WEIGHT] + i], squares[term[WEIGHT] + i]
+            bend = 2.0 * bend_of(term[LOSS], first, second, squared)
+            if bend == 0.0 or weight == 0.0:
+                at += width * (width + 1) // 2
+                continue
+            r = vector(residual, term[ROW] + i * m, m)
+            J = matrix(jacobian, term[ENTRY] + i * m * width, m, width)
+            for d in range(width):
+                slope[d] = 0.0
+                for a in range(m):
+                    slope[d] += J[a, d] * r[a] / weight
+                for e in range(d + 1):
+                    where = positions[at]
+                    at += 1
+                    if where >= 0:
+                        hessian[where] += bend * slope[d] * slope[e]
+                    elif where != -1:
+                        hessian[-2 - where] += 2.0 * bend * slope[d] * slope[e]
 
 
 @compiled

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
@@ -18,8 +17,6 @@ from unifg.program.passes import times, transposed_times
 from unifg.program.table import COLUMN, COUNT, ROWS, WIDTH, TermTable
 from unifg.program.term import CompiledTerm
 from unifg.typing import Array, IntArray
-
-HeldWeights: TypeAlias = dict[str, Array]
 
 
 @dataclass
@@ -55,7 +52,7 @@ class Linearization:
         hessian: Gauss-Newton Hessian of the objective, in the order of ``Program.normal``; scalar costs without their
             negative curvature.
         norms: each term's residual norm; for constraints the norm of the violation.
-        weights: weights of reweighted losses, to be held during the line search.
+        weights: of robust factors; line searches hold those of losses that ask for it.
         concavity: the negative curvature of scalar costs, in the order of ``Program.normal``; empty without such costs.
         squares: squared norms of the whitened residuals of robust factors, before their loss.
         scalars: (n,) values of each scalar cost.
@@ -72,7 +69,7 @@ class Linearization:
     gradient: Array
     hessian: Array
     norms: dict[str, float]
-    weights: HeldWeights = field(default_factory=dict)
+    weights: Array = field(default_factory=lambda: np.zeros(0))
     concavity: Array = field(default_factory=lambda: np.zeros(0))
     squares: Array = field(default_factory=lambda: np.zeros(0))
     scalars: dict[str, Array] = field(default_factory=dict)

@@ -7,8 +7,9 @@ already stand where a kernel would have written them.
 
 from __future__ import annotations
 
-import numpy as np
+from math import sqrt
 
+from unifg.kernels.robust import value_of, weight_of
 from unifg.kernels.whitening import whiten
 from unifg.machine.calls import call_residual, matrix, vector, vector_at
 from unifg.machine.jit import compiled, inlined
@@ -22,9 +23,12 @@ from unifg.program.table import (
     COUNT,
     ENTRY,
     GATHER,
+    HELD,
     KEEP,
     KERNEL_WIDTH,
     KIND,
+    LOSS,
+    LOSS_AT,
     PARAMETER,
     PARAMETERS,
     POSITION,
@@ -96,9 +100,19 @@ def _violation(value: float, lower: float, upper: float) -> float:
 
 @compiled
 def evaluate(
-    terms: TermArrays, values: Array, residual: Array, constraints: Array, squares: Array, scratch: Array
+    terms: TermArrays,
+    values: Array,
+    residual: Array,
+    constraints: Array,
+    squares: Array,
+    weights: Array,
+    holding: bool,
+    scratch: Array,
 ) -> float:
-    """Whitened residuals, constraints, and squared norms of robust factors; returns the cost of the others."""
+    """Whitened residuals, constraints, and squared norms of robust factors; returns the cost.
+
+    Factors whose loss is Python are left out of it, unless ``holding`` says that ``weights`` holds theirs.
+    """
     fields, gather, sizes, parameters = terms.fields, terms.gather, terms.sizes, terms.parameters
     whiteners, active = terms.whiteners, terms.active
     cost = 0.0
@@ -121,10 +135,14 @@ def evaluate(
                 squared = 0.0
                 for a in range(m):
                     squared += r[a] * r[a]
-                if term[WEIGHT] >= 0:
-                    squares[term[WEIGHT] + i] = squared
-                else:
+                if term[WEIGHT] < 0:
                     cost += 0.5 * squared
+                    continue
+                squares[term[WEIGHT] + i] = squared
+                if term[LOSS] > 0:
+                    cost += 0.5 * value_of(term[LOSS], parameters[term[LOSS_AT]], parameters[term[LOSS_AT] + 1], squared)
+                elif holding and term[LOSS] == HELD:
+                    cost += 0.5 * weights[term[WEIGHT] + i] * squared
     return cost
 
 
@@ -138,19 +156,20 @@ def linearize(
     constraints: Array,
     constraint_jacobian: Array,
     squares: Array,
+    weights: Array,
     norms: Array,
     gradient: Array,
     hessian: Array,
     scratch: Array,
 ) -> float:
-    """Residuals, Jacobians, gradient and J'J in one pass; robust factors stop after whitening, see :func:`weigh`.
+    """Residuals, Jacobians, gradient and J'J in one pass, scaled by the square roots of robust weights.
 
-    Returns the cost of the factors that are not robust. ``scratch`` holds a factor's variables, then J with all its
+    Factors whose loss is Python stop after whitening, see :func:`weigh`; returns the cost of all others. ``scratch`` holds a factor's variables, then J with all its
     columns for terms that keep only some.
     """
     fields, gather, sizes, parameters = terms.fields, terms.gather, terms.sizes, terms.parameters
     whiteners, active, columns, positions = terms.whiteners, terms.active, terms.columns, terms.positions
-    lower, upper = terms.lower, terms.upper
+    lower, upper, parameters = terms.lower, terms.upper, terms.parameters
     cost = 0.0
     for t in range(len(fields)):
         term = fields[t]
@@ -188,12 +207,19 @@ def linearize(
             for a in range(m):
                 squared += r[a] * r[a]
             total += squared
-            if term[WEIGHT] >= 0:
-                squares[term[WEIGHT] + i] = squared
-            else:
+            if term[WEIGHT] < 0:
                 cost += 0.5 * squared
-                _accumulate(term, i, columns, positions, r, J, gradient, hessian)
-        norms[t] = np.sqrt(total)
+            else:
+                squares[term[WEIGHT] + i] = squared
+                if term[LOSS] < 0:
+                    continue
+                first, second = parameters[term[LOSS_AT]], parameters[term[LOSS_AT] + 1]
+                cost += 0.5 * value_of(term[LOSS], first, second, squared)
+                weight = weights[term[WEIGHT] + i] = weight_of(term[LOSS], first, second, squared)
+                if weight != 1.0:
+                    _scale(sqrt(weight), r, J)
+            _accumulate(term, i, columns, positions, r, J, gradient, hessian)
+        norms[t] = sqrt(total)
     return cost
 
 
@@ -206,22 +232,27 @@ def weigh(
     gradient: Array,
     hessian: Array,
 ) -> None:
-    """Scale robust factors by the square root of their weights and add them to gradient and Hessian."""
+    """Scale factors whose loss is Python by the square root of their weights; add them to gradient and Hessian."""
     fields, columns, positions = terms.fields, terms.columns, terms.positions
     for t in range(len(fields)):
         term = fields[t]
-        if term[KIND] != COST or term[WEIGHT] < 0:
+        if term[LOSS] >= 0:
             continue
         m, width = term[ROWS], term[WIDTH]
         for i in range(term[COUNT]):
             r = vector(residual, term[ROW] + i * m, m)
             J = matrix(jacobian, term[ENTRY] + i * m * width, m, width)
-            root = np.sqrt(weights[term[WEIGHT] + i])
-            for a in range(m):
-                r[a] *= root
-                for d in range(width):
-                    J[a, d] *= root
+            _scale(sqrt(weights[term[WEIGHT] + i]), r, J)
             _accumulate(term, i, columns, positions, r, J, gradient, hessian)
+
+
+@compiled
+def _scale(root: float, r: Array, J: Array) -> None:
+    """Multiply residual and Jacobian."""
+    for a in range(len(r)):
+        r[a] *= root
+        for d in range(J.shape[1]):
+            J[a, d] *= root
 
 
 @inlined

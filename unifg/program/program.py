@@ -22,7 +22,7 @@ from unifg.machine.buffers import Buffers
 from unifg.program import passes
 from unifg.program.columns import Columns, Values
 from unifg.program.guess import GuessReader
-from unifg.program.linearization import Evaluation, HeldWeights, Linearization, Rows
+from unifg.program.linearization import Evaluation, Linearization, Rows
 from unifg.program.retraction import Retraction
 from unifg.program.systems import Systems
 from unifg.program.table import ENTRY, ROW, WIDTH, TermTable
@@ -99,8 +99,8 @@ class Program:
 
     @property
     def fully_compiled(self) -> bool:
-        """Whether a compiled loop can do without Python: every term a kernel, no robust loss, compiled retractions."""
-        return not (self.batched or self.scalar_terms or self.table.robust) and self.retraction.compiled
+        """Whether a compiled loop can do without Python: terms with kernels, losses as shipped, compiled retractions."""
+        return not (self.batched or self.scalar_terms or self.table.weighed) and self.retraction.compiled
 
     @property
     def hessian(self) -> Symmetric:
@@ -182,7 +182,7 @@ class Program:
 
     # ---------------------------------------------------------------- evaluation
 
-    def evaluate(self, values: Mapping[Family, Array], weights: HeldWeights | None = None) -> Evaluation:
+    def evaluate(self, values: Mapping[Family, Array], weights: Array | None = None) -> Evaluation:
         """Objective and constraints; ``weights`` are those of the linearisation whose line search this is."""
         table = self.table
         values = values if isinstance(values, Values) else self.columns.values(values)
@@ -191,12 +191,13 @@ class Program:
         with np.errstate(all="ignore"):
             for term in self.batched:
                 self.rows_of(term, residual, constraints)[:] = term.residual(values)
-            cost = passes.evaluate(table.arrays, values.flat, residual, constraints, squares, self.scratch)
-            for term, part in table.robust:
-                assert isinstance(term.term, Cost) and term.term.robust is not None
-                held = weights.get(term.name) if weights else None
-                robust = term.term.robust.value(squares[part]) if held is None else held * squares[part]
-                cost += 0.5 * float(robust.sum())
+            holding, held = weights is not None, squares if weights is None else weights
+            cost = passes.evaluate(
+                table.arrays, values.flat, residual, constraints, squares, held, holding, self.scratch
+            )
+            for loss, part in table.weighed:
+                if not (holding and loss.held):
+                    cost += 0.5 * float(loss.value(squares[part]).sum())
             for term in self.scalar_terms:
                 cost += float(term.residual(values).sum())
         return Evaluation(cost, constraints)
@@ -207,10 +208,10 @@ class Program:
         values = values if isinstance(values, Values) else self.columns.values(values)
         residual, jacobian, constraints, constraint_jacobian, gradient, hessian = self._buffers.take()
         gradient[:], hessian[:] = 0.0, 0.0
-        squares, size = np.empty(table.weights), np.empty(len(table.arrays.fields))
+        squares, weights = np.empty(table.weights), np.empty(table.weights)
+        size = np.empty(len(table.arrays.fields))
         norms: dict[str, float] = {}
         scalars: dict[str, Array] = {}
-        weights: HeldWeights = {}
         concavity = np.zeros(self.normal.nnz if self.scalar_terms else 0)
         rounding = np.zeros(self.columns.width if self.scalar_terms else 0)
         with np.errstate(all="ignore"):
@@ -226,13 +227,17 @@ class Program:
                 constraints,
                 constraint_jacobian,
                 squares,
+                weights,
                 size,
                 gradient,
                 hessian,
                 self.scratch,
             )
-            if table.robust:
-                cost += self._weigh(squares, residual, jacobian, gradient, hessian, weights)
+            if table.weighed:
+                for loss, part in table.weighed:
+                    weights[part] = loss.weight(squares[part])
+                    cost += 0.5 * float(loss.value(squares[part]).sum())
+                passes.weigh(table.arrays, weights, residual, jacobian, gradient, hessian)
             for term in self.scalar_terms:
                 value = term.residual(values)
                 cost += float(value.sum())
@@ -246,28 +251,6 @@ class Program:
         norms |= self.norms(size)
         found = residual, jacobian, constraints, constraint_jacobian, gradient, hessian
         return Linearization(values, cost, *found, norms, weights, concavity, squares, scalars, rounding)
-
-    def _weigh(
-        self,
-        squares: Array,
-        residual: Array,
-        jacobian: Array,
-        gradient: Array,
-        hessian: Array,
-        held: HeldWeights,
-    ) -> float:
-        """Finish what robust terms began: find weights, scale, accumulate; return their cost."""
-        table = self.table
-        weights, cost = np.empty(table.weights), 0.0
-        for term, part in table.robust:
-            assert isinstance(term.term, Cost) and term.term.robust is not None
-            loss = term.term.robust
-            weights[part] = loss.weight(squares[part])
-            cost += 0.5 * float(loss.value(squares[part]).sum())
-            if loss.held:
-                held[term.name] = weights[part]
-        passes.weigh(table.arrays, weights, residual, jacobian, gradient, hessian)
-        return cost
 
     def norms(self, sizes: Array) -> dict[str, float]:
         """Residual norms of the terms by name, as compiled loops leave them."""

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from unifg.elimination.symmetric import Symmetric
+from unifg.kernels.robust import Loss, form_of
 from unifg.kernels.steps import as_table, movable_parts
 from unifg.language.terms import Constraint, Cost
 from unifg.machine.jit import compiled
@@ -49,10 +50,13 @@ from unifg.typing import Array, IntArray
     PARTS,  # of the variables; 0: linear, or without a compiled retraction
     SECOND,  # address of the kernel's second derivatives; 0: to be differenced
     DIFFERENCED,  # whether the Jacobian is made of differences
+    LOSS,  # which robust loss, or one of the words below
+    LOSS_AT,  # where its two parameters stand in TermArrays.parameters
     FIELDS,
-) = range(30)
+) = range(32)
 
 COST, CONSTRAINT, BOUND = 0, 1, 2
+PYTHON, HELD = -1, -2  # losses whose formulas are Python; HELD: line searches keep the weights of a linearisation
 
 
 class TermArrays(NamedTuple):
@@ -68,7 +72,7 @@ class TermArrays(NamedTuple):
             for both triangles, because both columns are the same unknown.
         parts: (L, 6) of the variables of every term, as :class:`unifg.kernels.steps.Part` has them.
         active: flags.
-        parameters: of kernels, and constants in the place of variables.
+        parameters: of kernels, constants in the place of variables, and those of losses.
         whiteners: reciprocal standard deviations and upper triangular square roots.
         lower, upper: (M,) limits of constraints.
     """
@@ -99,6 +103,8 @@ class TermTable:
         scratch: how many numbers the loops need for one factor.
         differenced: whether the Jacobian of any term is made of differences.
         robust: robust terms and their slices of weights.
+        weighed: those of them whose losses are Python, with these.
+        holding: whether any loss holds its weights during line searches.
     """
 
     def __init__(self, terms: Sequence[CompiledTerm], columns: Columns, normal: Symmetric) -> None:
@@ -113,6 +119,8 @@ class TermTable:
         self.scratch = 1
         self.differenced = any(term.differenced for term in terms)
         self.robust: list[tuple[CompiledTerm, slice]] = []
+        self.weighed: list[tuple[Loss, slice]] = []
+        losses: dict[int, tuple[float, float]] = {}
         for row, term in zip(fields, terms, strict=True):
             layout = term.layout(starts["parameters"])
             count, m, width = layout.count, layout.rows, layout.columns.shape[1]
@@ -154,8 +162,16 @@ class TermTable:
                 self.entries += entries
                 if term.term.robust is not None:
                     row[WEIGHT] = self.weights
-                    self.robust.append((term, slice(self.weights, self.weights + count)))
+                    own = slice(self.weights, self.weights + count)
+                    self.robust.append((term, own))
                     self.weights += count
+                    form = form_of(term.term.robust)
+                    if form is None:
+                        form = HELD if term.term.robust.held else PYTHON, 0.0, 0.0
+                        self.weighed.append((term.term.robust, own))
+                    row[LOSS], row[LOSS_AT] = form[0], starts["parameters"]
+                    losses[starts["parameters"]] = form[1:]
+                    starts["parameters"] += 2
             else:
                 assert isinstance(term.term, Constraint)
                 row[KIND] = BOUND if term.is_bound else CONSTRAINT
@@ -163,6 +179,7 @@ class TermTable:
                 self.constraints += count * m
                 self.constraint_entries += entries
             term.place = row
+        self.holding = HELD in fields[:, LOSS]
         self.sizes = self.residuals, self.entries, self.constraints, self.constraint_entries
         counts = fields[:, COUNT]
         self._active_starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
@@ -180,6 +197,8 @@ class TermTable:
             np.empty(self.constraints),
             np.empty(self.constraints),
         )
+        for place, pair in losses.items():
+            self.arrays.parameters[place : place + 2] = pair
         locate(fields, self.arrays.columns, self.arrays.unknown, normal.indptr, normal.indices, self.arrays.positions)
 
     def bind(self, rebound: Sequence[CompiledTerm], lower: Array, upper: Array) -> None:
