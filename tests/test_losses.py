@@ -62,7 +62,9 @@ def objective(program: Program, values: dict[fg.Family, Array], loss: Loss, acti
     for term in program.cost_terms:
         r = term.residual(program.values_from(values))
         assert isinstance(term.term, Cost)
-        W = np.eye(term.size) if term.term.information is None else np.linalg.cholesky(term.term.information).T
+        W = np.eye(term.size)
+        if term.term.information is not None:
+            W = np.linalg.cholesky(np.asarray(term.term.information, dtype=float)).T
         if term.term.sigma is not None:
             W = W / np.asarray(term.term.sigma)
         squared = ((r @ W.T) ** 2).sum(axis=1)
@@ -145,7 +147,8 @@ RANGES_FROM = np.array([[0.0, 0.0], [6.0, 0.0], [0.0, 6.0], [6.0, 6.0], [3.0, -2
 
 def ranges_to(place: Array, bias: Array) -> Array:
     """(n, 1) biased distances from the beacons."""
-    return np.linalg.norm(place - RANGES_FROM, axis=1)[:, None] + bias
+    distance: Array = np.linalg.norm(place - RANGES_FROM, axis=1)[:, None]
+    return distance + bias
 
 
 def beacons(loss: Loss, constrained: bool, equal: bool) -> tuple[fg.Graph, dict[fg.Family, Array], Array]:

@@ -30,6 +30,7 @@ from unifg.errors import BackendError, GraphError
 from unifg.kernels.differences import convexified
 from unifg.language.terms import Cost
 from unifg.language.variables import Data, Family
+from unifg.program.curvature import loss_curvature, row_weights
 from unifg.program.linearization import Rows
 from unifg.program.program import Program
 from unifg.program.term import CompiledTerm
@@ -313,16 +314,13 @@ def _curvature(qp: QP, names: tuple[str, ...], first: IntArray) -> list[Factor]:
     program, lin = qp.program, qp.lin
     factors: list[Factor] = []
     for term in (*program.cost_terms, *program.constraint_terms):
-        if isinstance(term.term, Cost):
-            if term.term.robust is not None:
-                continue
-            weights = term.carry_back(program.rows_of(term, lin.residual, lin.constraints))
-        else:
-            assert qp.curved_by is not None
-            weights = program.rows_of(term, lin.residual, qp.curved_by)
+        assert qp.curved_by is not None
+        weights = row_weights(program, term, lin, qp.curved_by)
         if term.is_bound or not weights.any():
             continue
         hessian = term.second_derivatives(lin.values, weights)
+        if isinstance(term.term, Cost) and term.term.robust is not None:
+            hessian = hessian + loss_curvature(term, lin)
         factors += _quadratic(program, term, "curvature", hessian, np.zeros(hessian.shape[:2]), names, first)
     return factors
 

@@ -4,7 +4,8 @@ A loss enters Gauss-Newton through its weight rho'(s) (iteratively reweighted le
 rho'(s) J' r is the true one, so the KKT check judges the robust problem itself.
 
 The formulas of the shipped losses stand in :func:`value_of`, :func:`weight_of` and :func:`bend_of`, for one number and
-compiled; the classes apply them to arrays. They are compiled without liberties, so that NaN stays NaN and nothing is reordered.
+compiled; the classes apply them to arrays. They are compiled without liberties, so that NaN stays NaN and nothing is
+reordered.
 """
 
 from __future__ import annotations

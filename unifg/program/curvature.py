@@ -1,8 +1,9 @@
 """The Hessian of the Lagrangian: what Gauss-Newton leaves out is sum of w_a times the Hessian of r_a, for every factor.
 
-The weights w are the multipliers of constraints and the whitened residuals of costs, times their robust weights, carried
-back through the whitening. A robust weight has a slope of its own (:func:`add_losses`). The Hessian is that of t -> r(x Exp(t)), symmetric. A kernel that does not come with it has its Jacobian
-differenced along every tangent direction; where that is made of differences itself, the residual is differenced twice.
+The weights w are the multipliers of constraints and the whitened residuals of costs, times their robust weights,
+carried back through the whitening. The Hessian is that of t -> r(x Exp(t)), symmetric. A kernel that does not come with
+it has its Jacobian differenced along every tangent direction; where that is made of differences itself, the residual is
+differenced twice. A robust loss adds the slope of its weight (:func:`add_losses`).
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from unifg.kernels.robust import bend_of
+from unifg.kernels.robust import bend_of, form_of
 from unifg.kernels.steps import (
     ANGLE,
     ONE_SIDED,
@@ -102,14 +103,7 @@ def constraint_curvature(program: Program, lin: Linearization, multipliers: Arra
 
 def _add(program: Program, term: CompiledTerm, lin: Linearization, multipliers: Array, entries: Array) -> None:
     """Second derivatives of a term without a kernel."""
-    if isinstance(term.term, Cost):
-        weights = term.carry_back(program.rows_of(term, lin.residual, lin.constraints))
-        if term.term.robust is not None:
-            start = int(term.place[WEIGHT])
-            weights = weights * np.sqrt(lin.weights[start : start + term.count, None])
-    else:
-        weights = program.rows_of(term, lin.residual, multipliers)
-    second = term.second_derivatives(lin.values, weights)
+    second = term.second_derivatives(lin.values, row_weights(program, term, lin, multipliers))
     if not second.any():
         return
     known = program.once(_known)
@@ -117,6 +111,32 @@ def _add(program: Program, term: CompiledTerm, lin: Linearization, multipliers: 
         known[term] = _find(program, term)
     factor, row, column, times, place = known[term]
     np.add.at(entries, place, times * second[factor, row, column])
+
+
+def row_weights(program: Program, term: CompiledTerm, lin: Linearization, multipliers: Array) -> Array:
+    """(n, m) what the Hessian of every row of a term counts in that of the Lagrangian."""
+    if not isinstance(term.term, Cost):
+        return program.rows_of(term, lin.residual, multipliers)
+    weights = term.carry_back(program.rows_of(term, lin.residual, lin.constraints))
+    return weights if term.term.robust is None else weights * np.sqrt(_of_factors(term, lin.weights))[:, None]
+
+
+def loss_curvature(term: CompiledTerm, lin: Linearization) -> Array:
+    """(n, D, D) of one robust term what :func:`add_losses` adds for all."""
+    m, width, start = (int(term.place[field]) for field in (ROWS, WIDTH, ENTRY))
+    J = lin.jacobian[start : start + term.count * m * width].reshape(term.count, m, width)
+    r = lin.residual[term.place[ROW] : term.place[ROW] + term.count * m].reshape(term.count, m)
+    weights, form = _of_factors(term, lin.weights), form_of(term.term.robust) if isinstance(term.term, Cost) else None
+    if form is None:
+        return np.zeros((term.count, width, width))
+    slope = np.einsum("nad,na->nd", J, r) / np.where(weights == 0.0, np.inf, weights)[:, None]
+    bends = np.array([2.0 * bend_of(*form, squared) for squared in _of_factors(term, lin.squares)])
+    return np.asarray(bends[:, None, None] * slope[:, :, None] * slope[:, None, :])
+
+
+def _of_factors(term: CompiledTerm, robust: Array) -> Array:
+    """(n,) of an array with one number for every robust factor."""
+    return robust[term.place[WEIGHT] : term.place[WEIGHT] + term.count]
 
 
 def _known(_: Program) -> dict[CompiledTerm, Places]:

@@ -140,7 +140,9 @@ def evaluate(
                     continue
                 squares[term[WEIGHT] + i] = squared
                 if term[LOSS] > 0:
-                    cost += 0.5 * value_of(term[LOSS], parameters[term[LOSS_AT]], parameters[term[LOSS_AT] + 1], squared)
+                    cost += 0.5 * value_of(
+                        term[LOSS], parameters[term[LOSS_AT]], parameters[term[LOSS_AT] + 1], squared
+                    )
                 elif holding and term[LOSS] == HELD:
                     cost += 0.5 * weights[term[WEIGHT] + i] * squared
     return cost
@@ -164,8 +166,8 @@ def linearize(
 ) -> float:
     """Residuals, Jacobians, gradient and J'J in one pass, scaled by the square roots of robust weights.
 
-    Factors whose loss is Python stop after whitening, see :func:`weigh`; returns the cost of all others. ``scratch`` holds a factor's variables, then J with all its
-    columns for terms that keep only some.
+    Factors whose loss is Python stop after whitening, see :func:`weigh`; returns the cost of all others. ``scratch``
+    holds a factor's variables, then J with all its columns for terms that keep only some.
     """
     fields, gather, sizes, parameters = terms.fields, terms.gather, terms.sizes, terms.parameters
     whiteners, active, columns, positions = terms.whiteners, terms.active, terms.columns, terms.positions

@@ -99,7 +99,7 @@ class Program:
 
     @property
     def fully_compiled(self) -> bool:
-        """Whether a compiled loop can do without Python: terms with kernels, losses as shipped, compiled retractions."""
+        """Whether a compiled loop can do without Python: every term a kernel, every loss and retraction compiled."""
         return not (self.batched or self.scalar_terms or self.table.weighed) and self.retraction.compiled
 
     @property
