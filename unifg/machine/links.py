@@ -17,7 +17,7 @@ from numba.core.datamodel import default_manager
 
 from unifg.errors import UnifgError
 from unifg.machine.calls import _primitive
-from unifg.machine.jit import _Cache, compiled
+from unifg.machine.jit import _Cache, compiled, spelled
 from unifg.typing import IntArray
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -29,7 +29,7 @@ class _LinkedCache(_Cache):
     """A cache that also asks for what addresses of arrays mean."""
 
     def _index_key(self, signature: Any, codegen: Any) -> Any:
-        return *super()._index_key(signature, codegen), str(memory.kind)
+        return *super()._index_key(signature, codegen), spelled(memory.kind)
 
 
 def linked(function: F) -> F:
@@ -37,7 +37,6 @@ def linked(function: F) -> F:
     dispatcher: Any = compiled(function)
     dispatcher._cache = _LinkedCache(function)
     dispatcher.targetoptions["no_cpython_wrapper"] = True
-    dispatcher.targetoptions["no_cfunc_wrapper"] = True
     return cast(F, dispatcher)
 
 

@@ -1,0 +1,159 @@
+"""Kernels that come with the library: found by what they are made of, and by nothing else."""
+
+from __future__ import annotations
+
+import gc
+import importlib.util
+import logging
+import sys
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from unifg.machine import shipped, tally
+from unifg.machine.jit import compiled, in_order
+from unifg.machine.tally import Tally, counting
+
+SOURCE = """from unifg.machine.jit import compiled
+FACTOR = 2.0
+@compiled
+def inner(x):
+    return FACTOR * x
+def twice(x):
+    return inner(x) + 0.0
+"""
+
+
+def module(path: Path, source: str) -> Any:
+    """What a file holds, imported anew under its own name."""
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(source, encoding="utf-8")
+    spec = importlib.util.spec_from_file_location("doubling", path)
+    assert spec is not None and spec.loader is not None
+    found = importlib.util.module_from_spec(spec)
+    sys.modules["doubling"] = found
+    spec.loader.exec_module(found)
+    shipped.content.cache_clear()
+    return found
+
+
+@pytest.fixture(autouse=True)
+def forgotten() -> Iterator[None]:
+    """The module is nobody else's."""
+    yield
+    sys.modules.pop("doubling", None)
+
+
+@pytest.fixture
+def archive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Of the function ``twice``, made in another folder, in the place of the library's own."""
+    path = tmp_path / "kernels.zip"
+    with shipped.recording() as recorder:
+        assert compiled(module(tmp_path / "there" / "doubling.py", SOURCE).twice)(3.0) == 6.0
+    recorder.write(path, tmp_path)
+    monkeypatch.setattr(shipped, "ARCHIVE", path)
+    shipped.archive.cache_clear()
+    yield path
+    shipped.archive.cache_clear()
+
+
+def first_use(tmp_path: Path, source: str = SOURCE, how: Callable[..., Any] = compiled) -> Tally:
+    """What a first use in a new folder, which has no cache, takes."""
+    with counting() as counted:
+        assert how(module(tmp_path / "here" / "doubling.py", source).twice)(3.0) == 6.0
+    return counted
+
+
+def test_only_code_is_generated_and_then_read(archive: Path, tmp_path: Path) -> None:
+    first = first_use(tmp_path)
+    assert (first.compiled, first.generated, first.read) == ([], ["doubling.twice"], [])
+    function = module(tmp_path / "here" / "doubling.py", SOURCE).twice
+    assert compiled(function)(3.0) == 6.0
+    with counting() as second:
+        assert compiled(function)(3.0) == 6.0
+    assert (second.compiled, second.generated, second.read) == ([], [], ["doubling.twice"])
+
+
+@pytest.mark.parametrize(
+    ("source", "how"),
+    [
+        (SOURCE.replace("FACTOR * x", "x + FACTOR + x - 2.0"), compiled),
+        (SOURCE.replace("FACTOR = 2.0", "FACTOR = 1.0 + 1.0 "), compiled),
+        ("\n" + SOURCE, compiled),
+        (SOURCE, in_order),
+    ],
+    ids=["callee", "constant", "line", "liberties"],
+)
+def test_what_has_changed_is_compiled(archive: Path, tmp_path: Path, source: str, how: Callable[..., Any]) -> None:
+    assert "doubling.twice" in first_use(tmp_path, source, how).compiled
+
+
+@pytest.mark.parametrize("name", ["python", "numba", "llvmlite", "platform", "instructions"])
+def test_an_archive_for_others_is_left_alone(
+    archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    other = {**shipped.versions(), name: "of another kind"}
+    monkeypatch.setattr(shipped, "versions", lambda: other)
+    assert first_use(tmp_path).generated == []
+    assert shipped.outdated(tmp_path, archive) == ["archive"]
+
+
+@pytest.mark.parametrize("content", [None, b"", b"PK nothing of the kind"], ids=["none", "empty", "no archive"])
+def test_an_archive_that_cannot_be_read_is_none(archive: Path, tmp_path: Path, content: bytes | None) -> None:
+    archive.unlink()
+    if content is not None:
+        archive.write_bytes(content)
+    assert "doubling.twice" in first_use(tmp_path).compiled
+
+
+def test_an_archive_names_the_files_that_have_changed_since(archive: Path, tmp_path: Path) -> None:
+    assert shipped.outdated(tmp_path, archive) == []
+    (tmp_path / "there" / "doubling.py").write_text(SOURCE + "\n", encoding="utf-8")
+    shipped.content.cache_clear()
+    assert shipped.outdated(tmp_path, archive) == ["there/doubling.py"]
+    (tmp_path / "there" / "doubling.py").unlink()
+    assert shipped.outdated(tmp_path, archive) == ["there/doubling.py"]
+
+
+def test_members_are_numbered_beyond_those_of_a_process(archive: Path) -> None:
+    """Two functions of one name and of the same types would otherwise be one to the linker."""
+    with zipfile.ZipFile(archive) as file:
+        members = [name for name in file.namelist() if name != shipped.ABOUT]
+        assert len(members) == 2
+        assert all(f"v{shipped.FIRST_NUMBER}"[:4].encode() in file.read(name) for name in members)
+
+
+def test_a_compilation_is_announced_once_and_disturbs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(tally.listener, "announced", False)
+    before = gc.get_threshold()
+    with caplog.at_level(logging.INFO, "unifg"):
+        first_use(tmp_path)
+        first_use(tmp_path, SOURCE + "\n")
+    (said,) = [record.message for record in caplog.records if record.levelno == logging.WARNING]
+    assert "doubling.twice" in said and str(tmp_path / "here") in said
+    assert gc.get_threshold() == before
+
+    @compiled
+    def wrong(x: float) -> Any:
+        return x.no_such_attribute  # type: ignore[attr-defined]
+
+    with pytest.raises(Exception, match="no_such_attribute"):
+        wrong(1.0)
+    assert gc.get_threshold() == before
+
+
+def test_reading_is_no_compilation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    function = module(tmp_path / "here" / "doubling.py", SOURCE).twice
+    assert compiled(function)(3.0) == 6.0
+    monkeypatch.setattr(tally.listener, "announced", False)
+    with counting() as counted:
+        assert compiled(function)(3.0) == 6.0
+    assert (counted.compiled, counted.generated, counted.read) == ([], [], ["doubling.twice"])
+    assert counted.everything == 1 and caplog.records == []

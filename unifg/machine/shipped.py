@@ -1,0 +1,169 @@
+"""Kernels that come with the library half compiled: LLVM's code after all optimisation, before that of a processor.
+
+Nine tenths of a first compilation are the same on every machine: types are inferred, code is written down, linked and
+optimised. An archive beside this file keeps what comes of it, one member per function and signature, so that a first
+use generates code for the processor at hand and nothing else. What it made is then in the cache on disk like any other.
+
+A member is found by a digest of the sources of a function and of all it calls and of its types; the archive as a whole
+by the versions of Python, Numba, llvmlite and of the primitives of this room, and by the platform. So code that has
+changed is never found and is compiled instead: an archive that is out of date costs time, and nothing else.
+``unifg warmup --ship`` writes it anew; :func:`outdated` says what has changed since.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import pickle
+import sys
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache, lru_cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from llvmlite import binding as llvm
+from numba.core.bytecode import FunctionIdentity
+from numba.core.registry import cpu_target
+from numba.core.serialize import dumps
+
+logger = logging.getLogger("unifg")
+
+ARCHIVE = Path(__file__).with_name("kernels.zip")
+ABOUT = "about.json"
+OF_INSTRUCTIONS = ("borrow", "calls", "jit", "links", "vectors")  # files of this room that say what is generated
+FIRST_NUMBER = 10**9  # of functions in the archive: Numba numbers those of a process from one, and names hold numbers
+LINKED_MANY_TIMES = "linkonce_odr"
+
+
+def versions() -> dict[str, str]:
+    """What code generated here depends on, besides the sources."""
+    room = hashlib.sha256()
+    for name in OF_INSTRUCTIONS:
+        room.update(Path(__file__).with_name(f"{name}.py").read_bytes())
+    return {
+        "python": f"{sys.version_info.major}.{sys.version_info.minor}",
+        "numba": metadata.version("numba"),
+        "llvmlite": metadata.version("llvmlite"),
+        "platform": str(llvm.get_process_triple()),
+        "instructions": room.hexdigest(),
+    }
+
+
+@cache
+def content(path: str) -> str:
+    """Digest of a file."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+
+class Archive:
+    """Half compiled kernels in a file.
+
+    Attributes:
+        usable: whether there is a file, made for these versions.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Look at what the file is for."""
+        self.usable = False
+        try:
+            self._file = zipfile.ZipFile(path)
+            self.about = json.loads(self._file.read(ABOUT))
+        except (OSError, KeyError, ValueError, zipfile.BadZipFile):  # none is there, or it is cut off
+            return
+        kind = self.about["versions"]
+        different = [f"{name} {kind.get(name)}" for name, present in versions().items() if kind.get(name) != present]
+        self.usable = not different
+        if different:
+            logger.info("the kernels that come with unifg are of another kind (%s)", ", ".join(different))
+
+    def find(self, key: str) -> Any:
+        """What Numba's cache keeps of a function, with code for this processor; None where there is nothing."""
+        if not self.usable or key not in self._file.NameToInfo:
+            return None
+        (name, bitcode), *others = pickle.loads(self._file.read(key))
+        return (name, "object", _generated(bitcode)), *others
+
+
+@lru_cache(1)
+def archive() -> Archive:
+    """The one beside this file."""
+    return Archive(ARCHIVE)
+
+
+def outdated(root: Path, path: Path = ARCHIVE) -> list[str]:
+    """What has changed since an archive was made: files below the folder of the library, or "archive" for the whole."""
+    made = Archive(path)
+    if not made.usable:
+        return ["archive"]
+
+    def changed(name: str) -> bool:
+        return not (root / name).is_file() or content(str(root / name)) != made.about["sources"][name]
+
+    return [name for name in made.about["sources"] if changed(name)]
+
+
+def _generated(bitcode: bytes) -> tuple[bytes, bytes]:
+    """Object code for this processor, and what other functions link: the two that Numba's cache keeps."""
+    module = llvm.parse_bitcode(bitcode)
+    code = cpu_target.target_context.codegen()._tm.emit_object(module)
+    for function in module.functions:
+        if not function.is_declaration and function.linkage == llvm.Linkage.external:
+            function.linkage = LINKED_MANY_TIMES
+    return code, module.as_bitcode()
+
+
+class Recorder:
+    """Keeps what is compiled while an archive is made.
+
+    Attributes:
+        members: of the archive to be, by their keys.
+        sources: the files that were compiled.
+    """
+
+    def __init__(self) -> None:
+        """Nothing has been compiled."""
+        self.members: dict[str, bytes] = {}
+        self.sources: set[str] = set()
+
+    def keep(self, key: str, source: str, result: Any, reduced: tuple[Any, ...]) -> None:
+        """Add a function: its key, its file, what Numba made of it, and what the cache keeps of that."""
+        library = result.library
+        self.members[key] = dumps(((library.name, library._final_module.as_bitcode()), *reduced[1:]))
+        self.sources.add(source)
+
+    def write(self, path: Path, root: Path) -> None:
+        """Write the archive.
+
+        Args:
+            path: of the file.
+            root: folder of the library; functions of other files are left out of the list of sources.
+        """
+        inside = sorted(Path(source) for source in self.sources if Path(source).is_relative_to(root))
+        about = {
+            "versions": versions(),
+            "sources": {source.relative_to(root).as_posix(): content(str(source)) for source in inside},
+        }
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as file:
+            for name, data in {ABOUT: json.dumps(about, indent=1).encode(), **self.members}.items():
+                file.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_LZMA)
+
+
+recorder: Recorder | None = None
+
+
+@contextmanager
+def recording() -> Iterator[Recorder]:
+    """Compile everything anew meanwhile, and keep it."""
+    global recorder
+    numbers = FunctionIdentity._unique_ids
+    FunctionIdentity._unique_ids = iter(range(FIRST_NUMBER, 2 * FIRST_NUMBER))
+    recorder = Recorder()
+    try:
+        yield recorder
+    finally:
+        recorder = None
+        FunctionIdentity._unique_ids = numbers
