@@ -45,7 +45,8 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "unifg/answers/covariance.py": ("answers", "covariance", "graph"),
     "unifg/answers/optimality.py": ("kkt", "infeasible", "solvers", "refusals"),
     "unifg/answers/marginal.py": ("answers", "marginal_prior"),
-    "unifg/answers/solution.py": ("answers", "residual_history", "covariance", "refusals", "graph", "kkt"),
+    "unifg/answers/shift.py": ("answers", "binding", "graph"),
+    "unifg/answers/solution.py": ("answers", "residual_history", "covariance", "refusals", "graph", "kkt", "binding"),
     "unifg/answers/solver.py": (
         "answers",
         "early_ends",
@@ -55,6 +56,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
         "infeasible",
         "own_backend",
     ),
+    "unifg/program/binding.py": ("binding", "graph", "refusals"),
     "solvers/augmented_lagrangian.py": ("augmented_lagrangian", "answers", "solvers", "infeasible", "least_violation"),
     "solvers/interior_point/barrier.py": ("interior_point", "solvers", "infeasible"),
     "solvers/interior_point/direction.py": ("interior_point", "solvers"),

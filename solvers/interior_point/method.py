@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from unifg.answers.history import Iteration
 from unifg.answers.solver import Solver, SolveState
 from unifg.answers.status import Status
 from unifg.errors import BackendError
+from unifg.machine.buffers import Block
 from unifg.machine.links import memory
 from unifg.program.curvature import lagrangian_hessian
 from unifg.program.linearization import Linearization
@@ -38,6 +39,7 @@ ENDINGS = {
     state.VIOLATED: Status.STALLED,
     state.STOPPED: Status.STOP_RULE,
 }
+ANSWER = ("residual", "jacobian", "constraints", "constraint_jacobian", "gradient", "hessian")  # of `Work`
 NO_ANSWER = -1
 STUCK = (state.STALLED, state.SINGULAR, state.VIOLATED)
 RESTARTS = 3  # from points that violate less than where the method came to a halt
@@ -194,6 +196,9 @@ class Workspace:
             log=iterations + 2,
             data=len(plan.slots),
         )
+        self._answer = Block([len(getattr(self.work, name)) for name in ANSWER])
+        answer: dict[str, Any] = dict(zip(ANSWER, self._answer.arrays, strict=True))
+        self.work = self.work._replace(**answer)
         self.problem = Problem(
             np.zeros(1, state.LINKS),
             program.arrays,
@@ -208,6 +213,7 @@ class Workspace:
         )
         self._describe()
         self.problem.links[:] = addresses()
+        self._held = program.equality
         self._links, self.now = Fields(self.problem.links), Fields(self.work.scalars)
 
     def _unequal(self, term: IntArray) -> bool:
@@ -241,8 +247,10 @@ class Workspace:
 
     def prepare(self, run: SolveState, options: InteriorPoint) -> Fields:
         """Set up one solve with the present data; returns the scalars."""
-        if not (self.program.equality == self.system.held).all():
-            self._build(options.max_iterations)
+        if self.program.equality is not self._held:  # which is a new array when limits have changed
+            if not np.array_equal(self.program.equality, self.system.held):
+                self._build(options.max_iterations)
+            self._held = self.program.equality
         if len(self.work.log) < options.max_iterations + 2:
             self.work = self.work._replace(log=np.zeros((options.max_iterations + 2, 9)))
             self._describe()
@@ -271,15 +279,16 @@ class Workspace:
         program, work = self.program, self.work
         values = program.columns.view(work.values.copy())
         program.retraction.fix(values)
+        residual, jacobian, constraints, rows, gradient, hessian = self._answer.copied()
         return Linearization(
             values,
             self.now["cost"],
-            work.residual.copy(),
-            work.jacobian.copy(),
-            work.constraints.copy(),
-            work.constraint_jacobian.copy(),
-            work.gradient.copy(),
-            work.hessian.copy(),
+            residual,
+            jacobian,
+            constraints,
+            rows,
+            gradient,
+            hessian,
             program.norms(work.norms),
             work.weights.copy(),
             squares=work.squares.copy(),

@@ -29,7 +29,7 @@ them small.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,8 +44,7 @@ from unifg.program.table import COLUMN, COST, COUNT, DIFFERENCED, KIND, ROW, ROW
 from unifg.typing import Array, IntArray
 
 
-@dataclass(frozen=True)
-class Optimality:
+class Optimality(NamedTuple):
     """KKT numbers at a point.
 
     Attributes:
@@ -111,7 +110,7 @@ def optimality(
         multipliers,
     )
     stationarity, violation, complementarity, worst, finite = measured
-    if not finite or not np.isfinite(lin.cost):
+    if not finite or not math.isfinite(lin.cost):
         return Optimality(np.inf, np.inf, np.inf, -1, False)
     rounding = 0.0
     if program.differenced:

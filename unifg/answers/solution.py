@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,13 +13,14 @@ from unifg.answers.covariance import Covariances
 from unifg.answers.history import HEADER, FactorNorms, Iteration, factor_norms, line
 from unifg.answers.marginal import Variables, information, marginal_prior
 from unifg.answers.optimality import Optimality
+from unifg.answers.shift import Shifts
 from unifg.answers.status import Status
 from unifg.answers.verdict import Verdict
 from unifg.errors import GraphError, UnifgError
 from unifg.language.variables import Family, Selection, Variable, as_selection
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
-from unifg.typing import Array, BoolArray, IntArray
+from unifg.typing import Array, BoolArray
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,6 @@ class Solution:
         self._program = program
         self._lin = linearization
         self._multipliers, self._penalties = multipliers, penalties
-        self._data = dict(program.data)
         self._equality = program.equality
         self._lower, self._upper = program.lower, program.upper
         self.status = status
@@ -105,17 +105,17 @@ class Solution:
     @property
     def values(self) -> dict[Family, Array]:
         """Copies of the values of every family."""
-        return {family: array.copy() for family, array in self._lin.values.items()}
+        return self._program.columns.view(self._lin.values.flat.copy())
 
     @property
     def multipliers(self) -> dict[str, Array]:
         """Multipliers of every constraint term, (n, m) each."""
-        return self._by_term(self._multipliers)
+        return self._program.by_term(self._multipliers.copy())
 
     @property
     def penalties(self) -> dict[str, Array]:
         """Penalties the solve ended with, (n, m) for every constraint term; empty when the backend has none."""
-        return self._by_term(self._penalties) if self._penalties.any() else {}
+        return self._program.by_term(self._penalties.copy()) if self._penalties.any() else {}
 
     @property
     def residuals(self) -> FactorNorms:
@@ -163,22 +163,13 @@ class Solution:
             *families: the families that run along the horizon.
             by: number of stages, non-negative.
         """
-        if by < 0:
-            raise GraphError(f"shifted: by must not be negative, found {by}")
-        values = self.values
-        for family in families:
-            self._require(as_selection(family))
-            stages = np.minimum(np.arange(family.count) + by, family.count - 1)
-            values[family] = values[family][stages]
-        multipliers, penalties = self.multipliers, self.penalties
-        for term in self._program.constraint_terms:
-            first = term.gathers[0].selection
-            if first.family in families and len(first) == term.count:
-                rows = _shifted_rows(first.indices.astype(np.int64).tobytes(), by)
-                multipliers[term.name] = multipliers[term.name][rows]
-                if penalties:
-                    penalties[term.name] = penalties[term.name][rows]
-        return Guess(values, multipliers, penalties)
+        program = self._program
+        stored, rows = program.once(Shifts)(families, by)
+        return Guess(
+            program.columns.view(self._lin.values.flat[stored]),
+            program.by_term(self._multipliers[rows]),
+            program.by_term(self._penalties[rows]) if self._penalties.any() else {},
+        )
 
     def covariance(self, *variables: Variable) -> Array:
         """(k, k) joint covariance of the selected variables, in their tangent spaces, in the order given.
@@ -250,8 +241,9 @@ class Solution:
         return f"<Solution {self.report()}>"
 
     def __getstate__(self) -> dict[str, Any]:
-        """Pickle without factorisations, which are found again where somebody asks."""
-        return {name: value for name, value in self.__dict__.items() if name != "_covariances"}
+        """Pickle with the history, and without factorisations, which are found again where somebody asks."""
+        kept = {name: value for name, value in self.__dict__.items() if name != "_covariances"}
+        return {**kept, "_history": self.history}
 
     def _held(self) -> BoolArray:
         """Inequalities that are active: the multiplier outweighs the distance to its limit."""
@@ -260,43 +252,11 @@ class Solution:
         held: BoolArray = np.abs(self._multipliers) > distance
         return held
 
-    def _by_term(self, stacked: Array) -> dict[str, Array]:
-        """Rows of the constraints, (n, m) for every term."""
-        program = self._program
-        return {
-            term.name: stacked[rows].reshape(term.count, term.size).copy()
-            for term, rows in zip(program.constraint_terms, program.slices, strict=True)
-        }
-
     def _require(self, selection: Selection) -> None:
         if selection.family not in self._lin.values:
             raise GraphError(
                 f"family '{selection.family.name}' is not part of this solution", family=selection.family.name
             )
-
-
-@lru_cache(maxsize=256)
-def _shifted_rows(stages: bytes, by: int) -> IntArray:
-    """For each factor the factor ``by`` stages later with the same rank within its stage.
-
-    Where no such stage exists, the last stage that has that rank serves. Control loops ask for the same every tick.
-
-    Args:
-        stages: of the factors, int64.
-        by: number of stages.
-    """
-    place: dict[tuple[int, int], int] = {}
-    seen: dict[int, int] = {}
-    keys = []
-    last: dict[int, int] = {}
-    for factor, stage in enumerate(np.frombuffer(stages, dtype=np.int64).tolist()):
-        rank = seen.get(stage, 0)
-        seen[stage] = rank + 1
-        place[stage, rank] = factor
-        keys.append((stage, rank))
-        if rank not in last or stage >= keys[last[rank]][0]:
-            last[rank] = factor
-    return np.array([place.get((stage + by, rank), last[rank]) for stage, rank in keys], dtype=np.intp)
 
 
 class NotConverged(UnifgError, RuntimeError):

@@ -20,6 +20,7 @@ from unifg.answers.status import Status
 from unifg.errors import BackendError, GraphError
 from unifg.language.statement import Statement
 from unifg.language.variables import Data, Family
+from unifg.program.by_term import ByTerm
 from unifg.program.columns import Values
 from unifg.program.linearization import Linearization, all_finite
 from unifg.program.program import Program, compile_graph
@@ -410,9 +411,9 @@ class Prepared:
         program.bind(data or {})
         values = program.values_from(guess if isinstance(guess, Mapping) else guess.values)
         carried = {} if isinstance(guess, Mapping) else guess.multipliers
-        multipliers = self._stacked("multipliers", {**carried, **(duals or {})})
+        multipliers = self._stacked("multipliers", {**carried, **duals} if duals else carried)
         run = SolveState(self.solver, program, values, multipliers, callback)
-        if not isinstance(guess, Mapping):
+        if not isinstance(guess, Mapping) and guess.penalties:
             run.penalties = self._stacked("penalties", guess.penalties)
         self._refuse_not_finite(run)
         reason = None
@@ -439,6 +440,17 @@ class Prepared:
 
     def _stacked(self, what: str, given: Mapping[str, ArrayLike]) -> Array:
         """(M,) multipliers or penalties, zero where none are given."""
+        if isinstance(given, ByTerm) and given.places is self.program.places and given.intact:
+            result = given.flat.copy()
+        else:
+            result = self._read(what, given)
+        if given and not all_finite(result):
+            name = self.program.row_name(int(np.flatnonzero(~np.isfinite(result))[0]))[0]
+            raise GraphError(f"{what} of '{name}' are not finite", term=name)
+        return result
+
+    def _read(self, what: str, given: Mapping[str, ArrayLike]) -> Array:
+        """The same of arrays from anywhere."""
         result = np.zeros(self.program.constraints.count)
         for name, value in given.items():
             if name not in self._constraints:
@@ -451,9 +463,6 @@ class Prepared:
                     f"{what} of '{name}' have shape {array.shape}, expected {(term.count, term.size)}", term=name
                 )
             result[rows] = array.ravel()
-        if given and not all_finite(result):
-            name = self.program.row_name(int(np.flatnonzero(~np.isfinite(result))[0]))[0]
-            raise GraphError(f"{what} of '{name}' are not finite", term=name)
         return result
 
     def _refuse_not_finite(self, run: SolveState) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from math import prod
+from operator import is_
 
 import numpy as np
 
@@ -19,15 +21,26 @@ class Values(dict[Family, Array]):
     """(count, storage) arrays by family, all of them views of one flat array.
 
     Attributes:
+        columns: the numbering that says where each family stands.
         flat: the storage of all families in their order.
     """
 
     def __init__(self, columns: Columns, flat: Array) -> None:
         """View ``flat`` by families."""
+        self.columns = columns
         self.flat = flat
-        for family, start in columns.storage.items():
-            size = family.count * family.manifold.storage
-            self[family] = flat[start : start + size].reshape(family.count, family.manifold.storage)
+        for family, part, shape in columns.parts:
+            self[family] = flat[part].reshape(shape)
+        self._views = tuple(self.values())
+
+    @property
+    def intact(self) -> bool:
+        """Whether ``flat`` still says it all: nobody has put another array in the place of a family's."""
+        return len(self) == len(self._views) and all(map(is_, self.values(), self._views))
+
+    def __reduce__(self) -> tuple[type[Values], tuple[Columns, Array]]:
+        """Pickle the flat array: views of it would become arrays of their own."""
+        return Values, (self.columns, self.columns.values(self).flat)
 
 
 class Columns:
@@ -36,6 +49,7 @@ class Columns:
     Attributes:
         leaves: components of each family's manifold, and where each begins in storage and tangent.
         storage: where each family's storage starts.
+        parts: each family with its slice of the stored values and their shape (count, storage).
         stored: length of the storage of all families.
         offsets: first column of each family.
         width: number of columns, fixed variables included.
@@ -56,6 +70,8 @@ class Columns:
             self.offsets[family], self.storage[family] = self.width, self.stored
             self.width += family.count * family.manifold.dim
             self.stored += family.count * family.manifold.storage
+        sizes = {family: (family.count, family.manifold.storage) for family in families}
+        self.parts = [(f, slice(first, first + prod(sizes[f])), sizes[f]) for f, first in self.storage.items()]
         is_free = np.ones(self.width, dtype=bool)
         self.fixed: dict[str, IntArray] = {}
         for fix in fixes:
@@ -82,7 +98,7 @@ class Columns:
 
     def values(self, parts: Mapping[Family, Array]) -> Values:
         """One array per family as views of one flat array; values that are such already stay as they are."""
-        if isinstance(parts, Values):
+        if isinstance(parts, Values) and parts.intact:
             return parts
         flat = np.empty(self.stored)
         values = Values(self, flat)

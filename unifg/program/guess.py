@@ -36,6 +36,18 @@ class GuessReader:
         Raises:
             GraphError: naming the family and index of what is missing, misshapen, NaN or off its manifold.
         """
+        if isinstance(guess, Values) and guess.columns is self._columns and guess.intact:
+            values = Values(self._columns, guess.flat.copy())
+        else:
+            values = self._read(guess)
+        self._retraction.fix(values)
+        fine = all_finite(values.flat)
+        if not (fine and all(leaf.is_valid(values[f][:, part]).all() for f, part, leaf in self._particular)):
+            self._name_invalid(values)
+        return values
+
+    def _read(self, guess: Mapping[Family, ArrayLike]) -> Values:
+        """A copy of values from anywhere."""
         for family in guess:
             if not isinstance(family, Family) or self._graph.families.get(family.name) is not family:
                 raise GraphError(f"the guess contains {family!r}, which is no family of this graph")
@@ -57,10 +69,6 @@ class GuessReader:
                     family=family.name,
                 )
             own[:] = array
-        self._retraction.fix(values)
-        fine = all_finite(values.flat)
-        if not (fine and all(leaf.is_valid(values[f][:, part]).all() for f, part, leaf in self._particular)):
-            self._name_invalid(values)
         return values
 
     def _name_invalid(self, values: Values) -> None:

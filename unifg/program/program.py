@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -17,19 +17,35 @@ from unifg.errors import GraphError
 from unifg.kernels.differences import convexified
 from unifg.language.statement import Statement
 from unifg.language.terms import Constraint, Cost, ScalarCost
-from unifg.language.variables import Binding, Data, Family
+from unifg.language.variables import Data, Family
 from unifg.machine.buffers import Buffers
 from unifg.program import passes
+from unifg.program.binding import Binding
+from unifg.program.by_term import ByTerm, Places
 from unifg.program.columns import Columns, Values
 from unifg.program.guess import GuessReader
 from unifg.program.linearization import Evaluation, Linearization, Rows
 from unifg.program.retraction import Retraction
 from unifg.program.systems import Systems
-from unifg.program.table import ENTRY, ROW, WIDTH, TermTable
+from unifg.program.table import ENTRY, PARAMETER, ROW, WIDTH, TermTable
 from unifg.program.term import CompiledTerm
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 T = TypeVar("T")
+
+
+class Reader(NamedTuple):
+    """Who reads a datum.
+
+    Attributes:
+        bound: terms that have to work something out from it.
+        told: terms whose kernels find it among their parameters, already renewed.
+        fixes: numbers of the fixes whose values it is.
+    """
+
+    bound: list[CompiledTerm]
+    told: list[CompiledTerm]
+    fixes: list[int]
 
 
 class Program:
@@ -45,6 +61,7 @@ class Program:
         lower, upper: (M,) limits with the present data.
         cost_terms, scalar_terms, constraint_terms: compiled terms in row order.
         slices: rows of each constraint term.
+        places: name, rows and shape of each constraint term.
         bound_rows: (M,) whether a row bounds an unknown itself.
         systems: the normal equations and KKT matrices, their structure found once.
         table: all terms as compiled loops take them.
@@ -84,6 +101,8 @@ class Program:
         self._found: dict[Callable[[Program], Any], Any] = {}
         self._cost_slices = _slices(self.cost_terms)
         self.slices = _slices(self.constraint_terms)
+        shaped = zip(self.constraint_terms, self.slices, strict=True)
+        self.places: Places = [(term.name, rows, (term.count, term.size)) for term, rows in shaped]
         self.bound_rows = np.zeros(self.constraints.count, dtype=bool)
         for term, rows in zip(self.constraint_terms, self.slices, strict=True):
             self.bound_rows[rows] = term.is_bound
@@ -94,8 +113,10 @@ class Program:
         self._names = [term.name for term in stacked]
         self.scratch = np.empty(self.table.scratch)
         self._buffers = Buffers([*self.table.sizes, self.columns.width, self.normal.nnz])
-        self._binding, self._fresh, self._vetted = Binding(graph._data), True, False
-        self.bind({})
+        read = {value for term in self.terms for value in term.data}
+        read |= {fix.value for fix in graph.fixes if isinstance(fix.value, Data)}
+        self._binding, self._vetted = Binding(graph._data, filter(read.__contains__, graph._data.values())), False
+        self._bind_first()
 
     @property
     def fully_compiled(self) -> bool:
@@ -121,26 +142,54 @@ class Program:
             GraphError: on unknown data, a changed shape, NaN, or crossed limits.
         """
         changed = self._binding.take(data)
-        self.data = self._binding.given
-        if not (changed or self._fresh):
+        if not changed:
             return
-        try:
-            rebound = [term for term in self.terms if term.data & changed and term.rebind(self.data, changed)]
-            limits = self._fresh or any(isinstance(term.term, Constraint) for term in rebound)
-            if limits:
-                self._bind_limits()
-        except GraphError:
-            self._binding.forget()
-            raise
-        if limits or rebound:
-            self.table.bind(self.terms if self._fresh else rebound, self.lower, self.upper)
-        for k, fix in enumerate(self.graph.fixes):
-            if not isinstance(fix.value, Data):
-                if self._fresh:
-                    self.retraction.bind(k, np.asarray(fix.value))
-            elif self._fresh or fix.value in changed:
-                self.retraction.bind(k, self.data.get(fix.value, fix.value.value))
-        self._fresh = False
+        readers = [self._readers[handle] for handle in changed]
+        for term in [term for reader in readers for term in reader.told]:
+            term.forget()
+        if rebound := list(dict.fromkeys(term for reader in readers for term in reader.bound)):
+            try:
+                for term in rebound:
+                    term.bind(self._binding.present)
+                if any(isinstance(term.term, Constraint) for term in rebound):
+                    self._bind_limits()
+            except GraphError:
+                self._binding.forget()
+                raise
+            self.table.bind(rebound, self.lower, self.upper)
+        for handle, reader in zip(changed, readers, strict=True):
+            for fix in reader.fixes:
+                self.retraction.bind(fix, self._binding.present[handle])
+
+    def _bind_first(self) -> None:
+        """Take the defaults, and find out what has to be done when a datum changes."""
+        binding, fixes = self._binding, self.graph.fixes
+        binding.take({})
+        for term in self.terms:
+            if term.data:
+                term.bind(binding.present)
+        self._bind_limits()
+        self.table.bind(self.terms, self.lower, self.upper)
+        self._readers: dict[Data, Reader] = {}
+        sources, targets = [], []
+        for handle in binding.present:
+            reader = self._readers[handle] = Reader([], [], [k for k, f in enumerate(fixes) if f.value is handle])
+            for term in self.terms:
+                if handle not in term.data:
+                    continue
+                places = term.parameters_of(handle)
+                (reader.bound if places is None else reader.told).append(term)
+                for place in places or ():
+                    sources.append(np.broadcast_to(binding.place(handle).reshape(-1, place.shape[1]), place.shape))
+                    targets.append(int(term.place[PARAMETER]) + place)
+        binding.carry(sources, targets, self.arrays.parameters)
+        for k, fix in enumerate(fixes):
+            value = binding.present[fix.value] if isinstance(fix.value, Data) else np.asarray(fix.value)
+            self.retraction.bind(k, value)
+
+    def by_term(self, stacked: Array) -> ByTerm:
+        """(M,) numbers of the constraint rows, viewed as (n, m) of every term."""
+        return ByTerm(self.places, stacked)
 
     def _bind_limits(self) -> None:
         self.lower = _stacked([c.lower for c in self.constraint_terms])
@@ -300,9 +349,9 @@ class Program:
             self._found[find] = find(self)
         return cast(T, self._found[find])
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Pickle without what can be found again."""
-        return {**self.__dict__, "_found": {}}
+    def __reduce__(self) -> tuple[Callable[[Statement], Program], tuple[Statement]]:
+        """Pickle the graph: addresses of machine code mean nothing elsewhere, nor do views of arrays."""
+        return compile_graph, (self.graph,)
 
     def row_name(self, row: int) -> tuple[str, int]:
         """Term and factor of a constraint row."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -49,8 +50,10 @@ class Retraction:
         self.parts = np.array(parts, dtype=np.int64).reshape(-1, 8)
         places = [columns.starts(fix.selection)[:, None] + np.arange(fix.selection.manifold.storage) for fix in fixes]
         self._fixed = np.concatenate([np.zeros(0, dtype=np.intp), *(place.ravel() for place in places)])
-        self._sizes = [place.shape for place in places]
         self._values = np.zeros(len(self._fixed))
+        ends = np.cumsum([0, *(place.size for place in places)]).tolist()
+        own = [self._values[first:last] for first, last in pairwise(ends)]
+        self._views = [part.reshape(place.shape) for part, place in zip(own, places, strict=True)]
 
     @property
     def compiled(self) -> bool:
@@ -59,9 +62,7 @@ class Retraction:
 
     def bind(self, which: int, value: Array) -> None:
         """Take the present value of one fix."""
-        count, storage = self._sizes[which]
-        start = sum(a * b for a, b in self._sizes[:which])
-        self._values[start : start + count * storage].reshape(count, storage)[:] = value
+        self._views[which][...] = value
 
     def fix(self, values: Values) -> None:
         """Write the values of fixed variables."""

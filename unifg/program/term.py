@@ -7,7 +7,7 @@ kernel, checks, and messages.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Set
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from math import prod
@@ -162,23 +162,22 @@ class CompiledTerm:
         if hasattr(self, "size"):
             self._bind_parameters(data)
 
-    def rebind(self, data: Bound, changed: Set[Data]) -> bool:
-        """Take changed data; True when more than parameters of the kernel had to be renewed."""
-        if not (mine := self.data & changed):
-            return False
-        places = [k for k, a in enumerate(self.term.arguments) if isinstance(a, Data) and a in mine]
-        if self.kernel is None or mine & self._shaping or not all(place in self._blocks for place in places):
-            self.bind(data)
-            return True
-        for place in places:
-            handle = self.term.arguments[place]
-            self._arguments[place] = value = data.get(handle, handle.value)
-            first, size = self._blocks[place]
-            self._packed[:, first : first + size] = value.reshape(-1, size)
+    def parameters_of(self, handle: Data) -> list[IntArray] | None:
+        """Where the kernel's parameters hold a datum: (rows, numbers) for each argument it is.
+
+        None when more than parameters of the kernel are made of it.
+        """
+        places = [k for k, argument in enumerate(self.term.arguments) if argument is handle]
+        if self.kernel is None or handle in self._shaping or not all(place in self._blocks for place in places):
+            return None
+        packed = np.arange(self._packed.size).reshape(self._packed.shape)
+        return [packed[:, first : first + size] for first, size in map(self._blocks.__getitem__, places)]
+
+    def forget(self) -> None:
+        """Data have changed in place."""
         self._batched.forget()
         if self._attached is not None:
             self._attached.forget()
-        return False
 
     def settle(self, parameters: Array) -> None:
         """Keep the parameters where the compiled loops read them."""
