@@ -9,11 +9,13 @@ partial of what is not chosen may be infinite.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from unifg.kernels.derive.operations import STEADY, Op
 from unifg.kernels.derive.tape import Tape
 
 Partials = list[tuple[int, int]]
+WAIST = 1  # waists that a node may depend on without being one
 
 
 def jacobian(tape: Tape, outputs: Sequence[int], width: int) -> dict[tuple[int, int], int]:
@@ -35,7 +37,8 @@ def gradient(tape: Tape, outputs: Sequence[int], rows: Sequence[bool]) -> dict[i
     for row, output in enumerate(outputs):
         if rows[row]:
             weighted = tape.add(weighted, tape.multiply(tape.leaf(Op.WEIGHT, row), output))
-    return _by_tangent(tape, _adjoints(tape, weighted))
+    waists = _waists(tape, [weighted])
+    return _by_tangent(tape, _adjoints(tape, waists, waists.outputs[0]))
 
 
 def hessian(tape: Tape, outputs: Sequence[int], width: int) -> dict[tuple[int, int], int]:
@@ -68,86 +71,108 @@ def bent(tape: Tape, outputs: Sequence[int]) -> list[bool]:
     return [degree[output] == 2 for output in outputs]
 
 
+@dataclass(frozen=True)
+class _Waists:
+    """Where the outputs' dependence on the tangent coordinates is narrow, and derivatives between those places.
+
+    Most nodes depend on all tangent coordinates by way of one or two others, as all of a power series on its argument.
+    Their derivatives by these are worked out once, and only the waists are swept.
+
+    Attributes:
+        order: waists, as they stand on the tape; all tangent coordinates are.
+        slopes: of every waist but those, its derivatives by waists before it.
+        outputs: of every output, its derivatives by waists.
+    """
+
+    order: list[int]
+    slopes: dict[int, dict[int, int]]
+    outputs: list[dict[int, int]]
+
+
+def _waists(tape: Tape, outputs: Sequence[int]) -> _Waists:
+    order, slopes, by = list[int](), dict[int, dict[int, int]](), dict[int, dict[int, int]]()
+    for i in tape.live(outputs):
+        op = tape.op[i]
+        if op == Op.TANGENT:
+            order.append(i)
+            by[i] = {i: tape.one}
+        elif op > Op.TANGENT and op not in STEADY:
+            found = _chosen(tape, i, by) if op == Op.SELECT else _chained(tape, i, by)
+            if len(found) > WAIST:
+                order.append(i)
+                slopes[i], found = found, {i: tape.one}
+            if found:
+                by[i] = found
+    return _Waists(order, slopes, [by.get(output, {}) for output in outputs])
+
+
+def _chosen(tape: Tape, i: int, by: dict[int, dict[int, int]]) -> dict[int, int]:
+    first, second = by.get(tape.b[i], {}), by.get(tape.c[i], {})
+    return {
+        waist: tape.select(tape.a[i], first.get(waist, tape.zero), second.get(waist, tape.zero))
+        for waist in (*first, *(waist for waist in second if waist not in first))
+    }
+
+
+def _chained(tape: Tape, i: int, by: dict[int, dict[int, int]]) -> dict[int, int]:
+    if not any(j in by for j in (tape.a[i], tape.b[i])):
+        return {}
+    found = dict[int, int]()
+    for argument, partial in _partials(tape, i):
+        for waist, slope in by.get(argument, {}).items():
+            found[waist] = tape.add(found.get(waist, tape.zero), tape.scaled(slope, partial))
+    return found
+
+
 def _forwards(tape: Tape, outputs: Sequence[int], width: int) -> dict[tuple[int, int], int]:
-    live = tape.live(outputs)
-    depends = _dependence(tape, live)
+    waists = _waists(tape, outputs)
     found = dict[tuple[int, int], int]()
-    partials = dict[int, Partials]()
     for k in range(width):
-        bit = 1 << k
         along = dict[int, int]()
-        for i in live:
-            if not depends[i] & bit:
-                continue
-            op = tape.op[i]
-            if op == Op.TANGENT:
+
+        def total(slopes: dict[int, int], along: dict[int, int] = along) -> int:
+            node = tape.zero
+            for waist, slope in slopes.items():
+                if waist in along:
+                    node = tape.add(node, tape.scaled(along[waist], slope))
+            return node
+
+        for i in waists.order:
+            if tape.op[i] != Op.TANGENT:
+                node = total(waists.slopes[i])
+                if node != tape.zero:
+                    along[i] = node
+            elif tape.a[i] == k:
                 along[i] = tape.one
-            elif op == Op.SELECT:
-                chosen, other = along.get(tape.b[i], tape.zero), along.get(tape.c[i], tape.zero)
-                along[i] = tape.select(tape.a[i], chosen, other)
-            else:
-                if i not in partials:
-                    partials[i] = _partials(tape, i)
-                total = tape.zero
-                for argument, partial in partials[i]:
-                    if argument in along:
-                        total = tape.add(total, tape.scaled(along[argument], partial))
-                along[i] = total
-        for row, output in enumerate(outputs):
-            node = along.get(output, tape.zero)
+        for row, slopes in enumerate(waists.outputs):
+            node = total(slopes)
             if node != tape.zero:
                 found[row, k] = node
     return found
 
 
 def _backwards(tape: Tape, outputs: Sequence[int]) -> dict[tuple[int, int], int]:
+    waists = _waists(tape, outputs)
     found = dict[tuple[int, int], int]()
-    for row, output in enumerate(outputs):
-        for k, node in _by_tangent(tape, _adjoints(tape, output)).items():
+    for row, slopes in enumerate(waists.outputs):
+        for k, node in _by_tangent(tape, _adjoints(tape, waists, slopes)).items():
             found[row, k] = node
     return found
 
 
-def _adjoints(tape: Tape, output: int) -> dict[int, int]:
-    """Derivative of one output by every node it depends on that moves with the tangent coordinates."""
-    live = tape.live([output])
-    depends = _dependence(tape, live)
-    adjoint = {output: tape.one}
-    for i in reversed(live):
-        if i not in adjoint or not depends[i] or tape.op[i] == Op.TANGENT:
+def _adjoints(tape: Tape, waists: _Waists, slopes: dict[int, int]) -> dict[int, int]:
+    """Derivative of one output by every waist; its derivatives by the last of them are given."""
+    adjoint = dict(slopes)
+    for i in reversed(waists.order):
+        if i not in adjoint or tape.op[i] == Op.TANGENT:
             continue
-        weight = adjoint[i]
-        if tape.op[i] == Op.SELECT:
-            condition = tape.a[i]
-            contributions = [
-                (tape.b[i], tape.select(condition, weight, tape.zero)),
-                (tape.c[i], tape.select(condition, tape.zero, weight)),
-            ]
-        else:
-            contributions = [(j, tape.scaled(weight, partial)) for j, partial in _partials(tape, i) if depends[j]]
-        for argument, contribution in contributions:
-            adjoint[argument] = tape.add(adjoint.get(argument, tape.zero), contribution)
+        for waist, slope in waists.slopes[i].items():
+            adjoint[waist] = tape.add(adjoint.get(waist, tape.zero), tape.scaled(adjoint[i], slope))
     return adjoint
 
 
 def _by_tangent(tape: Tape, adjoint: dict[int, int]) -> dict[int, int]:
     return {tape.a[i]: node for i, node in adjoint.items() if tape.op[i] == Op.TANGENT and node != tape.zero}
-
-
-def _dependence(tape: Tape, live: Sequence[int]) -> dict[int, int]:
-    """For every node, the tangent coordinates it moves with, as bits."""
-    depends = dict[int, int]()
-    for i in live:
-        op = tape.op[i]
-        if op <= Op.TANGENT or op in STEADY:
-            depends[i] = 1 << tape.a[i] if op == Op.TANGENT else 0
-        else:
-            bits = depends[tape.a[i]] if op != Op.SELECT else 0
-            for j in (tape.b[i], tape.c[i]):
-                if j >= 0:
-                    bits |= depends[j]
-            depends[i] = bits
-    return depends
 
 
 def _rest(tape: Tape, outputs: list[int]) -> Tape:

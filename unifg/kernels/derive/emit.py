@@ -26,6 +26,7 @@ def residual_code(name: str, tape: Tape, rows: Sequence[int], slopes: dict[tuple
     line.compute(rows)
     for row, node in enumerate(rows):
         line.store("%data3", row, node)
+    line.contract()
     line.write("%wanted = icmp ne i64 %shape4_0, 0", "br i1 %wanted, label %slopes, label %done", "slopes:")
     line.compute(slopes.values())
     for place in range(len(rows) * width):
@@ -37,6 +38,7 @@ def residual_code(name: str, tape: Tape, rows: Sequence[int], slopes: dict[tuple
 def second_code(name: str, tape: Tape, entries: dict[tuple[int, int], int], width: int) -> Native:
     """``second(v, p, table, w, S)``: the symmetric matrix whose upper half is given."""
     line = _Line(tape, {Op.VARIABLE: "%data0", Op.PARAMETER: "%data1", Op.WEIGHT: "%data3"})
+    line.contract()
     line.compute(entries.values())
     for place in range(width * width):
         row, column = divmod(place, width)
@@ -53,6 +55,7 @@ class _Line:
         self._values: dict[int, str] = {}  # what stands for a node
         self._truths: dict[int, str] = {}  # of comparisons: one bit
         self._called = dict[str, int]()  # number of arguments
+        self._liberty = ""
 
     def native(self, name: str, arguments: tuple[object, ...]) -> Native:
         """What is written, as machine code."""
@@ -65,6 +68,10 @@ class _Line:
     def write(self, *lines: str) -> None:
         """Put down instructions."""
         self._lines.extend(lines)
+
+    def contract(self) -> None:
+        """From here on a product and a sum may be rounded once, which derivatives gain from and rows need not."""
+        self._liberty = " contract"
 
     def compute(self, outputs: Iterable[int]) -> None:
         """Write what the outputs need and is not there yet."""
@@ -111,7 +118,7 @@ class _Line:
         else:
             x, y = self._number(a), "" if b < 0 else self._number(b)
             if op in _INSTRUCTIONS:
-                self.write(f"{name} = {_INSTRUCTIONS[Op(op)]} double {x}, {y}")
+                self.write(f"{name} = {_INSTRUCTIONS[Op(op)]}{self._liberty} double {x}, {y}")
             elif op == Op.NEGATE:
                 self.write(f"{name} = fneg double {x}")
             elif op in _COMPARISONS:
