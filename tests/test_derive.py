@@ -159,7 +159,7 @@ def evaluated(expression: Expression, variables: Array, parameters: Array) -> tu
     code = expression.residual()
     r = np.full((len(variables), len(expression.rows)), np.nan)
     J = np.full((*r.shape, expression.width), np.nan)
-    evaluate_rows(code.address, variables, parameters, np.zeros(0), r, J)
+    evaluate_rows(code.address, variables, parameters, expression.table, r, J)
     return r, J
 
 
@@ -169,7 +169,7 @@ def curved(expression: Expression, variables: Array, parameters: Array, weights:
     S = np.full((len(variables), expression.width, expression.width), np.nan)
     for k in range(len(variables)):
         shared = parameters[min(k, len(parameters) - 1)][None]
-        evaluate_rows(code.address, variables[k][None], shared, np.zeros(0), weights[k][None].copy(), S[k][None])
+        evaluate_rows(code.address, variables[k][None], shared, expression.table, weights[k][None].copy(), S[k][None])
     return S
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from own_manifolds import OWN
 from test_derive import compared, curved, evaluated, packed, points
 from unifg.kernels.derive.expression import traced
 from unifg.kernels.derive.symbols import TraceError
@@ -250,6 +251,30 @@ def test_a_manifold_is_moved_along_its_retraction() -> None:
 def test_a_retraction_too_short_for_second_derivatives_is_refused() -> None:
     with pytest.raises(TraceError, match=r"Careless, whose retraction .* terms up to the second"):
         traced(lambda x: x, (Careless(),))
+
+
+@pytest.mark.parametrize("manifold", OWN, ids=lambda manifold: manifold.name)
+def test_manifolds_that_know_nothing_of_tracing(manifold: fg.Manifold) -> None:
+    """Where points go, and their local coordinates: fourth-order differences along the manifold's own retraction."""
+    rng = np.random.default_rng(6)
+    x = manifold.random(rng, (3,))
+    y = manifold.retract(x, 0.3 * rng.normal(size=(3, manifold.dim)))
+    expression = traced(lambda x, y: manifold.local(x, y), (manifold, manifold))
+    variables, parameters = packed((manifold, manifold), (x, y))
+    r, J = evaluated(expression, variables, parameters)
+    np.testing.assert_allclose(r, manifold.local(x, y), rtol=0, atol=1e-12)
+    w, h, d = rng.normal(size=r.shape), 1e-3, rng.normal(size=(3, 2 * manifold.dim))
+    S = curved(expression, variables, parameters, w)
+
+    def along(t: float) -> Any:
+        moved = manifold.retract(x, t * d[:, : manifold.dim]), manifold.retract(y, t * d[:, manifold.dim :])
+        return manifold.local(*moved)
+
+    slope = (8.0 * (along(h) - along(-h)) - (along(2 * h) - along(-2 * h))) / (12.0 * h)
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", J, d), slope, rtol=0, atol=1e-8)
+    bend = (16.0 * (along(h) + along(-h)) - (along(2 * h) + along(-2 * h)) - 30.0 * along(0.0)) / (12.0 * h * h)
+    found = np.einsum("nij,ni,nj->n", S, d, d)
+    np.testing.assert_allclose(found, np.sum(w * bend, axis=1), rtol=0, atol=1e-5 * (1 + np.abs(found).max()))
 
 
 # ---------------------------------------------------------------- functions that decide

@@ -201,6 +201,10 @@ def _partials(tape: Tape, i: int) -> Partials:
         lower = t.power(a, t.subtract(b, one))
         found = [(a, t.multiply(b, lower))]
         return found if t.is_constant(b) else [*found, (b, t.multiply(i, t.apply(Op.LOG, a)))]
+    if op == Op.COS and (length := _vanishing_length(t, a)) is not None:
+        # The cosine of a length has derivatives where that is zero, which the length has not: by its power series.
+        scale, square = length
+        return [(square, t.constant(-0.5 * scale)), (square, t.multiply(square, t.constant(scale * scale / 12.0)))]
     if op == Op.FMOD:
         ratio = t.divide(a, b)
         whole = t.multiply(t.apply(Op.SIGN, ratio), t.apply(Op.FLOOR, t.apply(Op.ABSOLUTE, ratio)))
@@ -212,6 +216,20 @@ def _partials(tape: Tape, i: int) -> Partials:
         return [(a, t.select(first, one, t.zero)), (b, t.select(first, t.zero, one))]
     slope = _slope(tape, op, i, a)
     return [] if slope == t.zero else [(a, slope)]
+
+
+def _vanishing_length(tape: Tape, i: int) -> tuple[float, int] | None:
+    """Of c sqrt(u), with u zero where all tangent coordinates are: the number c^2, and u."""
+    scale = 1.0
+    if tape.op[i] == Op.MULTIPLY:
+        for factor, rest in ((tape.a[i], tape.b[i]), (tape.b[i], tape.a[i])):
+            if tape.is_constant(factor):
+                scale, i = tape.value[factor], rest
+                break
+    if tape.op[i] != Op.SQRT:
+        return None
+    still, (node,) = tape.at_rest([tape.a[i]])
+    return (scale * scale, tape.a[i]) if node == still.zero else None
 
 
 def _slope(t: Tape, op: int, i: int, a: int) -> int:

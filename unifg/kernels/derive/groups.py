@@ -275,7 +275,8 @@ MATRICES: dict[Hashable, Callable[[Numbers], list[list[Any]]]] = {
     ],
 }
 
-KINDS = {type(group) for group in (SO2, SE2, SO3, SE3)}
+GROUPS = (SO2, SE2, SO3, SE3)
+KINDS = {type(group) for group in GROUPS}
 
 
 def closed_form(manifold: Manifold, name: str) -> Callable[..., Any] | None:

@@ -22,7 +22,7 @@ import numpy as np
 
 from unifg.kernels.derive.branches import every_way
 from unifg.kernels.derive.calculus import hessian, jacobian
-from unifg.kernels.derive.groups import closed_form, moved_closed
+from unifg.kernels.derive.groups import GROUPS, closed_form, moved_closed
 from unifg.kernels.derive.operations import Op
 from unifg.kernels.derive.symbols import Symbol, Symbols, TraceError, holds_symbols, node_of, symbols
 from unifg.kernels.derive.tape import Tape
@@ -34,8 +34,30 @@ Source: TypeAlias = Callable[[Any], Callable[..., Any]]
 """Makes of a function one that can be run on symbols."""
 Numbers: TypeAlias = Sequence[Any]
 NEAR = 1e-3  # step of the differences that a retraction is compared by
+POINTS = 2
 CLOSE = 1e-5  # how well they agree
-_confirmed: dict[Hashable, str] = {}  # what was found wrong with moving the points of a manifold: nothing, mostly
+_ways: dict[Hashable, Callable[..., list[Any]] | None] = {}  # how the points of a manifold are moved rightly
+
+_exponentials: dict[Hashable, tuple[Array, Array]] = {}  # their derivatives at zero
+
+
+def stated_closed() -> dict[int, Callable[..., None]]:
+    """The compiled functions of the groups here, by their ids, as closed forms that write symbols."""
+
+    def writer(closed: Callable[..., Any]) -> Callable[..., None]:
+        def write(*arguments: Any) -> None:
+            *given, out = arguments
+            out[...] = np.array(closed(*(list(part) for part in given)), dtype=object)
+
+        return write
+
+    found = {}
+    for group in GROUPS:
+        for name in LAYOUTS:
+            function, closed = stated(type(group), name), closed_form(group, name)
+            if function is not None and closed is not None:
+                found[id(function)] = writer(closed)
+    return found
 
 
 class Symbolic:
@@ -186,12 +208,16 @@ def moved(manifold: Manifold, point: Numbers, step: Numbers, source: Source) -> 
     closed = moved_closed(manifold, point, step)
     if closed is not None:
         return closed
-    way: Callable[..., list[Any]] = _by_product if isinstance(manifold, LieGroup) else _by_retraction
     key = cast(Hashable, manifold)
-    if key not in _confirmed:
-        _confirmed[key] = _what_is_wrong(manifold, way, source)
-    if _confirmed[key]:
-        raise TraceError(_confirmed[key])
+    if key not in _ways:
+        ways = (_by_product, _by_retraction) if isinstance(manifold, LieGroup) else (_by_retraction,)
+        _ways[key] = next((way for way in ways if _is_right(manifold, way, source)), None)
+    way = _ways[key]
+    if way is None:
+        raise TraceError(
+            f"a variable lies on {manifold.name}, whose retraction as it is written has other second derivatives at "
+            "zero than it has near it: a series there needs terms up to the second"
+        )
     return way(manifold, point, step, source)
 
 
@@ -199,8 +225,10 @@ def _by_retraction(manifold: Manifold, point: Numbers, step: Numbers, source: So
     return list(operate(manifold, "retract", source, point, step))
 
 
-def _by_product(group: LieGroup, point: Numbers, step: Numbers, source: Source) -> list[Any]:
-    by_step, bend = _exponential(group, source)
+def _by_product(group: Any, point: Numbers, step: Numbers, source: Source) -> list[Any]:
+    if group not in _exponentials:
+        _exponentials[group] = _exponential(group, source)
+    by_step, bend = _exponentials[group]
     small = list(group.identity())
     for i in range(group.storage):
         for j in range(group.dim):
@@ -238,30 +266,35 @@ def _at_rest(tape: Tape, entries: dict[tuple[int, int], int], shape: tuple[int, 
     return found
 
 
-def _what_is_wrong(manifold: Manifold, way: Callable[..., list[Any]], source: Source) -> str:
-    """Compare the derivatives of moved points with differences of the manifold's own retraction."""
+def _is_right(manifold: Manifold, way: Callable[..., list[Any]], source: Source) -> bool:
+    """Whether points moved this way have the derivatives that differences of the manifold's own retraction have."""
     dim, storage = manifold.dim, manifold.storage
     tape = Tape()
-    x = np.asarray(manifold.random(np.random.default_rng(0)), dtype=np.float64)
     step = [Symbol(tape, tape.leaf(Op.TANGENT, k)) for k in range(dim)]
     point = [Symbol(tape, tape.leaf(Op.VARIABLE, k)) for k in range(storage)]
-    rows = [node_of(tape, entry) for entry in way(manifold, point, step, source)]
-    units = NEAR * np.eye(dim)
-    pairs = [(j, k) for j in range(dim) for k in range(j, dim)]
-    ahead = manifold.retract(x, np.array([a * units[j] + b * units[k] for j, k in pairs for a, b in _CORNERS]))
-    corners = np.asarray(ahead).reshape(len(pairs), len(_CORNERS), storage)
-    expected = np.einsum("c,pcs->ps", _SIGNS, corners) / (4.0 * NEAR**2)
-    scale = 1.0 + float(np.abs(x).max())
-    for i, row in enumerate(rows):
-        entries = hessian(tape, [row], dim)
-        value = dict(zip(entries, tape.evaluate(list(entries.values()), x.tolist(), ()), strict=True))
-        found = np.array([value.get(pair, 0.0) for pair in pairs])
-        if not np.abs(found - expected[:, i]).max() <= CLOSE * scale:
-            return (
-                f"a variable lies on {manifold.name}, whose retraction as it is written has other second derivatives "
-                "at zero than it has near it: a series there needs terms up to the second"
-            )
-    return ""
+    try:
+        rows = [node_of(tape, entry) for entry in way(manifold, point, step, source)]
+    except TraceError:
+        if way is _by_product:  # its exponential may be out of reach where its retraction is not
+            return False
+        raise
+    first, second = jacobian(tape, rows, dim), [hessian(tape, [row], dim) for row in rows]
+    units, pairs = NEAR * np.eye(dim), [(j, k) for j in range(dim) for k in range(j, dim)]
+    corners = np.array([a * units[j] + b * units[k] for j, k in pairs for a, b in _CORNERS])
+    for x in np.asarray(manifold.random(np.random.default_rng(0), (POINTS,)), dtype=np.float64):
+        moved_there = np.asarray(manifold.retract(x, corners)).reshape(len(pairs), len(_CORNERS), storage)
+        bend = np.einsum("c,pcs->ps", _SIGNS, moved_there) / (4.0 * NEAR**2)
+        slope = np.asarray(manifold.retract(x, units)) - np.asarray(manifold.retract(x, -units))
+        scale = 1.0 + float(np.abs(x).max())
+        values = dict(zip(first, tape.evaluate(list(first.values()), x.tolist(), ()), strict=True))
+        found = np.array([[values.get((i, k), 0.0) for i in range(storage)] for k in range(dim)])
+        if not np.abs(found - slope / (2.0 * NEAR)).max() <= CLOSE * scale:
+            return False
+        for i, entries in enumerate(second):
+            values = dict(zip(entries, tape.evaluate(list(entries.values()), x.tolist(), ()), strict=True))
+            if not np.abs(np.array([values.get(pair, 0.0) for pair in pairs]) - bend[:, i]).max() <= CLOSE * scale:
+                return False
+    return True
 
 
 _CORNERS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))

@@ -19,7 +19,7 @@ import numpy as np
 
 from unifg.kernels.derive.branches import every_way
 from unifg.kernels.derive.groups import wrap
-from unifg.kernels.derive.symbolic import Symbolic
+from unifg.kernels.derive.symbolic import Symbolic, stated_closed
 from unifg.kernels.derive.symbols import UFUNCS, Symbol, Symbols, TraceError, node_of, plain, symbols, wrapped
 from unifg.kernels.derive.tape import Tape
 from unifg.lie import ManifoldBase, Product, so2, wrap_angle
@@ -253,8 +253,9 @@ _MAKERS = {
     "zeros": _filled(0.0), "empty": _filled(0.0), "ones": _filled(1.0), "full": _full, "eye": _eye, "identity": _eye,
     "atleast_1d": lambda a: _as_array(a) if np.ndim(a) else _as_array(a).reshape(1),
 }  # fmt: skip
-# Views and arrays on the stack, as compiled functions of this library take them.
+# The functions of groups, views, and arrays on the stack, as compiled functions of this library call them.
 BORROWED: dict[int, Callable[..., Any]] = {
+    **stated_closed(),
     id(calls.local_vector): lambda length: symbols((length,)),
     id(calls.local_matrix): lambda rows, columns: symbols((rows, columns)),
     id(calls.vector): lambda array, start, length: array[start : start + length],
