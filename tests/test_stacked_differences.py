@@ -57,8 +57,9 @@ class Counted:
 
 
 def chain(function: Callable[..., Array], *more: Any) -> tuple[Program, Linearization]:
-    """A graph of one dynamics term, at the points above."""
+    """A graph of one dynamics term evaluated by NumPy, at the points above."""
     graph = fg.Graph()
+    function = fg.residual(function, derivatives="differences")
     x, u = graph.variables("x", fg.Rn(STATES), N + 1), graph.variables("u", fg.Rn(CONTROLS), N)
     graph.constrain(function, x[:-1], u, x[1:], *more, lower=0.0, upper=0.0, name="motion")
     program = graph.compile()
@@ -68,7 +69,7 @@ def chain(function: Callable[..., Array], *more: Any) -> tuple[Program, Lineariz
 
 def second(program: Program, lin: Linearization, pull: Array = PULL) -> Array:
     """(N, 27, 27) second derivatives of the one term."""
-    return program.batched[0].second_derivatives(lin.values, pull)
+    return program.terms[0].second_derivatives(lin.values, pull)
 
 
 @pytest.mark.parametrize("function", [straight, bent])
@@ -119,9 +120,13 @@ def test_rows_without_weight_have_no_second_derivatives() -> None:
 ALIKE = ("knows its rows", "knows the index", "counts", "one by one", "given rows", "given each", "shared by chance")
 
 
+@pytest.mark.parametrize("derivatives", ["differences", None])
 @pytest.mark.parametrize("which", ALIKE)
-def test_functions_that_know_their_batch(which: str) -> None:
-    """Long batches are for functions of one factor after the other; all others get what they were written for."""
+def test_functions_that_know_their_batch(which: str, derivatives: Any) -> None:
+    """Long batches are for functions of one factor after the other; all others get what they were written for.
+
+    So are traces, of which the last three are.
+    """
     index = np.arange(N)
     more: tuple[Any, ...] = ()
     weight = ROWS
@@ -149,7 +154,8 @@ def test_functions_that_know_their_batch(which: str) -> None:
     x, u = graph.variables("x", fg.Rn(STATES), N + 1), graph.variables("u", fg.Rn(CONTROLS), N)
     if which == "given each":
         more = (graph.data("rows", ROWS, each=True),)
-    graph.constrain(function, x[:-1], u, x[1:], *more, lower=0.0, upper=0.0, name="motion")
+    stated = fg.residual(function, derivatives=derivatives)
+    graph.constrain(stated, x[:-1], u, x[1:], *more, lower=0.0, upper=0.0, name="motion")
     program = graph.compile()
     program.bind({})
     lin = program.linearize(program.values_from({x: X, u: U}))
@@ -157,7 +163,7 @@ def test_functions_that_know_their_batch(which: str) -> None:
     diagonal = np.arange(STATES)
     expected[:, diagonal, diagonal] += 2.0 * PULL * weight
     np.testing.assert_allclose(second(program, lin), expected, atol=1e-5)
-    slope = program.batched[0].jacobians(lin.values)[1]
+    slope = program.terms[0].jacobians(lin.values)[1]
     gain = np.tile(-SLOPE[:, STATES:], (N, 1, 1))
     gain[:, 0, 0] += X[:-1, 3]
     np.testing.assert_allclose(slope, gain, atol=1e-8)
@@ -180,28 +186,31 @@ def test_a_function_may_refuse_points_that_only_the_trial_asks_for() -> None:
     np.testing.assert_allclose(lin.jacobian.reshape(3, 2, 2), np.tile(np.eye(2), (3, 1, 1)), atol=1e-9)
 
 
-def test_rows_for_each_factor_may_change() -> None:
+@pytest.mark.parametrize("derivatives", ["differences", "trace"])
+def test_rows_for_each_factor_may_change(derivatives: Any) -> None:
     graph = fg.Graph()
     x = graph.variables("x", fg.Rn(2), 5)
     own = graph.data("own", np.ones((5, 2)), each=True)
-    graph.minimize(lambda x, own: own * x**2, x, own, name="term")
+    graph.minimize(fg.residual(lambda x, own: own * x**2, derivatives=derivatives), x, own, name="term")
     program = graph.compile()
     for scale in (1.0, 3.0):
         program.bind({own: np.full((5, 2), scale)})
         values = program.values_from({x: np.ones((5, 2))})
-        found = program.batched[0].second_derivatives(values, np.ones((5, 2)))
+        found = program.terms[0].second_derivatives(values, np.ones((5, 2)))
         np.testing.assert_allclose(found, np.tile(2.0 * scale * np.eye(2), (5, 1, 1)), atol=1e-6)
 
 
-def test_a_term_may_be_straight_at_one_point_and_bent_at_another() -> None:
+@pytest.mark.parametrize("derivatives", ["differences", "trace"])
+def test_a_term_may_be_straight_at_one_point_and_bent_at_another(derivatives: Any) -> None:
     """What was straight is looked at again: a hinge that does not bite at the guess bends later."""
     graph = fg.Graph()
     x = graph.variables("x", fg.Rn(3), 4)
-    graph.constrain(lambda x: np.maximum(x[:, :1] - 1.0, 0.0) * x[:, 1:2], x, upper=0.0, name="hinge")
+    hinge = fg.residual(lambda x: np.maximum(x[:, :1] - 1.0, 0.0) * x[:, 1:2], derivatives=derivatives)
+    graph.constrain(hinge, x, upper=0.0, name="hinge")
     program = graph.compile()
     program.bind({})
     at = np.zeros((4, 3))
-    term, pull = program.batched[0], np.ones((4, 1))
+    term, pull = program.terms[0], np.ones((4, 1))
     assert not term.second_derivatives(program.values_from({x: at}), pull).any()
     at[2] = 2.0, 5.0, 0.0
     expected = np.zeros((4, 3, 3))

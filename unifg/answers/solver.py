@@ -128,6 +128,8 @@ class Solver(Backend):
         """Compile the graph and allocate the backend's workspaces for repeated solves."""
         program = compile_graph(graph)
         self.require(program)
+        if not program.least_squares:  # there, curvature is asked for in rare cases only
+            program.table.require_second()
         return Prepared(self, program)
 
     def require(self, program: Program) -> None:

@@ -84,6 +84,10 @@ class Batched:
             if isinstance(given, np.ndarray) and given.tobytes() != kept.tobytes():
                 raise GraphError(changes(self.name, place), term=self.name)
 
+    def on_copies(self, points: Sequence[Array]) -> Array:
+        """The same as :meth:`at`, of a function that may write into what it is given."""
+        return self._vetted([a.copy() if isinstance(a, np.ndarray) else a for a in self.fill(points)])
+
     def _vetted(self, arguments: list[Any]) -> Array:
         try:
             result = self.function(*arguments)

@@ -139,6 +139,16 @@ class Kernel:
         ends = np.cumsum([manifold.dim for manifold in self.manifolds])
         return np.split(blocks, ends[:-1], axis=2)
 
+    def second_derivatives(self, weights: Array, *arguments: Any) -> Array:
+        """(n, D, D) Hessians of weights' r, weights (n, m), of a kernel that comes with them or is linear."""
+        variables, parameters, _ = self.split(arguments, len(weights))
+        width = sum(manifold.dim for manifold in self.manifolds)
+        second = np.zeros((len(weights), width, width))
+        if self.second_address and len(weights):
+            packed, shared = side_by_side(variables, len(weights)), side_by_side(parameters)
+            evaluate_rows(self.second_address, packed, shared, self.table, np.ascontiguousarray(weights), second)
+        return second
+
     def _run(self, arguments: Sequence[Any], derive: bool) -> tuple[Array, Array]:
         variables, parameters, count = self.split(arguments, None)
         m = self.size([parameter.shape[1:] for parameter in parameters])
@@ -165,12 +175,12 @@ def side_by_side(parts: Sequence[Array], count: int = 1) -> Array:
 def evaluate_rows(
     where: int, variables: Array, parameters: Array, table: Array, residual: Array, jacobian: Array
 ) -> None:
-    """Run one kernel over rows of its arguments."""
+    """Run one kernel, or its second derivatives, over rows of its arguments."""
     count, rows = residual.shape
     v, p, r, J = variables.ravel(), parameters.ravel(), residual.reshape(count * rows), jacobian.ravel()
     storage, size, width = variables.shape[1], parameters.shape[1], jacobian.shape[2]
     shared = parameters.shape[0] == 1
-    derive = rows if len(jacobian) else 0
+    derive = jacobian.shape[1]
     for i in range(count):
         call_residual(
             where,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from unifg.errors import GraphError
 from unifg.kernels.kernel import Kernel
@@ -13,6 +13,7 @@ from unifg.typing import Array
 
 Function: TypeAlias = Callable[..., Array]
 JacobianFunction: TypeAlias = Callable[..., Sequence[Array]]
+Derivatives: TypeAlias = Literal["trace", "differences"]
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Residual:
         kernel: ``function`` and ``jacobian`` for one factor, compiled; graphs run it in one loop with all others.
         search_kernel: the same with ``search`` in the place of the Jacobian.
         rows: m, of a ``function`` that a user has compiled for one factor.
+        derivatives: "trace" to insist on exact ones, "differences" to refuse them, empty for what is possible.
     """
 
     function: Function
@@ -38,6 +40,7 @@ class Residual:
     kernel: Kernel | None = None
     search_kernel: Kernel | None = None
     rows: int = 0
+    derivatives: str = ""
 
     def __call__(self, *arguments: Any) -> Array:
         """Evaluate the residual."""
@@ -50,6 +53,7 @@ def residual(
     name: str = "",
     search: JacobianFunction | Kernel | None = None,
     rows: int = 0,
+    derivatives: Derivatives | None = None,
 ) -> Residual:
     """Attach a Jacobian and a name to a function.
 
@@ -67,10 +71,17 @@ def residual(
             for each parameter, and the (m,) residual to be written last. A parameter array with two axes holds one
             row per factor; numbers and vectors are shared. ``jacobian``, if given, is compiled too and takes one
             (m, d_k) block per variable in the place of r.
+        derivatives: of a function without a Jacobian. None: it is traced (run once on symbols, differentiated
+            exactly and made into machine code) where that is possible, and differenced where it is not, which
+            ``graph.check`` and the log say. "trace" makes the second an error, and traces also functions that reach
+            what may change (methods, instances, dictionaries: their present content is compiled in) and those with a
+            Jacobian, which then only serves comparison. "differences" leaves the function as it is.
 
     Raises:
         GraphError: for a compiled function without ``rows``.
     """
+    if derivatives not in (None, "trace", "differences"):
+        raise GraphError(f"derivatives must be 'trace' or 'differences', found {derivatives!r}")
     search_kernel = search if isinstance(search, Kernel) else None
     looked_in = search.jacobian if isinstance(search, Kernel) else search
     own = is_compiled(function)
@@ -81,7 +92,12 @@ def residual(
     if isinstance(function, Kernel) and jacobian is None:
         return Residual(function, function.jacobian, name or function.name, looked_in, function, search_kernel)
     return Residual(
-        function, jacobian, name or getattr(function, "__name__", "residual"), looked_in, rows=rows if own else 0
+        function,
+        jacobian,
+        name or getattr(function, "__name__", "residual"),
+        looked_in,
+        rows=rows if own else 0,
+        derivatives=derivatives or "",
     )
 
 

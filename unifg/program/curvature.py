@@ -82,6 +82,7 @@ def lagrangian_hessian(program: Program, lin: Linearization, multipliers: Array)
         lin: where.
         multipliers: (M,).
     """
+    program.table.require_second()
     entries = lin.hessian + lin.concavity if len(lin.concavity) else lin.hessian.copy()
     add_curvature(program.arrays, lin.values.flat, lin.residual, lin.weights, multipliers, entries)
     if program.table.robust:
@@ -93,6 +94,7 @@ def lagrangian_hessian(program: Program, lin: Linearization, multipliers: Array)
 
 def constraint_curvature(program: Program, lin: Linearization, multipliers: Array) -> Array:
     """Hessian of multipliers' g alone, in the order of ``Program.normal``; arguments as above."""
+    program.table.require_second()
     entries = np.zeros(program.normal.nnz)
     add_curvature(program.arrays, lin.values.flat, np.zeros(len(lin.residual)), lin.weights, multipliers, entries)
     for term in program.batched:

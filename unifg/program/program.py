@@ -113,6 +113,7 @@ class Program:
         self._names = [term.name for term in stacked]
         self.scratch = np.empty(self.table.scratch)
         self._buffers = Buffers([*self.table.sizes, self.columns.width, self.normal.nnz])
+        self._watched: list[CompiledTerm] = []
         read = {value for term in self.terms for value in term.data}
         read |= {fix.value for fix in graph.fixes if isinstance(fix.value, Data)}
         self._binding, self._vetted = Binding(graph._data, filter(read.__contains__, graph._data.values())), False
@@ -210,8 +211,24 @@ class Program:
         if not self._vetted:
             for term in self.terms:
                 term.require_clean(values)
+                if not term.stands(values):
+                    self._give_up(term)
             self._vetted = True
+            self._watched = [term for term in self.terms if term.trace is not None and not term.trace.fixed]
+        for term in self._watched:
+            if term.trace is not None and term.trace.outdated:
+                if term.trace_again(values):
+                    self.table.renew(term)
+                    self.table.bind([term], self.lower, self.upper)
+                else:
+                    self._give_up(term)
         return values
+
+    def _give_up(self, term: CompiledTerm) -> None:
+        """Leave a term that was traced to Python."""
+        self.table.give_up(term)
+        self.batched.append(term)
+        self.differenced = True
 
     def retract(self, values: Values, step: Array) -> Values:
         """Move the unknowns by a tangent step; fixed variables stay."""

@@ -110,6 +110,7 @@ class TermTable:
     def __init__(self, terms: Sequence[CompiledTerm], columns: Columns, normal: Symmetric) -> None:
         """Lay everything out; numbers come with :meth:`bind`."""
         self._terms = terms
+        self._second = False
         self._columns = columns
         fields = np.zeros((len(terms), FIELDS), dtype=np.int64)
         gather, sizes, tangent = [], [], []
@@ -135,7 +136,7 @@ class TermTable:
             )
             row[ACTIVE], row[WEIGHT] = -1, -1
             row[PART] = len(parts)
-            if term.kernel is not None and not term.kernel.linear:
+            if term.kernel is not None and (term.trace is not None or not term.kernel.linear):
                 parts += movable_parts(term.kernel.manifolds)
             row[PARTS] = len(parts) - row[PART]
             row[DIFFERENCED] = term.differenced
@@ -151,7 +152,8 @@ class TermTable:
             self.scratch = max(self.scratch, sum(layout.sizes) + m * layout.kernel_width)
             row[PARAMETERS], row[SPREAD], row[WHITEN] = term.parameter_count, term.parameter_spread, term.whitening
             if term.kernel is not None:
-                row[ADDRESS], row[SECOND] = term.kernel.address, term.kernel.second_address
+                row[ADDRESS] = term.kernel.address
+                row[SECOND] = 0 if term.trace is not None else term.kernel.second_address
                 row[TABLE], row[TABLE_SIZE] = term.kernel.table.ctypes.data, term.kernel.table.size
             if term.search_kernel is not None:
                 row[SEARCH] = term.search_kernel.address
@@ -179,6 +181,8 @@ class TermTable:
                 self.constraints += count * m
                 self.constraint_entries += entries
             term.place = row
+            if term.trace is not None:
+                self.renew(term)
         self.holding = HELD in fields[:, LOSS]
         self.sizes = self.residuals, self.entries, self.constraints, self.constraint_entries
         counts = fields[:, COUNT]
@@ -200,6 +204,28 @@ class TermTable:
         for place, pair in losses.items():
             self.arrays.parameters[place : place + 2] = pair
         locate(fields, self.arrays.columns, self.arrays.unknown, normal.indptr, normal.indices, self.arrays.positions)
+
+    def renew(self, term: CompiledTerm) -> None:
+        """Take the machine code of a traced term; the numbers of its parameters have not changed."""
+        row, kernel = term.place, term.kernel
+        assert kernel is not None
+        row[ADDRESS] = kernel.address
+        row[SECOND] = kernel.second_address if self._second else 0
+        row[PARTS] = 0 if kernel.linear else len(movable_parts(kernel.manifolds))
+
+    def give_up(self, term: CompiledTerm) -> None:
+        """Leave a term to Python; its rows and entries stay where they are."""
+        row = term.place
+        row[ADDRESS] = row[SECOND] = row[PARTS] = 0
+        row[DIFFERENCED] = self.differenced = True
+
+    def require_second(self) -> None:
+        """Have second derivatives of derived kernels generated, which not every solver needs."""
+        if not self._second:
+            for term in self._terms:
+                if term.trace is not None and term.kernel is not None:
+                    term.place[SECOND] = term.kernel.second_address
+            self._second = True
 
     def bind(self, rebound: Sequence[CompiledTerm], lower: Array, upper: Array) -> None:
         """Copy limits and everything that some terms have bound; their parameters live here from then on."""

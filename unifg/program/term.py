@@ -35,10 +35,13 @@ from unifg.language.terms import Constraint, Cost, Parameter, ScalarCost, Term
 from unifg.language.variables import Data, Selection
 from unifg.lie import Manifold
 from unifg.program.columns import Columns, Values
+from unifg.program.traced import Batch, Trace, find, reason
 from unifg.typing import Array, BoolArray, IntArray
 
 Bound: TypeAlias = Mapping[Data, Array]
 logger = logging.getLogger("unifg")
+CHANGES = 3  # of what a traced function reads beyond its arguments, before it is left to Python
+_SEARCHED = "evaluated by Python, its derivatives attached: its search Jacobian belongs to another kernel"
 
 
 class Gather:
@@ -98,13 +101,21 @@ class CompiledTerm:
         columns: (n, d_k) full tangent columns of each variable argument.
         data: all data the term reads.
         differenced: whether the Jacobian of a term that is no scalar cost is made of differences.
+        trace: of a plain function that has been traced.
+        route: how it is evaluated and differentiated, in words.
     """
 
     parameters: Array
     _packed: Array
 
-    def __init__(self, term: Term, columns: Columns) -> None:
-        """Find the residual's dimension by one evaluation at identity elements."""
+    def __init__(self, term: Term, columns: Columns, trace: bool = True) -> None:
+        """Find the residual's dimension by one evaluation at identity elements.
+
+        Args:
+            term: what the user stated.
+            columns: numbering of the tangent coordinates.
+            trace: whether plain functions are traced.
+        """
         self.term = term
         self.name = term.name
         self.count = term.count
@@ -125,15 +136,15 @@ class CompiledTerm:
         self._shaping = frozenset(value for value in shaping if isinstance(value, Data))
         self.data = self._shaping | {argument for argument in term.arguments if isinstance(argument, Data)}
         self._blocks: dict[int, tuple[int, int]] = {}
+        self._taken = tuple(range(len(term.arguments)))
+        self.trace: Trace | None = None
+        self._changes = 0
         self.bind({})
         if term.residual.rows and not isinstance(term, ScalarCost):
             self.kernel = self._own_kernel()
             self._batched.function, self._jacobian = self.kernel, self.kernel.jacobian
         if self.kernel is not None:
             self._require_manifolds(self.kernel)
-        self.differenced = (
-            self._jacobian is None and not self.is_bound if self.kernel is None else self.kernel.differenced
-        )
         with np.errstate(all="ignore"):
             trial = self._batched.at([np.tile(m.identity(), (self.count, 1)) for m in self.manifolds])
         scalar = isinstance(term, ScalarCost)
@@ -146,12 +157,117 @@ class CompiledTerm:
             )
         self.size = 1 if scalar else trial.shape[1]
         self.shape = trial.shape
+        self.route = self._choose_route(trace)
+        self.differenced = (
+            self._jacobian is None and not self.is_bound if self.kernel is None else self.kernel.differenced
+        )
         self._bind_parameters({})
         if isinstance(self.term, Cost) and isinstance(self.term.information, np.ndarray):
             _notice_no_information(self.name, self.whitener)
 
+    def _choose_route(self, trace: bool) -> str:
+        """Trace a plain function if that is possible; how the term is evaluated.
+
+        Raises:
+            GraphError: it must be traced, and cannot be; or its rows depend on other factors.
+        """
+        own = self.term.residual
+        if self.is_bound:
+            return "the variable itself"
+        if own.kernel is not None:
+            return "a kernel that ships, its derivatives exact" if self.kernel is not None else _SEARCHED
+        if own.rows:
+            return "compiled by Numba, its derivatives " + ("attached" if own.jacobian else "by differences")
+        asked, scalar = own.derivatives == "trace", isinstance(self.term, ScalarCost)
+        if own.jacobian is not None and not asked:
+            return "evaluated by Python, its derivatives attached"
+        why = "it has a search Jacobian" if own.search else ""
+        if own.derivatives == "differences" or not trace or scalar:
+            why = "as it was asked to be"
+        if not why:
+            self.trace, why = find(self._batch, own.function, asked)
+        if self.trace is None:
+            return self._by_python(why)
+        self.kernel, self._taken, self._jacobian = self.trace.kernel, self.trace.taken, self._exact
+        logger.info("term '%s' was traced: its derivatives are exact", self.name)
+        return "traced, its derivatives exact"
+
+    def _by_python(self, why: str) -> str:
+        if why and self.term.residual.derivatives != "differences":
+            logger.warning("term '%s' is evaluated by Python and differenced: %s", self.name, why)
+        return "evaluated by Python, its derivatives by differences" + (f": {why}" if why else "")
+
+    @property
+    def _batch(self) -> Batch:
+        shared = [gather.shared for gather in self.gathers]
+        return Batch(
+            self.name,
+            self._batched,
+            self.term.arguments,
+            self._arguments,
+            self.manifolds,
+            shared,
+            self.count,
+            self.size,
+        )
+
+    def _exact(self, *arguments: Any) -> list[Array]:
+        """Jacobian of a derived kernel, of the arguments of the function it was derived from."""
+        assert self.kernel is not None
+        return self.kernel.jacobian(*(arguments[place] for place in self._taken))
+
+    def _for_kernel(self, points: list[Array]) -> list[Any]:
+        """The arguments that the kernel takes, variables at these points."""
+        filled = self._batched.fill(points)
+        return [filled[place] for place in self._taken]
+
+    def stands(self, values: Values) -> bool:
+        """Whether the trace of a function computes what the function does at a guess; otherwise it is given up.
+
+        Raises:
+            GraphError: rows of a factor depend on other factors; or there is no such trace, and the user insists.
+        """
+        if self.trace is None:
+            return True
+        points = self.points(values)
+        if self.trace.agrees(self._batch, points):
+            return True
+        self._leave(reason(self._batch, points))
+        return False
+
+    def trace_again(self, values: Values) -> bool:
+        """Trace a function anew that reads something else than before; whether the term has a trace still.
+
+        Raises:
+            GraphError: as for :meth:`stands`.
+        """
+        assert self.trace is not None
+        old, self._changes = self.trace, self._changes + 1
+        asked = self.term.residual.derivatives == "trace"
+        found, why = find(self._batch, self.term.residual.function, asked)
+        if found is not None and (found.taken != old.taken or found.kernel.arguments != old.kernel.arguments):
+            found, why = None, "what it reads beyond its arguments has changed its shape"
+        if self._changes > CHANGES and not asked:
+            found, why = None, "what it reads beyond its arguments keeps changing: declare it by graph.data"
+        if found is None:
+            self._leave(why)
+            return False
+        self.trace, self.kernel = found, found.kernel
+        self._bind_parameters(self._data)
+        return self.stands(values)
+
+    def _leave(self, why: str) -> None:
+        """Leave to Python what was traced."""
+        if self.term.residual.derivatives == "trace":
+            raise GraphError(f"term '{self.name}': cannot be traced: {why}", term=self.name)
+        self.trace = self.kernel = self._jacobian = None
+        self._taken = tuple(range(len(self.term.arguments)))
+        self.differenced, self.route = True, self._by_python(why)
+        self._bind_parameters(self._data)
+
     def bind(self, data: Bound) -> None:
         """Take the present value of every data argument."""
+        self._data = data
         self._arguments: list[Any] = [data.get(a, a.value) if isinstance(a, Data) else a for a in self.term.arguments]
         active = self.term.active
         mask = data.get(active, active.value) if isinstance(active, Data) else active
@@ -168,7 +284,8 @@ class CompiledTerm:
         None when more than parameters of the kernel are made of it.
         """
         places = [k for k, argument in enumerate(self.term.arguments) if argument is handle]
-        if self.kernel is None or handle in self._shaping or not all(place in self._blocks for place in places):
+        kept = all(place in self._blocks for place in places) and handle.value.dtype == FLOAT64
+        if self.kernel is None or handle in self._shaping or not kept:
             return None
         packed = np.arange(self._packed.size).reshape(self._packed.shape)
         return [packed[:, first : first + size] for first, size in map(self._blocks.__getitem__, places)]
@@ -232,7 +349,7 @@ class CompiledTerm:
         if self.is_bound:
             return
         with np.errstate(all="ignore"):
-            if self.kernel is None or isinstance(self.term, ScalarCost):
+            if self.kernel is None or self.trace is not None or isinstance(self.term, ScalarCost):
                 self._batched.require_clean(self.points(values))
             elif self.term.residual.rows:
                 self._require_all_rows(self.kernel, self.points(values))
@@ -271,9 +388,11 @@ class CompiledTerm:
         return residual
 
     def second_derivatives(self, values: Values, weights: Array) -> Array:
-        """(n, D, D) Hessians of weights' r, weights (n, m), by differences; zero where inactive."""
+        """(n, D, D) Hessians of weights' r, weights (n, m), zero where inactive; by differences unless traced."""
         points = self.points(values)
         with np.errstate(all="ignore"):
+            if self.trace is not None:
+                return self._masked(self.trace.kernel.second_derivatives(weights, *self._for_kernel(points)))
             if self._jacobian is None or self.differenced:
                 return self._masked(weighted_hessian(self._batched, self._directions, points, weights))
             if self._attached is None:
@@ -307,7 +426,8 @@ class CompiledTerm:
         gather: list[IntArray] = []
         keep: list[int] = []
         sizes, width = [], 0
-        for argument, expected in zip(self.term.arguments, self.kernel.arguments, strict=True):
+        for place, expected in zip(self._taken, self.kernel.arguments, strict=True):
+            argument = self.term.arguments[place]
             if isinstance(expected, int | tuple):
                 continue
             sizes.append(expected.storage)
@@ -355,18 +475,19 @@ class CompiledTerm:
         """Put the kernel's parameters side by side, and after them the constants in the place of variables."""
         points = [np.empty((1, m.storage)) for m in self.manifolds]
         try:
-            variables, parameters, _ = kernel.split(self._batched.fill(points), self.count)
+            variables, parameters, _ = kernel.split(self._for_kernel(points), self.count)
         except GraphError as error:
             raise GraphError(f"term '{self.name}': {error}", term=self.name) from None
         packed = side_by_side(parameters)
         self.parameter_count = packed.shape[1]
         self.parameter_spread = packed.shape[1] if len(packed) > 1 else 0
-        places = [k for k, expected in enumerate(kernel.arguments) if not isinstance(expected, int | tuple)]
+        taken = list(zip(self._taken, kernel.arguments, strict=True))
+        places = [k for k, expected in taken if not isinstance(expected, int | tuple)]
         given = {slot: v for slot, (k, v) in enumerate(zip(places, variables, strict=True)) if k not in self._places}
         self._constants = given
         self.parameters = np.concatenate([packed.ravel(), *(array.ravel() for array in given.values())])
         self._packed = self.parameters[: packed.size].reshape(packed.shape)
-        slots = [k for k, expected in enumerate(kernel.arguments) if isinstance(expected, int | tuple)]
+        slots = [k for k, expected in taken if isinstance(expected, int | tuple)]
         sizes = [prod(part.shape[1:]) for part in parameters]
         starts = np.cumsum([0, *sizes]).tolist()
         self._blocks = {k: (start, size) for k, start, size in zip(slots, starts, sizes, strict=False) if size}

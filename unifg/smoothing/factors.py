@@ -220,7 +220,7 @@ def _compiled(cost: Cost) -> CompiledTerm:
     """Compile a statement; refuse a function that changes its arguments or leaves rows out, looking at identities."""
     families = [selection.family for selection in cost.selections]
     columns = Columns(families, ())
-    term = CompiledTerm(cost, columns)
+    term = CompiledTerm(cost, columns, trace=False)
     identities = {family: np.tile(family.manifold.identity(), (family.count, 1)) for family in families}
     term.require_clean(columns.values(identities))
     return term

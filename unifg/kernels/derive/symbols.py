@@ -26,10 +26,13 @@ def _both(ufunc: str) -> tuple[Any, Any]:
     """The operator that does what a ufunc does, and the same from the right."""
 
     def operator(self: Any, other: Any) -> Any:
-        return NotImplemented if isinstance(other, np.ndarray) else UFUNCS[ufunc](self, other)
+        return each(self, plain(other)) if isinstance(other, np.ndarray) else UFUNCS[ufunc](self, other)
 
     def mirrored(self: Any, other: Any) -> Any:
-        return NotImplemented if isinstance(other, np.ndarray) else UFUNCS[ufunc](other, self)
+        return each(plain(other), self) if isinstance(other, np.ndarray) else UFUNCS[ufunc](other, self)
+
+    def each(a: Any, b: Any) -> Any:
+        return wrapped(np.frompyfunc(UFUNCS[ufunc], 2, 1)(a, b))
 
     return operator, mirrored
 
@@ -345,7 +348,7 @@ def _reduced(scalar: Callable[..., Any], method: str, array: Any, axis: Any = 0,
         neutral = {"add": 0.0, "multiply": 1.0}
         total: Any = np.full(moved.shape[1:], neutral["multiply" if scalar is UFUNCS["multiply"] else "add"], object)
     else:
-        total = rows[0]
+        total = np.array(rows[0], dtype=object)  # the caller may write into it
         for row in rows[1:]:
             total = combine(total, row)
     if keep:

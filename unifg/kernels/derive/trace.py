@@ -12,6 +12,7 @@ import builtins
 import math
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from types import CellType, FunctionType, ModuleType
 from typing import Any
 
@@ -49,7 +50,7 @@ def run(function: Callable[..., Any], arguments: Sequence[Any], tape: Tape, rebo
             return made(*arguments)
 
         def once() -> list[int]:
-            written = symbols((rows,))
+            written = symbols((rows,), math.nan)  # what is not written stays so
             made(*(argument.copy() if isinstance(argument, Symbols) else argument for argument in arguments), written)
             return [node_of(tape, entry) for entry in written]
 
@@ -88,9 +89,8 @@ class Rebound:
         """A callable, rebound as far as it is written in Python."""
         if isinstance(thing, FunctionType) or is_compiled(thing):
             return self.function(thing)
-        inner = getattr(thing, "func", None)
-        if inner is not None and hasattr(thing, "keywords"):  # functools.partial
-            return type(thing)(self.callable(inner), *thing.args, **thing.keywords)
+        if isinstance(thing, partial):
+            return partial(self.callable(thing.func), *thing.args, **thing.keywords)
         return thing
 
     def function(self, function: Any) -> Any:
@@ -137,6 +137,8 @@ class Rebound:
         if isinstance(thing, FunctionType):
             module = str(thing.__module__ or "")
             return thing if module.partition(".")[0] == "numpy" else self.function(thing)
+        if isinstance(thing, partial):
+            return self.callable(thing)
         return CONSTRUCTORS.get(_identity(thing), thing) if callable(thing) else thing
 
 

@@ -1,0 +1,444 @@
+"""Plain functions as users write them: traced where that is right, left alone where not, never wrong in silence."""
+
+import functools
+import logging
+import math
+import pickle
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.errors import GraphError
+from unifg.kernels.derive.derived import Each, Shared, derived
+from unifg.kernels.derive.reach import reach_of
+from unifg.kernels.derive.symbols import TraceError
+from unifg.program.curvature import lagrangian_hessian
+from unifg.program.term import CHANGES
+from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, InteriorPoint
+from unifg.typing import Array
+
+Function = Callable[..., Any]
+N = 6
+TARGETS = np.random.default_rng(0).normal(size=(N, 3))
+GAIN = 2.0
+
+
+def stated(function: Any, *arguments: Any, manifold: Any = None, count: int = N) -> tuple[fg.Graph, fg.Family]:
+    """A graph of one cost of every variable."""
+    graph = fg.Graph()
+    x = graph.variables("x", manifold or fg.Rn(3), count)
+    graph.minimize(function, x, *arguments, name="term")
+    return graph, x
+
+
+def solved(function: Any, *arguments: Any, **options: Any) -> tuple[str, Array]:
+    """How the one term was evaluated after a solve, and the answer."""
+    graph, x = stated(function, *arguments, **options)
+    start = np.tile(x.manifold.identity(), (x.count, 1))
+    solution = GaussNewton().solve(graph, {x: x.manifold.retract(start, np.full((x.count, x.manifold.dim), 0.1))})
+    return graph.compile().terms[0].route, solution[x]
+
+
+# ---------------------------------------------------------------- arguments
+
+
+@pytest.mark.parametrize("each", [True, False])
+def test_constants_are_read_as_the_function_means_them(each: bool) -> None:
+    """As many rows as factors may be a row for each, or one matrix for all."""
+    square = np.random.default_rng(1).normal(size=(3, 3)) + 3.0 * np.eye(3)
+    function: Function = (lambda x, t: x - t) if each else (lambda x, t: x @ t - 1.0)
+    route, found = solved(function, square, count=3)
+    assert route.startswith("traced")
+    expected = square if each else np.tile(np.linalg.solve(square.T, np.ones(3)), (3, 1))
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments"),
+    [
+        (lambda x, t: x - t, (TARGETS,)),
+        (lambda x, t: x - t[0], (TARGETS[:1],)),
+        (lambda x, t: x - t, (TARGETS[0],)),
+        (lambda x, t: x - t, (0.3,)),
+        (lambda x, t: x - t, (3,)),
+        (lambda x, k: x ** np.arange(1, k + 1) - 0.2, (3,)),
+        (lambda x, t: x - t, ([0.1, 0.2, 0.3],)),
+        (lambda x, which: x[:, which] - 1.0, (np.array([2, 0, 1]),)),
+        (lambda x, which: x - (1.0 if which == "one" else 2.0), ("one",)),
+        (lambda x, t, s: x * s[:, None] - t, (TARGETS, np.arange(1.0, N + 1))),
+        (lambda x, R, t: np.einsum("nij,nj->ni", R, x) - t, (np.tile(2.0 * np.eye(3), (N, 1, 1)), 1.0)),
+        (lambda x, t: list(x - t), (TARGETS,)),
+        (functools.partial(lambda t, x: x - t, 0.5), ()),
+        (lambda x, t=0.5: x - t, ()),
+        (lambda x: GAIN * x - 1.0, ()),
+        (lambda x: math.sqrt(2.0) * x - 1.0, ()),
+    ],
+    ids=str,
+)
+def test_arguments_and_what_a_function_reaches_are_constants(function: Function, arguments: tuple[Any, ...]) -> None:
+    route, found = solved(function, *arguments)
+    assert route == "traced, its derivatives exact"
+    residual = np.array(function(found, *arguments))
+    assert np.abs(residual).max() < 1e-6
+
+
+def test_an_element_of_a_group_may_be_a_constant() -> None:
+    pose = np.array([1.0, 2.0, 0.3])
+    route, found = solved(lambda x, y: fg.SE2.local(y, x), pose, manifold=fg.SE2)
+    assert route.startswith("traced")
+    np.testing.assert_allclose(found, np.tile(pose, (N, 1)), atol=1e-9)
+
+
+def test_lambdas_made_in_a_loop_keep_what_they_mean() -> None:
+    """All of them mean the last number, as anywhere in Python, unless it is a default."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 3)
+    for k in range(3):
+        graph.minimize(lambda x, k=k: x - k, x[k])
+        graph.minimize(lambda x: x - k, x[k])  # noqa: B023
+    solution = GaussNewton().solve(graph, {x: np.zeros((3, 1))})
+    np.testing.assert_allclose(solution[x].ravel(), [1.0, 1.5, 2.0], atol=1e-9)
+
+
+def test_data_are_inputs_of_a_trace() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), N)
+    goal, rows = graph.data("goal", np.zeros(2)), graph.data("rows", np.zeros((N, 2)), each=True)
+    switch = graph.data("switch", np.ones(N, dtype=bool), each=True)
+    graph.minimize(lambda x, g, r, s: np.where(s[:, None], x - g - r, x), x, goal, rows, switch)
+    prepared = GaussNewton().prepare(graph)
+    address = prepared.program.terms[0].place.copy()
+    for scale in (1.0, 2.0):
+        given = {goal: np.full(2, scale), rows: scale * TARGETS[:, :2], switch: np.arange(N) % 2 == 0}
+        found = prepared.solve({x: np.ones((N, 2))}, data=given)[x]
+        np.testing.assert_allclose(found[::2], scale * (1.0 + TARGETS[::2, :2]), atol=1e-9)
+        np.testing.assert_allclose(found[1::2], 0.0, atol=1e-9)
+    np.testing.assert_array_equal(prepared.program.terms[0].place, address)
+
+
+def test_a_decision_about_data_is_left_to_python() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 2)
+    sign = graph.data("sign", 1.0)
+    graph.minimize(lambda x, s: x - 1.0 if s > 0 else x + 1.0, x, sign)
+    for value in (1.0, -1.0):
+        solution = GaussNewton().solve(graph, {x: np.zeros((2, 1))}, data={sign: value})
+        np.testing.assert_allclose(solution[x], value, atol=1e-9)
+    assert "asks whether a number holds" in graph.compile().terms[0].route
+
+
+# ---------------------------------------------------------------- what a trace cannot stand for
+
+
+def branching(x: Array) -> Array:
+    if x[0, 0] > 5.0:
+        return x
+    return 2.0 * x - 1.0
+
+
+def printing(x: Array) -> Array:
+    print("x")
+    return x - 1.0
+
+
+def trying(x: Array) -> Array:
+    try:
+        return np.asarray(np.sqrt(x) - 1.0)
+    except ValueError:
+        return x
+
+
+def importing(x: Array) -> Array:
+    import random
+
+    return x - random.SystemRandom().choice([1.0])
+
+
+class Model:
+    """Something that may change."""
+
+    gain = 2.0
+
+    def residual(self, x: Array) -> Array:
+        return self.gain * x - 1.0
+
+    def __call__(self, x: Array) -> Array:
+        return self.residual(x)
+
+
+SETTINGS = {"gain": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("function", "why"),
+    [
+        (branching, "test_traced_terms.py:"),
+        (printing, "calls print()"),
+        (trying, "handles exceptions"),
+        (importing, "imports random"),
+        (Model().residual, "a method of an instance of Model"),
+        (Model(), "an instance of Model"),
+        (lambda x: SETTINGS["gain"] * x - 1.0, "'SETTINGS' is a dict"),
+        (lambda x: x - np.random.normal(size=(1, 3)), "other numbers each time"),  # noqa: NPY002
+        (lambda x: np.linalg.qr(np.eye(3) + 0.0 * x[:, None])[1][:, 0] + x, "np.linalg.qr"),
+        (lambda x: x * len(x) - 1.0, "which factor they belong to"),
+        (lambda x: x - np.arange(len(x))[:, None], "which factor they belong to"),
+    ],
+)
+def test_what_is_not_traced_is_said(function: Function, why: str, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING, "unifg"):
+        route, _ = solved(function)
+    assert route.startswith("evaluated by Python, its derivatives by differences: ") and why in route
+    assert sum("term 'term' is evaluated by Python" in message for message in caplog.messages) == 1
+
+
+@pytest.mark.parametrize("function", [Model().residual, Model(), lambda x: SETTINGS["gain"] * x - 1.0])
+def test_what_may_change_is_traced_when_asked(function: Function) -> None:
+    route, found = solved(fg.residual(function, derivatives="trace"))
+    assert route.startswith("traced")
+    np.testing.assert_allclose(found, 0.5, atol=1e-9)
+
+
+@pytest.mark.parametrize("function", [branching, lambda x: x * len(x) - 1.0])
+def test_what_cannot_be_traced_is_an_error_when_asked(function: Function) -> None:
+    with pytest.raises(GraphError, match="term 'term': cannot be traced: ") as raised:
+        solved(fg.residual(function, derivatives="trace"))
+    assert raised.value.term == "term"
+
+
+def test_differences_when_asked() -> None:
+    route, _ = solved(fg.residual(lambda x: x - 1.0, derivatives="differences"))
+    assert route == "evaluated by Python, its derivatives by differences: as it was asked to be"
+    with pytest.raises(GraphError, match="'trace' or 'differences'"):
+        fg.residual(lambda x: x, derivatives="exact")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: x - x.mean(axis=0) + 0.1 * x,
+        lambda x: 2.0 * x - x[0],
+        lambda x: 2.0 * x - np.roll(x, 1, axis=0),
+        lambda x: x / np.abs(x).max(),
+    ],
+)
+def test_rows_that_depend_on_other_factors_are_an_error(function: Function) -> None:
+    """Their derivatives were wrong however they were found."""
+    with pytest.raises(GraphError, match=r"term 'term': the rows of factor \d change when") as raised:
+        solved(function)
+    assert raised.value.term == "term" and raised.value.index is not None
+
+
+def test_the_first_row_of_a_shared_variable_is_everybody_s() -> None:
+    graph = fg.Graph()
+    x, centre = graph.variables("x", fg.Rn(2), N), graph.variables("c", fg.Rn(2), 1)
+    graph.minimize(lambda x, c: x - c[0] - TARGETS[0, :2], x, centre)
+    graph.minimize(lambda c: c - 1.0, centre)
+    solution = GaussNewton().solve(graph, {x: np.zeros((N, 2)), centre: np.zeros((1, 2))})
+    np.testing.assert_allclose(solution[x] - TARGETS[0, :2], 1.0, atol=1e-9)
+    assert all(term.route.startswith("traced") for term in graph.compile().terms)
+
+
+def test_a_trace_that_is_wrong_at_the_guess_only_is_given_up() -> None:
+    """About the origin nothing is amiss: a table of the function's own begins elsewhere."""
+
+    def far(x: Array) -> Array:
+        return np.asarray(x - 100.0 + np.maximum(x - 50.0, 0.0) * np.arange(len(x))[:, None] * 0.01)
+
+    graph, x = stated(far)
+    assert graph.compile().terms[0].route.startswith("traced")
+    guess = {x: np.full((N, 3), 90.0)}
+    solution = InteriorPoint().solve(graph, guess)
+    assert "which factor they belong to" in graph.compile().terms[0].route
+    assert np.abs(far(solution[x])).max() < 1e-5
+    with pytest.raises(GraphError, match="cannot be traced"):
+        graph, x = stated(fg.residual(far, derivatives="trace"))
+        InteriorPoint().solve(graph, {x: np.full((N, 3), 90.0)})
+
+
+@pytest.mark.parametrize("derivatives", [None, "trace", "differences"])
+def test_arguments_belong_to_the_solver(derivatives: Any) -> None:
+    def shifting(x: Array) -> Array:
+        x -= 1.0
+        return x
+
+    with pytest.raises(GraphError, match="changes its argument 0"):
+        solved(fg.residual(shifting, derivatives=derivatives))
+
+
+@pytest.mark.parametrize("derivatives", [None, "trace"])
+def test_coarse_numbers_are_refused_as_ever(derivatives: Any) -> None:
+    with pytest.raises(GraphError, match="returned float32"):
+        solved(fg.residual(lambda x: (x - 1.0).astype(np.float32), derivatives=derivatives))
+
+
+# ---------------------------------------------------------------- what a function closes over may change
+
+
+def test_what_a_function_closes_over_is_looked_at_before_each_solve() -> None:
+    target = np.zeros(3)
+    graph, x = stated(lambda x: x - target)
+    prepared = GaussNewton().prepare(graph)
+    for k in range(CHANGES + 3):
+        target[:] = k
+        np.testing.assert_allclose(prepared.solve({x: np.zeros((N, 3))})[x], k, atol=1e-9)
+    assert "keeps changing" in graph.compile().terms[0].route
+
+
+def test_names_that_mean_something_else_are_looked_at_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, x = stated(lambda x: GAIN * x - 1.0)
+    prepared = GaussNewton().prepare(graph)
+    for gain in (2.0, 4.0):
+        monkeypatch.setitem(globals(), "GAIN", gain)
+        np.testing.assert_allclose(prepared.solve({x: np.zeros((N, 3))})[x], 1.0 / gain, atol=1e-9)
+    assert prepared.program.terms[0].route.startswith("traced")
+
+
+def test_a_constant_argument_may_be_written_to_between_solves() -> None:
+    target = np.zeros((N, 3))
+    graph, x = stated(lambda x, t: x - t, target)
+    prepared = GaussNewton().prepare(graph)
+    for k in (1.0, 2.0):
+        target[:] = k
+        np.testing.assert_allclose(prepared.solve({x: np.zeros((N, 3))})[x], k, atol=1e-9)
+
+
+def test_a_straight_function_may_become_a_bent_one() -> None:
+    power = 1.0
+
+    def function(x: Array) -> Array:
+        return np.asarray(x**power - 2.0)
+
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 2)
+    graph.constrain(function, x, lower=0.0, upper=0.0)
+    graph.minimize(lambda x: x, x)
+    prepared = InteriorPoint().prepare(graph)
+    for power in (1.0, 2.0):
+        solution = prepared.solve({x: np.ones((2, 1))})
+        np.testing.assert_allclose(solution[x], 2.0 ** (1.0 / power), atol=1e-6)
+    program, lin = prepared.program, solution._lin
+    hessian = lagrangian_hessian(program, lin, np.ones(2))
+    np.testing.assert_allclose(hessian, 1.0 + 2.0, atol=1e-12)
+
+
+# ---------------------------------------------------------------- kernels are shared, kept and carried
+
+
+def test_functions_that_compute_the_same_share_a_kernel() -> None:
+    def offset(by: float) -> Function:
+        return lambda x: x - by
+
+    def kernel(function: Function) -> Any:
+        return derived(function, (fg.Rn(2),), reach_of(function))
+
+    one, same, other = kernel(offset(1.0)), kernel(offset(1.0)), kernel(offset(2.0))
+    assert one is same and one is not other
+    assert kernel(lambda x: 0.0 * x) is not kernel(lambda x: -0.0 * x)
+
+
+def test_what_cannot_be_told_apart_is_not_shared() -> None:
+    function = Model().residual
+    assert derived(function, (fg.Rn(2),), reach_of(function)) is not derived(function, (fg.Rn(2),), reach_of(function))
+
+
+def test_a_kernel_is_pickled_with_its_tape() -> None:
+    function = lambda x, t: np.sin(x) * t  # noqa: E731
+    kernel = derived(function, (fg.Rn(2), Each((2,))), reach_of(function))
+    before = kernel.address
+    copy = pickle.loads(pickle.dumps(kernel))
+    assert "address" not in copy.__dict__
+    x, t = TARGETS[:, :2], TARGETS[:, 1:]
+    np.testing.assert_array_equal(copy(x, t), kernel(x, t))
+    np.testing.assert_array_equal(copy.jacobian(x, t)[0], kernel.jacobian(x, t)[0])
+    assert copy.address != before
+
+
+def test_second_derivatives_wait_until_somebody_asks() -> None:
+    graph, x = stated(lambda x: np.sin(x))
+    program = GaussNewton().prepare(graph).program
+    kernel = program.terms[0].kernel
+    assert kernel is not None and "second_address" not in kernel.__dict__
+    graph.constrain(lambda x: np.cos(x), x, upper=1.0)
+    program = InteriorPoint().prepare(graph).program
+    assert all(term.kernel is not None and "second_address" in term.kernel.__dict__ for term in program.terms)
+
+
+def test_straight_rows_have_no_second_derivatives() -> None:
+    function = lambda x, t: 3.0 * x - x[:, ::-1] * t  # noqa: E731
+    assert derived(function, (fg.Rn(2), Shared(())), reach_of(function)).linear
+    assert not derived(lambda x: x**2, (fg.Rn(2),), reach_of(lambda x: x**2)).linear
+
+
+def test_threads_trace_at_once() -> None:
+    found: dict[int, Array] = {}
+
+    def work(k: int) -> None:
+        found[k] = solved(lambda x: np.sin(x) + k * x - 1.0)[1]
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(1, 5)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for k in range(1, 5):
+        np.testing.assert_allclose(np.sin(found[k]) + k * found[k], 1.0, atol=1e-9)
+
+
+def test_a_function_that_would_take_seconds_to_compile_is_left_alone() -> None:
+    def long(x: Array) -> Array:
+        for _ in range(3000):
+            x = np.sin(x) + x
+        return x
+
+    with pytest.raises(TraceError, match="numbers for one factor"):
+        derived(long, (fg.Rn(1),), reach_of(long))
+
+
+# ---------------------------------------------------------------- the same answers as by differences
+
+
+def pendulum(x: Array, u: Array, after: Array, dt: float) -> Array:
+    """Implicit midpoint rule."""
+    mid = 0.5 * (x + after)
+    return np.stack(
+        [after[:, 0] - x[:, 0] - dt * mid[:, 1], after[:, 1] - x[:, 1] - dt * (u[:, 0] - np.sin(mid[:, 0]))], axis=1
+    )
+
+
+@pytest.mark.parametrize(
+    "solver", [InteriorPoint(), SQP(hessian="exact"), SQP(), AugmentedLagrangian()], ids=lambda s: s.name
+)
+def test_backends_find_what_they_find_by_differences(solver: fg.Solver) -> None:
+    found = []
+    for derivatives in ("trace", "differences"):
+        make = functools.partial(fg.residual, derivatives=derivatives)
+        graph = fg.Graph()
+        x, u = graph.variables("x", fg.Rn(2), 11), graph.variables("u", fg.Rn(1), 10)
+        graph.constrain(make(pendulum), x[:-1], u, x[1:], 0.2, lower=0.0, upper=0.0)
+        graph.minimize(make(lambda u: u), u)
+        graph.constrain(make(lambda x: x - np.array([0.0, 1.0])), x[0], lower=0.0, upper=0.0)
+        graph.constrain(make(lambda x: x - np.array([1.0, 0.0])), x[-1], lower=0.0, upper=0.0)
+        graph.constrain(make(lambda x: np.hypot(x[:, :1], x[:, 1:])), x[1:-1], upper=1.1)
+        solution = solver.solve(graph, {x: np.full((11, 2), 0.3), u: np.zeros((10, 1))}, check=True)
+        found.append(np.concatenate([solution[x].ravel(), solution[u].ravel()]))
+    np.testing.assert_allclose(found[0], found[1], atol=2e-5)
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_derivatives_do_not_mind_where_the_origin_is(offset: float) -> None:
+    beacons = np.array([[3.0, 4.0], [-2.0, 1.0], [0.5, -3.0]]) + offset
+    ranges = np.array([5.0, 2.2, 3.1])
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 3)
+    graph.minimize(lambda x, b, r: np.linalg.norm(x - b, axis=1, keepdims=True) - r[:, None], x, beacons, ranges)
+    graph.minimize(lambda x: x - offset, x, sigma=10.0)
+    program = graph.compile()
+    lin = program.linearize(program.values_from({x: np.full((3, 2), offset + 0.25)}))
+    away = offset + 0.25 - beacons
+    expected = away / np.linalg.norm(away, axis=1, keepdims=True)
+    np.testing.assert_allclose(lin.jacobian[:6].reshape(3, 2), expected, rtol=1e-14)

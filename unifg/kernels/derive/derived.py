@@ -1,0 +1,188 @@
+"""Kernels made of plain functions: traced once for all terms that use a function alike, and kept for as long as needed.
+
+A kernel is found again by what its function computes: its code and the values it reaches, the manifolds and shapes it
+is used with. It keeps the tape and nothing of the function, so it can be pickled, and nothing in it grows old.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import prod
+from threading import RLock
+from typing import Any, NoReturn, TypeAlias
+
+import numpy as np
+
+from unifg.kernels.derive.expression import Expression, traced
+from unifg.kernels.derive.operations import Op
+from unifg.kernels.derive.reach import Reach
+from unifg.kernels.derive.symbols import TraceError
+from unifg.kernels.kernel import Argument, Kernel
+from unifg.lie import Manifold
+from unifg.machine.jit import is_compiled
+
+logger = logging.getLogger("unifg")
+KEPT = 256  # kernels
+LONGEST = 5000  # nodes of a residual; of more, machine code takes seconds
+WIDEST = 2000  # parameters of one factor
+
+
+@dataclass(frozen=True)
+class Each:
+    """An argument with a row for each factor; ``shape`` is that of a row."""
+
+    shape: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Shared:
+    """An argument that all factors share, whose numbers may change."""
+
+    shape: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Fixed:
+    """An argument that all factors share and that a trace fixes; ``key`` tells it from others, None if nothing can."""
+
+    value: Any
+    key: Hashable | None
+
+
+Given: TypeAlias = Manifold | Each | Shared | Fixed
+
+
+def _nowhere(*_: Any) -> NoReturn:
+    raise TraceError("a derived kernel is machine code; nothing compiled by Numba can call it")
+
+
+@dataclass(frozen=True, eq=False)
+class DerivedKernel(Kernel):
+    """A kernel whose Jacobian and second derivatives are exact, because they were derived.
+
+    Machine code is generated when its address is first asked for; that of second derivatives most programs never ask.
+
+    Attributes:
+        expression: what it computes.
+    """
+
+    function: Callable[..., None] = _nowhere
+    arguments: tuple[Argument, ...] = ()
+    rows: int = 0
+    expression: Expression = field(kw_only=True)
+
+    @cached_property
+    def address(self) -> int:
+        """Of the machine code of residual and Jacobian."""
+        with _lock:
+            return self.expression.residual().address
+
+    @cached_property
+    def second_address(self) -> int:
+        """Of the machine code of second derivatives, 0 where all of them are zero."""
+        if self.linear:
+            return 0
+        with _lock:
+            return self.expression.second().address
+
+
+_lock = RLock()  # tracing rebinds names in copies of functions, and what it writes is one tape
+_kernels: OrderedDict[Hashable, DerivedKernel | TraceError] = OrderedDict()
+
+
+def derived(
+    function: Callable[..., Any],
+    given: Sequence[Given],
+    reach: Reach,
+    rows: int = 0,
+    name: str = "",
+    limit: bool = True,
+) -> DerivedKernel:
+    """The kernel of a plain function, traced once for all who use it alike.
+
+    Args:
+        function: batched NumPy, or compiled for one factor.
+        given: what stands in the place of each argument.
+        reach: what the function reaches.
+        rows: m of a compiled function.
+        name: for messages.
+        limit: refuse functions whose code would take long to generate.
+
+    Raises:
+        TraceError: the function does what cannot be traced.
+    """
+    with _lock:
+        fixed = [part for part in given if isinstance(part, Fixed)]
+        if reach.key is None or any(part.key is None for part in fixed):
+            return _traced(function, given, rows, name, limit)
+        key = reach.key, tuple(part.key if isinstance(part, Fixed) else part for part in given), rows, limit
+        found = _kernels.get(key)
+        if found is None:
+            try:
+                found = _traced(function, given, rows, name, limit)
+            except TraceError as error:
+                found = error.with_traceback(None)
+            _kernels[key] = found
+            while len(_kernels) > KEPT:
+                _kernels.popitem(last=False)
+        _kernels.move_to_end(key)
+        if isinstance(found, TraceError):
+            raise TraceError(str(found))
+        return found
+
+
+def _traced(function: Callable[..., Any], given: Sequence[Given], rows: int, name: str, limit: bool) -> DerivedKernel:
+    arguments: list[Argument] = []
+    for part in given:
+        if isinstance(part, Manifold):
+            arguments.append(part)
+        elif not isinstance(part, Fixed):
+            arguments.append(part.shape)
+    numbers = sum(prod(argument) for argument in arguments if isinstance(argument, tuple))
+    if limit and numbers > WIDEST:
+        raise TraceError(f"its constants are {numbers} numbers for each factor")
+    called = function if is_compiled(function) else _as_called(function, given)
+    expression = traced(called, arguments, rows, name)
+    tape = expression.tape
+    live = tape.live(expression.rows)
+    if limit and len(live) > LONGEST:
+        raise TraceError(f"it computes {len(live)} numbers for one factor")
+    if is_compiled(function) and any(tape.op[i] == Op.CONSTANT and tape.value[i] != tape.value[i] for i in live):
+        raise TraceError("some of its rows are not written, or read before they are")
+    return DerivedKernel(
+        arguments=tuple(arguments),
+        rows=len(expression.rows),
+        table=expression.table,
+        name=name,
+        linear=all(expression.linear_rows),
+        expression=expression,
+    )
+
+
+def _as_called(function: Callable[..., Any], given: Sequence[Given]) -> Callable[..., Any]:
+    """The function as a term calls it: some arguments have a row for each factor, others stand as they are."""
+    places = list(given)
+
+    def call(*numbers: Any) -> Any:
+        rest = iter(numbers)
+        arguments, kept = [], []
+        for part in places:
+            if isinstance(part, Fixed):
+                arguments.append(part.value)
+                continue
+            array = next(rest)
+            argument = array[0] if isinstance(part, Shared) else array
+            arguments.append(argument)
+            if isinstance(argument, np.ndarray):
+                kept.append((len(arguments) - 1, argument, list(argument.flat)))
+        result = function(*arguments)
+        for place, argument, entries in kept:
+            if any(now is not before for now, before in zip(argument.flat, entries, strict=True)):
+                raise TraceError(f"changes its argument {place}")
+        return result
+
+    return call

@@ -1,0 +1,249 @@
+"""What a function reaches beyond its arguments: a trace fixes it, so it must be known, and looked at again.
+
+Numbers, text, tuples, frozen records and arrays are values; functions are followed. Lists, dictionaries, instances and
+what a function writes outside itself may change with nobody noticing: such a function is traced only when its user asks
+for that.
+"""
+
+from __future__ import annotations
+
+import dis
+import functools
+import hashlib
+from collections.abc import Callable, Hashable, Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from enum import Enum
+from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
+from typing import Any
+
+import numpy as np
+
+from unifg.lie import Manifold
+from unifg.machine.jit import is_compiled
+from unifg.typing import Array
+
+TRUSTED = ("numpy", "math", "unifg", "builtins", "numba", "operator")
+"""Packages whose functions and classes nobody changes."""
+OUTWARD = frozenset({"print", "open", "input", "eval", "exec", "globals", "vars", "setattr", "id"})
+"""Built-in functions that do or see more than numbers."""
+_MISSING = object()
+_PLAIN = (bool, int, float, complex, str, bytes, type(None), type(Ellipsis), range)
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """What a function reaches.
+
+    Attributes:
+        key: equal for functions that compute the same; None where that cannot be said.
+        refusal: why it is not traced unless its user asks; empty where it is.
+        size: how many numbers stand in the arrays.
+    """
+
+    key: Hashable | None
+    refusal: str
+    size: int
+    _cells: tuple[tuple[CellType, Any], ...]
+    _names: tuple[tuple[dict[str, Any], str, Any], ...]
+    _arrays: tuple[tuple[Array, bytes], ...]
+
+    @property
+    def changed(self) -> bool:
+        """Whether a name means something else by now, or an array holds other numbers."""
+        for cell, value in self._cells:
+            if _inside(cell) is not value:
+                return True
+        for names, name, value in self._names:
+            if names.get(name, _MISSING) is not value:
+                return True
+        return any(array.tobytes() != content for array, content in self._arrays)
+
+    @property
+    def fixed(self) -> bool:
+        """Whether there is nothing that could change."""
+        return not (self._cells or self._names or self._arrays)
+
+
+def reach_of(function: Callable[..., Any]) -> Reach:
+    """Look at a function, and at everything it refers to."""
+    walk = _Walk()
+    if isinstance(function, MethodType):
+        walk.refuse(f"it is a method of {_kind(function.__self__)}, which may change")
+        function = function.__func__
+    key = walk.value(function, "it")
+    return Reach(
+        None if walk.refusal else key,
+        walk.refusal,
+        walk.size,
+        tuple(walk.cells),
+        tuple(walk.names),
+        tuple(walk.arrays),
+    )
+
+
+class _Walk:
+    """Follows references, each once."""
+
+    def __init__(self) -> None:
+        self.refusal = ""
+        self.size = 0
+        self.cells: list[tuple[CellType, Any]] = []
+        self.names: list[tuple[dict[str, Any], str, Any]] = []
+        self.arrays: list[tuple[Array, bytes]] = []
+        self._seen: dict[int, int] = {}
+        self._attributes: set[str] = set()
+
+    def refuse(self, why: str) -> None:
+        self.refusal = self.refusal or why
+
+    def value(self, value: Any, where: str) -> Hashable:
+        """What tells a value from others."""
+        if isinstance(value, _PLAIN) and type(value) in _PLAIN:
+            return type(value).__name__, repr(value)
+        if isinstance(value, np.generic):
+            return "number", value.dtype.str, value.tobytes()
+        if isinstance(value, np.ndarray):
+            return self._array(value, where)
+        if isinstance(value, tuple | frozenset):
+            if type(value) not in (tuple, frozenset) and not hasattr(value, "_fields"):
+                self.refuse(f"{where} is {_kind(value)}, which may change")
+            return type(value), tuple(self.value(item, f"an entry of {where}") for item in value)
+        if isinstance(value, slice):
+            return "slice", tuple(self.value(part, where) for part in (value.start, value.stop, value.step))
+        if isinstance(value, ModuleType):
+            return self._module(value)
+        if isinstance(value, FunctionType) or is_compiled(value):
+            return self._function(value)
+        if type(value) is functools.partial:
+            options = tuple((name, self.value(item, f"'{name}'")) for name, item in sorted(value.keywords.items()))
+            given = tuple(self.value(item, "a given argument") for item in value.args)
+            return "partial", self.value(value.func, "its function"), given, options
+        return self._other(value, where)
+
+    def _other(self, value: Any, where: str) -> Hashable:
+        if isinstance(value, np.ufunc | Manifold | Enum):
+            return type(value), value
+        if isinstance(value, BuiltinFunctionType) and isinstance(value.__self__, ModuleType | type | None):
+            if value.__name__ in OUTWARD:
+                self.refuse(f"it calls {value.__name__}()")
+            return value
+        if isinstance(value, type):
+            if not _trusted(value.__module__):
+                self.refuse(f"{where} is the class {value.__name__}, which may change")
+            return value
+        if type(value).__module__.partition(".")[0] == "numpy" and callable(value) and hasattr(value, "__name__"):
+            return "numpy", value.__name__, id(value)  # functions of NumPy that are not written in Python
+        if is_dataclass(value) and getattr(vars(type(value)).get("__dataclass_params__"), "frozen", False):
+            used = [name for name in vars(type(value)) if name in self._attributes and not name.startswith("__")]
+            for name in used:
+                if isinstance(vars(type(value))[name], FunctionType | property):
+                    self.refuse(f"{where} is {_kind(value)}, whose method {name} it uses")
+            parts = tuple(self.value(getattr(value, f.name), f"{where}.{f.name}") for f in fields(value))
+            return type(value), parts
+        self.refuse(f"{where} is {_kind(value)}, which may change")
+        return id(value)
+
+    def _array(self, array: Array, where: str) -> Hashable:
+        if array.dtype.hasobject or type(array) is not np.ndarray:
+            self.refuse(f"{where} is {_kind(array)}")
+            return id(array)
+        content = array.tobytes()
+        self.arrays.append((array, content))
+        self.size += array.size
+        return array.dtype.str, array.shape, hashlib.blake2b(content, digest_size=16).digest()
+
+    def _module(self, module: ModuleType) -> Hashable:
+        if _trusted(module.__name__):
+            return module.__name__
+        if id(module) in self._seen:
+            return "seen", self._seen[id(module)]
+        self._seen[id(module)] = len(self._seen)
+        names = [name for name in sorted(self._attributes) if name in vars(module)]
+        return module.__name__, tuple(self._named(vars(module), name, module.__name__ + ".") for name in names)
+
+    def _named(self, names: dict[str, Any], name: str, prefix: str = "") -> Hashable:
+        value = names[name]
+        if not (isinstance(value, ModuleType) and _trusted(value.__name__)):
+            self.names.append((names, name, value))
+        return name, self.value(value, f"'{prefix}{name}'")
+
+    def _function(self, function: Any) -> Hashable:
+        python: FunctionType = getattr(function, "py_func", function)
+        if id(python) in self._seen:
+            return "seen", self._seen[id(python)]
+        self._seen[id(python)] = len(self._seen)
+        code, own = python.__code__, not _trusted(str(python.__module__))
+        seen = _scanned(code)
+        parts: list[Hashable] = [code]
+        if own:
+            if seen.trouble:
+                self.refuse(f"{seen.trouble}")
+            self._attributes |= seen.attributes
+        for name, cell in zip(code.co_freevars, python.__closure__ or (), strict=True):
+            value = _inside(cell)
+            self.cells.append((cell, value))
+            parts.append((name, "unassigned" if value is _MISSING else self.value(value, f"'{name}'")))
+        for default in (*(python.__defaults__ or ()), *sorted((python.__kwdefaults__ or {}).items())):
+            parts.append(self.value(default, "a default"))
+        if own:
+            known = python.__globals__
+            for name in sorted(seen.names):
+                if name in known:
+                    parts.append(self._named(known, name))
+                elif name in OUTWARD:
+                    self.refuse(f"it calls {name}()")
+        return tuple(parts)
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """What the instructions of a function say: names of globals, of attributes, and what speaks against a trace."""
+
+    names: frozenset[str]
+    attributes: frozenset[str]
+    trouble: str
+
+
+@functools.lru_cache(maxsize=1024)
+def _scanned(code: CodeType) -> _Scan:
+    names, attributes, trouble = set[str](), set[str](), ""
+    for inner in _codes(code):
+        steps = list(dis.get_instructions(inner))
+        for step, after in zip(steps, [*steps[1:], steps[-1]], strict=True):
+            operation = step.opname
+            if operation in ("LOAD_GLOBAL", "LOAD_NAME"):
+                names.add(str(step.argval))
+            elif operation in ("LOAD_ATTR", "LOAD_METHOD"):
+                attributes.add(str(step.argval))
+            elif operation in ("STORE_GLOBAL", "DELETE_GLOBAL"):
+                trouble = trouble or f"it changes the global name '{step.argval}'"
+            elif operation == "STORE_DEREF" and step.argval in code.co_freevars:
+                trouble = trouble or f"it changes '{step.argval}' outside itself"
+            elif operation == "IMPORT_NAME" and not _trusted(str(step.argval)):
+                trouble = trouble or f"it imports {step.argval}"
+            elif operation == "PUSH_EXC_INFO" and after.opname != "WITH_EXCEPT_START":
+                trouble = trouble or "it handles exceptions, so what it computes may depend on the numbers"
+    return _Scan(frozenset(names), frozenset(attributes), trouble)
+
+
+def _codes(code: CodeType) -> Iterator[CodeType]:
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _codes(constant)
+
+
+def _inside(cell: CellType) -> Any:
+    try:
+        return cell.cell_contents
+    except ValueError:  # not assigned yet
+        return _MISSING
+
+
+def _trusted(module: str) -> bool:
+    return module.partition(".")[0] in TRUSTED
+
+
+def _kind(value: Any) -> str:
+    name = type(value).__name__
+    return f"an instance of {name}" if not isinstance(value, list | dict | set) else f"a {name}"
