@@ -85,3 +85,23 @@ def test_one_iteration_a_step_is_an_option() -> None:
         cost += problem.stage_cost(state, control, index) if index < 100 else 0.0
         state = problem.plant(state, control, index)
     assert cost == pytest.approx(3285.17, rel=2e-3)  # that of solvers which converge in every step
+
+
+@pytest.mark.parametrize("problem", [Quadrotor("figure8", True, 20), Unicycle("curve", True, 20)])
+def test_a_single_step_becomes_as_many_as_the_obstacles_ask_for(problem: Problem) -> None:
+    """Plainly stopped after one iteration, these loops drive into a sphere and into a disc."""
+    deepest, costs, taken = {}, {}, {}
+    rules: dict[str, dict[str, float]] = {"safe": {"step_tolerance": np.inf, "violation_tolerance": 1e-4}, "whole": {}}
+    for name, options in rules.items():
+        driver = Driver(problem, InteriorPoint(tolerance=1e-4, **options))  # type: ignore[arg-type]
+        state, cost, depth, iterations = problem.start, 0.0, -np.inf, 0
+        for index in range(60):
+            control, _, count, status = driver.control(state, index)
+            assert status in ("converged", "stop rule")
+            cost += problem.stage_cost(state, control, index)
+            state = problem.plant(state, control, index)
+            depth, iterations = max(depth, problem.penetration(state)), iterations + count
+        deepest[name], costs[name], taken[name] = depth, cost, iterations
+    assert deepest["safe"] <= max(deepest["whole"], 0.0) + 1e-7
+    assert costs["safe"] == pytest.approx(costs["whole"], rel=1e-3)
+    assert taken["safe"] < 0.9 * taken["whole"]

@@ -8,6 +8,8 @@ import pytest
 import unifg as fg
 from problems.control import Quadrotor, Unicycle
 from problems.known import short_drive
+from unifg.answers.solver import SolveState
+from unifg.models import avoidance
 from unifg.solvers import SQP, InteriorPoint
 from unifg.solvers.interior_point.method import Workspace
 
@@ -42,6 +44,61 @@ def test_a_stop_rule_ends_when_full_steps_are_short() -> None:
     assert alone.history[-1].step_norm < 1e-2 * alone.history[-1].step_length
     never = InteriorPoint(max_iterations=30, step_tolerance=1e3, violation_tolerance=1e-300)
     assert never.solve(stated.graph, stated.guess).converged, "a violation too large to stop at"
+
+
+@pytest.mark.parametrize("watched", [False, True])
+def test_a_time_limit_ends_both_ways_of_running_at_the_same_iterate(
+    watched: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stated = Unicycle("straight", True, 20).formulation()
+    whole = InteriorPoint(tolerance=1e-4, keep_values=True).solve(stated.graph, stated.guess)
+    monkeypatch.setattr(SolveState, "seconds", property(lambda run: float(run.iterations)))
+    look = (lambda row: None) if watched else None
+    for iterations in (0, 1, 4):
+        late = InteriorPoint(tolerance=1e-4, time_limit=iterations - 0.5)
+        solution = late.solve(stated.graph, stated.guess, callback=look)
+        assert solution.status is fg.Status.TIME_LIMIT and solution.iterations == iterations
+        row = whole.history[iterations]
+        assert solution.cost == pytest.approx(row.cost, rel=1e-9) and row.values is not None
+        np.testing.assert_allclose(solution[stated.x], row.values[stated.x], atol=1e-9)
+        assert solution.history[-1].cost == pytest.approx(row.cost, rel=1e-9)
+    ample = InteriorPoint(tolerance=1e-4, time_limit=1e3).solve(stated.graph, stated.guess, callback=look)
+    assert ample.converged and ample.iterations == whole.iterations
+    np.testing.assert_allclose(ample[stated.x], whole[stated.x], atol=1e-9)
+
+
+def test_a_time_limit_leaves_the_solve_to_compiled_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    stated = Unicycle("straight", True, 20).formulation()
+    monkeypatch.setattr(InteriorPoint, "_guided", None)
+    assert InteriorPoint(tolerance=1e-4, time_limit=10.0).solve(stated.graph, stated.guess).converged
+
+
+@pytest.mark.parametrize("watched", [False, True])
+@pytest.mark.parametrize("limit", ["iterations", "time"])
+def test_a_stopped_loop_hands_back_what_kept_the_constraints(
+    limit: str, watched: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A point on a sphere is drawn to one far away: a single step along the tangent leaves the sphere by far."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(3), 1)
+    graph.minimize(fg.prior, x, [[0.0, 5.0, 0.0]], sigma=1.0)
+    graph.constrain(avoidance.sphere_clearance, x, np.zeros((1, 3)), np.ones(1), lower=0.0, upper=0.0, name="sphere")
+    guess = {x: np.array([[1.0, 0.0, 0.0]])}
+    monkeypatch.setattr(SolveState, "seconds", property(lambda run: float(run.iterations)))
+    options = {"max_iterations": 1} if limit == "iterations" else {"time_limit": 0.5}
+    look = (lambda row: None) if watched else None
+    rule = {"step_tolerance": np.inf, "violation_tolerance": 1e-4}
+    plain = InteriorPoint(**options).solve(graph, guess, callback=look)
+    safe = InteriorPoint(**options, **rule).solve(graph, guess, callback=look)  # type: ignore[arg-type]
+    assert plain.status is safe.status and plain.iterations == safe.iterations == 1
+    assert plain.violation > 0.1, "the plain one hands on where it came to"
+    assert safe.violation <= 1e-4
+    np.testing.assert_array_equal(safe[x], guess[x])
+    outside = {x: np.array([[2.0, 0.0, 0.0]])}
+    lost = InteriorPoint(**options, **rule).solve(graph, outside, callback=look)  # type: ignore[arg-type]
+    assert lost.violation > 1e-4 and not np.array_equal(lost[x], outside[x]), "nothing kept them"
+    done = InteriorPoint(**rule).solve(graph, guess, callback=look)  # type: ignore[arg-type]
+    assert done.violation <= 1e-4 and done.iterations > 1
 
 
 def test_the_same_variable_twice_in_an_equality() -> None:

@@ -56,18 +56,19 @@ def test_one_iteration_a_step_is_named_where_it_is_not_safe() -> None:
     results: dict[Problem, dict[str, Drive]] = {
         planar: {
             "ipopt": drive(2.0, 10.0), "ipm": drive(1.0, 10.0), "ipm, 1 iteration": drive(0.1, 10.5, 2e-3),
-            "sqp, 1 iteration": drive(0.4, 10.001, -1e-5),
+            "sqp, 1 iteration": drive(0.4, 10.001, -1e-5), "ipm, safe": drive(0.2, 10.0, 3e-3),
         },
         spatial: {
             "ipopt": drive(1.0, 7.0), "ipm": drive(1.0, 7.0), "ipm, 1 iteration": drive(0.088, 7.0),
-            "sqp, 1 iteration": drive(0.4, 7.0),
+            "sqp, 1 iteration": drive(0.4, 7.0), "ipm, safe": drive(0.1, 7.0),
         },
     }  # fmt: skip
     text = control_loops.render_single(results)
     assert "at most 0.5 times as long on the unicycle and 2.0 times as long on the quadrotor" in text
-    named = text.partition("in an obstacle: ")[2].splitlines()[-1]
-    assert "`ipm, 1 iteration` in unicycle straight, discs, N = 50 (+5.0 % cost, 2 mm deep in an obstacle)." in named
-    assert "sqp" not in named
+    named = text.splitlines()[-1].partition("in an obstacle: ")[2]
+    single, _, safe = named.partition(" The same of loops")
+    assert single == "`ipm, 1 iteration` in unicycle straight, discs, N = 50 (+5.0 % cost, 2 mm deep in an obstacle)."
+    assert safe.endswith("`ipm, safe` in unicycle straight, discs, N = 50 (+0.0 % cost, 3 mm deep in an obstacle).")
 
 
 def test_claims_survive_the_file_and_are_counted() -> None:

@@ -359,7 +359,7 @@ def test(address: int) -> None:
         if now.violation < now.violation_tolerance:
             now.answer = STOPPED
             return
-    if now.violation <= tolerance:
+    if now.violation <= now.keeping:
         now.kept = 1
         for k in range(len(values)):
             kept[k] = values[k]

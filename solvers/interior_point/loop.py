@@ -60,14 +60,18 @@ def advance(address: int) -> None:
 
 @linked
 def loop(address: int) -> None:
-    """Iterate from ``work.values``, which is moved, to one of the endings."""
+    """Iterate from ``work.values``, which is moved, to one of the endings.
+
+    With a clock to be watched it returns before every direction, and goes on from there when it is called again.
+    """
     constraint_jacobian, constraints = parts(address, "constraint_jacobian constraints")
     curvature, gradient, hessian, jacobian = parts(address, "curvature gradient hessian jacobian")
     links, multipliers, norms, residual = parts(address, "links multipliers norms residual")
     scalars, scratch, squares, terms, trial = parts(address, "scalars scratch squares terms trial")
     values, weights = parts(address, "values weights")
     now = scalars[0]
-    moved, started = True, now.going_on == 1
+    started, looked = now.going_on > 0, now.going_on == 2
+    moved = not looked
     while True:
         if moved:
             fill(gradient, 0.0)
@@ -92,7 +96,12 @@ def loop(address: int) -> None:
             )
             run(links[0].measure if started else links[0].begin, (address,))
             started = True
-        run(links[0].test, (address,))
+        if not looked:
+            run(links[0].test, (address,))
+            if now.answer == TRY and now.clocked == 1:
+                now.going_on = 2
+                return
+        looked = False
         if now.answer == TRY:
             if now.exact == 1 and (now.iteration > 0 or now.cold == 0):
                 copy(hessian, curvature)

@@ -38,6 +38,7 @@ ENDINGS = {
     state.NOT_FINITE: Status.NOT_FINITE,
     state.VIOLATED: Status.STALLED,
     state.STOPPED: Status.STOP_RULE,
+    state.TRY: Status.TIME_LIMIT,  # there was no time for the step
 }
 ANSWER = ("residual", "jacobian", "constraints", "constraint_jacobian", "gradient", "hessian")  # of `Work`
 NO_ANSWER = -1
@@ -58,7 +59,9 @@ class InteriorPoint(Solver):
             where they are far from it, and prices and mu in proportion to a large gradient. Inside only: tolerances and
             multipliers are those of the problem as stated.
         step_tolerance, violation_tolerance: stop rule on the norm of the full step and the largest violation, for
-            control loops. A positive step_tolerance switches it on; it does not grant CONVERGED.
+            control loops. A positive step_tolerance switches it on; it does not grant CONVERGED. An infinite one asks
+            for a single step, and more of them only as long as constraints are violated. With the rule on, a solve
+            that runs out of time or iterations hands back the last iterate that kept the constraints, if one did.
     """
 
     max_iterations: int = 300
@@ -88,6 +91,16 @@ class InteriorPoint(Solver):
 
     def iterate(self, run: SolveState, workspace: Workspace) -> Status | None:
         """Iterate to convergence; where that is not to be had, to a point of least violation, or on from another."""
+        reason = self._iterate(run, workspace)
+        now = workspace.now
+        if self.step_tolerance > 0.0 and now["kept"] and run.optimality.violation > now["keeping"]:
+            ending = run.status or reason
+            if ending in (Status.TIME_LIMIT, Status.ITERATION_LIMIT):  # what kept the constraints may be acted on
+                run.begin_at(run.program.linearize(run.program.columns.view(workspace.work.kept.copy())))
+                run.status = ending
+        return reason
+
+    def _iterate(self, run: SolveState, workspace: Workspace) -> Status | None:
         now = workspace.prepare(run, self)
         restarts = 0
         while True:
@@ -117,7 +130,12 @@ class InteriorPoint(Solver):
     def _alone(self, run: SolveState, workspace: Workspace) -> Status:
         """The compiled loop."""
         work, now = workspace.work, workspace.now
-        interrupted = workspace.loop()
+
+        def out_of_time() -> bool:
+            run.iterations = now["iteration"]
+            return run.out_of_time
+
+        interrupted = workspace.loop(out_of_time)
         lin, iterations = workspace.found(), now["iteration"]
         log = work.log[: iterations + 1].copy()
         if now["kept"] and now["violation"] > run.tolerance:
@@ -230,8 +248,11 @@ class Workspace:
         """Run one of the linked functions."""
         call(self._links[function], self._address)
 
-    def loop(self) -> bool:
+    def loop(self, out_of_time: Callable[[], bool]) -> bool:
         """Run the whole solve; returns whether control-C was pressed, which Python learns when it is over.
+
+        Args:
+            out_of_time: asked before every step, if there is a limit.
 
         Raises:
             KeyboardInterrupt: when it was pressed before the solve had begun.
@@ -239,6 +260,8 @@ class Workspace:
         self.now["answer"] = NO_ANSWER
         try:
             self.call("loop")
+            while self.now["answer"] == state.TRY and not out_of_time():
+                self.call("loop")
         except KeyboardInterrupt:
             if self.now["answer"] == NO_ANSWER:
                 raise
@@ -259,7 +282,8 @@ class Workspace:
         now["tolerance"] = 0.0 if run.program.least_squares else run.tolerance
         now["asked"], now["scaling"] = 0.0, bool(options.scaling)
         now["step_tolerance"] = options.step_tolerance
-        now["violation_tolerance"] = options.violation_tolerance
+        now["violation_tolerance"], now["clocked"] = options.violation_tolerance, options.time_limit < np.inf
+        now["keeping"] = max(run.tolerance, options.violation_tolerance if options.step_tolerance > 0.0 else 0.0)
         now["iteration"], now["kept"], now["raises"] = 0, 0, 0
         work.row_units[:] = work.units[:] = 1.0
         now["limit"], now["exact"] = options.max_iterations, options.hessian == "exact"

@@ -48,6 +48,7 @@ NOW = np.dtype(
         ("cost_unit", np.float64),  # what the objective is measured in
         ("step_tolerance", np.float64),  # norm of a full step below which to stop, once the violation is small enough
         ("violation_tolerance", np.float64),
+        ("keeping", np.float64),  # violation up to which an iterate counts as one that keeps all constraints
         ("answer", np.int64),  # of the last call, one of the words below
         ("sides", np.int64),  # how many there are
         ("iteration", np.int64),
@@ -61,7 +62,8 @@ NOW = np.dtype(
         ("cold", np.int64),  # whether the start had no multipliers
         ("descent", np.int64),  # whether the last trial was accepted because it lowers the barrier function
         ("elastic", np.int64),  # whether equalities are elastic, as inequalities always are
-        ("going_on", np.int64),  # whether slacks and multipliers are there: the solve goes on where it was
+        ("going_on", np.int64),  # 1: slacks and multipliers are there, the solve goes on; 2: the iterate is tested too
+        ("clocked", np.int64),  # whether to ask before every direction if there is time for it
         ("kept", np.int64),  # whether an iterate kept all constraints
         ("short_steps", np.int64),  # in a row
         ("scaling", np.int64),  # whether units are to be found

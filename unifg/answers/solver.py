@@ -137,7 +137,10 @@ class Solver(Backend):
         require(program, self.name, self.constraints, self.scalar_costs)
 
     def runs_alone(self, program: Program) -> bool:
-        """Whether :meth:`iterate` evaluates the start and ends with :meth:`SolveState.conclude` when nobody watches."""
+        """Whether :meth:`iterate` evaluates the start and ends with :meth:`SolveState.conclude` when nobody watches.
+
+        Such a backend minds the time limit itself.
+        """
         return False
 
     @abstractmethod
@@ -237,17 +240,16 @@ class SolveState:
         if self._solver.verbose:
             logger.info(line(row))
         self._keep_best()
-        self.status = self._decide()
+        self.status = self._decide_in_time()
         if self._callback is not None and self._callback(row) and self.status is None:
             self.status = Status.INTERRUPTED
         deferred.close()
 
     @property
     def watched(self) -> bool:
-        """Whether somebody looks at every iteration: a callback, a log, kept values or residuals, a time limit."""
+        """Whether somebody looks at every iteration: a callback, a log, kept values or residuals."""
         solver = self._solver
-        kept = solver.verbose or solver.keep_values or solver.keep_residuals
-        return bool(self._callback or kept or np.isfinite(solver.time_limit))
+        return bool(self._callback or solver.verbose or solver.keep_values or solver.keep_residuals)
 
     def conclude(
         self, lin: Linearization, multipliers: Array, iterations: int, history: Callable[[], list[Iteration]]
@@ -280,7 +282,7 @@ class SolveState:
         """Move the start, as onto the bounds, without spending an iteration."""
         self._move(lin, self.multipliers)
         self._keep_best()
-        self.status = self._decide()
+        self.status = self._decide_in_time()
 
     def search(self, workspace: Any) -> None:
         """Take the first steps along the search Jacobians; the multipliers wait, and the true numbers are recorded.
@@ -368,9 +370,10 @@ class SolveState:
             return Status.CONVERGED if self.optimality.passes(self.tolerance) else Status.IMPRECISE
         if self.iterations >= self._solver.max_iterations:
             return Status.ITERATION_LIMIT
-        if self.out_of_time:
-            return Status.TIME_LIMIT
         return None
+
+    def _decide_in_time(self) -> Status | None:
+        return self._decide() or (Status.TIME_LIMIT if self.out_of_time else None)
 
     def _keep_best(self) -> None:
         """What to return if the last iterate is not finite: feasible ones rank by stationarity, others by violation."""
