@@ -403,3 +403,20 @@ def test_a_function_that_closes_over_numbers() -> None:
     r, J = evaluated(expression, np.array([[1.0, 2.0]]), np.zeros((1, 0)))
     np.testing.assert_array_equal(r, [[-10.0]])
     np.testing.assert_array_equal(J, [[[2.0, -6.0]]])
+
+
+def test_second_derivatives_of_products_that_share_their_slopes() -> None:
+    """The slope of x cos(y) is a node that the other row has: it stands for what it depends on, once."""
+
+    def turned(x: Array) -> Array:
+        s, c = np.sin(x[:, 1] + 2.0 * x[:, 2]), np.cos(x[:, 1] + 2.0 * x[:, 2])
+        return np.stack([x[:, 0] * c, x[:, 0] * s, x[:, 0] * s / c], axis=1)
+
+    x, w = np.array([[0.7, 0.3, -0.4]]), np.array([[0.6, -1.1, 0.9]])
+    S = curved(traced(turned, (Rn(3),)), x, np.zeros((1, 0)), w)[0]
+    angle, along = x[0, 1] + 2.0 * x[0, 2], np.array([1.0, 2.0])
+    s, c = np.sin(angle), np.cos(angle)
+    slope = w[0] @ [-s, c, 1.0 / c**2]
+    bend = x[0, 0] * (w[0] @ [-c, -s, 2.0 * s / c**3])
+    np.testing.assert_allclose(S[0], [0.0, *(slope * along)], atol=1e-14)
+    np.testing.assert_allclose(S[1:, 1:], bend * np.outer(along, along), atol=1e-14)

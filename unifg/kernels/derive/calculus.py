@@ -31,22 +31,59 @@ def jacobian(tape: Tape, outputs: Sequence[int], width: int) -> dict[tuple[int, 
     return swept[0] if lengths[0] < lengths[1] else swept[1]
 
 
-def gradient(tape: Tape, outputs: Sequence[int], rows: Sequence[bool]) -> dict[int, int]:
-    """Derivative of the sum of weights times some outputs by every tangent coordinate where it is not zero."""
+def hessian(tape: Tape, outputs: Sequence[int], width: int) -> dict[tuple[int, int], int]:
+    """Second derivatives of the sum of weights times outputs: those on and above the diagonal that are not zero.
+
+    Backwards over the waists, every pair of them once (Gower and Mello 2012, edge pushing): what two waists bend by
+    goes to those they depend on, along their slopes, and a waist adds the bend of its own slopes, as much as it weighs.
+    """
+    rows = bent(tape, outputs)
     weighted = tape.zero
     for row, output in enumerate(outputs):
         if rows[row]:
             weighted = tape.add(weighted, tape.multiply(tape.leaf(Op.WEIGHT, row), output))
     waists = _waists(tape, [weighted])
-    return _by_tangent(tape, _adjoints(tape, waists, waists.outputs[0]))
+    adjoint = dict[int, int]()
+    bends = dict[int, dict[int, int]]()  # by two waists, either way round
 
+    def bend(a: int, b: int, node: int) -> None:
+        if node != tape.zero:
+            for one, other in ((a, b), (b, a)) if a != b else ((a, b),):
+                row = bends.setdefault(one, {})
+                row[other] = tape.add(row.get(other, tape.zero), node)
 
-def hessian(tape: Tape, outputs: Sequence[int], width: int) -> dict[tuple[int, int], int]:
-    """Second derivatives of the sum of weights times outputs: those on and above the diagonal that are not zero."""
-    first = gradient(tape, outputs, bent(tape, outputs))
-    slopes = [first.get(k, tape.zero) for k in range(width)]
-    entries = _forwards(tape, slopes, width)
-    return {(j, k): node for (j, k), node in entries.items() if j <= k}
+    def create(i: int, weight: int, slopes: dict[int, int]) -> None:
+        seconds = _between(tape, i, slopes)
+        for a, slope in slopes.items():
+            adjoint[a] = tape.add(adjoint.get(a, tape.zero), tape.scaled(weight, slope))
+            for b, second in seconds.get(slope, {}).items():
+                if a <= b:
+                    bend(a, b, tape.scaled(weight, second))
+
+    create(weighted, tape.one, waists.outputs[0])
+    for i in reversed(waists.order):
+        if tape.op[i] == Op.TANGENT:
+            continue
+        slopes, pairs = waists.slopes[i], bends.pop(i, {})
+        own = pairs.pop(i, tape.zero)
+        for other, node in pairs.items():
+            bends[other].pop(i)
+            for a, slope in slopes.items():
+                pushed = tape.scaled(node, slope)
+                bend(a, other, tape.add(pushed, pushed) if a == other else pushed)
+        for a, slope in slopes.items():
+            once = tape.scaled(own, slope)
+            for b, other_slope in slopes.items():
+                if a <= b:
+                    bend(a, b, tape.scaled(once, other_slope))
+        if i in adjoint:
+            create(i, adjoint[i], slopes)
+    return {
+        (j, k): node
+        for (a, row) in bends.items()
+        for b, node in row.items()
+        if (j := tape.a[a]) <= (k := tape.a[b]) and node != tape.zero
+    }
 
 
 def bent(tape: Tape, outputs: Sequence[int]) -> list[bool]:
@@ -104,6 +141,22 @@ def _waists(tape: Tape, outputs: Sequence[int]) -> _Waists:
             if found:
                 by[i] = found
     return _Waists(order, slopes, [by.get(output, {}) for output in outputs])
+
+
+def _between(tape: Tape, i: int, slopes: dict[int, int]) -> dict[int, dict[int, int]]:
+    """Derivatives of the slopes of a waist by the same waists.
+
+    They are all that the slopes move with: a slope is stated by what the waist takes, and by the waist itself.
+    """
+    by = {i: slopes}
+    for j in tape.live(slopes.values(), slopes):
+        if j in slopes:
+            by[j] = {j: tape.one}
+        elif tape.op[j] > Op.TANGENT and tape.op[j] not in STEADY and j != i:
+            found = _chosen(tape, j, by) if tape.op[j] == Op.SELECT else _chained(tape, j, by)
+            if found:
+                by[j] = found
+    return by
 
 
 def _chosen(tape: Tape, i: int, by: dict[int, dict[int, int]]) -> dict[int, int]:

@@ -9,7 +9,7 @@ what stands under it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 
 import numpy as np
 
@@ -227,14 +227,14 @@ class Tape:
 
     # ---------------------------------------------------------------- whole tapes
 
-    def live(self, outputs: Iterable[int]) -> list[int]:
-        """Nodes that the outputs depend on, in order."""
+    def live(self, outputs: Iterable[int], ends: Container[int] = ()) -> list[int]:
+        """Nodes that the outputs depend on, in order; of what ``ends`` depend on only them."""
         needed = set(outputs)
         waiting = list(needed)
         op, takes = self.op, (self.a, self.b, self.c)
         while waiting:
             i = waiting.pop()
-            if op[i] <= Op.TANGENT:
+            if op[i] <= Op.TANGENT or i in ends:
                 continue
             for column in takes:
                 j = column[i]
