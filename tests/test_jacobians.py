@@ -16,7 +16,19 @@ import unifg.models
 from unifg.kernels.differences import jacobian
 from unifg.kernels.residuals import Residual
 from unifg.machine.jit import compiled
-from unifg.models import avoidance, landmarks, lidar, obstacles, quadrotor, rkmk, unicycle, vehicle
+from unifg.models import (
+    avoidance,
+    bicycle,
+    cart_pole,
+    landmarks,
+    lidar,
+    manipulator,
+    obstacles,
+    quadrotor,
+    rkmk,
+    unicycle,
+    vehicle,
+)
 from unifg.models.compiled_field import CompiledField
 from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.models.potential import potential
@@ -155,6 +167,21 @@ CASES["quadrotor.disturbed_dynamics"] = (
 CASES["rkmk.trapezoid, quadrotor"] = (
     rkmk.trapezoid(quadrotor.STATE, quadrotor.field), [*FLIGHT, *UNKNOWN, LANDED], MANIFOLDS, [0.3],
 )  # fmt: skip
+CASES["bicycle.dynamics"] = (
+    bicycle.dynamics(bicycle.Bicycle()),
+    [bicycle.STATE.random(RNG, (COUNT,)), 0.3 * vectors(2), bicycle.STATE.random(RNG, (COUNT,))],
+    [bicycle.STATE, bicycle.CONTROL, bicycle.STATE], [0.3],
+)  # fmt: skip
+CASES["cart_pole.dynamics"] = (
+    cart_pole.dynamics(cart_pole.CartPole()),
+    [cart_pole.STATE.random(RNG, (COUNT,)), vectors(1), cart_pole.STATE.random(RNG, (COUNT,))],
+    [cart_pole.STATE, cart_pole.FORCE, cart_pole.STATE], [0.1],
+)  # fmt: skip
+CASES["manipulator.dynamics"] = (
+    manipulator.dynamics(manipulator.Arm()),
+    [manipulator.STATE.random(RNG, (COUNT,)), vectors(2), manipulator.STATE.random(RNG, (COUNT,))],
+    [manipulator.STATE, manipulator.TORQUES, manipulator.STATE], [0.1],
+)  # fmt: skip
 MARKS = 3.0 * vectors(2)
 CASES["landmarks.bearing_range"] = (
     landmarks.bearing_range, [FLIGHT[0], MARKS], [quadrotor.STATE, fg.Rn(2)], [vectors(2)],
@@ -253,6 +280,7 @@ def test_models_are_kernels_unless_their_functions_are_batched() -> None:
         if name.partition(".")[0] in {module.name for module in pkgutil.iter_modules(unifg.models.__path__)}
     }
     batched = {"rkmk.trapezoid", "rkmk.trapezoid, simplified", "rkmk.trapezoid, pose and velocity"}
+    batched |= {f"{robot}.dynamics" for robot in ("bicycle", "cart_pole", "manipulator")}
     assert models - set(KERNELS) == batched
 
 

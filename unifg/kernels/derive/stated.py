@@ -1,0 +1,43 @@
+"""Kernels that say what they take and compute it in plain NumPy; the rest is derived when it is first needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from unifg.kernels.derive.derived import generating
+from unifg.kernels.derive.expression import Expression, traced
+from unifg.kernels.kernel import Kernel
+
+
+@dataclass(frozen=True, eq=False)
+class StatedKernel(Kernel):
+    """A kernel whose ``function`` is batched NumPy: it is run once on symbols, in the shapes of ``arguments``.
+
+    A second derivative that is given takes the place of the derived one.
+    """
+
+    @cached_property
+    def expression(self) -> Expression:
+        """What it computes."""
+        with generating:
+            return traced(self.function, self.arguments, name=self.name)
+
+    @cached_property
+    def address(self) -> int:
+        """Of the machine code of residual and Jacobian."""
+        with generating:
+            return self.expression.residual().address
+
+    @cached_property
+    def second_address(self) -> int:
+        """Of the machine code of second derivatives, 0 where all of them are zero."""
+        if self.second is not None:
+            return Kernel.second_address.func(self)  # type: ignore[attr-defined, no-any-return]
+        with generating:
+            return 0 if self.linear or self.expression.linear else self.expression.second().address
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle what is stated; another process derives it anew."""
+        return {name: value for name, value in super().__getstate__().items() if name != "expression"}
