@@ -29,6 +29,7 @@ from unifg.errors import (
     ScenarioError,
     UnifgError,
 )
+from unifg.kernels.derive.casadi_function import from_casadi
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import Residual, residual
 from unifg.kernels.robust import DCS, Cauchy, GemanMcClure, Huber, Loss, Reweighted, TruncatedLeastSquares, Tukey
@@ -113,6 +114,7 @@ __all__ = [
     "compiled",
     "difference",
     "elementwise",
+    "from_casadi",
     "joint_prior",
     "optimality",
     "prior",

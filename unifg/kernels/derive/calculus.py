@@ -8,6 +8,7 @@ partial of what is not chosen may be infinite.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -307,6 +308,14 @@ def _slope(t: Tape, op: int, i: int, a: int) -> int:
         return t.apply(Op.SINH, a)
     if op == Op.TANH:
         return t.subtract(one, t.multiply(i, i))
+    if op == Op.ARCSINH:
+        return t.divide(one, t.apply(Op.SQRT, t.add(one, t.multiply(a, a))))
+    if op == Op.ARCCOSH:
+        return t.divide(one, t.apply(Op.SQRT, t.multiply(t.subtract(a, one), t.add(a, one))))
+    if op == Op.ARCTANH:
+        return t.divide(one, t.multiply(t.subtract(one, a), t.add(one, a)))
+    if op == Op.ERF:
+        return t.multiply(t.constant(2.0 / math.sqrt(math.pi)), t.apply(Op.EXP, t.negate(t.multiply(a, a))))
     if op == Op.EXP:
         return i
     if op == Op.EXPM1:

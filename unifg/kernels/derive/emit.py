@@ -12,7 +12,8 @@ from unifg.machine.native import POINTER, Native, number
 _INSTRUCTIONS = {Op.ADD: "fadd", Op.SUBTRACT: "fsub", Op.MULTIPLY: "fmul", Op.DIVIDE: "fdiv"}
 _LIBRARY = {  # functions of the C library, and those that processors know
     Op.TAN: "tan", Op.ARCSIN: "asin", Op.ARCCOS: "acos", Op.ARCTAN: "atan", Op.ARCTAN2: "atan2", Op.SINH: "sinh",
-    Op.COSH: "cosh", Op.TANH: "tanh", Op.EXPM1: "expm1", Op.LOG1P: "log1p", Op.POWER: "pow", Op.SIN: "sin",
+    Op.COSH: "cosh", Op.TANH: "tanh", Op.ARCSINH: "asinh", Op.ARCCOSH: "acosh",
+    Op.ARCTANH: "atanh", Op.ERF: "erf", Op.EXPM1: "expm1", Op.LOG1P: "log1p", Op.POWER: "pow", Op.SIN: "sin",
     Op.COS: "cos", Op.EXP: "exp", Op.LOG: "log", Op.SQRT: "llvm.sqrt.f64", Op.ABSOLUTE: "llvm.fabs.f64",
     Op.FLOOR: "llvm.floor.f64", Op.RINT: "llvm.rint.f64", Op.FMOD: "fmod",
 }  # fmt: skip

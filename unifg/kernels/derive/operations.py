@@ -29,6 +29,10 @@ class Op(IntEnum):
     SINH = auto()
     COSH = auto()
     TANH = auto()
+    ARCSINH = auto()
+    ARCCOSH = auto()
+    ARCTANH = auto()
+    ERF = auto()
     EXP = auto()
     EXPM1 = auto()
     LOG = auto()
@@ -54,8 +58,8 @@ class Op(IntEnum):
 UNARY = frozenset(
     {
         Op.NEGATE, Op.SQRT, Op.SIN, Op.COS, Op.TAN, Op.ARCSIN, Op.ARCCOS, Op.ARCTAN, Op.SINH, Op.COSH, Op.TANH,
-        Op.EXP, Op.EXPM1, Op.LOG, Op.LOG1P, Op.ABSOLUTE, Op.SIGN, Op.FLOOR, Op.RINT, Op.NOT,
-        Op.GATHER,
+        Op.ARCSINH, Op.ARCCOSH, Op.ARCTANH, Op.ERF, Op.EXP, Op.EXPM1, Op.LOG, Op.LOG1P, Op.ABSOLUTE, Op.SIGN, Op.FLOOR,
+        Op.RINT, Op.NOT, Op.GATHER,
     }
 )  # fmt: skip
 STEADY = frozenset({Op.SIGN, Op.FLOOR, Op.RINT, Op.LESS, Op.LESS_EQUAL, Op.EQUAL, Op.AND, Op.OR, Op.NOT, Op.GATHER})

@@ -265,7 +265,10 @@ BORROWED: dict[int, Callable[..., Any]] = {
 }
 NUMPY = _Proxy(np, _MAKERS)
 CONSTRUCTORS = {id(getattr(np, name)): made for name, made in _MAKERS.items()}
-_MATH = {"fabs": "absolute", "pow": "power", "asin": "arcsin", "acos": "arccos", "atan": "arctan", "atan2": "arctan2"}
+_MATH = {
+    "fabs": "absolute", "pow": "power", "asin": "arcsin", "acos": "arccos", "atan": "arctan", "atan2": "arctan2",
+    "asinh": "arcsinh", "acosh": "arccosh", "atanh": "arctanh",
+}  # fmt: skip
 
 
 def _mathematical(name: str) -> Callable[..., Any]:
