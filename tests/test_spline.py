@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline, RectBivariateSpline
 
+import unifg as fg
 from test_derive import compared, curved, evaluated
 from unifg.errors import ModelError
 from unifg.kernels.derive.expression import traced
 from unifg.lie import SE2, Rn
 from unifg.models.distance_map import DistanceMap
 from unifg.models.spline import BEYOND, SplineCurve, SplineField
+from unifg.solvers import LevenbergMarquardt
 from unifg.typing import Array
 
 RNG = np.random.default_rng(4)
@@ -154,5 +156,28 @@ def test_a_field_does_not_change() -> None:
     before = field(np.array([[2.3, 1.2]]))
     grid[:] = 0.0
     assert field(np.array([[2.3, 1.2]])) == before
-    with pytest.raises(ValueError, match="read-only"):
-        field.table[0] = 1.0
+    for part in (field.table, field.values):
+        with pytest.raises(ValueError, match="read-only"):
+            part[0] = 1.0
+    with pytest.raises(AttributeError, match="never changes"):
+        field.origin = (1.0, 0.0, 0.0)
+
+
+def test_fields_that_compute_the_same_are_known_as_equal() -> None:
+    digests = {
+        SplineField(GRID, 1.0).digest, SplineField(GRID, 2.0).digest, SplineField(GRID, 1.0, (0.0, 0.0, 1.0)).digest,
+        SplineField(GRID + 1e-9, 1.0).digest, SplineField(GRID.T, 1.0).digest,
+    }  # fmt: skip
+    assert len(digests) == 5 and SplineField(GRID.copy(), 1.0).digest in digests
+
+
+def test_a_graph_is_traced_through_a_field() -> None:
+    """A function that reaches a field is compiled with its table, and solved with exact derivatives."""
+    bowl = SplineField(np.add.outer((np.arange(8.0) - 3.3) ** 2, (np.arange(9.0) - 4.6) ** 2), 1.0)
+    graph = fg.Graph()
+    x = graph.variables("x", Rn(2), 3)
+    graph.minimize(lambda p: bowl(p)[:, None], x, name="bowl")
+    assert bowl(np.array([[4.6, 3.3]]))[0] == pytest.approx(0.0, abs=1e-12)
+    solution = LevenbergMarquardt(max_iterations=60).solve(graph, {x: np.array([[4.0, 3.0], [5.0, 4.0], [4.5, 2.8]])})
+    assert float(np.abs(bowl(solution[x])).max()) < 1e-3
+    assert "bowl" not in str(graph.check({x: np.zeros((3, 2))}))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,16 +16,40 @@ from unifg.typing import Array, ArrayLike
 class Lookup:
     """A function of a table that never changes: a traced function may call it, and carries the table with it.
 
-    A subclass states ``__call__`` by NumPy and by :meth:`take`, so that arrays and traces run the same lines.
+    A subclass states ``__call__`` by NumPy and by :meth:`take`, so that arrays and traces run the same lines. It sets
+    its own attributes before it hands over the table: none can be set afterwards, and its arrays are read-only.
 
     Attributes:
-        table: flat numbers, read-only.
+        table: flat numbers.
     """
+
+    table: Array
 
     def __init__(self, table: ArrayLike) -> None:
         """Keep a copy of the table."""
-        self.table: Array = np.array(table, dtype=np.float64).ravel()
-        self.table.flags.writeable = False
+        for part in vars(self).values():
+            if isinstance(part, np.ndarray):
+                part.flags.writeable = False
+        copy = np.array(table, dtype=np.float64).ravel()
+        copy.flags.writeable = False
+        self.table = copy
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Only until the table is there."""
+        if "table" in vars(self) and name != "digest":
+            raise AttributeError(f"a {type(self).__name__} never changes: make another one")
+        super().__setattr__(name, value)
+
+    @cached_property
+    def digest(self) -> bytes:
+        """Equal for those that compute the same."""
+        digest = hashlib.blake2b(digest_size=16)
+        for name, part in sorted(vars(self).items()):
+            content = (
+                f"{part.shape}".encode() + part.tobytes() if isinstance(part, np.ndarray) else f"{part!r}".encode()
+            )
+            digest.update(name.encode() + content)
+        return digest.digest()
 
     def take(self, place: Any) -> Any:
         """Entries at whole numbers, as floats, of any shape; the first where that is not a number."""

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from unifg.kernels.derive.lookup import Lookup
 from unifg.lie import Manifold
 from unifg.machine.jit import is_compiled
 from unifg.typing import Array
@@ -123,6 +124,8 @@ class _Walk:
     def _other(self, value: Any, where: str) -> Hashable:
         if isinstance(value, np.ufunc | Manifold | Enum):
             return type(value), value
+        if isinstance(value, Lookup) and _trusted(type(value).__module__):
+            return type(value), value.digest
         if isinstance(value, BuiltinFunctionType) and isinstance(value.__self__, ModuleType | type | None):
             if value.__name__ in OUTWARD:
                 self.refuse(f"it calls {value.__name__}()")
