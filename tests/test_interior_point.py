@@ -1,17 +1,25 @@
-"""The interior point's two ways of running, and what data change between solves."""
+"""The interior point alone, watched and with terms in Python, and what data change between solves."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
 
 import unifg as fg
+from own_manifolds import S2, SphereManifold
 from problems.control import Quadrotor, Unicycle
 from problems.known import short_drive
 from unifg.answers.solver import SolveState
+from unifg.kernels.robust import Loss
 from unifg.models import avoidance
+from unifg.program.columns import Values
 from unifg.solvers import SQP, InteriorPoint
 from unifg.solvers.interior_point.method import Workspace
+from unifg.typing import Array, ArrayLike
 
 
 def test_a_watched_solve_takes_the_same_steps() -> None:
@@ -248,3 +256,106 @@ def test_a_warm_tick_on_its_way_raises_no_price() -> None:
         assert solution.converged
         assert all(float(row.details["mu"]) <= 1e-5 for row in solution.history[1:])
     assert max(iterations) <= 3
+
+
+def in_python(graph: fg.Graph, names: Sequence[str] | None = None) -> fg.Graph:
+    """State some terms as functions of NumPy with the same Jacobians; all of them if no names are given."""
+    for k, term in enumerate(graph.terms):
+        kernel = term.residual.kernel
+        if kernel is not None and (names is None or term.name in names):
+            plain = fg.residual(
+                lambda *a, f=kernel: f(*a), lambda *a, f=kernel: f.jacobian(*a), name=term.residual.name
+            )
+            graph.terms[k] = replace(term, residual=plain)
+    return graph
+
+
+def disturbed(loss: Loss | None) -> tuple[fg.Graph, fg.Guess]:
+    """A drive past discs whose references have losses, one of them switched off, to an end that is given."""
+    stated = Unicycle("straight", True, 10).formulation()
+    graph = stated.graph
+    x = graph.families["state"]
+    sighted = np.array([True, False, True])
+    graph.minimize(fg.prior, x[[3, 5, 8]], np.zeros(3), sigma=0.3, robust=loss, active=sighted, name="sights")
+    return graph, stated.guess
+
+
+@pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
+@pytest.mark.parametrize("loss", [None, fg.Cauchy(0.5), fg.Reweighted(lambda s: np.where(s < 5.0, 1.0, 0.25))])
+def test_terms_in_python_change_no_step(loss: Loss | None, hessian: Literal["gauss-newton", "exact"]) -> None:
+    """None, one or all terms without a kernel; alone or watched: one loop, the same iterates."""
+    runs = []
+    for names in ((), ("sights",), ("dynamics", "sights"), None):
+        graph, guess = disturbed(loss)
+        in_python(graph, names)
+        solver = InteriorPoint(tolerance=1e-7, hessian=hessian)
+        run = solver.prepare(graph)
+        plain = [term for term in graph.terms if term.residual.kernel is None and not getattr(term, "is_bound", False)]
+        assert len(run.program.batched) == len(plain) >= (len(names) if names is not None else 4)
+        runs += [run.solve(guess), run.solve(guess), run.solve(guess, callback=lambda row: None)]
+    first = runs[0]
+    assert first.converged and first.iterations > 4
+    for other in runs[1:]:
+        assert other.iterations == first.iterations
+        mine, wanted = ([(row.cost, row.step_length) for row in solution.history] for solution in (other, first))
+        np.testing.assert_allclose(mine, wanted, rtol=1e-10 if hessian == "gauss-newton" else 1e-5)
+        assert other.history[-1].terms.keys() == first.history[-1].terms.keys()
+
+
+class Plain(SphereManifold):
+    """Unit vectors, moved by Python."""
+
+    def retract(self, x: ArrayLike, d: ArrayLike, /) -> Array:
+        return S2.retract(x, d)
+
+
+@pytest.mark.parametrize("sphere", [S2, Plain()], ids=["compiled", "Python"])
+def test_a_manifold_without_a_compiled_retraction_and_a_fixed_member(sphere: SphereManifold) -> None:
+    """Its part of a step is taken in Python; what is fixed stays to the last bit."""
+    rng = np.random.default_rng(2)
+    graph = fg.Graph()
+    g, q = graph.variables("g", sphere, 2), graph.variables("q", fg.SO3, 2)
+    kept = fg.SO3.random(rng) * (1.0 + 3e-13)
+    graph.fix(q[0], kept)
+    seen = S2.random(rng, (12,))
+    graph.minimize(lambda a, z: a - z, g[np.arange(12) % 2], seen, sigma=0.3)
+    graph.minimize(fg.between, q[0], q[1], fg.SO3.exp([0.3, -0.2, 0.5]), sigma=0.1)
+    graph.constrain(lambda a: a[:, 2:], g, lower=0.4, upper=0.9)
+    guess = {g: S2.random(rng, (2,)), q: np.tile(kept, (2, 1))}
+    runs = [InteriorPoint(tolerance=1e-7).prepare(graph).solve(guess, callback=c) for c in (None, lambda row: None)]
+    for solution in runs:
+        assert solution.converged, solution.report()
+        assert solution.iterations > 3
+        assert solution[q][0].tobytes() == kept.tobytes()
+        np.testing.assert_allclose(np.linalg.norm(solution[g], axis=1), 1.0, atol=1e-12)
+        assert solution.cost == pytest.approx(runs[0].cost, rel=1e-12)
+    # The mean of what was seen, cut at its limits.
+    for k in range(2):
+        mean = seen[k::2].sum(axis=0)
+        height = np.clip(mean[2] / np.linalg.norm(mean), 0.4, 0.9)
+        wanted = np.array([*(np.sqrt(1.0 - height**2) * mean[:2] / np.linalg.norm(mean[:2])), height])
+        np.testing.assert_allclose(runs[0][g][k], wanted, atol=1e-5)
+
+
+def test_control_c_while_a_term_runs_in_python() -> None:
+    graph, guess = disturbed(None)
+    in_python(graph, ["sights"])
+    run = InteriorPoint(tolerance=1e-7).prepare(graph)
+    whole = run.solve(guess)
+    batched, calls = run.program.batched[0], 0
+    evaluate = batched.residual
+
+    def pressed(values: Values) -> Array:
+        nonlocal calls
+        calls += 1
+        if calls == 6:
+            raise KeyboardInterrupt
+        return evaluate(values)
+
+    batched.residual = pressed  # type: ignore[method-assign]
+    solution = run.solve(guess)
+    assert solution.status is fg.Status.INTERRUPTED
+    assert 0 < solution.iterations < whole.iterations
+    assert solution.cost == pytest.approx(run.program.evaluate(solution.values).cost, rel=1e-12)
+    batched.residual = evaluate  # type: ignore[method-assign]
+    assert run.solve(guess).cost == whole.cost

@@ -1,4 +1,7 @@
-"""The whole interior-point solve without Python, and the table of addresses through which its parts call each other."""
+"""The whole interior-point solve, and the table of addresses through which its parts call each other.
+
+It runs without Python where it can, and asks for what only Python can do.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,26 @@ from unifg.program import passes
 from unifg.program.curvature import add_curvature, add_losses
 from unifg.program.retraction import retract_parts
 from unifg.solvers.interior_point import barrier, direction, filter_search
-from unifg.solvers.interior_point.state import ACCEPTED, AGAIN, LINKS, TRY, Problem, Records, Work
+from unifg.solvers.interior_point.state import (
+    ACCEPTED,
+    AGAIN,
+    AIMED,
+    BEND,
+    BENT,
+    EVALUATE,
+    EVALUATED,
+    LINEARIZE,
+    LINEARIZED,
+    LINKS,
+    MEASURED,
+    MOVED,
+    SHOW,
+    TESTED,
+    TRY,
+    Problem,
+    Records,
+    Work,
+)
 from unifg.typing import Array
 
 
@@ -41,10 +63,10 @@ def fill(target: Array, number: float) -> None:
 @linked
 def advance(address: int) -> None:
     """Move to the trial and evaluate it."""
-    free, links, move, retraction, scalars = parts(address, "free links move retraction scalars")
-    scratch, spread, squares, step, terms, weights = parts(address, "scratch spread squares step terms weights")
-    trial, trial_constraints, trial_residual = parts(address, "trial trial_constraints trial_residual")
-    (values,) = parts(address, "values")
+    fixed, free, links, move, retraction = parts(address, "fixed free links move retraction")
+    scalars, scratch, spread, squares, step = parts(address, "scalars scratch spread squares step")
+    terms, trial, trial_constraints = parts(address, "terms trial trial_constraints")
+    trial_residual, values, weights = parts(address, "trial_residual values weights")
     now = scalars[0]
     alpha = now.alpha
     for k in range(len(free)):
@@ -52,6 +74,8 @@ def advance(address: int) -> None:
     copy(values, trial)
     fill(spread, 0.0)
     run(links[0].retract, (retraction, free, move, spread, values, trial))
+    for place in fixed:  # retractions wrap and renormalise
+        trial[place] = values[place]
     now.trial_cost = number(
         links[0].evaluate,
         (terms, trial, trial_residual, trial_constraints, squares, weights, False, scratch),
@@ -59,63 +83,98 @@ def advance(address: int) -> None:
 
 
 @linked
+def renew(address: int) -> None:
+    """Linearise at the present iterate."""
+    constraint_jacobian, constraints = parts(address, "constraint_jacobian constraints")
+    gradient, hessian, jacobian, links, norms = parts(address, "gradient hessian jacobian links norms")
+    residual, scalars, scratch, squares = parts(address, "residual scalars scratch squares")
+    terms, values, weights = parts(address, "terms values weights")
+    fill(gradient, 0.0)
+    fill(hessian, 0.0)
+    scalars[0].cost = number(
+        links[0].linearize,
+        (
+            terms,
+            values,
+            False,
+            residual,
+            jacobian,
+            constraints,
+            constraint_jacobian,
+            squares,
+            weights,
+            norms,
+            gradient,
+            hessian,
+            scratch,
+        ),
+    )
+
+
+@linked
+def bend(address: int) -> None:
+    """Find the second derivatives of the Lagrangian at the present iterate."""
+    curvature, hessian, jacobian, links = parts(address, "curvature hessian jacobian links")
+    multipliers, residual, squares, terms = parts(address, "multipliers residual squares terms")
+    values, weights = parts(address, "values weights")
+    copy(hessian, curvature)
+    run(links[0].curve, (terms, values, residual, weights, multipliers, curvature))
+    if len(weights):
+        run(links[0].weigh, (terms, residual, jacobian, squares, weights, curvature))
+
+
+@linked
 def loop(address: int) -> None:
     """Iterate from ``work.values``, which is moved, to one of the endings.
 
-    With a clock to be watched it returns before every direction, and goes on from there when it is called again.
+    Where Python has to do something it is asked by the answer, and the loop goes on at its stage when called again: for
+    numbers if ``assisted``, to show every iterate if ``watched``, and before every direction, where the answer is to
+    try it, if ``clocked``.
     """
-    constraint_jacobian, constraints = parts(address, "constraint_jacobian constraints")
-    curvature, gradient, hessian, jacobian = parts(address, "curvature gradient hessian jacobian")
-    links, multipliers, norms, residual = parts(address, "links multipliers norms residual")
-    scalars, scratch, squares, terms, trial = parts(address, "scalars scratch squares terms trial")
-    values, weights = parts(address, "values weights")
+    links, scalars, trial, values = parts(address, "links scalars trial values")
     now = scalars[0]
-    started, looked = now.going_on > 0, now.going_on == 2
-    moved = not looked
+    python, watched, stage = now.assisted == 1, now.watched == 1, now.stage
     while True:
-        if moved:
-            fill(gradient, 0.0)
-            fill(hessian, 0.0)
-            now.cost = number(
-                links[0].linearize,
-                (
-                    terms,
-                    values,
-                    False,
-                    residual,
-                    jacobian,
-                    constraints,
-                    constraint_jacobian,
-                    squares,
-                    weights,
-                    norms,
-                    gradient,
-                    hessian,
-                    scratch,
-                ),
-            )
-            run(links[0].measure if started else links[0].begin, (address,))
-            started = True
-        if not looked:
-            run(links[0].test, (address,))
-            if now.answer == TRY and now.clocked == 1:
-                now.going_on = 2
+        if stage == MOVED:
+            if python:
+                now.answer, now.stage = LINEARIZE, LINEARIZED
                 return
-        looked = False
-        if now.answer == TRY:
+            run(links[0].renew, (address,))
+            stage = LINEARIZED
+        if stage == LINEARIZED:
+            run(links[0].measure if now.going_on == 1 else links[0].begin, (address,))
+            now.going_on, stage = 1, MEASURED
+            if watched:
+                now.answer, now.stage = SHOW, MEASURED
+                return
+        if stage == MEASURED:
+            run(links[0].test, (address,))
+            if now.answer != TRY:
+                return
+            stage = TESTED
+            if now.clocked == 1:
+                now.stage = TESTED
+                return
+        if stage == TESTED:
+            stage = BENT
             if now.exact == 1 and (now.iteration > 0 or now.cold == 0):
-                copy(hessian, curvature)
-                run(links[0].curve, (terms, values, residual, weights, multipliers, curvature))
-                if len(weights):
-                    run(links[0].bend, (terms, residual, jacobian, squares, weights, curvature))
-            run(links[0].direct, (address,))
-        while now.answer == TRY:
+                if python:
+                    now.answer, now.stage = BEND, BENT
+                    return
+                run(links[0].bend, (address,))
+        if stage == AIMED:
+            if python:
+                now.answer, now.stage = EVALUATE, EVALUATED
+                return
             run(links[0].advance, (address,))
-            run(links[0].judge, (address,))
-        moved = now.answer == ACCEPTED
-        if moved:
+        run(links[0].direct if stage == BENT else links[0].judge, (address,))
+        stage = AIMED
+        if now.answer == ACCEPTED:
             copy(trial, values)
-        elif now.answer != AGAIN:
+            stage = MOVED
+        elif now.answer == AGAIN:
+            stage = MEASURED
+        elif now.answer != TRY:
             return
 
 
@@ -148,7 +207,7 @@ def addresses() -> Records:
         add_curvature, NOTHING, terms, values, residual, kinds["weights"], constraints, kinds["hessian"]
     )
     robust = kinds["squares"], kinds["weights"]
-    links[0]["bend"] = link(add_losses, NOTHING, terms, residual, kinds["jacobian"], *robust, kinds["hessian"])
+    links[0]["weigh"] = link(add_losses, NOTHING, terms, residual, kinds["jacobian"], *robust, kinds["hessian"])
     links[0]["retract"] = link(
         retract_parts, NOTHING, kinds["retraction"], kinds["free"], vector, kinds["spread"], values, values
     )
@@ -164,6 +223,8 @@ def addresses() -> Records:
         "direct": direction.direct,
         "steer": direction.steer,
         "advance": advance,
+        "renew": renew,
+        "bend": bend,
         "loop": loop,
     }
     for name, function in functions.items():

@@ -1,8 +1,7 @@
 """Primal-dual interior point on the graph: hard inequalities from bad guesses, one elimination per iteration.
 
-The method is in :mod:`unifg.solvers.interior_point.barrier`; this file runs it. A graph whose terms all have kernels is
-solved by one compiled loop; with batched NumPy terms, or a callback per iteration, the same functions are called from
-Python.
+The method is in :mod:`unifg.solvers.interior_point.barrier`; this file runs it. One compiled loop solves every graph.
+It comes back where it needs Python: to evaluate terms without a kernel, or to show an iterate to somebody who looks.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from unifg.answers.status import Status
 from unifg.errors import BackendError
 from unifg.machine.buffers import Block
 from unifg.machine.links import memory
+from unifg.program.columns import Values
 from unifg.program.curvature import lagrangian_hessian
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
@@ -82,12 +82,22 @@ class InteriorPoint(Solver):
                 raise BackendError(f"{self.name}: {name} must be positive, found {value}")
 
     def runs_alone(self, program: Program) -> bool:
-        """Whether a compiled loop can make the whole solve; that of least squares is tested outside, at every step."""
-        return program.fully_compiled and not program.least_squares
+        """Whether the loop may make the whole solve; that of least squares is tested outside, at every step."""
+        return not program.least_squares
 
     def workspace(self, program: Program) -> Workspace:
         """Structure of the KKT matrix."""
         return Workspace(program)
+
+    def search_step(self, run: SolveState, workspace: Workspace, lin: Linearization) -> Array | None:
+        """The first step of a solve from there, by Gauss-Newton, as far as slacks and multipliers stay positive."""
+        now = workspace.prepare(run, self)
+        now["exact"] = 0
+        workspace.take(lin)
+        workspace.call("begin")
+        workspace.call("direct")
+        step: Array = now["alpha"] * workspace.work.step[: run.program.size]
+        return step if now["answer"] == state.TRY else None
 
     def iterate(self, run: SolveState, workspace: Workspace) -> Status | None:
         """Iterate to convergence; where that is not to be had, to a point of least violation, or on from another."""
@@ -104,7 +114,7 @@ class InteriorPoint(Solver):
         now = workspace.prepare(run, self)
         restarts = 0
         while True:
-            reason = self._alone(run, workspace) if run.alone else self._guided(run, workspace)
+            reason = self._attempt(run, workspace)
             if now["answer"] not in STUCK or run.status not in (None, Status.ITERATION_LIMIT):
                 return reason
             if run.optimality.violation <= run.tolerance:
@@ -127,60 +137,44 @@ class InteriorPoint(Solver):
                 return reason
             run.status = None
 
-    def _alone(self, run: SolveState, workspace: Workspace) -> Status:
-        """The compiled loop."""
-        work, now = workspace.work, workspace.now
-
-        def out_of_time() -> bool:
-            run.iterations = now["iteration"]
-            return run.out_of_time
-
-        interrupted = workspace.loop(out_of_time)
-        lin, iterations = workspace.found(), now["iteration"]
-        log = work.log[: iterations + 1].copy()
-        if now["kept"] and now["violation"] > run.tolerance:
-            run.begin_at(run.program.linearize(run.program.columns.view(work.kept.copy())))
-        run.conclude(lin, work.multipliers.copy(), iterations, _history(log, lin.norms, run.seconds))
-        ending = ENDINGS[now["answer"]]
-        if interrupted:
-            run.status = ending if ending is Status.CONVERGED else Status.INTERRUPTED
-        return ending
-
-    def _guided(self, run: SolveState, workspace: Workspace) -> Status | None:
-        """The same loop, with every evaluation made by the program and every iterate shown."""
+    def _attempt(self, run: SolveState, workspace: Workspace) -> Status | None:
+        """From where the workspace is to one of the endings."""
         program, work, now = run.program, workspace.work, workspace.now
-        lin = run.lin
-        if not np.array_equal(lin.values.flat, work.values):
-            run.begin_at(program.linearize(program.columns.view(work.values.copy())))
-            lin = run.lin
-            if run.status is not None:
-                return None
-        workspace.take(lin)
-        workspace.call("measure" if now["going_on"] else "begin")
-        while True:
-            workspace.call("test")
-            if now["answer"] == state.TRY:
-                if self.hessian == "exact":
-                    work.curvature[:] = lagrangian_hessian(program, lin, work.multipliers)
-                workspace.call("direct")
-            while now["answer"] == state.TRY:
-                values = program.retract(lin.values, now["alpha"] * work.step[: program.size])
-                found = program.evaluate(values, lin.weights)
-                now["trial_cost"], work.trial_constraints[:] = found.cost, found.constraints
-                workspace.call("judge")
-            if now["answer"] == state.AGAIN:
-                if run.out_of_time:
-                    return Status.TIME_LIMIT
-                continue
-            if now["answer"] != state.ACCEPTED:
-                return ENDINGS[now["answer"]]
-            lin = program.linearize(values)
-            workspace.take(lin)
-            workspace.call("measure")
-            details = _details(now["mu"], now["delta"], now["gauss_newton"])
-            run.accept(lin, work.multipliers.copy(), now["step"], now["taken"], **details)
-            if run.status is not None:
-                return None
+        now["assisted"], now["watched"], now["stage"] = not program.fully_compiled, not run.alone, state.MOVED
+        if not run.alone:
+            if not np.array_equal(run.lin.values.flat, work.values):
+                run.begin_at(program.linearize(program.columns.view(work.values.copy())))
+                if run.status is not None:
+                    return None
+            workspace.take(run.lin)
+            now["stage"] = state.LINEARIZED
+        interrupted, seen, now["answer"] = False, now["iteration"], NO_ANSWER
+        try:
+            while workspace.asks():
+                if run.alone:
+                    run.iterations = now["iteration"]
+                if now["answer"] == state.TRY and run.out_of_time:
+                    break
+                if now["answer"] == state.SHOW and now["iteration"] > seen:
+                    seen = now["iteration"]
+                    details = _details(now["mu"], now["delta"], now["gauss_newton"])
+                    run.accept(workspace.found(), work.multipliers.copy(), now["step"], now["taken"], **details)
+                    if run.status is not None:
+                        return None
+        except KeyboardInterrupt:
+            if not run.alone or now["answer"] == NO_ANSWER:
+                raise
+            interrupted = True  # in compiled code Python learns of it when that is over
+        ending = ENDINGS.get(now["answer"], Status.INTERRUPTED)
+        if run.alone:
+            lin, iterations = workspace.found(), now["iteration"]
+            log = work.log[: iterations + 1].copy()
+            if now["kept"] and now["violation"] > run.tolerance:
+                run.begin_at(program.linearize(program.columns.view(work.kept.copy())))
+            run.conclude(lin, work.multipliers.copy(), iterations, _history(log, lin.norms, run.seconds))
+            if interrupted:
+                run.status = ending if ending is Status.CONVERGED else Status.INTERRUPTED
+        return ending
 
 
 class Workspace:
@@ -189,6 +183,7 @@ class Workspace:
     def __init__(self, program: Program) -> None:
         """Analyse the KKT matrix and compile."""
         self.program = program
+        self._taken: Linearization | None = None
         self._build(1)
 
     def _build(self, iterations: int) -> None:
@@ -223,6 +218,7 @@ class Workspace:
             plan,
             program.retraction.parts,
             program.columns.free,
+            program.retraction.fixed,
             program.scratch,
             arrays.rows,
             arrays.entries,
@@ -248,25 +244,22 @@ class Workspace:
         """Run one of the linked functions."""
         call(self._links[function], self._address)
 
-    def loop(self, out_of_time: Callable[[], bool]) -> bool:
-        """Run the whole solve; returns whether control-C was pressed, which Python learns when it is over.
-
-        Args:
-            out_of_time: asked before every step, if there is a limit.
-
-        Raises:
-            KeyboardInterrupt: when it was pressed before the solve had begun.
-        """
-        self.now["answer"] = NO_ANSWER
-        try:
-            self.call("loop")
-            while self.now["answer"] == state.TRY and not out_of_time():
-                self.call("loop")
-        except KeyboardInterrupt:
-            if self.now["answer"] == NO_ANSWER:
-                raise
-            return True
-        return False
+    def asks(self) -> bool:
+        """Run the loop up to an ending, a question, or something to show; answer a question; whether it goes on."""
+        program, work, now = self.program, self.work, self.now
+        self.call("loop")
+        answer = now["answer"]
+        if answer == state.LINEARIZE:
+            self.take(program.linearize(self._values()))
+        elif answer == state.BEND:
+            work.curvature[:] = lagrangian_hessian(program, self.found(), work.multipliers)
+        elif answer == state.EVALUATE:
+            lin = self.found()
+            values = program.retract(lin.values, now["alpha"] * work.step[: program.size])
+            found = program.evaluate(values, lin.weights)
+            now["trial_cost"], work.trial[:] = found.cost, values.flat
+            work.trial_constraints[:] = found.constraints
+        return answer in (state.TRY, state.LINEARIZE, state.BEND, state.EVALUATE, state.SHOW)
 
     def prepare(self, run: SolveState, options: InteriorPoint) -> Fields:
         """Set up one solve with the present data; returns the scalars."""
@@ -277,7 +270,7 @@ class Workspace:
         if len(self.work.log) < options.max_iterations + 2:
             self.work = self.work._replace(log=np.zeros((options.max_iterations + 2, 9)))
             self._describe()
-        work, now = self.work, self.now
+        work, now, self._taken = self.work, self.now, None
         # The test of least squares has no absolute tolerance.
         now["tolerance"] = 0.0 if run.program.least_squares else run.tolerance
         now["asked"], now["scaling"] = 0.0, bool(options.scaling)
@@ -299,13 +292,16 @@ class Workspace:
         now["rho"] = options.price * 10.0 ** now["raises"]
 
     def found(self) -> Linearization:
-        """The linearisation at which the compiled loop ended."""
+        """The linearisation at the present iterate."""
         program, work = self.program, self.work
-        values = program.columns.view(work.values.copy())
-        program.retraction.fix(values)
+        if not program.fully_compiled:
+            if self._taken is None or not np.array_equal(self._taken.values.flat, work.values):
+                self.take(program.linearize(self._values()))
+            assert self._taken is not None
+            return self._taken
         residual, jacobian, constraints, rows, gradient, hessian = self._answer.copied()
         return Linearization(
-            values,
+            self._values(),
             self.now["cost"],
             residual,
             jacobian,
@@ -320,11 +316,16 @@ class Workspace:
 
     def take(self, lin: Linearization) -> None:
         """Copy a linearisation to where the compiled functions look for it."""
-        work = self.work
+        work, self._taken = self.work, lin
         self.now["cost"], work.values[:] = lin.cost, lin.values.flat
         work.residual[:], work.jacobian[:] = lin.residual, lin.jacobian
         work.constraints[:], work.constraint_jacobian[:] = lin.constraints, lin.constraint_jacobian
         work.gradient[:], work.hessian[:] = lin.gradient, lin.hessian
+        work.squares[:], work.weights[:] = lin.squares, lin.weights
+
+    def _values(self) -> Values:
+        """The present iterate."""
+        return self.program.columns.view(self.work.values.copy())
 
 
 def _history(log: Array, norms: dict[str, float], seconds: float) -> Callable[[], list[Iteration]]:

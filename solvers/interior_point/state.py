@@ -62,12 +62,15 @@ NOW = np.dtype(
         ("cold", np.int64),  # whether the start had no multipliers
         ("descent", np.int64),  # whether the last trial was accepted because it lowers the barrier function
         ("elastic", np.int64),  # whether equalities are elastic, as inequalities always are
-        ("going_on", np.int64),  # 1: slacks and multipliers are there, the solve goes on; 2: the iterate is tested too
+        ("going_on", np.int64),  # whether slacks and multipliers are there: the solve goes on where it was
         ("clocked", np.int64),  # whether to ask before every direction if there is time for it
         ("kept", np.int64),  # whether an iterate kept all constraints
         ("short_steps", np.int64),  # in a row
         ("scaling", np.int64),  # whether units are to be found
         ("raises", np.int64),  # of the prices
+        ("assisted", np.int64),  # whether Python evaluates, linearises and bends
+        ("watched", np.int64),  # whether somebody looks at every iterate
+        ("stage", np.int64),  # where the loop goes on
     ]
 )
 # A finite limit of an inequality row.
@@ -101,12 +104,16 @@ PAIR = np.dtype(
     ]
 )
 # Addresses of compiled functions.
-FUNCTIONS = "factor solve linearize evaluate curve bend retract"
-FUNCTIONS += " begin measure test direct steer advance judge correct restore accept relax loop"
+FUNCTIONS = "factor solve linearize evaluate curve weigh retract"
+FUNCTIONS += " begin measure test bend direct steer advance judge correct restore accept relax renew loop"
 LINKS = np.dtype([(name, np.int64) for name in FUNCTIONS.split()])
 
 # What a call answers.
 TRY, ACCEPTED, AGAIN, CONVERGED, LIMIT_REACHED, SINGULAR, STALLED, NOT_FINITE, VIOLATED, STOPPED = range(10)
+# What the loop asks of Python, before it is called again.
+LINEARIZE, BEND, EVALUATE, SHOW = range(10, 14)
+# Where it goes on then.
+MOVED, LINEARIZED, MEASURED, TESTED, BENT, AIMED, EVALUATED = range(7)
 FILTER = 400  # pairs of theta and phi that are remembered
 
 
@@ -119,6 +126,7 @@ class Problem(NamedTuple):
         plan: elimination of the KKT matrix, whose entries come in the order of ``Work.data``.
         retraction: its parts.
         free: columns that are unknown.
+        fixed: places of stored values that stay.
         scratch: memory of the loops over terms.
         rows: (E,) equality rows.
         entries: entries of the constraint Jacobian behind those of the Hessian in ``Work.data``.
@@ -131,6 +139,7 @@ class Problem(NamedTuple):
     plan: Plan
     retraction: IntArray
     free: IntArray
+    fixed: IntArray
     scratch: Array
     rows: IntArray
     entries: IntArray
