@@ -77,7 +77,7 @@ def test_a_time_limit_ends_both_ways_of_running_at_the_same_iterate(
 
 def test_a_time_limit_leaves_the_solve_to_compiled_code(monkeypatch: pytest.MonkeyPatch) -> None:
     stated = Unicycle("straight", True, 20).formulation()
-    monkeypatch.setattr(InteriorPoint, "_guided", None)
+    monkeypatch.setattr(SolveState, "accept", None)
     assert InteriorPoint(tolerance=1e-4, time_limit=10.0).solve(stated.graph, stated.guess).converged
 
 
