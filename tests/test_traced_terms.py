@@ -4,10 +4,12 @@ import functools
 import logging
 import math
 import pickle
+import re
 import threading
 from collections.abc import Callable
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 
@@ -131,6 +133,81 @@ def test_a_decision_about_data_is_left_to_python() -> None:
     assert "asks whether a number holds" in graph.compile().terms[0].route
 
 
+# ---------------------------------------------------------------- functions of one factor, scalar costs
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def half_sine(a: float) -> float:
+    return 0.5 * math.sin(a)
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def compiled(x: Array, target: Array, scale: float, r: Array) -> None:
+    for k in range(3):
+        r[k] = scale * (x[k] - target[k])
+    r[0] += half_sine(x[0]) if x[0] > 0.0 else 0.5 * x[0]
+
+
+@pytest.mark.parametrize("derivatives", [None, "differences"])
+def test_functions_of_one_factor_are_traced_from_their_source(derivatives: Any) -> None:
+    residual = fg.residual(compiled, rows=3, derivatives=derivatives)
+    route, found = solved(residual, TARGETS, 2.0)
+    assert route.startswith("compiled by Numba" if derivatives else "traced")
+    r = np.empty(3)
+    for x, target in zip(found, TARGETS, strict=True):
+        compiled.py_func(x, target, 2.0, r)
+        assert np.abs(r).max() < 1e-8
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def writing(x: Array, r: Array) -> None:
+    x[0] = 1.0
+    r[0] = x[0] - x[1]
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def forgetting(x: Array, r: Array) -> None:
+    r[0] = x[0]
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def adding(x: Array, r: Array) -> None:
+    r[0] += x[0]
+    r[1] = x[1]
+
+
+@pytest.mark.parametrize(
+    ("function", "rows", "message"),
+    [
+        (writing, 1, "changes its argument 0"),
+        (forgetting, 2, "does not write row 1 of factor 0"),
+        (adding, 2, "does not write row 0 of factor 0"),
+    ],
+)
+def test_functions_of_one_factor_are_refused_as_ever(function: Any, rows: int, message: str) -> None:
+    with pytest.raises(GraphError, match=message):
+        solved(fg.residual(function, rows=rows))
+
+
+@pytest.mark.parametrize("derivatives", [None, "differences"])
+def test_scalar_costs_have_exact_derivatives(derivatives: Any) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE2, 3)
+    top = graph.data("top", TARGETS[:3], each=True)
+    graph.minimize_scalar(
+        fg.residual(lambda x, top: np.cosh(fg.SE2.log(x) - top).sum(axis=1), derivatives=derivatives), x, top
+    )
+    prepared = SQP(hessian="exact", tolerance=1e-9).prepare(graph)
+    for scale in (1.0, 0.5):
+        solution = prepared.solve({x: np.zeros((3, 3))}, data={top: scale * TARGETS[:3]})
+        if derivatives is None:
+            np.testing.assert_allclose(fg.SE2.log(solution[x]), scale * TARGETS[:3], atol=1e-7)
+            assert solution.rounding == 0.0 and solution.converged and solution.stationarity < 1e-9
+        else:
+            assert solution.rounding > 0.0
+    assert prepared.program.terms[0].route.startswith("traced") == (derivatives is None)
+
+
 # ---------------------------------------------------------------- what a trace cannot stand for
 
 
@@ -210,6 +287,23 @@ def test_what_cannot_be_traced_is_an_error_when_asked(function: Function) -> Non
     assert raised.value.term == "term"
 
 
+def test_check_and_report_say_what_python_evaluates() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(3), N)
+    graph.minimize(branching, x, name="slow")
+    graph.minimize(lambda x: x, x, name="fast")
+    graph.minimize(fg.prior, x, np.zeros(3), name="shipped")
+    report = graph.check({x: np.ones((N, 3))})
+    assert report and str(report).splitlines()[0] == "nothing found"
+    assert "term 'slow': evaluated by Python, its derivatives by differences: " in str(report)
+    assert report.routes["fast"] == "traced, its derivatives exact"
+    assert report.routes["shipped"].startswith("a kernel that ships")
+    text = GaussNewton().solve(graph, {x: np.ones((N, 3))}).report()
+    assert re.search(r" \d+ % of the time went into functions in Python: 'slow'\.", text), text
+    graph, x = stated(lambda x: x)
+    assert "in Python" not in GaussNewton().solve(graph, {x: np.ones((N, 3))}).report()
+
+
 def test_differences_when_asked() -> None:
     route, _ = solved(fg.residual(lambda x: x - 1.0, derivatives="differences"))
     assert route == "evaluated by Python, its derivatives by differences: as it was asked to be"
@@ -279,12 +373,42 @@ def test_coarse_numbers_are_refused_as_ever(derivatives: Any) -> None:
 # ---------------------------------------------------------------- what a function closes over may change
 
 
-def test_what_a_function_closes_over_is_looked_at_before_each_solve() -> None:
-    target = np.zeros(3)
+@pytest.mark.parametrize("rows", [3, N])
+def test_arrays_that_a_function_closes_over_are_parameters(rows: int) -> None:
+    """One row for each factor, or one array for all; nothing is compiled when they change."""
+    target = np.zeros((rows, 3)) if rows == N else np.zeros(3)
     graph, x = stated(lambda x: x - target)
     prepared = GaussNewton().prepare(graph)
+    kernel = prepared.program.terms[0].kernel
     for k in range(CHANGES + 3):
-        target[:] = k
+        target[:] = k + np.arange(3)
+        np.testing.assert_allclose(prepared.solve({x: np.zeros((N, 3))})[x], target + np.zeros((N, 3)), atol=1e-9)
+    assert prepared.program.terms[0].kernel is kernel and kernel is not None
+
+
+def test_another_array_under_the_same_name_is_seen() -> None:
+    target: Array = np.zeros((N, 3))
+
+    def function(x: Array) -> Array:
+        return np.asarray(x - target)
+
+    graph, x = stated(function)
+    prepared = GaussNewton().prepare(graph)
+    for k in range(CHANGES + 3):
+        target = TARGETS * k
+        np.testing.assert_allclose(prepared.solve({x: np.zeros((N, 3))})[x], target, atol=1e-9)
+    assert prepared.program.terms[0].route.startswith("traced")
+    target = np.ones(3)
+    np.testing.assert_allclose(prepared.solve({x: np.zeros((N, 3))})[x], 1.0, atol=1e-9)
+    assert "changed its shape" in prepared.program.terms[0].route
+
+
+def test_what_is_compiled_in_is_looked_at_before_each_solve() -> None:
+    target = (np.zeros(3), 1.0)
+    graph, x = stated(lambda x: x * target[1] - target[0])
+    prepared = GaussNewton().prepare(graph)
+    for k in range(CHANGES + 3):
+        target[0][:] = k
         np.testing.assert_allclose(prepared.solve({x: np.zeros((N, 3))})[x], k, atol=1e-9)
     assert "keeps changing" in graph.compile().terms[0].route
 

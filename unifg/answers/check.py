@@ -1,13 +1,14 @@
 """``graph.check(guess)``: mistakes found before a solve, by term, family and index.
 
 Looks for residuals that are not finite, attached Jacobians that disagree with numerical differentiation,
-unknowns that nothing determines, and constraints whose rows depend on each other at the guess.
+unknowns that nothing determines, and constraints whose rows depend on each other at the guess. Says of every term
+how it is evaluated.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -44,17 +45,24 @@ class Finding:
 
 @dataclass(frozen=True)
 class Report:
-    """All findings; true when there are none."""
+    """All findings; true when there are none.
+
+    Attributes:
+        findings: mistakes.
+        routes: for each term by name, how it is evaluated and differentiated, and why not faster.
+    """
 
     findings: tuple[Finding, ...]
+    routes: dict[str, str] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
         """Whether nothing was found."""
         return not self.findings
 
     def __str__(self) -> str:
-        """One line per finding."""
-        return "\n".join(f"{f.kind}: {f.message}" for f in self.findings) or "nothing found"
+        """One line per finding, then one per term."""
+        found = [f"{f.kind}: {f.message}" for f in self.findings] or ["nothing found"]
+        return "\n".join([*found, *(f"term '{name}': {route}" for name, route in self.routes.items())])
 
 
 def check_graph(
@@ -76,7 +84,7 @@ def check_graph(
     if not any(f.kind == "not finite" for f in findings):
         findings += _undetermined(program, values)
         findings += _dependent(program, values)
-    return Report(tuple(findings))
+    return Report(tuple(findings), {term.name: term.route for term in program.terms})
 
 
 def _not_finite(term: CompiledTerm, values: Values) -> Finding | None:

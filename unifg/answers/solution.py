@@ -50,9 +50,11 @@ class Solution:
         iterations: number of iterations taken.
         seconds: wall-clock time of the solve.
         solver: name of the backend.
+        in_python: seconds of them spent in residuals that Python evaluates, see ``graph.check``.
         verdict: which measurements it believes, from solves that decide that.
     """
 
+    in_python = 0.0
     verdict: Verdict[Solution] | None = None
 
     def __init__(
@@ -228,6 +230,10 @@ class Solution:
         if self.worst is not None and self.violation > 0.0 and not self.converged:
             name, index = self.worst
             text += f" Largest violation: '{name}', factor {index}."
+        if self.in_python > 0.01 * self.seconds:
+            names = ", ".join(f"'{name}'" for name in self._program.left_to_python)
+            share = 100.0 * self.in_python / self.seconds
+            text += f" {share:.0f} % of the time went into functions in Python: {names}."
         if self.verdict is not None:
             text += f" {self.verdict.sentence(self.cost)}"
         return text

@@ -182,6 +182,7 @@ class SolveState:
         self._solver = solver
         self._callback = callback
         self._started = time.perf_counter()
+        self._in_python = program.python_seconds
         self.program = program
         self.tolerance = solver.tolerance
         self.history: list[Iteration] = []
@@ -346,7 +347,7 @@ class SolveState:
             status = Status.IMPRECISE
         elif status.converged:
             status = Status.STALLED
-        return Solution(
+        solution = Solution(
             self.program,
             self.lin,
             self.multipliers,
@@ -358,6 +359,8 @@ class SolveState:
             self.seconds,
             self._solver.name,
         )
+        solution.in_python = self.program.python_seconds - self._in_python
+        return solution
 
     def _decide(self) -> Status | None:
         if not self.optimality.finite:

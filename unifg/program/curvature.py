@@ -9,6 +9,7 @@ differenced twice. A robust loss adds the slope of its weight (:func:`add_losses
 from __future__ import annotations
 
 from math import sqrt
+from time import perf_counter
 from typing import TypeAlias
 
 import numpy as np
@@ -105,7 +106,9 @@ def constraint_curvature(program: Program, lin: Linearization, multipliers: Arra
 
 def _add(program: Program, term: CompiledTerm, lin: Linearization, multipliers: Array, entries: Array) -> None:
     """Second derivatives of a term without a kernel."""
+    began = perf_counter()
     second = term.second_derivatives(lin.values, row_weights(program, term, lin, multipliers))
+    program.python_seconds += perf_counter() - began
     if not second.any():
         return
     known = program.once(_known)

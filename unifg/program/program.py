@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
+from time import perf_counter
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
@@ -71,6 +72,7 @@ class Program:
         batched: terms without a kernel, evaluated by NumPy.
         retraction: moves all variables.
         scratch: memory for compiled loops.
+        python_seconds: time spent so far in terms that Python evaluates.
     """
 
     def __init__(self, graph: Statement) -> None:
@@ -93,7 +95,7 @@ class Program:
         self.table = TermTable(stacked, self.columns, self.normal)
         self.arrays = self.table.arrays
         self.least_squares = bool(self.cost_terms) and not (self.scalar_terms or self.constraint_terms)
-        self.differenced = bool(self.scalar_terms or self.table.differenced)
+        self.differenced = self.table.differenced or any(term.trace is None for term in self.scalar_terms)
         self.batched = [term for term in stacked if term.kernel is None and not term.is_bound]
         self.costs = Rows(self.table, self.cost_terms, True, self.size)
         self.constraints = Rows(self.table, self.constraint_terms, False, self.size)
@@ -114,10 +116,16 @@ class Program:
         self.scratch = np.empty(self.table.scratch)
         self._buffers = Buffers([*self.table.sizes, self.columns.width, self.normal.nnz])
         self._watched: list[CompiledTerm] = []
+        self.python_seconds = 0.0
         read = {value for term in self.terms for value in term.data}
         read |= {fix.value for fix in graph.fixes if isinstance(fix.value, Data)}
         self._binding, self._vetted = Binding(graph._data, filter(read.__contains__, graph._data.values())), False
         self._bind_first()
+
+    @property
+    def left_to_python(self) -> list[str]:
+        """Names of the terms that Python evaluates."""
+        return [term.name for term in self.batched + self.scalar_terms if term.trace is None]
 
     @property
     def fully_compiled(self) -> bool:
@@ -214,21 +222,29 @@ class Program:
                 if not term.stands(values):
                     self._give_up(term)
             self._vetted = True
-            self._watched = [term for term in self.terms if term.trace is not None and not term.trace.fixed]
+            self._watched = [term for term in self.terms if term.trace is not None and not term.trace.constant]
         for term in self._watched:
-            if term.trace is not None and term.trace.outdated:
-                if term.trace_again(values):
+            if term.trace is None:
+                continue
+            if term.trace.outdated:
+                if not term.trace_again(values):
+                    self._give_up(term)
+                elif not isinstance(term.term, ScalarCost):
                     self.table.renew(term)
                     self.table.bind([term], self.lower, self.upper)
-                else:
-                    self._give_up(term)
+            elif term.trace.moved:
+                term.refresh()
+                if not isinstance(term.term, ScalarCost):
+                    self.table.bind([term], self.lower, self.upper)
         return values
 
     def _give_up(self, term: CompiledTerm) -> None:
         """Leave a term that was traced to Python."""
-        self.table.give_up(term)
-        self.batched.append(term)
         self.differenced = True
+        if not isinstance(term.term, ScalarCost):
+            self.table.give_up(term)
+            if term.kernel is None:
+                self.batched.append(term)
 
     def retract(self, values: Values, step: Array) -> Values:
         """Move the unknowns by a tangent step; fixed variables stay."""
@@ -255,8 +271,11 @@ class Program:
         residual, constraints = np.empty(table.residuals), np.empty(table.constraints)
         squares = np.empty(table.weights)
         with np.errstate(all="ignore"):
-            for term in self.batched:
-                self.rows_of(term, residual, constraints)[:] = term.residual(values)
+            if self.batched:
+                began = perf_counter()
+                for term in self.batched:
+                    self.rows_of(term, residual, constraints)[:] = term.residual(values)
+                self.python_seconds += perf_counter() - began
             holding, held = weights is not None, squares if weights is None else weights
             cost = passes.evaluate(
                 table.arrays, values.flat, residual, constraints, squares, held, holding, self.scratch
@@ -265,7 +284,9 @@ class Program:
                 if not (holding and loss.held):
                     cost += 0.5 * float(loss.value(squares[part]).sum())
             for term in self.scalar_terms:
+                began = perf_counter()
                 cost += float(term.residual(values).sum())
+                self.python_seconds += 0.0 if term.trace else perf_counter() - began
         return Evaluation(cost, constraints)
 
     def linearize(self, values: Mapping[Family, Array], search: bool = False) -> Linearization:
@@ -281,9 +302,12 @@ class Program:
         concavity = np.zeros(self.normal.nnz if self.scalar_terms else 0)
         rounding = np.zeros(self.columns.width if self.scalar_terms else 0)
         with np.errstate(all="ignore"):
-            for term in self.batched:
-                self.rows_of(term, residual, constraints)[:] = term.residual(values)
-                self._entries_of(term, jacobian, constraint_jacobian, term.jacobians(values, search=search))
+            if self.batched:
+                began = perf_counter()
+                for term in self.batched:
+                    self.rows_of(term, residual, constraints)[:] = term.residual(values)
+                    self._entries_of(term, jacobian, constraint_jacobian, term.jacobians(values, search=search))
+                self.python_seconds += perf_counter() - began
             cost = passes.linearize(
                 table.arrays,
                 values.flat,
@@ -305,10 +329,12 @@ class Program:
                     cost += 0.5 * float(loss.value(squares[part]).sum())
                 passes.weigh(table.arrays, weights, residual, jacobian, gradient, hessian)
             for term in self.scalar_terms:
+                began = perf_counter()
                 value = term.residual(values)
                 cost += float(value.sum())
                 scalars[term.name], norms[term.name] = value, float(np.abs(value).sum())
                 slope, curvature, doubt = term.scalar_derivatives(values)
+                self.python_seconds += 0.0 if term.trace else perf_counter() - began
                 columns, factor, a, b, place = self._scalars[term.name]
                 np.add.at(gradient, columns.ravel(), slope.ravel())
                 np.add.at(rounding, columns.ravel(), doubt.ravel())
@@ -438,6 +464,8 @@ class Program:
         """Where gradient and Hessian blocks of scalar costs go."""
         self._scalars: dict[str, tuple[IntArray, IntArray, IntArray, IntArray, IntArray]] = {}
         for term in self.scalar_terms:
+            if term.trace is not None:
+                _ = term.trace.kernel.address, term.trace.kernel.second_address  # every linearisation takes both
             full = np.concatenate(term.columns, axis=1)
             mapped = self.columns.unknown[full]
             keep = (mapped[:, :, None] <= mapped[:, None, :]) & (mapped[:, :, None] >= 0)

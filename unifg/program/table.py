@@ -214,9 +214,11 @@ class TermTable:
         row[PARTS] = 0 if kernel.linear else len(movable_parts(kernel.manifolds))
 
     def give_up(self, term: CompiledTerm) -> None:
-        """Leave a term to Python; its rows and entries stay where they are."""
-        row = term.place
+        """Leave a term that was traced to its own function; its rows, entries and parameters stay where they are."""
+        row, kernel = term.place, term.kernel
         row[ADDRESS] = row[SECOND] = row[PARTS] = 0
+        if kernel is not None:
+            row[ADDRESS], row[PARTS] = kernel.address, len(movable_parts(kernel.manifolds))
         row[DIFFERENCED] = self.differenced = True
 
     def require_second(self) -> None:

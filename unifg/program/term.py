@@ -140,9 +140,7 @@ class CompiledTerm:
         self.trace: Trace | None = None
         self._changes = 0
         self.bind({})
-        if term.residual.rows and not isinstance(term, ScalarCost):
-            self.kernel = self._own_kernel()
-            self._batched.function, self._jacobian = self.kernel, self.kernel.jacobian
+        self.route = "" if not term.residual.rows or isinstance(term, ScalarCost) else self._choose_single(trace)
         if self.kernel is not None:
             self._require_manifolds(self.kernel)
         with np.errstate(all="ignore"):
@@ -157,7 +155,7 @@ class CompiledTerm:
             )
         self.size = 1 if scalar else trial.shape[1]
         self.shape = trial.shape
-        self.route = self._choose_route(trace)
+        self.route = self.route or self._choose_route(trace)
         self.differenced = (
             self._jacobian is None and not self.is_bound if self.kernel is None else self.kernel.differenced
         )
@@ -176,26 +174,53 @@ class CompiledTerm:
             return "the variable itself"
         if own.kernel is not None:
             return "a kernel that ships, its derivatives exact" if self.kernel is not None else _SEARCHED
-        if own.rows:
-            return "compiled by Numba, its derivatives " + ("attached" if own.jacobian else "by differences")
-        asked, scalar = own.derivatives == "trace", isinstance(self.term, ScalarCost)
+        asked = own.derivatives == "trace"
         if own.jacobian is not None and not asked:
             return "evaluated by Python, its derivatives attached"
         why = "it has a search Jacobian" if own.search else ""
-        if own.derivatives == "differences" or not trace or scalar:
+        if own.derivatives == "differences" or not trace:
             why = "as it was asked to be"
         if not why:
             self.trace, why = find(self._batch, own.function, asked)
         if self.trace is None:
             return self._by_python(why)
-        self.kernel, self._taken, self._jacobian = self.trace.kernel, self.trace.taken, self._exact
+        if not isinstance(self.term, ScalarCost):
+            self.kernel, self._taken, self._jacobian = self.trace.kernel, self.trace.taken, self._exact
+        return self._traced()
+
+    def _choose_single(self, trace: bool) -> str:
+        """The same of a function of one factor that is compiled: traced from its source, or called as it is."""
+        own, why = self.term.residual, "as it was asked to be"
+        asked = own.derivatives == "trace"
+        if asked or (trace and own.jacobian is None and own.derivatives != "differences"):
+            self.size = own.rows
+            self.trace, why = find(self._batch, own.function, asked)
+            del self.size
+        if self.trace is None:
+            self._call_single()
+            if own.jacobian is not None:
+                return "compiled by Numba, its derivatives attached"
+            return self._said("compiled by Numba", why)
+        self.kernel = self.trace.kernel
+        self._batched.function, self._jacobian = self.kernel, self._exact
+        return self._traced()
+
+    def _call_single(self) -> None:
+        """Have a function of one factor called as it is."""
+        self.kernel = self._own_kernel()
+        self._batched.function, self._jacobian = self.kernel, self.kernel.jacobian
+
+    def _traced(self) -> str:
         logger.info("term '%s' was traced: its derivatives are exact", self.name)
         return "traced, its derivatives exact"
 
     def _by_python(self, why: str) -> str:
-        if why and self.term.residual.derivatives != "differences":
-            logger.warning("term '%s' is evaluated by Python and differenced: %s", self.name, why)
-        return "evaluated by Python, its derivatives by differences" + (f": {why}" if why else "")
+        return self._said("evaluated by Python", why)
+
+    def _said(self, how: str, why: str) -> str:
+        if self.term.residual.derivatives != "differences":
+            logger.warning("term '%s' is %s and differenced: %s", self.name, how, why)
+        return f"{how}, its derivatives by differences: {why}"
 
     @property
     def _batch(self) -> Batch:
@@ -209,17 +234,19 @@ class CompiledTerm:
             shared,
             self.count,
             self.size,
+            isinstance(self.term, ScalarCost),
+            self.term.residual.function if self.term.residual.rows else None,
         )
 
     def _exact(self, *arguments: Any) -> list[Array]:
         """Jacobian of a derived kernel, of the arguments of the function it was derived from."""
-        assert self.kernel is not None
-        return self.kernel.jacobian(*(arguments[place] for place in self._taken))
+        assert self.trace is not None
+        return self.trace.kernel.jacobian(*self.trace.arguments(arguments))
 
     def _for_kernel(self, points: list[Array]) -> list[Any]:
         """The arguments that the kernel takes, variables at these points."""
         filled = self._batched.fill(points)
-        return [filled[place] for place in self._taken]
+        return filled if self.trace is None else self.trace.arguments(filled)
 
     def stands(self, values: Values) -> bool:
         """Whether the trace of a function computes what the function does at a guess; otherwise it is given up.
@@ -242,19 +269,29 @@ class CompiledTerm:
             GraphError: as for :meth:`stands`.
         """
         assert self.trace is not None
-        old, self._changes = self.trace, self._changes + 1
+        old = self.trace
         asked = self.term.residual.derivatives == "trace"
         found, why = find(self._batch, self.term.residual.function, asked)
-        if found is not None and (found.taken != old.taken or found.kernel.arguments != old.kernel.arguments):
+        if found is not None and found.layout != old.layout:
             found, why = None, "what it reads beyond its arguments has changed its shape"
+        same = found is not None and found.kernel is old.kernel
+        self._changes += not same
         if self._changes > CHANGES and not asked:
             found, why = None, "what it reads beyond its arguments keeps changing: declare it by graph.data"
         if found is None:
             self._leave(why)
             return False
-        self.trace, self.kernel = found, found.kernel
+        self.trace = found
+        if self.kernel is not None:
+            self.kernel = found.kernel
         self._bind_parameters(self._data)
-        return self.stands(values)
+        return same or self.stands(values)
+
+    def refresh(self) -> None:
+        """Take the present content of arrays that are parameters of a trace and belong to the user."""
+        assert self.trace is not None
+        self.trace = self.trace.refreshed()
+        self._bind_parameters(self._data)
 
     def _leave(self, why: str) -> None:
         """Leave to Python what was traced."""
@@ -262,7 +299,12 @@ class CompiledTerm:
             raise GraphError(f"term '{self.name}': cannot be traced: {why}", term=self.name)
         self.trace = self.kernel = self._jacobian = None
         self._taken = tuple(range(len(self.term.arguments)))
-        self.differenced, self.route = True, self._by_python(why)
+        if self.term.residual.rows:
+            self._call_single()
+            self.route = self._said("compiled by Numba", why)
+        else:
+            self.route = self._by_python(why)
+        self.differenced = True
         self._bind_parameters(self._data)
 
     def bind(self, data: Bound) -> None:
@@ -313,7 +355,10 @@ class CompiledTerm:
 
     def residual(self, values: Values) -> Array:
         """(n, m) residuals, zero where inactive, not whitened; (n,) for a scalar cost."""
-        return self._masked(self._checked(self._batched.at(self.points(values))))
+        points = self.points(values)
+        if self.trace is not None and self.kernel is None:  # a scalar cost
+            return self._masked(self.trace.kernel(*self._for_kernel(points))[:, 0])
+        return self._masked(self._checked(self._batched.at(points)))
 
     def jacobians(self, values: Values, numerical: bool = False, search: bool = False) -> list[Array]:
         """One (n, m, d_k) array per variable argument, zero where inactive.
@@ -408,7 +453,13 @@ class CompiledTerm:
 
     def scalar_derivatives(self, values: Values) -> tuple[Array, Array, Array]:
         """Gradient (n, D), Hessian (n, D, D), rounding of the gradient (n, D) of a scalar cost, zero where inactive."""
-        found = scalar_slopes(self._batched, self._directions, self.points(values))
+        points = self.points(values)
+        if self.trace is not None:
+            kernel, given = self.trace.kernel, self._for_kernel(points)
+            slopes = np.concatenate(kernel.jacobian(*given), axis=2)[:, 0]
+            bent = kernel.second_derivatives(np.ones((self.count, 1)), *given)
+            return self._masked(slopes), self._masked(bent), np.zeros(slopes.shape)
+        found = scalar_slopes(self._batched, self._directions, points)
         gradient, hessian, rounding = (self._masked(array) for array in found)
         return gradient, hessian, rounding
 
@@ -426,7 +477,7 @@ class CompiledTerm:
         gather: list[IntArray] = []
         keep: list[int] = []
         sizes, width = [], 0
-        for place, expected in zip(self._taken, self.kernel.arguments, strict=True):
+        for place, expected in zip(self._taken, self.kernel.arguments, strict=False):
             argument = self.term.arguments[place]
             if isinstance(expected, int | tuple):
                 continue
@@ -481,7 +532,7 @@ class CompiledTerm:
         packed = side_by_side(parameters)
         self.parameter_count = packed.shape[1]
         self.parameter_spread = packed.shape[1] if len(packed) > 1 else 0
-        taken = list(zip(self._taken, kernel.arguments, strict=True))
+        taken = list(zip(self._taken, kernel.arguments, strict=False))  # others are no arguments of the term
         places = [k for k, expected in taken if not isinstance(expected, int | tuple)]
         given = {slot: v for slot, (k, v) in enumerate(zip(places, variables, strict=True)) if k not in self._places}
         self._constants = given

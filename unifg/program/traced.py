@@ -11,19 +11,19 @@ from __future__ import annotations
 import itertools
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.kernels.batched import Batched
-from unifg.kernels.derive.derived import DerivedKernel, Each, Fixed, Given, Shared, derived
+from unifg.kernels.batched import Batched, changes
+from unifg.kernels.derive.derived import DerivedKernel, Each, Fixed, Given, Shared, derived, in_python
 from unifg.kernels.derive.reach import Reach, reach_of
 from unifg.kernels.derive.symbols import TraceError
 from unifg.language.variables import Data, Selection
 from unifg.lie import Manifold
-from unifg.typing import Array, BoolArray
+from unifg.typing import Array, BoolArray, IntArray
 
 logger = logging.getLogger("unifg")
 READINGS = 8  # of arrays that may or may not have a row for each factor
@@ -31,7 +31,11 @@ ALIKE = 1e-9  # relative to the numbers that go in and come out
 AMPLIFIED = 1e4  # roundings of the arguments, as the function itself enlarges them
 DOUBTED = 1e-5  # the most of it, relative as above
 NEAR = (1e-3, 0.3)  # how far from the guess the function is compared once more [m, rad]
+SHORT = 256  # numbers of an array that becomes a parameter, for each factor
+FEW = 16  # factors that a function of one factor is compared at
 WATCHED = 64, 4096  # numbers in reach, for each factor and at all, that are looked at again before each solve
+
+Contents: TypeAlias = tuple[tuple[Array, bytes], ...]
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,7 @@ class Batch:
         shared: for each variable, whether all factors have the same.
         count, size: number of factors, rows of each.
         scalar: whether it returns (n,).
+        single: the function, where it takes one factor at a time and is compiled.
     """
 
     name: str
@@ -58,11 +63,52 @@ class Batch:
     count: int
     size: int
     scalar: bool = False
+    single: Callable[..., Any] | None = None
+
+    def may_have_rows(self, place: int) -> bool:
+        """Whether an argument is an array as long as the batch, with a row for each factor or not."""
+        argument, value = self.arguments[place], self.present[place]
+        if not isinstance(value, np.ndarray) or (isinstance(argument, Data) and argument.each):
+            return False
+        return bool(value.ndim and len(value) == self.count > 1)
+
+    @property
+    def looked_at(self) -> IntArray:
+        """Factors that are compared: of a function of one factor a few, for no factor can be another's."""
+        if self.single is None:
+            return np.arange(self.count)
+        return np.unique(np.linspace(0, self.count - 1, FEW).astype(np.intp))
 
     def original(self, points: Sequence[Array]) -> Array:
-        """(n, m) what the function itself returns."""
+        """(n, m) what the function itself returns, of the factors that are compared.
+
+        Raises:
+            GraphError: it changes its arguments.
+        """
         with np.errstate(all="ignore"):
-            return self.batched.on_copies(points).reshape(self.count, self.size)
+            if self.single is None:
+                return self.batched.on_copies(points).reshape(self.count, self.size)
+            filled = self.batched.fill(points)
+            found = np.full((self.count, self.size), np.nan)
+            for factor in self.looked_at:
+                given = [np.array(a[factor] if row else a) for a, row in zip(filled, self.rows_of(filled), strict=True)]
+                before = [a.tobytes() for a in given]
+                found[factor] = in_python(self.single, [a if a.ndim else float(a) for a in given], self.size)
+                for place, (now, kept) in enumerate(zip(given, before, strict=True)):
+                    if now.tobytes() != kept:
+                        raise GraphError(changes(self.name, place), term=self.name)
+            return found
+
+    def rows_of(self, filled: Sequence[Any]) -> list[bool]:
+        """Which arguments of a function of one factor have a row for each factor."""
+        found = []
+        for argument, value in zip(self.arguments, filled, strict=True):
+            if isinstance(argument, Selection):
+                found.append(True)
+            else:
+                own = argument.each if isinstance(argument, Data) else np.ndim(value) > 1
+                found.append(own and len(value) == self.count)
+        return found
 
     def anywhere(self, rng: np.random.Generator) -> list[Array]:
         """Points that differ from factor to factor, about the identity."""
@@ -84,32 +130,50 @@ class Trace:
     Attributes:
         kernel: what was derived.
         taken: places of the arguments that the kernel takes.
-        reach: what the function reaches.
-        constants: arrays that are arguments of the term and belong to the user, and what stood in them.
+        reached: named arrays of the function that the kernel takes after these.
+        reach: what else the function reaches, which is compiled in.
+        fixed, free: arrays of the user that are compiled in, or are parameters, and what stood in them.
     """
 
     kernel: DerivedKernel
     taken: tuple[int, ...]
+    reached: tuple[Array, ...]
     reach: Reach
-    constants: tuple[tuple[Array, bytes], ...]
+    fixed: Contents
+    free: Contents
 
     @property
-    def fixed(self) -> bool:
+    def layout(self) -> tuple[Any, ...]:
+        """What the numbers of its parameters depend on."""
+        return self.taken, self.kernel.arguments, [array.shape for array in self.reached]
+
+    @property
+    def constant(self) -> bool:
         """Whether there is nothing that could change."""
-        return self.reach.fixed and not self.constants
+        return self.reach.fixed and not (self.fixed or self.free)
 
     @property
     def outdated(self) -> bool:
-        """Whether something has changed that the function reads and that is no data."""
-        return self.reach.changed or any(array.tobytes() != content for array, content in self.constants)
+        """Whether something has changed that is compiled in."""
+        return self.reach.changed or _changed(self.fixed)
+
+    @property
+    def moved(self) -> bool:
+        """Whether parameters have changed that are no data."""
+        return _changed(self.free)
+
+    def refreshed(self) -> Trace:
+        """The same trace with the present content of its parameters."""
+        return replace(self, free=_contents([array for array, _ in self.free]))
+
+    def arguments(self, filled: Sequence[Any]) -> list[Any]:
+        """What the kernel takes, of all arguments of the term."""
+        return [*(filled[place] for place in self.taken), *self.reached]
 
     def differs(self, batch: Batch, points: Sequence[Array]) -> BoolArray:
         """(n,) for which factors it computes something else than the function."""
-        taken = [self.taken.index(k) for k, a in enumerate(batch.arguments) if isinstance(a, Selection)]
-        given = [batch.present[k] for k in self.taken]
-        for place, point in zip(taken, points, strict=True):
-            given[place] = point
-        theirs = batch.original(points)
+        given = self.arguments(batch.batched.fill(points))
+        theirs, looked_at = batch.original(points), batch.looked_at
         variables, parameters, _ = self.kernel.split(given, batch.count)
         with np.errstate(all="ignore"):
             ours = self.kernel(*given)
@@ -118,12 +182,15 @@ class Trace:
             for array in (*variables, *parameters):
                 size = size + np.abs(array.reshape(len(array), -1)).max(axis=1, initial=0.0)
             size = np.where(np.isfinite(size), size, 1.0)
-            wrong = _unequal(theirs, ours, (ALIKE * size)[:, None])
+            theirs, ours = theirs[looked_at], ours[looked_at]
+            size = size[looked_at] if len(size) == batch.count else size
+            wrong = np.zeros(batch.count, dtype=bool)
+            wrong[looked_at] = _unequal(theirs, ours, (ALIKE * size)[:, None])
             if wrong.any():  # a function may enlarge the roundings of its arguments
                 apart = [p * (1.0 + 4.0 * np.finfo(float).eps * np.sign(np.sin(1e3 * p + 1.0))) for p in points]
-                doubt = np.nan_to_num(np.abs(batch.original(apart) - theirs)).max(axis=1)
+                doubt = np.nan_to_num(np.abs(batch.original(apart)[looked_at] - theirs)).max(axis=1)
                 doubt = np.minimum(AMPLIFIED * doubt, DOUBTED * size)
-                wrong = _unequal(theirs, ours, (ALIKE * size + doubt)[:, None])
+                wrong[looked_at] = _unequal(theirs, ours, (ALIKE * size + doubt)[:, None])
         return wrong
 
     def agrees(self, batch: Batch, points: Sequence[Array]) -> bool:
@@ -163,24 +230,27 @@ def find(
         GraphError: rows of a factor depend on other factors; or there is no trace, and the user insists.
     """
     reach = reach_of(function)
-    refusal = reach.refusal
-    per_factor, at_all = WATCHED
-    if not refusal and reach.size > max(at_all, per_factor * batch.count):
-        refusal = f"it reaches arrays of {reach.size} numbers, which would be looked at again before each solve"
-    if refusal and not asked:
-        return None, refusal
+    if reach.refusal and not asked:
+        return None, reach.refusal
     trace, why = _found(batch, function, reach, asked)
     if trace is None and asked:
         raise GraphError(f"term '{batch.name}': cannot be traced: {why}", term=batch.name)
     return trace, why
 
 
-def _found(batch: Batch, function: Callable[..., Any], reach: Reach, asked: bool) -> tuple[Trace | None, str]:
+def _found(batch: Batch, function: Callable[..., Any], everything: Reach, asked: bool) -> tuple[Trace | None, str]:
     why, name = "", getattr(function, "__name__", "residual")
-    different: Trace | None = None
-    for given in _readings(batch):
+    per_factor, at_all = WATCHED
+    most = max(at_all, per_factor * batch.count)
+    different = False
+    for given, reached in _readings(batch, everything.named):
+        reach = reach_of(function, [array for array, _ in reached]) if reached else everything
+        if reach.size > most and not asked:
+            why = why or f"it reaches {reach.size} numbers, which would be looked at again before each solve"
+            continue
+        rows = batch.size if batch.single else 0
         try:
-            kernel = derived(function, given, reach, name=name, limit=not asked)
+            kernel = derived(function, given, reach, rows, batch.scalar, name, not asked, reached)
         except TraceError as error:
             why = why or str(error)
             continue
@@ -188,20 +258,20 @@ def _found(batch: Batch, function: Callable[..., Any], reach: Reach, asked: bool
             why = why or f"it returns {kernel.rows} rows for one factor and {batch.size} for {batch.count}"
             continue
         taken = tuple(k for k, part in enumerate(given) if not isinstance(part, Fixed))
-        trace = Trace(kernel, taken, reach, _constants(batch))
-        points = batch.anywhere(np.random.default_rng(0))
+        arrays = {k: a for k, a in enumerate(batch.arguments) if isinstance(a, np.ndarray) and not a.dtype.hasobject}
+        fixed = [array for k, array in arrays.items() if k not in taken]
+        free = [*(array for k, array in arrays.items() if k in taken), *(array for array, _ in reached)]
+        trace = Trace(kernel, taken, tuple(array for array, _ in reached), reach, _contents(fixed), _contents(free))
         try:
-            wrong = bool(trace.differs(batch, points).any())
+            wrong = bool(trace.differs(batch, batch.anywhere(np.random.default_rng(0))).any())
         except GraphError:
             raise
         except Exception:  # it refuses points that nobody asked for
             wrong = False
         if not wrong:
             return trace, ""
-        different = trace
-    if different is None:
-        return None, why
-    return None, reason(batch, batch.anywhere(np.random.default_rng(0)))
+        different = True
+    return None, reason(batch, batch.anywhere(np.random.default_rng(0))) if different else why
 
 
 def reason(batch: Batch, points: Sequence[Array]) -> str:
@@ -210,6 +280,8 @@ def reason(batch: Batch, points: Sequence[Array]) -> str:
     Raises:
         GraphError: rows of a factor depend on other factors.
     """
+    if batch.single is not None:
+        return "what was traced is not what it computes"
     before = batch.original(points)
     if _unequal(before, batch.original(points), 0.0).any():
         return "it returns other numbers each time it is called"
@@ -238,25 +310,36 @@ def reason(batch: Batch, points: Sequence[Array]) -> str:
     )
 
 
-def _readings(batch: Batch) -> Iterator[list[Given]]:
-    """What may stand in the place of each argument, likeliest first."""
-    unclear = [
-        k
-        for k, (argument, value) in enumerate(zip(batch.arguments, batch.present, strict=True))
-        if isinstance(value, np.ndarray)
-        and not (isinstance(argument, Data) and argument.each)
-        and value.ndim
-        and len(value) == batch.count > 1
-    ]
-    choices = list(itertools.product((True, False), repeat=len(unclear)))
+def _readings(batch: Batch, named: Sequence[Array]) -> Iterator[tuple[list[Given], list[tuple[Array, bool]]]]:
+    """What may stand in the place of each argument, and of arrays that have a name; likeliest first."""
+    if batch.single is not None:
+        rows = batch.rows_of(batch.present)
+        yield (
+            [
+                a.manifold if isinstance(a, Selection) else (Each(np.shape(v)[1:]) if each else Shared(np.shape(v)))
+                for a, v, each in zip(batch.arguments, batch.present, rows, strict=True)
+            ],
+            [],
+        )
+        return
+    places = range(len(batch.arguments))
+    unclear = [k for k in places if batch.may_have_rows(k)]
+    open_rows = [array for array in named if len(array) == batch.count > 1 and array[0].size <= SHORT]
+    choices = list(itertools.product((True, False), repeat=len(unclear) + len(open_rows)))
     if len(choices) > READINGS:
         choices = [choices[0], choices[-1]]
     for fixed in (False, True):
         for choice in choices:
-            each = {k for k, rows in zip(unclear, choice, strict=True) if rows}
-            given = [_given(batch, k, k in each, fixed) for k in range(len(batch.arguments))]
-            if not fixed or any(isinstance(part, Fixed) for part in given):
-                yield given
+            each = {k for k, rows in zip(unclear, choice, strict=False) if rows}
+            rowed = {id(array): rows for array, rows in zip(open_rows, choice[len(unclear) :], strict=True)}
+            given = [_given(batch, k, k in each, fixed) for k in places]
+            reached = [
+                (array, rowed.get(id(array), False))
+                for array in named
+                if rowed.get(id(array)) or (array.size <= SHORT and not fixed)
+            ]
+            if not fixed or any(isinstance(part, Fixed) for part in given) or len(reached) < len(named):
+                yield given, reached
 
 
 def _given(batch: Batch, place: int, each: bool, fixed: bool) -> Given:
@@ -275,8 +358,12 @@ def _given(batch: Batch, place: int, each: bool, fixed: bool) -> Given:
     return Fixed(value, reach_of_value(value))
 
 
-def _constants(batch: Batch) -> tuple[tuple[Array, bytes], ...]:
-    return tuple((a, a.tobytes()) for a in batch.arguments if isinstance(a, np.ndarray) and not a.dtype.hasobject)
+def _contents(arrays: Sequence[Array]) -> Contents:
+    return tuple((array, array.tobytes()) for array in arrays)
+
+
+def _changed(contents: Contents) -> bool:
+    return any(array.tobytes() != content for array, content in contents)
 
 
 def reach_of_value(value: Any) -> Any:

@@ -21,9 +21,12 @@ from unifg.kernels.derive.expression import Expression, traced
 from unifg.kernels.derive.operations import Op
 from unifg.kernels.derive.reach import Reach
 from unifg.kernels.derive.symbols import TraceError
+from unifg.kernels.derive.tape import Tape
+from unifg.kernels.derive.trace import Rebound, run
 from unifg.kernels.kernel import Argument, Kernel
 from unifg.lie import Manifold
 from unifg.machine.jit import is_compiled
+from unifg.typing import Array
 
 logger = logging.getLogger("unifg")
 KEPT = 256  # kernels
@@ -99,8 +102,10 @@ def derived(
     given: Sequence[Given],
     reach: Reach,
     rows: int = 0,
+    scalar: bool = False,
     name: str = "",
     limit: bool = True,
+    reached: Sequence[tuple[Array, bool]] = (),
 ) -> DerivedKernel:
     """The kernel of a plain function, traced once for all who use it alike.
 
@@ -109,8 +114,10 @@ def derived(
         given: what stands in the place of each argument.
         reach: what the function reaches.
         rows: m of a compiled function.
+        scalar: whether a batched function returns (n,).
         name: for messages.
         limit: refuse functions whose code would take long to generate.
+        reached: named arrays that the kernel is given after all arguments, and whether they have a row for each factor.
 
     Raises:
         TraceError: the function does what cannot be traced.
@@ -118,12 +125,13 @@ def derived(
     with _lock:
         fixed = [part for part in given if isinstance(part, Fixed)]
         if reach.key is None or any(part.key is None for part in fixed):
-            return _traced(function, given, rows, name, limit)
-        key = reach.key, tuple(part.key if isinstance(part, Fixed) else part for part in given), rows, limit
+            return _traced(function, given, rows, scalar, name, limit, reached)
+        places = tuple(part.key if isinstance(part, Fixed) else part for part in given)
+        key = reach.key, places, rows, scalar, limit, tuple((array.shape, each) for array, each in reached)
         found = _kernels.get(key)
         if found is None:
             try:
-                found = _traced(function, given, rows, name, limit)
+                found = _traced(function, given, rows, scalar, name, limit, reached)
             except TraceError as error:
                 found = error.with_traceback(None)
             _kernels[key] = found
@@ -135,18 +143,30 @@ def derived(
         return found
 
 
-def _traced(function: Callable[..., Any], given: Sequence[Given], rows: int, name: str, limit: bool) -> DerivedKernel:
+def _traced(
+    function: Callable[..., Any],
+    given: Sequence[Given],
+    rows: int,
+    scalar: bool,
+    name: str,
+    limit: bool,
+    reached: Sequence[tuple[Array, bool]],
+) -> DerivedKernel:
     arguments: list[Argument] = []
     for part in given:
         if isinstance(part, Manifold):
             arguments.append(part)
         elif not isinstance(part, Fixed):
             arguments.append(part.shape)
+    arguments += [array.shape[1:] if each else array.shape for array, each in reached]
     numbers = sum(prod(argument) for argument in arguments if isinstance(argument, tuple))
     if limit and numbers > WIDEST:
         raise TraceError(f"its constants are {numbers} numbers for each factor")
-    called = function if is_compiled(function) else _as_called(function, given)
-    expression = traced(called, arguments, rows, name)
+    changed: list[int] = []
+    called = function if is_compiled(function) else _as_called(function, given, scalar, changed)
+    expression = traced(called, arguments, rows, name, reached)
+    if changed:
+        raise TraceError(f"it changes its argument {changed[0]}")
     tape = expression.tape
     live = tape.live(expression.rows)
     if limit and len(live) > LONGEST:
@@ -163,8 +183,19 @@ def _traced(function: Callable[..., Any], given: Sequence[Given], rows: int, nam
     )
 
 
-def _as_called(function: Callable[..., Any], given: Sequence[Given]) -> Callable[..., Any]:
-    """The function as a term calls it: some arguments have a row for each factor, others stand as they are."""
+def in_python(function: Callable[..., Any], arguments: Sequence[Any], rows: int) -> Array:
+    """(m,) what a compiled function of one factor writes, found without compiling it."""
+    with _lock:
+        return np.array(run(function, arguments, Tape(), Rebound(), rows), dtype=np.float64)
+
+
+def _as_called(
+    function: Callable[..., Any], given: Sequence[Given], scalar: bool, changed: list[int]
+) -> Callable[..., Any]:
+    """The function as a term calls it: some arguments have a row for each factor, others stand as they are.
+
+    Arguments that it changes are noted in ``changed``.
+    """
     places = list(given)
 
     def call(*numbers: Any) -> Any:
@@ -182,7 +213,7 @@ def _as_called(function: Callable[..., Any], given: Sequence[Given]) -> Callable
         result = function(*arguments)
         for place, argument, entries in kept:
             if any(now is not before for now, before in zip(argument.flat, entries, strict=True)):
-                raise TraceError(f"changes its argument {place}")
-        return result
+                changed.append(place)
+        return np.asarray(result)[:, None] if scalar else result
 
     return call

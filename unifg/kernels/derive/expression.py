@@ -76,7 +76,13 @@ class Expression:
         return second_code(self.name, tape, dict(zip(self.curvature, nodes, strict=True)), self.width)
 
 
-def traced(function: Callable[..., Any], arguments: Sequence[Argument], rows: int = 0, name: str = "") -> Expression:
+def traced(
+    function: Callable[..., Any],
+    arguments: Sequence[Argument],
+    rows: int = 0,
+    name: str = "",
+    reached: Sequence[tuple[Array, bool]] = (),
+) -> Expression:
     """Run a function once and keep what it computes.
 
     Args:
@@ -85,6 +91,8 @@ def traced(function: Callable[..., Any], arguments: Sequence[Argument], rows: in
         arguments: the manifold of each variable, the shape of each parameter for one factor.
         rows: m of a compiled function.
         name: for messages.
+        reached: arrays that the function has names for and that are parameters too, the last of ``arguments``; and
+            whether each has a row for every factor.
 
     Raises:
         TraceError: the function does what cannot be traced, or returns another shape.
@@ -108,7 +116,10 @@ def traced(function: Callable[..., Any], arguments: Sequence[Argument], rows: in
             array[:] = moved(argument, point, step, rebound.callable)
             given.append(array if single else array[None])
             stored, width = stored + argument.storage, width + argument.dim
-    result = np.asarray(run(function, given, tape, rebound, rows), dtype=object)
+    first = len(given) - len(reached)
+    for (array, each), numbers in zip(reached, given[first:], strict=True):
+        rebound.given[id(array)] = numbers if each else numbers[0]
+    result = np.asarray(run(function, given[:first], tape, rebound, rows), dtype=object)
     if not single and (result.ndim != 2 or len(result) != 1):
         raise TraceError(f"returns an array of shape {result.shape} for one factor, expected (1, m)")
     return Expression(tape, tuple(node_of(tape, entry) for entry in result.ravel()), width, name or "residual")

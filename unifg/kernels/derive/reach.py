@@ -10,7 +10,7 @@ from __future__ import annotations
 import dis
 import functools
 import hashlib
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
@@ -39,11 +39,13 @@ class Reach:
         key: equal for functions that compute the same; None where that cannot be said.
         refusal: why it is not traced unless its user asks; empty where it is.
         size: how many numbers stand in the arrays.
+        named: arrays of floats that have a name of their own in the function or in one that it calls.
     """
 
     key: Hashable | None
     refusal: str
     size: int
+    named: tuple[Array, ...]
     _cells: tuple[tuple[CellType, Any], ...]
     _names: tuple[tuple[dict[str, Any], str, Any], ...]
     _arrays: tuple[tuple[Array, bytes], ...]
@@ -65,9 +67,14 @@ class Reach:
         return not (self._cells or self._names or self._arrays)
 
 
-def reach_of(function: Callable[..., Any]) -> Reach:
-    """Look at a function, and at everything it refers to."""
-    walk = _Walk()
+def reach_of(function: Callable[..., Any], given: Sequence[Array] = ()) -> Reach:
+    """Look at a function, and at everything it refers to.
+
+    Args:
+        function: in Python, or compiled by Numba.
+        given: named arrays whose content does not matter, because a kernel is given it each time.
+    """
+    walk = _Walk(given)
     if isinstance(function, MethodType):
         walk.refuse(f"it is a method of {_kind(function.__self__)}, which may change")
         function = function.__func__
@@ -76,6 +83,7 @@ def reach_of(function: Callable[..., Any]) -> Reach:
         None if walk.refusal else key,
         walk.refusal,
         walk.size,
+        tuple(walk.named.values()),
         tuple(walk.cells),
         tuple(walk.names),
         tuple(walk.arrays),
@@ -85,7 +93,9 @@ def reach_of(function: Callable[..., Any]) -> Reach:
 class _Walk:
     """Follows references, each once."""
 
-    def __init__(self) -> None:
+    def __init__(self, given: Sequence[Array]) -> None:
+        self._given = {id(array): k for k, array in enumerate(given)}
+        self.named: dict[int, Array] = {}
         self.refusal = ""
         self.size = 0
         self.cells: list[tuple[CellType, Any]] = []
@@ -93,6 +103,14 @@ class _Walk:
         self.arrays: list[tuple[Array, bytes]] = []
         self._seen: dict[int, int] = {}
         self._attributes: set[str] = set()
+
+    def named_value(self, value: Any, where: str) -> Hashable:
+        """What tells the value of a name from others."""
+        if type(value) is np.ndarray and value.dtype == np.float64 and value.ndim:
+            self.named[id(value)] = value
+            if id(value) in self._given:
+                return "given", self._given[id(value)], value.shape
+        return self.value(value, where)
 
     def refuse(self, why: str) -> None:
         self.refusal = self.refusal or why
@@ -168,7 +186,7 @@ class _Walk:
         value = names[name]
         if not (isinstance(value, ModuleType) and _trusted(value.__name__)):
             self.names.append((names, name, value))
-        return name, self.value(value, f"'{prefix}{name}'")
+        return name, self.named_value(value, f"'{prefix}{name}'")
 
     def _function(self, function: Any) -> Hashable:
         python: FunctionType = getattr(function, "py_func", function)
@@ -185,9 +203,9 @@ class _Walk:
         for name, cell in zip(code.co_freevars, python.__closure__ or (), strict=True):
             value = _inside(cell)
             self.cells.append((cell, value))
-            parts.append((name, "unassigned" if value is _MISSING else self.value(value, f"'{name}'")))
-        for default in (*(python.__defaults__ or ()), *sorted((python.__kwdefaults__ or {}).items())):
-            parts.append(self.value(default, "a default"))
+            parts.append((name, "unassigned" if value is _MISSING else self.named_value(value, f"'{name}'")))
+        for default in (*(python.__defaults__ or ()), *(v for _, v in sorted((python.__kwdefaults__ or {}).items()))):
+            parts.append(self.named_value(default, "a default"))
         if own:
             known = python.__globals__
             for name in sorted(seen.names):
