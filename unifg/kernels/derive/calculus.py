@@ -4,6 +4,10 @@ Forwards every node carries its derivative along one tangent coordinate; backwar
 of one output by it (Griewank and Walther 2008, sections 3.1 and 3.2). Both write more nodes on the same tape, where
 what is said twice stands once. A choice passes on the derivatives of what it chooses and multiplies nothing else: the
 partial of what is not chosen may be infinite.
+
+Where a function has a kink or a jump its slope is fixed: of |x| zero at zero, of the least and the greatest of equals
+that of the first named, of a choice that of what is chosen, of what jumps (sign, floor, rint, comparisons, a number
+read from a table) zero. Remainders move with what is divided.
 """
 
 from __future__ import annotations

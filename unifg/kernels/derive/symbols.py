@@ -17,6 +17,8 @@ from unifg.errors import UnifgError
 from unifg.kernels.derive.operations import Op
 from unifg.kernels.derive.tape import NUMPY, Tape
 
+INSTEAD = 'leave it to differences: fg.residual(f, derivatives="differences")'
+
 
 class TraceError(UnifgError):
     """A function does something that cannot be written on a tape."""
@@ -71,7 +73,6 @@ class Symbol:
         """The same."""
         return self
 
-    __hash__ = None  # type: ignore[assignment]
     __add__, __radd__ = _both("add")
     __sub__, __rsub__ = _both("subtract")
     __mul__, __rmul__ = _both("multiply")
@@ -98,7 +99,8 @@ class Symbol:
     def __float__(self) -> NoReturn:
         """Nobody knows."""
         raise TraceError(
-            "turns a number that is not known yet into a float: math.* and arrays of floats do; use np.* and np.stack"
+            "turns a number that is not known yet into a float, as foreign functions and arrays of floats do; write it "
+            f"by np.* and np.stack, or {INSTEAD}"
         )
 
     def __int__(self) -> NoReturn:
@@ -106,6 +108,19 @@ class Symbol:
         raise TraceError("turns a number that is not known yet into an integer")
 
     __index__ = __int__
+
+    def __complex__(self) -> NoReturn:
+        """There are none."""
+        raise TraceError("makes a complex number; write real and imaginary parts")
+
+    def __hash__(self) -> NoReturn:
+        """Nobody knows."""
+        raise TraceError("looks up a number that is not known yet in a dictionary or a set; write np.where(...)")
+
+    def __round__(self, digits: int = 0) -> Any:
+        """Round to so many places."""
+        scale = 10.0**digits
+        return _apply(Op.RINT, self * scale) / scale if digits else _apply(Op.RINT, self)
 
     def __iter__(self) -> NoReturn:
         """It is one."""
@@ -118,19 +133,22 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
         """Do what the ufunc does, entry by entry."""
         out = options.pop("out", None)
-        if ufunc is np.matmul and method == "__call__":
-            result = matmul(*(plain(item) for item in inputs))
+        if ufunc in FUNCTIONS and method == "__call__":
+            result = FUNCTIONS[ufunc](*(plain(item) for item in inputs), **options)
         elif (scalar := UFUNCS.get(ufunc.__name__)) is None:
-            raise TraceError(f"calls np.{ufunc.__name__}, which has no derivative here")
+            raise TraceError(f"calls {ufunc.__name__}, which has no derivative here; {INSTEAD}")
         elif method == "__call__":
             if options.pop("where", True) is not True:
-                raise TraceError(f"calls np.{ufunc.__name__} with where=; use np.where on the result")
+                raise TraceError(f"calls np.{ufunc.__name__} with where=; write np.where(condition, a, b)")
             options.pop("dtype", None), options.pop("casting", None)
             result = np.frompyfunc(scalar, ufunc.nin, 1)(*(plain(item) for item in inputs))
         elif method in ("reduce", "accumulate") and ufunc.nin == 2:
             result = _reduced(scalar, method, plain(inputs[0]), *inputs[1:], **options)
+        elif method == "outer":
+            first, second = (np.asarray(plain(item), dtype=object) for item in inputs)
+            result = np.frompyfunc(scalar, 2, 1)(first.reshape(first.shape + (1,) * second.ndim), second)
         else:
-            raise TraceError(f"calls np.{ufunc.__name__}.{method}")
+            raise TraceError(f"calls np.{ufunc.__name__}.{method}, which is not traced; {INSTEAD}")
         if out is not None:
             plain(out[0])[...] = result
             return out[0]
@@ -141,8 +159,12 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
         special = FUNCTIONS.get(function)
         if special is not None:
             return wrapped(special(*arguments, **options))
-        if function.__module__.startswith("numpy.linalg"):
-            raise TraceError(f"calls np.linalg.{function.__name__}; of np.linalg, norm, det, inv and solve are traced")
+        if function.__module__.startswith(("numpy.linalg", "numpy.fft")):
+            module = function.__module__.removeprefix("numpy")
+            raise TraceError(
+                f"calls np{module}.{function.__name__}; of np.linalg, norm, det, inv, solve and cholesky of "
+                f"small matrices are traced; {INSTEAD}"
+            )
         return wrapped(super().__array_function__(function, kinds, arguments, options))
 
     def __getitem__(self, key: Any) -> Any:
@@ -166,16 +188,24 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
         return super().__bool__()
 
     def astype(self, *arguments: Any, **options: Any) -> Any:
-        """Symbols stay symbols."""
-        return self.copy()
+        """Symbols stay symbols; whole numbers are what is left without the fraction."""
+        kind = np.dtype(arguments[0] if arguments else options["dtype"]).kind
+        return np.trunc(self) if kind in "iu" else self.copy()
+
+    def sort(self, *arguments: Any, **options: Any) -> Any:
+        """Nobody knows the order."""
+        raise TraceError(f"sorts by numbers that are not known yet; write np.minimum and np.maximum, or {INSTEAD}")
+
+    argsort = argmax = argmin = argpartition = partition = searchsorted = nonzero = sort
 
     def clip(self, lower: Any = None, upper: Any = None, **options: Any) -> Any:  # type: ignore[override]
         """Limit every entry."""
-        return np.clip(self, lower, upper)
+        return np.clip(self, options.get("min", lower), options.get("max", upper))
 
-    def round(self, *arguments: Any, **options: Any) -> Any:
-        """Round to whole numbers."""
-        return np.rint(self)
+    def round(self, decimals: int = 0, out: Any = None) -> Any:  # type: ignore[override]
+        """Round to so many places."""
+        rounded: Any = np.rint(self * 10.0**decimals) / 10.0**decimals if decimals else np.rint(self)
+        return rounded
 
 
 def holds_symbols(array: Any) -> bool:
@@ -201,6 +231,8 @@ def symbols(shape: tuple[int, ...], fill: Any = 0.0) -> Any:
 
 def node_of(tape: Tape, value: Any) -> int:
     """The node of a symbol or of a number."""
+    if isinstance(value, complex):
+        raise TraceError("makes a complex number; write real and imaginary parts")
     return value.node if isinstance(value, Symbol) else tape.constant(float(value))
 
 
@@ -292,6 +324,15 @@ UFUNCS: dict[str, Callable[..., Any]] = {
     "log2": lambda a: _apply(Op.LOG, a) / math.log(2.0),
     "log10": lambda a: _apply(Op.LOG, a) / math.log(10.0),
     "log1p": _operation(Op.LOG1P),
+    "logaddexp2": lambda a, b: (
+        _apply(Op.MAXIMUM, a, b)
+        + _apply(Op.LOG1P, _apply(Op.EXP, -_apply(Op.ABSOLUTE, a - b) * math.log(2.0))) / math.log(2.0)
+    ),
+    "erfc": lambda a: 1.0 - _apply(Op.ERF, a),
+    "expit": lambda a: 0.5 + 0.5 * _apply(Op.TANH, 0.5 * a),
+    "isnan": lambda a: _apply(Op.NOT, _apply(Op.EQUAL, a, a)),
+    "isfinite": lambda a: _apply(Op.LESS, _apply(Op.ABSOLUTE, a), math.inf),
+    "isinf": lambda a: _apply(Op.EQUAL, _apply(Op.ABSOLUTE, a), math.inf),
     "logaddexp": lambda a, b: _apply(Op.MAXIMUM, a, b) + _apply(Op.LOG1P, _apply(Op.EXP, -_apply(Op.ABSOLUTE, a - b))),
     "hypot": _hypot,
     "deg2rad": lambda a: a * (math.pi / 180.0),
@@ -360,151 +401,5 @@ def _reduced(scalar: Callable[..., Any], method: str, array: Any, axis: Any = 0,
     return total
 
 
-# ---------------------------------------------------------------- functions of NumPy that must be done again here
-
-_Pick = np.frompyfunc(choose, 3, 1)
-
-
-def _objects(array: Any) -> Any:
-    return np.asarray(plain(array) if isinstance(array, np.ndarray) else array, dtype=object)
-
-
-def matmul(a: Any, b: Any) -> Any:
-    """``a @ b`` with NumPy's rules for stacks and vectors."""
-    a, b = _objects(a), _objects(b)
-    left, right = a[None, :] if a.ndim == 1 else a, b[:, None] if b.ndim == 1 else b
-    product = np.sum(left[..., :, :, None] * right[..., None, :, :], axis=-2)
-    if a.ndim == 1:
-        product = product[..., 0, :]
-    return product[..., 0] if b.ndim == 1 else product
-
-
-def _where(condition: Any, *parts: Any) -> Any:
-    if len(parts) != 2:
-        raise TraceError("asks np.where for places that are not known yet; give it what to choose from")
-    return _Pick(_objects(condition), _objects(parts[0]), _objects(parts[1]))
-
-
-def _clip(array: Any, lower: Any = None, upper: Any = None, **options: Any) -> Any:
-    lower, upper = options.get("min", lower), options.get("max", upper)
-    limited = wrapped(_objects(array))
-    if lower is not None:
-        limited = np.maximum(limited, lower)
-    return limited if upper is None else np.minimum(limited, upper)
-
-
-def _norm(array: Any, ord: Any = None, axis: Any = None, keepdims: bool = False) -> Any:
-    array = wrapped(_objects(array))
-    if ord in (None, 2, "fro") and not (ord == 2 and axis is None and array.ndim == 2):
-        return np.sqrt(np.sum(array * array, axis=axis, keepdims=keepdims))
-    if ord == 1:
-        return np.sum(np.abs(array), axis=axis, keepdims=keepdims)
-    if ord == np.inf:
-        return np.max(np.abs(array), axis=axis, keepdims=keepdims)
-    raise TraceError(f"asks np.linalg.norm for order {ord}")
-
-
-def _cross(a: Any, b: Any, *arguments: Any, **options: Any) -> Any:
-    if arguments or options.get("axis", -1) != -1:
-        raise TraceError("asks np.cross for other axes than the last")
-    a, b = wrapped(_objects(a)), wrapped(_objects(b))
-    if a.shape[-1] == 2 and b.shape[-1] == 2:
-        return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return np.stack(
-        [a[..., i] * b[..., j] - a[..., j] * b[..., i] for i, j in ((1, 2), (2, 0), (0, 1))],
-        axis=-1,
-    )
-
-
-def _einsum(subscripts: str, *operands: Any, **options: Any) -> Any:
-    if "->" not in subscripts:
-        raise TraceError("calls np.einsum without '->': say which axes are left")
-    return np.einsum(subscripts, *(_objects(item) for item in operands), optimize=False)
-
-
-def _like(value: float | None) -> Callable[..., Any]:
-    def fill(array: Any, *arguments: Any, **options: Any) -> Any:
-        shape = options.get("shape")
-        number = arguments[0] if value is None else value
-        return symbols(np.shape(array) if shape is None else shape, number)
-
-    return fill
-
-
-def _determinant(array: Any) -> Any:
-    array = _objects(array)
-    n = array.shape[-1]
-    if n == 1:
-        return array[..., 0, 0]
-    total: Any = 0.0
-    for k in range(n):
-        minor = _determinant(np.delete(array[..., 1:, :], k, axis=-1))
-        total = total + (1.0 if k % 2 == 0 else -1.0) * array[..., 0, k] * minor
-    return total
-
-
-def _inverse(array: Any) -> Any:
-    array = _objects(array)
-    n = array.shape[-1]
-    if n > 4:
-        raise TraceError("inverts a matrix of more than four rows")
-    if n == 1:
-        return np.frompyfunc(UFUNCS["reciprocal"], 1, 1)(array)
-    determinant = np.asarray(_determinant(array), dtype=object)
-    rows = [
-        [
-            (1.0 if (i + j) % 2 == 0 else -1.0) * _determinant(np.delete(np.delete(array, j, -2), i, -1)) / determinant
-            for j in range(n)
-        ]
-        for i in range(n)
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def _solve(a: Any, b: Any) -> Any:
-    inverse = _inverse(a)
-    b = _objects(b)
-    return matmul(inverse, b) if b.ndim != 1 else matmul(inverse, b[:, None])[..., 0]
-
-
-def _every(array: Any, *arguments: Any, **options: Any) -> Any:
-    return np.logical_and.reduce(wrapped(_objects(array)), *arguments, **options)
-
-
-def _some(array: Any, *arguments: Any, **options: Any) -> Any:
-    return np.logical_or.reduce(wrapped(_objects(array)), *arguments, **options)
-
-
-def _mean(array: Any, axis: Any = None, keepdims: bool = False, **options: Any) -> Any:
-    array = wrapped(_objects(array))
-    total = np.sum(array, axis=axis, keepdims=keepdims)
-    return total / (array.size / np.size(total))
-
-
-FUNCTIONS: dict[Any, Callable[..., Any]] = {
-    np.where: _where,
-    np.clip: _clip,
-    np.cross: _cross,
-    np.einsum: _einsum,
-    np.dot: lambda a, b: (
-        _objects(a) * _objects(b) if min(np.ndim(a), np.ndim(b)) == 0 else _dot(_objects(a), _objects(b))
-    ),
-    np.linalg.norm: _norm,
-    np.linalg.det: _determinant,
-    np.linalg.inv: _inverse,
-    np.linalg.solve: _solve,
-    np.zeros_like: _like(0.0),
-    np.empty_like: _like(0.0),
-    np.ones_like: _like(1.0),
-    np.full_like: _like(None),
-    np.all: _every,
-    np.any: _some,
-    np.mean: _mean,
-}
-"""Functions of NumPy that look at what entries are, or call compiled code."""
-
-
-def _dot(a: Any, b: Any) -> Any:
-    if b.ndim > 2:
-        raise TraceError("calls np.dot with a stack of matrices; use @")
-    return matmul(a, b)
+FUNCTIONS: dict[Any, Callable[..., Any]] = {}
+"""What functions of NumPy do with arrays of symbols, where NumPy itself would look at entries."""

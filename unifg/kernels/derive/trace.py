@@ -18,14 +18,27 @@ from typing import Any
 
 import numpy as np
 
+from unifg.kernels.derive.array_functions import TABLE
 from unifg.kernels.derive.branches import every_way
 from unifg.kernels.derive.groups import wrap
 from unifg.kernels.derive.symbolic import Symbolic, stated_closed
-from unifg.kernels.derive.symbols import UFUNCS, Symbol, Symbols, TraceError, node_of, plain, symbols, wrapped
+from unifg.kernels.derive.symbols import (
+    FUNCTIONS,
+    UFUNCS,
+    Symbol,
+    Symbols,
+    TraceError,
+    node_of,
+    plain,
+    symbols,
+    wrapped,
+)
 from unifg.kernels.derive.tape import Tape
 from unifg.lie import ManifoldBase, Product, so2, wrap_angle
 from unifg.machine import calls
 from unifg.machine.jit import is_compiled, source_of
+
+FUNCTIONS.update(TABLE)
 
 
 def run(function: Callable[..., Any], arguments: Sequence[Any], tape: Tape, rebound: Rebound, rows: int = 0) -> Any:
@@ -67,14 +80,18 @@ def _line(function: Callable[..., Any]) -> str:
     """The innermost line of the user's own code that was running, or where the function begins."""
     code = getattr(source_of(function), "__code__", None)
     trace, own = sys.exc_info()[2], "" if code is None else f"{code.co_filename}:{code.co_firstlineno}: "
-    inside = __name__.rpartition(".")[0]
     while trace is not None:
         code, names = trace.tb_frame.f_code, trace.tb_frame.f_globals
-        module = str(names.get("__name__", ""))
-        if not module.startswith((inside, "numpy")):
+        package = str(names.get("__name__", "")).partition(".")[0]
+        if package != "unifg" and package not in sys.stdlib_module_names and not _installed(code.co_filename):
             own = f"{code.co_filename}:{trace.tb_lineno}: "
         trace = trace.tb_next
     return own
+
+
+def _installed(path: str) -> bool:
+    """Whether a file belongs to a package that somebody has installed, or to what is compiled."""
+    return "site-packages" in path or "dist-packages" in path or path.endswith(".pyx")
 
 
 class Rebound:
@@ -155,7 +172,6 @@ class _Names(dict[str, Any]):
             "abs": abs,
             "max": _greatest,
             "min": _least,
-            "float": _float,
             "sum": _sum,
         }
 
@@ -166,10 +182,6 @@ def _wrapped(angle: Any) -> Any:
 
 def _identity(thing: Any) -> int:
     return id(thing)
-
-
-def _float(value: Any = 0.0) -> Any:
-    return value if isinstance(value, Symbol) else float(value)
 
 
 def _greatest(*values: Any, **options: Any) -> Any:
@@ -217,9 +229,17 @@ def _as_array(values: Any, *arguments: Any, **options: Any) -> Any:
 
 def _filled(value: float) -> Callable[..., Any]:
     def make(shape: Any, *arguments: Any, **options: Any) -> Any:
+        if _whole(arguments, options):
+            return np.full(shape, value, dtype=arguments[0] if arguments else options["dtype"])
         return symbols(tuple(shape) if isinstance(shape, list | tuple) else (int(shape),), value)
 
     return make
+
+
+def _whole(arguments: tuple[Any, ...], options: dict[str, Any]) -> bool:
+    """Whether an array is to hold integers or truth values, such as indices: nothing that is not known goes there."""
+    kind = arguments[0] if arguments else options.get("dtype")
+    return kind is not None and np.dtype(kind).kind in "iub"
 
 
 def _full(shape: Any, value: Any, *arguments: Any, **options: Any) -> Any:
