@@ -16,7 +16,7 @@ from benchmarks import compiled_peers
 from benchmarks.casadi_peer import available
 from benchmarks.report import listing, words
 from benchmarks.timing import interleave, number
-from problems.control import Problem
+from problems.control import Formulated, Problem
 from unifg.typing import Array
 
 PEERS = ("ipopt", "fatrop", "fatrop, compiled")
@@ -103,7 +103,7 @@ Results: TypeAlias = Mapping[Problem, Outcomes]
 Told: TypeAlias = Callable[[Outcome], str]
 
 
-def attempt(solver: fg.Solver, problem: Problem, prepared: bool) -> Callable[[Outcome], float]:
+def attempt(solver: fg.Solver, problem: Formulated, prepared: bool) -> Callable[[Outcome], float]:
     """A cold solve by one of ours, the graph compiled before; its processor time [ms]."""
     stated = problem.formulation()
     kept = solver.prepare(stated.graph)

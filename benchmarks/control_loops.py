@@ -99,8 +99,12 @@ def contestant(problem: Problem, name: str) -> Contestant:
 
 
 def drive(problem: Problem, ours: Sequence[str] = OURS, peers: tuple[str, ...] = PEERS) -> dict[str, Drive]:
+    """Drive a problem's robot with backends and peers by their names."""
+    return race(problem, {name: contestant(problem, name) for name in (*ours, *runnable(peers))})
+
+
+def race(problem: Problem, who: Mapping[str, Contestant]) -> dict[str, Drive]:
     """Drive every robot one step in turn: a slow moment of the machine meets all of them."""
-    who = {name: contestant(problem, name) for name in (*ours, *runnable(peers))}
     drives, states = {name: Drive() for name in who}, dict.fromkeys(who, problem.start)
     controls: dict[str, Array] = {}
     for index in range(STEPS + 1):

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.casadi_peer import Staged
-from problems.control import Problem, Quadrotor, Tick
+from problems.cart_pole import CART, LENGTH, POLE
+from problems.control import Problem, Tick
 from problems.twins.twin import quaternion_times
 from unifg.models.quadrotor import GRAVITY
 from unifg.typing import Array
@@ -39,7 +40,7 @@ class ControlPeer(Staged):
         import casadi as ca
 
         self.problem = problem
-        model = _QuadrotorModel(problem.dt) if isinstance(problem, Quadrotor) else _UnicycleModel(problem.dt)
+        model = MODELS[problem.robot](problem.dt)
         size, controls, n = len(problem.start), len(problem.effort), problem.horizon
         start, reference = ca.SX.sym("start", size), ca.SX.sym("reference", size, n + 1)
         cruise = ca.SX.sym("cruise", controls, n)
@@ -125,3 +126,34 @@ class _QuadrotorModel:
         q = quaternion_times(x[3:7], ca.vertcat(cosine, 0.5 * sinc * turn))
         v = x[7:] + dt * (0.5 * u[3] * (up(x[3:7]) + up(q)) - ca.DM([0, 0, GRAVITY]))
         return after - ca.vertcat(x[:3] + 0.5 * dt * (x[7:] + v), q, v)
+
+
+class _CartPoleModel:
+    """Runge-Kutta of order four."""
+
+    def __init__(self, dt: float) -> None:
+        self._dt = dt
+
+    def error(self, x: Any, wanted: Any) -> Any:
+        return x - wanted
+
+    def gap(self, x: Any, u: Any, after: Any) -> Any:
+        import casadi as ca
+
+        def velocity(state: Any) -> Any:
+            sine, cosine = ca.sin(state[1]), ca.cos(state[1])
+            total = POLE + CART
+            push = (u[0] + POLE * LENGTH * state[3] ** 2 * sine) / total
+            turn = (GRAVITY * sine - cosine * push) / (LENGTH * (4.0 / 3.0 - POLE * cosine**2 / total))
+            return ca.vertcat(state[2], state[3], push - POLE * LENGTH * turn * cosine / total, turn)
+
+        dt = self._dt
+        a = velocity(x)
+        b = velocity(x + 0.5 * dt * a)
+        c = velocity(x + 0.5 * dt * b)
+        d = velocity(x + dt * c)
+        return after - (x + dt / 6.0 * (a + 2.0 * b + 2.0 * c + d))
+
+
+MODELS: dict[str, Any] = {"unicycle": _UnicycleModel, "quadrotor": _QuadrotorModel, "cart-pole": _CartPoleModel}
+"""By robot."""

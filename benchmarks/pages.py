@@ -72,6 +72,7 @@ PAGES = {
         Page("collection", "A collection of small problems", "benchmarks.collection"),
         Page("velocity-tracking", "Velocity tracking", "benchmarks.ecg2o"),
         Page("control-cases", "Control cases", "benchmarks.control_cases", hours=0.4),
+        Page("own-functions", "Functions of one's own", "benchmarks.own_functions"),
         Page("claims", "What the backends claim, judged from outside", "benchmarks.claims", hours=0.2),
         Page("navigation", "Drives, sequential coupling", "benchmarks.navigation", hours=0.05),
         Page("joint-drives", "Drives, joint coupling", "benchmarks.navigation", ("--coupling", "joint"), hours=0.06),

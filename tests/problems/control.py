@@ -14,7 +14,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
@@ -183,6 +183,14 @@ class Problem(ABC):
             yield moved, controls + of_controls * rng.standard_normal(controls.shape)
 
 
+class Formulated(Protocol):
+    """What can be stated as a factor graph: a problem, or one way to state it."""
+
+    def formulation(self) -> Stated:
+        """As a factor graph."""
+        ...
+
+
 class Stated(ABC):
     """A problem as a factor graph whose start and references are data.
 
@@ -268,7 +276,15 @@ class Unicycle(Problem):
 
 
 class UnicycleGraph(Stated):
-    """The unicycle's problem with shipped kernels."""
+    """The unicycle's problem with shipped kernels, or with residuals in their place.
+
+    Attributes:
+        tracking, dynamics, clearance: of the terms of those names.
+    """
+
+    tracking: Any = unicycle.tracking
+    dynamics: Any = unicycle.dynamics
+    clearance: Any = obstacles.disc_clearance
 
     def __init__(self, problem: Unicycle) -> None:
         """Build the graph."""
@@ -278,14 +294,14 @@ class UnicycleGraph(Stated):
         self._stages = graph.data("stages", reference[:-1], each=True)
         self._end = graph.data("end", reference[-1])
         effort = graph.data("effort", cruise, each=True)
-        graph.minimize(unicycle.tracking, x[:-1], self._stages, sigma=problem.stage**-0.5, name="tracking")
-        graph.minimize(unicycle.tracking, x[-1], self._end, sigma=problem.terminal**-0.5, name="terminal")
+        graph.minimize(self.tracking, x[:-1], self._stages, sigma=problem.stage**-0.5, name="tracking")
+        graph.minimize(self.tracking, x[-1], self._end, sigma=problem.terminal**-0.5, name="terminal")
         graph.minimize(fg.prior, u, effort, sigma=problem.effort**-0.5, name="effort")
-        graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], problem.dt, lower=0.0, upper=0.0, name="dynamics")
+        graph.constrain(self.dynamics, x[:-1], u, x[1:], problem.dt, lower=0.0, upper=0.0, name="dynamics")
         graph.bound(u, lower=problem.lower, upper=problem.upper, name="limits")
         if problem.blocked:
             discs = problem.discs
-            graph.constrain(obstacles.disc_clearance, x[1:], discs[:, :2], discs[:, 2], lower=0.0, name="discs")
+            graph.constrain(self.clearance, x[1:], discs[:, :2], discs[:, 2], lower=0.0, name="discs")
 
     def data(self, state: Array, first: int) -> dict[fg.Data, Array]:
         """The data of closed-loop step ``first``, begun at a pose."""
@@ -372,7 +388,13 @@ class Quadrotor(Problem):
 
 
 class QuadrotorGraph(Stated):
-    """The quadrotor's problem with shipped kernels; costs are priors of the parts of its state."""
+    """The quadrotor's problem with shipped kernels; costs are priors of the parts of its state.
+
+    Attributes:
+        dynamics: of the term of that name.
+    """
+
+    dynamics: Any = quadrotor.dynamics
 
     def __init__(self, problem: Quadrotor) -> None:
         """Build the graph."""
@@ -391,7 +413,7 @@ class QuadrotorGraph(Stated):
         self._cruise = graph.data("cruise", controls, each=True)
         graph.minimize(fg.prior, u, self._cruise, sigma=problem.effort**-0.5, name="effort")
         motion = x[:-1], u, x[1:], UNIT_MASS.packed, problem.dt
-        graph.constrain(quadrotor.dynamics, *motion, lower=0.0, upper=0.0, name="dynamics")
+        graph.constrain(self.dynamics, *motion, lower=0.0, upper=0.0, name="dynamics")
         graph.bound(u, lower=problem.lower, upper=problem.upper, name="limits")
         if problem.blocked:
             clearance = avoidance.sphere_clearance if problem.axes == 3 else avoidance.cylinder_clearance
@@ -427,7 +449,9 @@ class Tick(NamedTuple):
 class Driver:
     """A backend in closed loop: every solve begins at its own last answer, moved by one stage."""
 
-    def __init__(self, problem: Problem, solver: fg.Solver, multipliers: bool = True, penalties: bool = True) -> None:
+    def __init__(
+        self, problem: Formulated, solver: fg.Solver, multipliers: bool = True, penalties: bool = True
+    ) -> None:
         """Prepare the graph; the first solve is to the end for a backend that is stopped early in the others.
 
         Args:

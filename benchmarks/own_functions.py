@@ -1,0 +1,341 @@
+"""What a function of one's own costs: control problems stated with plain functions, beside shipped kernels and fatrop.
+
+    python -m benchmarks.own_functions [--rounds R] [--fields K]
+
+The same problems with the same solver, the interior point, with their dynamics, costs and clearances as they ship, as
+batched NumPy functions, as functions of one factor under ``numba.njit``, and as NumPy functions that are differenced in
+batches. Each way is stated in a new process, which tells how long it takes from the first statement to the first answer
+where compiled functions are in the cache. Writes docs/own-functions.md.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numba
+import numpy as np
+from tqdm import tqdm
+
+import unifg as fg
+from benchmarks import control_loops
+from benchmarks.casadi_peer import available
+from benchmarks.cold import Outcome, attempt, attempt_peer, runnable
+from benchmarks.obstacle_fields import Field
+from benchmarks.report import CHECKOUT, command, machine, publish, table
+from benchmarks.timing import interleave, number, shown, spread
+from problems.cart_pole import CartPole, CartPoleGraph, cart_pole_dynamics, cart_pole_dynamics_of_one
+from problems.control import Driver, Problem, Quadrotor, QuadrotorGraph, Stated, Unicycle, UnicycleGraph
+from unifg.lie import wrap_angle
+from unifg.models.quadrotor import GRAVITY
+from unifg.solvers import InteriorPoint
+from unifg.typing import Array
+
+TOLERANCE = 1e-4
+LOOP = 30  # horizon of the cart-pole
+NAMES = {
+    "shipped": "shipped",
+    "numpy": "NumPy function",
+    "njit": "`@njit` function",
+    "differences": 'NumPy function, `derivatives="differences"`',
+    "fatrop": "fatrop",
+    "fatrop, compiled": "fatrop, compiled",
+}
+
+
+# ---------------------------------------------------------------- the unicycle
+
+
+def tracking(x: Array, reference: Array) -> Array:
+    """(n, 3) deviation from reference poses in world axes."""
+    return np.concatenate([x[:, :2] - reference[..., :2], wrap_angle(x[:, 2:] - reference[..., 2:])], axis=1)
+
+
+def dynamics(x: Array, u: Array, after: Array, dt: float) -> Array:
+    """(n, 3) defect of the midpoint rule in world axes."""
+    middle = x[:, 2] + 0.5 * dt * u[:, 1]
+    moved = dt * u[:, :1] * np.stack([np.cos(middle), np.sin(middle)], axis=1)
+    turned = wrap_angle(after[:, 2] - x[:, 2] - dt * u[:, 1])
+    return np.concatenate([after[:, :2] - x[:, :2] - moved, turned[:, None]], axis=1)
+
+
+def clearance(x: Array, centres: Array, radii: Array) -> Array:
+    """(n, M) distance to discs."""
+    distance: Array = np.linalg.norm(x[:, None, :2] - centres, axis=2)
+    return distance - radii
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def tracking_of_one(x: Array, reference: Array, r: Array) -> None:
+    """The same for one factor."""
+    r[0], r[1] = x[0] - reference[0], x[1] - reference[1]
+    turn = x[2] - reference[2]
+    r[2] = math.atan2(math.sin(turn), math.cos(turn))
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def dynamics_of_one(x: Array, u: Array, after: Array, dt: float, r: Array) -> None:
+    """The same for one factor."""
+    middle = x[2] + 0.5 * dt * u[1]
+    r[0] = after[0] - x[0] - dt * u[0] * math.cos(middle)
+    r[1] = after[1] - x[1] - dt * u[0] * math.sin(middle)
+    turn = after[2] - x[2] - dt * u[1]
+    r[2] = math.atan2(math.sin(turn), math.cos(turn))
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def clearance_of_one(x: Array, centres: Array, radii: Array, r: Array) -> None:
+    """The same for one factor."""
+    for k in range(len(radii)):
+        r[k] = math.hypot(x[0] - centres[k, 0], x[1] - centres[k, 1]) - radii[k]
+
+
+# ---------------------------------------------------------------- the quadrotor
+
+
+def quadrotor_dynamics(x: Array, u: Array, after: Array, parameters: Array, dt: float) -> Array:
+    """(n, 9) defect of the trapezoid; drag and wind of the shipped one are zero here, the mass is one."""
+
+    def force(state: Array) -> Array:
+        w, a, b, c = state[:, 3], state[:, 4], state[:, 5], state[:, 6]
+        up = np.stack([2.0 * (a * c + w * b), 2.0 * (b * c - w * a), 1.0 - 2.0 * (a * a + b * b)], axis=1)
+        return np.asarray(u[:, 3:] * up - np.array([0.0, 0.0, GRAVITY]))
+
+    turned = fg.SO3.log(fg.SO3.between(x[:, 3:7], after[:, 3:7])) - dt * u[:, :3]
+    moved = after[:, :3] - x[:, :3] - 0.5 * dt * (x[:, 7:] + after[:, 7:])
+    pushed = after[:, 7:] - x[:, 7:] - 0.5 * dt * (force(x) + force(after))
+    return np.concatenate([moved, turned, pushed], axis=1)
+
+
+# ---------------------------------------------------------------- ways
+
+
+def _residuals(way: str, **functions: tuple[Any, Any, int]) -> dict[str, Any]:
+    """Class attributes of a graph: for each name the NumPy function, the one of one factor, and its rows."""
+    if way == "shipped":
+        return {}
+    if way == "njit":
+        return {name: fg.residual(one, rows=rows) for name, (_, one, rows) in functions.items()}
+    forced = "differences" if way == "differences" else None
+    return {name: fg.residual(batched, derivatives=forced) for name, (batched, _, _) in functions.items()}
+
+
+def _made(kind: type[Any], functions: dict[str, Any], problem: Problem) -> Stated:
+    graph: Stated = type("Own", (kind,), functions)(problem)
+    return graph
+
+
+def stated(problem: Problem, way: str) -> Stated:
+    """A problem with its functions stated in one of the ways of :data:`NAMES`."""
+    if isinstance(problem, Quadrotor):
+        functions = _residuals(way, dynamics=(quadrotor_dynamics, None, 9))
+        return _made(QuadrotorGraph, functions, problem)
+    if isinstance(problem, CartPole):
+        functions = _residuals(way, dynamics=(cart_pole_dynamics, cart_pole_dynamics_of_one, 4))
+        return _made(CartPoleGraph, functions, problem)
+    functions = _residuals(
+        way,
+        tracking=(tracking, tracking_of_one, 3),
+        dynamics=(dynamics, dynamics_of_one, 3),
+        clearance=(clearance, clearance_of_one, max(len(problem.discs), 1)),
+    )
+    return _made(UnicycleGraph, functions, problem)
+
+
+@dataclass(frozen=True)
+class Way:
+    """A problem as one of the ways states it: what :func:`benchmarks.cold.attempt` and a loop ask for."""
+
+    problem: Problem
+    way: str
+
+    def formulation(self) -> Stated:
+        """As a factor graph."""
+        return stated(self.problem, self.way)
+
+
+def problems() -> dict[str, Problem]:
+    """By title, those the targets speak of."""
+    found: list[Problem] = [
+        Unicycle("straight", False, 50),
+        Unicycle("straight", True, 50),
+        Unicycle("ahead", True, 50),
+    ]
+    found += [Quadrotor("figure8", False, 20), Quadrotor("figure8", True, 20), CartPole("upright", False, LOOP)]
+    return {problem.title: problem for problem in found}
+
+
+def ways(problem: Problem) -> list[str]:
+    """The ways a problem can be stated."""
+    without = {Quadrotor: {"njit"}, CartPole: {"shipped"}}.get(type(problem), set())
+    return [way for way in ("shipped", "numpy", "njit", "differences") if way not in without]
+
+
+# ---------------------------------------------------------------- what is measured
+
+
+def first_answer(title: str, way: str) -> tuple[float, float]:
+    """Processor time [s] to state and prepare a problem, and to solve it the first time; for a process of its own."""
+    problem = problems()[title]
+    begin = time.process_time()
+    built = stated(problem, way)
+    run = InteriorPoint(tolerance=TOLERANCE).prepare(built.graph)
+    ready = time.process_time()
+    run.solve(built.guess)
+    return ready - begin, time.process_time() - ready
+
+
+def _in_a_process(title: str, way: str) -> tuple[float, float]:
+    code = (
+        f"import json; from benchmarks import own_functions as o; print(json.dumps(o.first_answer({title!r}, {way!r})))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], cwd=CHECKOUT, capture_output=True, text=True, check=True)
+    first, second = json.loads(run.stdout.splitlines()[-1])
+    return first, second
+
+
+@dataclass
+class Cold:
+    """One way of one problem.
+
+    Attributes:
+        first: seconds until it is prepared, and of the first solve; not a number for peers.
+        outcome: of the repeated solves.
+        ratio: of its times to fatrop's, round by round.
+    """
+
+    first: tuple[float, float]
+    outcome: Outcome
+    ratio: list[float] | None
+
+
+def cold(title: str, problem: Problem, rounds: int) -> dict[str, Cold]:
+    """Every way, and fatrop, interleaved."""
+    solver = InteriorPoint(tolerance=TOLERANCE)
+    attempts: dict[str, Callable[[Outcome], float]] = {
+        way: attempt(solver, Way(problem, way), True) for way in ways(problem)
+    }
+    for peer in runnable(("fatrop", "fatrop, compiled")):
+        attempts[peer] = attempt_peer(peer, problem, TOLERANCE)
+    outcomes = {way: Outcome(problem, way) for way in attempts}
+    times = interleave({way: partial(solve, outcomes[way]) for way, solve in attempts.items()}, rounds, slow=100.0)
+    found = {}
+    for way, outcome in outcomes.items():
+        outcome.times = times[way].tolist()
+        first = (math.nan, math.nan) if way not in ways(problem) else _in_a_process(title, way)
+        ratio = None
+        if "fatrop" in times:
+            shared = min(len(times[way]), len(times["fatrop"]))
+            ratio = spread(times[way][:shared] / times["fatrop"][:shared])
+        found[way] = Cold(first, outcome, ratio)
+    return found
+
+
+def render_cold(results: Mapping[str, Mapping[str, Cold]]) -> str:
+    """A row for each way of each problem."""
+    rows = []
+    for title, found in results.items():
+        for way, one in found.items():
+            first = [number(part) for part in one.first]
+            times = number(one.outcome.median)
+            rows.append(
+                (title, NAMES[way], one.outcome.status, str(one.outcome.iterations), *first, times, shown(one.ratio))
+            )
+    head = ("problem", "functions", "status", "iterations", "to prepared [s]", "first solve [s]", "solve [ms]")
+    return table((*head, "times fatrop"), rows, 3)
+
+
+def loop() -> dict[str, control_loops.Drive]:
+    """The cart-pole in closed loop."""
+    problem = CartPole("upright", False, LOOP)
+    solver = InteriorPoint(tolerance=TOLERANCE)
+    who: dict[str, control_loops.Contestant] = {way: Driver(Way(problem, way), solver) for way in ways(problem)}
+    for peer in runnable(("fatrop", "fatrop, compiled")):
+        who[peer] = control_loops.contestant(problem, peer)
+    return control_loops.race(problem, who)
+
+
+def render_loop(drives: Mapping[str, control_loops.Drive]) -> str:
+    """A row for each way."""
+    rows = []
+    for way, drive in drives.items():
+        ratio = "-"
+        if "fatrop" in drives:
+            ratio = shown(spread(np.array(drive.times) / np.array(drives["fatrop"].times)))
+        rows.append(
+            (
+                NAMES[way], f"{np.median(drive.times):.3f}", f"{np.percentile(drive.times, 99):.3f}",
+                f"{np.mean(drive.iterations):.1f}", str(sum(drive.failures.values())), f"{drive.cost:.5g}", ratio,
+            )
+        )  # fmt: skip
+    head = ("functions", "median [ms]", "p99 [ms]", "iterations", "failures", "cost", "times fatrop")
+    return table(head, rows)
+
+
+def fields(count: int) -> str:
+    """Random fields of discs with NumPy functions, beside fatrop."""
+    solver = InteriorPoint(tolerance=TOLERANCE)
+    outcomes: dict[str, list[Outcome]] = {}
+    for seed in tqdm(range(count), unit="field"):
+        problem = Field("straight", True, 50, seed)
+        attempts: dict[str, Callable[[Outcome], float]] = {"numpy": attempt(solver, Way(problem, "numpy"), True)}
+        for peer in runnable(("fatrop",)):
+            attempts[peer] = attempt_peer(peer, problem, TOLERANCE)
+        found = {way: Outcome(problem, way) for way in attempts}
+        times = interleave({way: partial(solve, found[way]) for way, solve in attempts.items()}, 3)
+        for way, outcome in found.items():
+            outcome.times = times[way].tolist()
+            outcomes.setdefault(way, []).append(outcome)
+    rows = []
+    for way, mine in outcomes.items():
+        solved = [outcome for outcome in mine if outcome.status == "converged"]
+        both = [
+            (outcome, other)
+            for outcome, other in zip(mine, outcomes.get("fatrop", mine), strict=True)
+            if outcome.status == other.status == "converged"
+        ]
+        ratios = np.array([outcome.median / other.median for outcome, other in both])
+        steps = np.array([outcome.iterations / max(other.iterations, 1) for outcome, other in both])
+        rows.append(
+            (
+                NAMES[way], f"{len(solved)} / {count}", f"{np.median([o.iterations for o in solved]):.0f}",
+                number(float(np.median([o.median for o in solved]))), str(len(both)),
+                shown(spread(ratios)), shown(spread(steps)),
+            )
+        )  # fmt: skip
+    head = ("functions", "converged", "iterations", "solve [ms]", "both converged")
+    return table((*head, "time / fatrop's", "iterations / fatrop's"), rows)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure and write the page."""
+    parser = command(__doc__)
+    parser.add_argument("--rounds", type=int, default=20, help="cold solves of every problem in every way")
+    parser.add_argument("--fields", type=int, default=200, help="random fields of discs")
+    options = parser.parse_args(arguments)
+    stated_so = tqdm(problems().items(), unit="problem")
+    results = {title: cold(title, problem, options.rounds) for title, problem in stated_so}
+    peers = ("casadi",) if available() else ()
+    parts = [
+        "### Cold", render_cold(results),
+        f"Tolerance {TOLERANCE:.0e}, median processor time of {options.rounds} interleaved solves; ratios with "
+        "quartiles. To prepared and first solve: processor time in a new process whose compiled functions are in the "
+        "cache.",
+        "### A cart-pole in closed loop", render_loop(loop()),
+        f"Horizon of {LOOP} steps, {control_loops.STEPS} ticks after a cold one, warm starts, interleaved.",
+        "### Fields of discs", fields(options.fields),
+        machine("numpy", "numba", *peers),
+    ]  # fmt: skip
+    publish("own-functions", "\n\n".join(parts), docs=options.fields >= 200)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
