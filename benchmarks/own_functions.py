@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numba
 import numpy as np
@@ -40,6 +40,7 @@ from unifg.typing import Array
 
 TOLERANCE = 1e-4
 LOOP = 30  # horizon of the cart-pole
+WAYS = ("shipped", "numpy", "njit", "differences")
 NAMES = {
     "shipped": "shipped",
     "numpy": "NumPy function",
@@ -90,13 +91,6 @@ def dynamics_of_one(x: Array, u: Array, after: Array, dt: float, r: Array) -> No
     r[2] = math.atan2(math.sin(turn), math.cos(turn))
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def clearance_of_one(x: Array, centres: Array, radii: Array, r: Array) -> None:
-    """The same for one factor."""
-    for k in range(len(radii)):
-        r[k] = math.hypot(x[0] - centres[k, 0], x[1] - centres[k, 1]) - radii[k]
-
-
 # ---------------------------------------------------------------- the quadrotor
 
 
@@ -122,8 +116,8 @@ def _residuals(way: str, **functions: tuple[Any, Any, int]) -> dict[str, Any]:
     if way == "shipped":
         return {}
     if way == "njit":
-        return {name: fg.residual(one, rows=rows) for name, (_, one, rows) in functions.items()}
-    forced = "differences" if way == "differences" else None
+        return {name: fg.residual(one, rows=rows) for name, (_, one, rows) in functions.items() if rows}
+    forced: Literal["differences"] | None = "differences" if way == "differences" else None
     return {name: fg.residual(batched, derivatives=forced) for name, (batched, _, _) in functions.items()}
 
 
@@ -144,7 +138,7 @@ def stated(problem: Problem, way: str) -> Stated:
         way,
         tracking=(tracking, tracking_of_one, 3),
         dynamics=(dynamics, dynamics_of_one, 3),
-        clearance=(clearance, clearance_of_one, max(len(problem.discs), 1)),
+        clearance=(clearance, None, 0),
     )
     return _made(UnicycleGraph, functions, problem)
 
@@ -174,8 +168,8 @@ def problems() -> dict[str, Problem]:
 
 def ways(problem: Problem) -> list[str]:
     """The ways a problem can be stated."""
-    without = {Quadrotor: {"njit"}, CartPole: {"shipped"}}.get(type(problem), set())
-    return [way for way in ("shipped", "numpy", "njit", "differences") if way not in without]
+    shipped, compiled = type(problem) is not CartPole, type(problem) is not Quadrotor and not problem.blocked
+    return [way for way, there in zip(WAYS, (shipped, True, compiled, True), strict=True) if there]
 
 
 # ---------------------------------------------------------------- what is measured
