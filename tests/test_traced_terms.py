@@ -79,7 +79,6 @@ def test_constants_are_read_as_the_function_means_them(each: bool) -> None:
         (lambda x: GAIN * x - 1.0, ()),
         (lambda x: math.sqrt(2.0) * x - 1.0, ()),
     ],
-    ids=str,
 )
 def test_arguments_and_what_a_function_reaches_are_constants(function: Function, arguments: tuple[Any, ...]) -> None:
     route, found = solved(function, *arguments)
