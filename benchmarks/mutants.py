@@ -70,6 +70,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "solvers/globalize/least_violation.py": ("infeasible", "solvers"),
     "solvers/penalty.py": ("penalty", "solvers"),
     "solvers/augmented_objective.py": ("augmented_lagrangian", "solvers"),
+    "solvers/augmented_usual.py": ("augmented_lagrangian", "solvers"),
     "solvers/augmented_step.py": ("augmented_lagrangian", "penalty", "solvers"),
     "solvers/quadratic_programs/exact_hessian.py": ("sqp_exact", "solvers"),
     "solvers/sqp.py": (

@@ -82,7 +82,7 @@ class Primal:
     def slope(self, lin: Linearization, multipliers: Array) -> float:
         """Largest entry of the Lagrangian's gradient over the unknowns."""
         program = self.program
-        return float(_slope(program.arrays, program.columns.free, lin.gradient, lin.constraint_jacobian, multipliers))
+        return float(slope_of(program.arrays, program.columns.free, lin.gradient, lin.constraint_jacobian, multipliers))
 
     def curvature(self, lin: Linearization, multipliers: Array, penalty: Array) -> Array:
         """Gauss-Newton Hessian entries J'J + A' diag(rho, active rows) A."""
@@ -134,7 +134,7 @@ class Primal:
 
 
 @compiled
-def _slope(terms: TermArrays, free: IntArray, gradient: Array, entries: Array, multipliers: Array) -> float:
+def slope_of(terms: TermArrays, free: IntArray, gradient: Array, entries: Array, multipliers: Array) -> float:
     """Max |gradient + A' multipliers| over the unknowns; NaN where one is."""
     full, largest = gradient.copy(), 0.0
     transposed_times(terms, False, entries, multipliers, full)

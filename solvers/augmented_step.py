@@ -134,7 +134,7 @@ def model_step(
     program = primal.program
     primal.damping = damping
     step = np.zeros(program.size)
-    predicted = _minimize(
+    predicted = minimize(
         program.arrays,
         primal.solver.plan,
         program.columns.free,
@@ -157,7 +157,7 @@ def model_step(
 
 
 @compiled
-def _minimize(
+def minimize(
     terms: TermArrays,
     plan: Plan,
     free: IntArray,
@@ -187,17 +187,22 @@ def _minimize(
     added, curvature, here = np.empty_like(step), np.empty_like(hessian), np.empty_like(step)
     bent, bent_move, bow, bow_here = np.zeros_like(step), np.zeros_like(step), 0.0, 0.0  # of the second derivatives
     update(constraints, lower, upper, multipliers, penalty, after)
+    # Equalities are there in every step: what they add to the curvature is found once.
+    settled = hessian.copy()
+    if curved:
+        settled += bend
     for row in range(len(weights)):
-        weights[row] = penalty[row] if equality[row] or after[row] != 0.0 else 0.0
+        weights[row] = penalty[row] if equality[row] else 0.0
+    add_constraints(terms, constraint_jacobian, weights, settled)
+    for row in range(len(weights)):
+        weights[row] = penalty[row] if not equality[row] and after[row] != 0.0 else 0.0
     value = 0.5 * float(np.dot(residual, residual)) + barrier(constraints, lower, upper, multipliers, penalty)
     start = value
     for newton in range(NEWTON_STEPS):
         full[:] = 0.0
         transposed_times(terms, True, jacobian, residual, full)
         transposed_times(terms, False, constraint_jacobian, after, full)
-        curvature[:] = hessian
-        if curved:
-            curvature += bend
+        curvature[:] = settled
         add_constraints(terms, constraint_jacobian, weights, curvature)
         if newton == 0:
             _damping(curvature, indptr, damping, added)
@@ -237,7 +242,7 @@ def _minimize(
         update(constraints, lower, upper, multipliers, penalty, after)
         same = True
         for row in range(len(weights)):
-            weight = penalty[row] if equality[row] or after[row] != 0.0 else 0.0
+            weight = penalty[row] if not equality[row] and after[row] != 0.0 else 0.0
             same = same and weight == weights[row]
             weights[row] = weight
         if length == 1.0 and same:

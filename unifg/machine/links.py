@@ -51,6 +51,11 @@ def link(function: Callable[..., Any], result: Any, *arguments: Any) -> int:
     return int(overload.library.get_pointer_to_function(overload.fndesc.llvm_func_name))
 
 
+def link_like(function: Callable[..., Any], result: Any, *arguments: Any) -> int:
+    """The same for arguments like these."""
+    return link(function, result, *map(typeof, arguments))
+
+
 def _calling(result: Any) -> Any:
     """What compiled code calls as ``f(address, (argument, ...))``; the arguments have the types the tuple says."""
 

@@ -73,6 +73,7 @@ class Program:
         retraction: moves all variables.
         scratch: memory for compiled loops.
         python_seconds: time spent so far in terms that Python evaluates.
+        buffers: memory for linearisations.
     """
 
     def __init__(self, graph: Statement) -> None:
@@ -114,7 +115,7 @@ class Program:
         self._read = GuessReader(graph, self.columns, self.retraction)
         self._names = [term.name for term in stacked]
         self.scratch = np.empty(self.table.scratch)
-        self._buffers = Buffers([*self.table.sizes, self.columns.width, self.normal.nnz])
+        self.buffers = Buffers([*self.table.sizes, self.columns.width, self.normal.nnz])
         self._watched: list[CompiledTerm] = []
         self.python_seconds = 0.0
         read = {value for term in self.terms for value in term.data}
@@ -293,7 +294,7 @@ class Program:
         """Everything a backend needs at ``values``; with ``search``, by search Jacobians where a residual has one."""
         table = self.table
         values = values if isinstance(values, Values) else self.columns.values(values)
-        residual, jacobian, constraints, constraint_jacobian, gradient, hessian = self._buffers.take()
+        residual, jacobian, constraints, constraint_jacobian, gradient, hessian = self.buffers.take()
         gradient[:], hessian[:] = 0.0, 0.0
         squares, weights = np.empty(table.weights), np.empty(table.weights)
         size = np.empty(len(table.arrays.fields))

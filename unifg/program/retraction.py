@@ -19,7 +19,7 @@ class Retraction:
 
     Attributes:
         parts: one row per component of a family, for :func:`retract_parts`.
-        fixed: places in the stored values that no step moves.
+        fixed, fixed_values: stored numbers that do not move, and what they are.
     """
 
     def __init__(self, columns: Columns, fixes: Sequence[Fix]) -> None:
@@ -51,9 +51,9 @@ class Retraction:
         self.parts = np.array(parts, dtype=np.int64).reshape(-1, 8)
         places = [columns.starts(fix.selection)[:, None] + np.arange(fix.selection.manifold.storage) for fix in fixes]
         self.fixed: IntArray = np.concatenate([np.zeros(0, dtype=np.int64), *(place.ravel() for place in places)])
-        self._values = np.zeros(len(self.fixed))
+        self.fixed_values = np.zeros(len(self.fixed))
         ends = np.cumsum([0, *(place.size for place in places)]).tolist()
-        own = [self._values[first:last] for first, last in pairwise(ends)]
+        own = [self.fixed_values[first:last] for first, last in pairwise(ends)]
         self._views = [part.reshape(place.shape) for part, place in zip(own, places, strict=True)]
 
     @property
@@ -67,7 +67,7 @@ class Retraction:
 
     def fix(self, values: Values) -> None:
         """Write the values of fixed variables."""
-        values.flat[self.fixed] = self._values
+        values.flat[self.fixed] = self.fixed_values
 
     def __call__(self, values: Values, step: Array) -> Values:
         """Move the unknowns by a tangent step."""
