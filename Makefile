@@ -6,7 +6,8 @@
 #   make bench    measure everything again and rewrite the tables in docs/ (long)
 #   make results PAGE=control-cases    measure one page of docs/ again; without PAGE, list them
 #   make stale    name the pages of docs/ whose tables were measured on other sources
-#   make release-check    the same, and fail if there are any
+#   make release-check    the same, and fail if there are any, or if the kernels that come with unifg are out of date
+#   make kernels  compile everything anew into unifg/machine/kernels.zip, which spares a first use most of it (minutes)
 #   make mutants  change decisions one at a time and see whether a test notices (hours; FILES='scenarios/driving/drive_joint.py')
 #   make offsets  solve the same problems with their worlds moved by up to 5000 km (minutes)
 #   make fences   run the shell commands shown in README.md and docs/
@@ -26,16 +27,18 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Matrices here are small: more threads per process only make the processes wait for each other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: help demo test lint types bench results stale release-check mutants fences clean offsets
+.PHONY: kernels help demo test lint types bench results stale release-check mutants fences clean offsets
 .DELETE_ON_ERROR:
 
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
 
 demo: $(VENV)/ready
+	$(BIN)/unifg warmup
 	$(BIN)/unifg run navigation --obstacles 3 --seed 0 --out out/demo
 
 test: $(VENV)/ready
+	$(ONE_THREAD) $(BIN)/unifg warmup
 	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(PYTEST)
 
 lint: $(VENV)/ready-dev
@@ -57,6 +60,10 @@ stale: $(VENV)/ready
 
 release-check: $(VENV)/ready
 	@$(BIN)/python -m benchmarks.pages stale --strict
+	@$(BIN)/unifg warmup --check
+
+kernels: $(VENV)/ready
+	$(ONE_THREAD) $(BIN)/unifg warmup --ship
 
 mutants: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/python -m benchmarks.mutants $(FILES)

@@ -14,6 +14,7 @@ import argparse
 import re
 import signal
 import sys
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
@@ -81,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as stop:  # argparse has said what is wrong, or has printed help
         return stop.code if isinstance(stop.code, int) else REFUSED
     try:
-        return _run(chosen)
+        return _warm_up(chosen) if chosen.name == "warmup" else _run(chosen)
     except UnifgError as error:
         return _refuse(str(error))
     except KeyboardInterrupt:
@@ -107,7 +108,34 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     solve.set_defaults(name="solve")
     if list(words[:1]) == ["solve"]:
         SOLVE.add_options(solve)
+    about = "Compile, once for all programs to come, what the library and its scenarios can reach."
+    warm = commands.add_parser("warmup", help="compile everything beforehand", description=about, allow_abbrev=False)
+    warm.set_defaults(name="warmup")
+    other = warm.add_mutually_exclusive_group()
+    other.add_argument("--ship", action="store_true", help="write the half compiled kernels that come with unifg anew")
+    other.add_argument("--check", action="store_true", help="say whether these are out of date; compile nothing")
+    if list(words[:1]) == ["warmup"]:
+        warm.set_defaults(module=import_module("unifg.scenarios.commands.warm"))
     return parser
+
+
+def _warm_up(chosen: argparse.Namespace) -> int:
+    """Compile everything, and say how much there was to do."""
+    if chosen.check:
+        changed = chosen.module.outdated()
+        if changed:
+            print("out of date: " + ", ".join(changed) + "; write it anew with `unifg warmup --ship`")
+        return FAILED if changed else SUCCEEDED
+    began = time.perf_counter()
+    with _progress_bar("warmup") as progress:
+        done = chosen.module.ship(progress) if chosen.ship else chosen.module.run(progress)
+    if chosen.ship:
+        print(f"{done}: {done.stat().st_size / 1e6:.1f} MB")
+    else:
+        parts = (len(done.compiled), "compiled"), (len(done.generated), "generated"), (len(done.read), "read")
+        text = ", ".join(f"{count} functions {what}" for count, what in parts if count)
+        print(f"{text or 'everything is there: found'} in {time.perf_counter() - began:.1f} s")
+    return SUCCEEDED
 
 
 def _run(chosen: argparse.Namespace) -> int:

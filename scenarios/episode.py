@@ -1,11 +1,12 @@
-"""What every episode does alike: tick until it is over, tell how far it has come, and stop when the user asks."""
+"""What every episode does alike: rehearse, tick until it is over, tell how far it has come, stop when the user asks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeAlias
+from dataclasses import replace
+from typing import Any, TypeAlias
 
-__all__ = ["Progress", "run_ticks", "silent"]
+__all__ = ["Progress", "rehearse", "run_ticks", "silent"]
 
 Progress: TypeAlias = Callable[[float, str], None]
 """Called with the fraction done and a short text, once a tick; may raise KeyboardInterrupt."""
@@ -37,3 +38,33 @@ def run_ticks(limit: int, tick: Callable[[int], tuple[float, str] | None], progr
         interrupted = True
     progress(1.0, "done")
     return interrupted
+
+
+GOOD_TICKS, BAD_TICKS = 3, 4
+_rehearsed: set[object] = set()
+
+
+def rehearse(kind: object, twin: Callable[[], Any]) -> None:
+    """Run a few ticks of a twin, once per process and kind of run, so that the ticks of the run itself compile nothing.
+
+    What a pilot calls besides its solvers, and where it turns when they fail, is compiled or read from the disk then.
+
+    Args:
+        kind: of the run: what decides which code it calls.
+        twin: makes another run like it, with a ``run(progress)`` and a ``pilot``; it is thrown away.
+    """
+    if kind in _rehearsed:
+        return
+    _rehearsed.add(kind)
+    other, ticks = twin(), 0
+    controller = other.pilot.controller
+
+    def after(done: float, text: str) -> None:
+        nonlocal ticks
+        ticks += 1
+        if ticks == GOOD_TICKS:  # from now on no plan is good enough
+            controller.settings = replace(controller.settings, feasible=-1.0)
+        if ticks == GOOD_TICKS + BAD_TICKS:
+            raise KeyboardInterrupt
+
+    other.run(after)

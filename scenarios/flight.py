@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from unifg.errors import ScenarioError, UnifgError
+from unifg.machine.tally import counting
 from unifg.models import quadrotor
-from unifg.scenarios.episode import Progress, run_ticks, silent
+from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
 from unifg.scenarios.flying.braking import braking_control
 from unifg.scenarios.flying.estimator import EstimatorSettings
 from unifg.scenarios.flying.flight_pilot import COUPLINGS, make_pilot
@@ -112,8 +113,8 @@ class Flight:
         pilot: what flies.
     """
 
-    def __init__(self, settings: FlightSettings) -> None:
-        """Draw the world and wake the pilot."""
+    def __init__(self, settings: FlightSettings, *, rehearsal: bool = False) -> None:
+        """Draw the world and wake the pilot, and rehearse unless this is a rehearsal."""
         self.settings = settings
         self.conditions = found = draw_conditions(settings.seed, settings.mass_error)
         self.world = QuadrotorWorld(found.layout, settings.seed, found.true, settings.movers)
@@ -123,6 +124,10 @@ class Flight:
             settings.coupling, settings.solver, found.layout, believed, found.nominal, settings.estimator,
             settings.controller,
         )  # fmt: skip
+        if not rehearsal:
+            avoidance, association = settings.controller.avoidance, settings.estimator.association
+            kind = SCENARIO, settings.coupling, settings.solver, avoidance, association, settings.movers > 0
+            rehearse(kind, lambda: Flight(settings, rehearsal=True))
 
     def run(self, progress: Progress) -> FlightLog:
         """Fly to the target, or until it is no use."""
@@ -153,10 +158,11 @@ class Flight:
         """Sense, estimate, plan and record; the control (4,) to be flown."""
         pilot, world, reading = self.pilot, self.world, self.world.sense()
         plan: Plan | None = None
-        try:
-            plan = pilot.tick(reading, self._control)
-        except (UnifgError, ArithmeticError, ValueError) as error:  # a robot in the air has to go on
-            logger.warning("the tick at %.2f s failed, the vehicle brakes: %s", world.time, error)
+        with counting() as new:
+            try:
+                plan = pilot.tick(reading, self._control)
+            except (UnifgError, ArithmeticError, ValueError) as error:  # a robot in the air has to go on
+                logger.warning("the tick at %.2f s failed, the vehicle brakes: %s", world.time, error)
         belief, settings = pilot.belief, self.settings.controller
         control = braking_control(belief.state, belief.parameters, *settings.box) if plan is None else plan.control
         marks = belief.landmarks
@@ -173,6 +179,7 @@ class Flight:
             seen=reading.ids,
             movers=world.mover_states(),
             **pilot.clock.milliseconds,
+            compiled=new.everything,
             statuses="failed" if plan is None else plan.status.name.lower().replace("_", " "),
             clearance=world.clearance(),
             emergency=plan is None or plan.emergency,

@@ -15,12 +15,13 @@ import numpy as np
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import load_map
 from unifg.lie import wrap_angle
+from unifg.machine.tally import counting
 from unifg.models.distance_map import DistanceMap
 from unifg.models.unicycle import step
 from unifg.scenarios.driving.drive_pilot import make_pilot
 from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.driving.route import Route
-from unifg.scenarios.episode import Progress, run_ticks, silent
+from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
 from unifg.scenarios.horizon.loop import Plan
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.drive_log import EpisodeLog
@@ -83,8 +84,8 @@ def run_navigation(settings: NavigationSettings, progress: Progress | None = Non
 class Episode:
     """World, robot and goals of one run."""
 
-    def __init__(self, settings: NavigationSettings) -> None:
-        """Load the map, plan the legs, place the obstacles, wake the robot."""
+    def __init__(self, settings: NavigationSettings, *, rehearsal: bool = False) -> None:
+        """Load the map, plan the legs, place the obstacles, wake the robot, and rehearse unless this is a rehearsal."""
         self.settings = settings
         control = settings.controller
         self.occupancy = building_map() if settings.map is None else load_map(settings.map)
@@ -117,6 +118,9 @@ class Episode:
         self.pilot = make_pilot(
             settings.coupling, self.distance_map, settings.solver, control, believed, sigma, self.world.lidar.beams
         )
+        if not rehearsal:
+            kind = "navigation", settings.coupling, settings.solver
+            rehearse(kind, lambda: Episode(settings, rehearsal=True))
 
     def run(self, progress: Progress) -> EpisodeLog:
         """Tick until the last goal is reached or time is up."""
@@ -155,8 +159,9 @@ class Episode:
             self._dead_reckoning = step(self._dead_reckoning[None], odometry[None], dt)[0]
             self._driven += abs(odometry[0]) * dt
         scan = self.world.scan()
-        plan = self.pilot.tick(scan, odometry, self.legs[goal])
-        self._record(scan, plan)
+        with counting() as new:
+            plan = self.pilot.tick(scan, odometry, self.legs[goal])
+        self._record(scan, plan, new.everything)
         if self._arrived(goal):
             self._reached[goal] = self._confirmed(goal)
             self._goal = goal = goal + 1
@@ -167,7 +172,7 @@ class Episode:
         self.world.step(float(plan.control[0]), float(plan.control[1]), dt)
         return self._driven / length, f"goal {goal + 1}/{len(self.goals)}"
 
-    def _record(self, scan: Scan, plan: Plan) -> None:
+    def _record(self, scan: Scan, plan: Plan, compiled: int) -> None:
         """Keep what this tick leaves behind; the measured time is what a robot would spend."""
         pilot, world = self.pilot, self.world
         took = pilot.clock.milliseconds
@@ -183,6 +188,7 @@ class Episode:
             detected=np.column_stack([pilot.tracks.centre, pilot.tracks.radius]),
             solve_ms=took["localise_ms"] + took["plan_ms"],
             **took,
+            compiled=compiled,
             localisation_iterations=pilot.iterations,
             plan_iterations=plan.iterations,
             status=plan.status.name.lower(),

@@ -69,6 +69,8 @@ class AugmentedLagrangian(Solver):
             convex) or "gauss-newton". Bazzana's schedules and graphs without constraints have Gauss-Newton's.
     """
 
+    rehearses = True
+
     scalar_costs = False
 
     max_iterations: int = 300

@@ -195,10 +195,10 @@ class _Search:
         self._options, self._stages, self._data = options, stages, data
         self.history = _History(callback)
         solver = options.solver
-        self._plain = solver.prepare(staged)
+        self._plain = solver.bound(staged)
         rough = max(solver.tolerance, ROUGH)
-        self._run = replace(solver, max_iterations=options.stage_iterations, tolerance=rough).prepare(staged)
-        self._last = solver.prepare(graph)
+        self._run = replace(solver, max_iterations=options.stage_iterations, tolerance=rough).bound(staged)
+        self._last = solver.bound(graph)
         self._damped: Prepared | None = None
         self.found: list[_Answer] = []
         robust = self._run.program.table.robust
@@ -259,7 +259,7 @@ class _Search:
         if self._damped is None:
             limit, tolerance = self._run.solver.max_iterations, self._run.solver.tolerance
             damped = LevenbergMarquardt(max_iterations=limit, tolerance=tolerance)
-            self._damped = damped.prepare(self._run.program.graph)
+            self._damped = damped.bound(self._run.program.graph)
         return self.history.add(self._damped, found.values, self._data, restart=True)
 
     def _stated(self, found: Solution) -> Solution:
@@ -267,7 +267,7 @@ class _Search:
         return self.history.add(self._last, found.values, self._data)
 
     def _interrupted(self, found: Solution) -> Solution:
-        last = replace(self._options.solver, max_iterations=0).prepare(self._last.program.graph)
+        last = replace(self._options.solver, max_iterations=0).bound(self._last.program.graph)
         solution = self.history.add(last, found.values, self._data)
         solution.status = Status.INTERRUPTED
         return solution

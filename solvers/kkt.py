@@ -63,6 +63,7 @@ class KKT(Solver):
             there). A positive number switches it on; it does not grant CONVERGED.
     """
 
+    rehearses = True
     constraints = "equalities"
     scalar_costs = False
 

@@ -37,6 +37,7 @@ class LeastSquares(Solver):
         step_tolerance: optional stop rule on the norm of the step; it does not grant CONVERGED.
     """
 
+    rehearses = True
     constraints = "none"
     scalar_costs = False
 

@@ -43,6 +43,8 @@ class Penalty(Solver):
         damping: initial Levenberg-Marquardt damping of each weight.
     """
 
+    rehearses = True
+
     scalar_costs = False
 
     max_iterations: int = 300

@@ -68,6 +68,8 @@ class SQP(Solver):
         full_steps: take every step in full, as the paper does; no merit function.
     """
 
+    rehearses = True
+
     max_iterations: int = 200
     hessian: Literal["gauss-newton", "exact"] = "gauss-newton"
     qp: str = "osqp"

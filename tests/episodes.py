@@ -74,6 +74,7 @@ def episode(ticks: int = 40, obstacles: int = 2, *, map_yaw: float = 0.0, seed: 
         detected=[_seen(places[k], k) for k in range(ticks)],
         solve_ms=solve,
         localise_ms=solve * 0.25,
+        compiled=np.zeros(ticks, dtype=np.intp),
         plan_ms=solve * 0.75,
         perceive_ms=solve * 0.1,
         route_ms=solve * 0.05,

@@ -29,6 +29,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("answers",),
     ("solvers", "smoothing", "pose_graphs", "models"),
     ("files",),
+    ("warming",),
     ("unifg",),  # the names of the user's script, gathered
     ("scenarios",),
     ("benchmarks",),

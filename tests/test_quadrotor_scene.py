@@ -80,6 +80,7 @@ def flight(ticks: int = 24, *, estimated: bool = True, movers: int = 1, reached:
             movers=[[8.0 + 0.01 * k, -2.0, 0.4]] * movers,
             estimate_ms=5.0 if estimated else 0.0,
             plan_ms=7.0 + k if estimated else 0.0,
+            compiled=0,
             statuses="converged",
             clearance=1.0 + 0.01 * (k - 12) ** 2,
             emergency=estimated and k in (5, 6),

@@ -328,7 +328,8 @@ def flown(ticks: int) -> FlightLog:
             plans=np.tile(state[:3], (21, 1)), pasts=np.tile(state[:3], (tick, 1)),
             landmarks=(reading.ids, world.things()[reading.ids, :2], np.tile(np.eye(2), (count, 1, 1)), reading.radii),
             parameters=PARAMETERS.packed, parameters_sigma=np.zeros(7), seen=reading.ids, movers=world.mover_states(),
-            estimate_ms=1.0, plan_ms=2.0, statuses="converged", clearance=world.clearance(), emergency=tick == 1,
+            estimate_ms=1.0, plan_ms=2.0, compiled=0, statuses="converged", clearance=world.clearance(),
+            emergency=tick == 1,
         )  # fmt: skip
         world.step(HOVER)
     return recorder.finish(collisions=world.collisions, reached=False)

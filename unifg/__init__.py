@@ -10,6 +10,7 @@ graph.minimize(fg.between, x[0], x[1], [1.0, 0.0, 0.3], sigma=0.1)
 solution = SQP().solve(graph, {x: np.zeros((2, 3))})
 """
 
+from collections.abc import Callable as _Callable
 from importlib import metadata as _metadata
 from pathlib import Path as _Path
 
@@ -119,8 +120,22 @@ __all__ = [
     "optimality",
     "prior",
     "residual",
+    "warmup",
     "wrap_angle",
 ]
+
+
+def warmup(progress: _Callable[[float, str], object] | None = None) -> None:
+    """Compile what the shipped backends, smoothers and models can reach, and keep it on disk for programs to come.
+
+    Where everything is there already it is read and found to run, which takes a second or two.
+
+    Args:
+        progress: called with the share that is done, and what comes next.
+    """
+    from unifg.warming import jobs, perform
+
+    perform("library", lambda: list(jobs()), progress)
 
 
 def __dir__() -> list[str]:

@@ -80,6 +80,8 @@ class EpisodeLog:
     """Update of the tracked obstacles."""
     route_ms: Array = column("ms")
     """Repair of the global route, most often nothing."""
+    compiled: IntArray = column("functions", dtype=np.intp)
+    """What was compiled, or read from the disk, in the tick: none, once the robot has been woken."""
     localisation_iterations: IntArray = column("iterations", dtype=np.intp)
     plan_iterations: IntArray = column("iterations", dtype=np.intp)
     status: list[str] = words()

@@ -92,6 +92,8 @@ class FlightLog:
     """Moving obstacles: x, y, radius."""
     estimate_ms: Array = column("ms")
     plan_ms: Array = column("ms")
+    compiled: IntArray = column("functions", dtype=np.intp)
+    """What was compiled, or read from the disk, in the tick: none, once the pilot has been woken."""
     statuses: list[str] = words()
     """Of the plan."""
     emergency: BoolArray = column(dtype=np.bool_)

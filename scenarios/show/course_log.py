@@ -50,6 +50,7 @@ def course_log(course: Course) -> FlightLog:
         movers=np.zeros((count, 0, 3)),
         estimate_ms=np.zeros(count),
         plan_ms=np.zeros(count),
+        compiled=np.zeros(count, dtype=np.intp),
         statuses=[c.solution.status.name] * count,
         emergency=np.zeros(count, dtype=bool),
         clearance=c.layout.distance(states[:, :2]) - VEHICLE_RADIUS,

@@ -64,6 +64,8 @@ class InteriorPoint(Solver):
             that runs out of time or iterations hands back the last iterate that kept the constraints, if one did.
     """
 
+    rehearses = True
+
     max_iterations: int = 300
     hessian: Literal["exact", "gauss-newton"] = "exact"
     barrier: float = 0.3

@@ -13,6 +13,7 @@ import numpy as np
 
 from unifg.answers.history import HEADER, Deferred, Iteration, factor_norms, line
 from unifg.answers.optimality import infeasible_stationary, optimality, within_bounds
+from unifg.answers.rehearsal import rehearse
 from unifg.answers.relative_offset import Factored
 from unifg.answers.requirements import Constraints, require
 from unifg.answers.solution import Guess, NotConverged, Solution
@@ -40,10 +41,13 @@ class Backend(ABC):
     Attributes:
         constraints: which it takes.
         scalar_costs: whether it takes costs that are no squares.
+        rehearses: whether :meth:`Solver.prepare` may take it through small problems of its own
+            (:mod:`unifg.answers.rehearsal`).
     """
 
     constraints: ClassVar[Constraints] = "all"
     scalar_costs: ClassVar[bool] = True
+    rehearses: ClassVar[bool] = False
 
     @property
     def name(self) -> str:
@@ -122,10 +126,21 @@ class Solver(Backend):
 
         ``duals`` are multipliers by term name, overriding those of the guess.
         """
-        return self.prepare(graph).solve(guess, data=data, duals=duals, check=check, callback=callback)
+        return self.bound(graph).solve(guess, data=data, duals=duals, check=check, callback=callback)
 
     def prepare(self, graph: Statement) -> Prepared:
-        """Compile the graph and allocate the backend's workspaces for repeated solves."""
+        """Compile the graph, and everything that its solves can reach, for repeated solves.
+
+        Solves in a loop then neither compile anything nor read compiled functions from the disk, however they end.
+        """
+        prepared = self.bound(graph)
+        prepared.allocate()
+        if self.rehearses:
+            rehearse(self)
+        return prepared
+
+    def bound(self, graph: Statement) -> Prepared:
+        """Compile the graph alone: a single solve compiles what it comes to need."""
         program = compile_graph(graph)
         self.require(program)
         if not program.least_squares:  # there, curvature is asked for in rare cases only
@@ -426,8 +441,7 @@ class Prepared:
         self._refuse_not_finite(run)
         reason = None
         if run.status is None:
-            if self._workspace is None:
-                self._workspace = self.solver.workspace(program)
+            self.allocate()
             try:
                 run.search(self._workspace)
                 reason = self.solver.iterate(run, self._workspace)
@@ -441,6 +455,11 @@ class Prepared:
         if check and not solution.converged:
             raise NotConverged(solution)
         return solution
+
+    def allocate(self) -> None:
+        """Make the backend's workspace, unless there is one."""
+        if self._workspace is None:
+            self._workspace = self.solver.workspace(self.program)
 
     def __getstate__(self) -> dict[str, Any]:
         """Workspaces hold compiled objects that do not pickle; they are rebuilt on first use."""

@@ -16,6 +16,7 @@ import hashlib
 import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
@@ -24,6 +25,7 @@ import numpy as np
 from numba import types
 from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
+from numba.core.registry import cpu_target
 from numba.core.sigutils import normalize_signature
 
 from unifg.machine import shipped
@@ -83,6 +85,16 @@ def is_compiled(function: object) -> bool:
     return isinstance(function, Dispatcher)
 
 
+def folder_of(function: Any) -> Path:
+    """Where the cache keeps a compiled function."""
+    return Path(function._cache.cache_path)
+
+
+def processor() -> str:
+    """What code is generated for."""
+    return repr(cpu_target.target_context.codegen().magic_tuple())
+
+
 def source_of(function: Any) -> FunctionType:
     """The function in Python of a compiled one; any other as it is."""
     return cast(FunctionType, getattr(function, "py_func", function))
@@ -103,6 +115,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
             found = None
         if found is not None:
             tally.read.append(name)
+            tally.files.append(self._cache_file._index_path)
             return found
         if (half := shipped.archive().find(self._shipping_key(signature, target.codegen()))) is None:
             return None
@@ -111,11 +124,13 @@ class _Cache(FunctionCache):  # type: ignore[misc]
             self._impl.locator.ensure_cache_path()
             self._cache_file.save(self._index_key(signature, target.codegen()), half)
         tally.generated.append(name)
+        tally.files.append(self._cache_file._index_path)
         return found
 
     def save_overload(self, signature: Any, result: Any) -> None:
         result = result._replace(type_annotation="")  # half of what would be written, and nobody reads it
         super().save_overload(signature, result)
+        tally.files.append(self._cache_file._index_path)
         if shipped.recorder is not None:
             key, source = self._shipping_key(signature, result.codegen), self._py_func.__code__.co_filename
             shipped.recorder.keep(key, source, result, self._impl.reduce(result))
@@ -126,8 +141,8 @@ class _Cache(FunctionCache):  # type: ignore[misc]
     def _shipping_key(self, signature: Any, codegen: Any) -> str:
         """What the function is called in an archive that is made elsewhere: no date and no processor."""
         function, (_, _, _, *more) = self._py_func, self._index_key(signature, codegen)
-        arguments, result = normalize_signature(signature)
-        parts = (function.__module__, function.__qualname__, spelled(result), *map(spelled, arguments), *more)
+        arguments, _ = normalize_signature(signature)  # a dispatcher, too, tells functions by their arguments alone
+        parts = (function.__module__, function.__qualname__, *map(spelled, arguments), *more)
         return hashlib.sha256(repr((*parts, stamp(function, shipped.content))).encode()).hexdigest()
 
 

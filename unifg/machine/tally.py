@@ -30,11 +30,13 @@ class Tally:
         compiled: by Numba.
         generated: from what comes with the library; only code for this processor was missing.
         read: from the cache on disk, ready to run.
+        files: where the cache keeps them.
     """
 
     compiled: list[str] = field(default_factory=list)
     generated: list[str] = field(default_factory=list)
     read: list[str] = field(default_factory=list)
+    files: list[str] = field(default_factory=list)
 
     @property
     def everything(self) -> int:
@@ -49,7 +51,7 @@ tally = Tally()
 @contextmanager
 def counting() -> Iterator[Tally]:
     """What a block adds to the tally; complete when it is left."""
-    marks = len(tally.compiled), len(tally.generated), len(tally.read)
+    marks = len(tally.compiled), len(tally.generated), len(tally.read), len(tally.files)
     added = Tally()
     try:
         yield added
@@ -57,6 +59,7 @@ def counting() -> Iterator[Tally]:
         added.compiled += tally.compiled[marks[0] :]
         added.generated += tally.generated[marks[1] :]
         added.read += tally.read[marks[2] :]
+        added.files += tally.files[marks[3] :]
 
 
 class _Listener(event.Listener):  # type: ignore[misc]

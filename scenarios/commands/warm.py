@@ -1,0 +1,55 @@
+"""``unifg warmup``: everything compiled before it is needed, the scenarios' own functions too."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import unifg as fg
+from unifg.machine import shipped
+from unifg.machine.tally import Tally
+from unifg.scenarios import course, flight, manoeuvres, navigation, velocity_tracking
+from unifg.scenarios.commands.outcome import Progress
+from unifg.scenarios.flying.flight_pilot import COUPLINGS
+from unifg.warming import Job, jobs, perform
+
+__all__ = ["outdated", "run", "ship"]
+
+LIBRARY = Path(fg.__file__).resolve().parent
+
+
+def run(progress: Progress, anew: bool = False) -> Tally:
+    """Compile what the library and its scenarios can reach, or find that it is there."""
+    return perform("all", lambda: [*jobs(), *_scenarios()], progress, anew)
+
+
+def ship(progress: Progress) -> Path:
+    """Compile everything anew and write the archive of half compiled kernels that comes with the library."""
+    with shipped.recording() as recorder:
+        run(progress, anew=True)
+    recorder.write(shipped.ARCHIVE, _root())
+    return shipped.ARCHIVE
+
+
+def outdated() -> list[str]:
+    """Files that have changed since the archive was written, below the folder of the checkout."""
+    return shipped.outdated(_root())
+
+
+def _root() -> Path:
+    """The folder below which all sources lie: of the checkout, whose side folders stand beside ``unifg``."""
+    return LIBRARY.parent
+
+
+def _scenarios() -> Iterator[Job]:
+    for coupling in ("sequential", "joint"):
+        drive = navigation.NavigationSettings(coupling=coupling)
+        yield f"navigation, {coupling}", partial(navigation.Episode, drive)
+    for coupling in COUPLINGS:
+        settings = flight.FlightSettings(coupling=coupling)
+        yield f"flight, {coupling}", partial(flight.Flight, settings)
+    yield "course", course.run_course
+    yield "velocity tracking", velocity_tracking.run_tracking
+    for name, case in manoeuvres.CASES.items():
+        yield f"manoeuvre {name}", partial(manoeuvres.run_manoeuvre, case)

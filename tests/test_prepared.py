@@ -1,0 +1,104 @@
+"""After prepare() nothing is compiled or read from the cache: not while solves fail, not in a whole drive."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+
+# In a process of its own: in this one, other tests have long compiled everything.
+SOLVES = """
+import json, sys
+from dataclasses import replace
+import numpy as np
+import unifg as fg
+from unifg.models import obstacles, unicycle
+from unifg.machine.tally import counting
+from unifg.solvers.names import CONSTRAINED, backend
+
+def problem(gap):
+    graph = fg.Graph()
+    x, u = graph.variables("x", fg.SE2, 9), graph.variables("u", fg.Rn(2), 8)
+    graph.minimize(fg.prior, x[-1], [2.0, 0.3, 0.0], sigma=0.1, name="goal", robust=fg.Huber(1.0))
+    graph.minimize(fg.prior, u, [0.0, 0.0], sigma=2.0, name="effort")
+    graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], 0.3, lower=0, upper=0, name="motion")
+    graph.constrain(obstacles.disc_clearance, x[1:], [[1.0, 0.1]], [0.3], lower=0, name="disc")
+    graph.constrain(fg.prior, x[0], [0.0, 0.0, 0.0], lower=0, upper=0, name="start")
+    graph.bound(u, lower=-1, upper=1, name="limits")
+    if gap:
+        graph.constrain(fg.prior, x[4], [9.0, 0.0, 0.0], lower=0, upper=0, name="too far")
+    return graph, {x: np.linspace([0, 0, 0], [2, 0.3, 0], 9), u: np.zeros((8, 2))}
+
+found = {}
+for name in CONSTRAINED:
+    prepared = [(backend(name).prepare(graph), guess) for graph, guess in map(problem, (False, True))]
+    short = replace(backend(name), max_iterations=1).prepare(prepared[0][0].program.graph)
+    statuses = []
+    with counting() as new:
+        for run, guess in [*prepared, (short, prepared[0][1])]:
+            solution = run.solve(guess)
+            statuses.append(solution.status.name)
+            statuses.append(run.solve(solution.shifted(*guess)).status.name)
+    found[name] = [statuses, new.compiled, new.generated, new.read]
+print(json.dumps(found))
+"""
+
+EPISODE = """
+import json, sys
+from dataclasses import replace
+from unifg.machine.tally import counting
+from unifg.scenarios import flight, navigation
+
+ticks = 0
+def progress(done, text):
+    global ticks
+    ticks += 1
+    if ticks == 8:  # from now on solves end early
+        loop = run.pilot.controller.loop
+        for prepared in (loop.warm, loop.cold):
+            prepared.solver = replace(prepared.solver, max_iterations=1)
+        run.pilot.controller.settings = replace(run.pilot.controller.settings, feasible=1e-9)
+    if ticks == 16:
+        raise KeyboardInterrupt
+
+coupling = sys.argv[2]
+if sys.argv[1] == "drive":
+    run = navigation.Episode(navigation.NavigationSettings(obstacles=2, coupling=coupling))
+else:
+    run = flight.Flight(flight.FlightSettings(movers=1, coupling=coupling))
+with counting() as new:
+    log = run.run(progress)
+print(json.dumps([int(log.emergency.sum()), log.compiled.tolist(), new.compiled, new.generated, new.read]))
+"""
+
+
+def said(source: str, *words: str) -> object:
+    """What a script prints, of which only the last line counts."""
+    done = subprocess.run(
+        [sys.executable, "-c", source, *words], cwd=CHECKOUT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_no_backend_compiles_after_prepare_however_its_solves_end() -> None:
+    found = said(SOLVES)
+    assert isinstance(found, dict) and len(found) >= 4
+    for name, (statuses, *new) in found.items():
+        assert new == [[], [], []], (name, new)
+        assert "CONVERGED" in statuses and "ITERATION_LIMIT" in statuses, name
+        assert "LOCALLY_INFEASIBLE" in statuses or name == "penalty", (name, statuses)
+
+
+@pytest.mark.parametrize(("what", "coupling"), [("drive", "sequential"), ("drive", "joint"), ("flight", "joint")])
+def test_no_tick_compiles_though_solves_fail(what: str, coupling: str) -> None:
+    found = said(EPISODE, what, coupling)
+    assert isinstance(found, list)
+    emergencies, columns, *new = found
+    assert emergencies >= 3
+    assert new == [[], [], []] and columns == [0] * 16
