@@ -329,9 +329,12 @@ def test_windows_forget_alike_whoever_evaluates(fixed_points: bool) -> None:
 
     for compiled, by_python in ((None, fg.Reweighted(np.ones_like)), (fg.Cauchy(2.0), fg.Cauchy(2.0))):
         wanted, none = drive_window(window(), fg.residual(place_from_once, rows=2), compiled)
-        found, held = drive_window(window(), fg.residual(place_from), by_python)
+        found, held = drive_window(window(), fg.residual(place_from, derivatives="differences"), by_python)
         np.testing.assert_allclose(found, wanted, atol=1e-8)
         assert none == 0 and 0 < held < 90
+        found, held = drive_window(window(), fg.residual(place_from), compiled)
+        np.testing.assert_allclose(found, wanted, atol=1e-8)
+        assert held == 0, "a traced function is a kernel"
         found, _ = drive_window(window(), fg.residual(place_from), by_python, Plain())
         np.testing.assert_allclose(found, wanted, atol=1e-7)
 

@@ -40,6 +40,7 @@ from unifg.typing import Array, BoolArray, IntArray
 
 Bound: TypeAlias = Mapping[Data, Array]
 logger = logging.getLogger("unifg")
+_told: set[tuple[str, str]] = set()  # what the log knows: loops state the same graph again and again
 CHANGES = 3  # of what a traced function reads beyond its arguments, before it is left to Python
 _SEARCHED = "evaluated by Python, its derivatives attached: its search Jacobian belongs to another kernel"
 
@@ -108,14 +109,8 @@ class CompiledTerm:
     parameters: Array
     _packed: Array
 
-    def __init__(self, term: Term, columns: Columns, trace: bool = True) -> None:
-        """Find the residual's dimension by one evaluation at identity elements.
-
-        Args:
-            term: what the user stated.
-            columns: numbering of the tangent coordinates.
-            trace: whether plain functions are traced.
-        """
+    def __init__(self, term: Term, columns: Columns) -> None:
+        """Find the residual's dimension by one evaluation at identity elements; trace its function if possible."""
         self.term = term
         self.name = term.name
         self.count = term.count
@@ -140,7 +135,7 @@ class CompiledTerm:
         self.trace: Trace | None = None
         self._changes = 0
         self.bind({})
-        self.route = "" if not term.residual.rows or isinstance(term, ScalarCost) else self._choose_single(trace)
+        self.route = "" if not term.residual.rows or isinstance(term, ScalarCost) else self._choose_single()
         if self.kernel is not None:
             self._require_manifolds(self.kernel)
         with np.errstate(all="ignore"):
@@ -155,7 +150,7 @@ class CompiledTerm:
             )
         self.size = 1 if scalar else trial.shape[1]
         self.shape = trial.shape
-        self.route = self.route or self._choose_route(trace)
+        self.route = self.route or self._choose_route()
         self.differenced = (
             self._jacobian is None and not self.is_bound if self.kernel is None else self.kernel.differenced
         )
@@ -163,7 +158,7 @@ class CompiledTerm:
         if isinstance(self.term, Cost) and isinstance(self.term.information, np.ndarray):
             _notice_no_information(self.name, self.whitener)
 
-    def _choose_route(self, trace: bool) -> str:
+    def _choose_route(self) -> str:
         """Trace a plain function if that is possible; how the term is evaluated.
 
         Raises:
@@ -178,7 +173,7 @@ class CompiledTerm:
         if own.jacobian is not None and not asked:
             return "evaluated by Python, its derivatives attached"
         why = "it has a search Jacobian" if own.search else ""
-        if own.derivatives == "differences" or not trace:
+        if own.derivatives == "differences":
             why = "as it was asked to be"
         if not why:
             self.trace, why = find(self._batch, own.function, asked)
@@ -188,11 +183,11 @@ class CompiledTerm:
             self.kernel, self._taken, self._jacobian = self.trace.kernel, self.trace.taken, self._exact
         return self._traced()
 
-    def _choose_single(self, trace: bool) -> str:
+    def _choose_single(self) -> str:
         """The same of a function of one factor that is compiled: traced from its source, or called as it is."""
         own, why = self.term.residual, "as it was asked to be"
         asked = own.derivatives == "trace"
-        if asked or (trace and own.jacobian is None and own.derivatives != "differences"):
+        if asked or (own.jacobian is None and own.derivatives != "differences"):
             self.size = own.rows
             self.trace, why = find(self._batch, own.function, asked)
             del self.size
@@ -218,7 +213,8 @@ class CompiledTerm:
         return self._said("evaluated by Python", why)
 
     def _said(self, how: str, why: str) -> str:
-        if self.term.residual.derivatives != "differences":
+        if self.term.residual.derivatives != "differences" and (self.name, why) not in _told:
+            _told.add((self.name, why))
             logger.warning("term '%s' is %s and differenced: %s", self.name, how, why)
         return f"{how}, its derivatives by differences: {why}"
 

@@ -2,7 +2,7 @@
 
 A statement is a cost like those of a graph, and the first of its kind is compiled as a graph compiles it
 (:class:`unifg.program.term.CompiledTerm`), with the same demands and messages. After that the kernel is known, and the
-next statement only lays out its numbers.
+next statement only lays out its numbers. What a traced function reaches counts as it is when the factor is stated.
 """
 
 from __future__ import annotations
@@ -28,10 +28,12 @@ from unifg.lie.moving import ADDITION, move_of
 from unifg.lie.product import leaves
 from unifg.program.columns import Columns
 from unifg.program.term import CompiledTerm
+from unifg.program.traced import Trace, reach_of_value
 from unifg.smoothing.families import GrowingFamily
 from unifg.smoothing.state import BY_PYTHON
 from unifg.typing import Array, BoolArray, IntArray
 
+REMEMBERED = 256  # kinds of statements
 PLAIN: Form = (QUADRATIC, 0.0, 0.0)
 NOBODY = np.zeros(0, dtype=np.int64)
 
@@ -80,7 +82,8 @@ class Types:
         self.slots: list[tuple[int, ...]] = []
         self.scratch = 8
         self._numbers: dict[tuple[Any, ...], int] = {}
-        self._kernels: dict[tuple[Any, ...], tuple[Kernel, Residual]] = {}
+        self._kernels: dict[tuple[Any, ...], tuple[Kernel, Residual, Trace | None]] = {}
+        self._kept: dict[int, Kernel] = {}  # ids stay theirs, and addresses good
 
     def stage(
         self,
@@ -114,19 +117,23 @@ class Types:
             families.append(selection.family)
         members = [int(s.indices[0]) if len(s) == 1 else s.indices for s in selections]
         form = form_of(robust)
-        key = self._key(wrapped, normal)
+        key = self._key(wrapped, normal, count)
         known = self._kernels.get(key) if form is not None else None
-        if known is None:
+        if known is None or (known[2] is not None and known[2].outdated):
             term = _compiled(Cost(name, wrapped, _by_itself(normal), None, count, sigma, information, robust))
             if term.kernel is None or form is None or len(term.kernel.manifolds) > len(selections):
                 rest = np.zeros((count, 0))
                 kind = self._kind(None, (0, 0, 0, term.size), selections, (), *PLAIN)
                 staged = Staged(kind, families, members, rest, name, term, np.arange(count))
                 return _active(staged, active)
-            known = self._kernels[key] = term.kernel, wrapped
-        kernel, form = known[0], form or PLAIN
+            known = term.kernel, wrapped, term.trace
+            if term.trace is None or not _compiled_in(term.trace, normal):
+                self._remember(key, known)
+        (kernel, _, trace), form = known, form or PLAIN
         values = [argument.value if isinstance(argument, Data) else argument for argument in normal]
         filled = [np.empty((1, a.manifold.storage)) if isinstance(a, Selection) else a for a in values]
+        if trace is not None:
+            filled = trace.arguments(filled)
         try:
             _, parameters, rows = kernel.split(filled, count)
         except GraphError as error:
@@ -153,6 +160,12 @@ class Types:
         kind = self._kind(kernel, counts, selections, shapes, *form)
         return _active(Staged(kind, families, members, data, name), active)
 
+    def _remember(self, key: tuple[Any, ...], known: tuple[Kernel, Residual, Trace | None]) -> None:
+        """Keep what the next statement of its kind needs; functions made anew for each are not kept for ever."""
+        if len(self._kernels) >= REMEMBERED:
+            self._kernels.clear()
+        self._kernels[key] = known
+
     def _kind(
         self,
         kernel: Kernel | None,
@@ -166,6 +179,8 @@ class Types:
         """Number of a type; kernels are kept, because compiled code knows only where they stand."""
         parameters, numbers, whitening, size = counts
         reads = tuple([(s.storage.start, s.manifold.storage, s.tangent.start, s.manifold.dim) for s in selections])
+        if kernel is not None:
+            self._kept[id(kernel)] = kernel
         key = id(kernel), counts, reads, shapes, loss, first, second
         kind = self._numbers.get(key)
         if kind is not None:
@@ -184,9 +199,12 @@ class Types:
         self._numbers[key] = len(self.fields) - 1
         return len(self.fields) - 1
 
-    def _key(self, wrapped: Residual, arguments: Sequence[Any]) -> tuple[Any, ...]:
+    def _key(self, wrapped: Residual, arguments: Sequence[Any], count: int) -> tuple[Any, ...]:
         """What makes statements share a kernel."""
         kernel = wrapped.kernel
+        if kernel is None and not wrapped.rows:  # what a trace makes of constants depends on all of this
+            stated = [a.manifold if isinstance(a, Selection) else _told(a) for a in arguments]
+            return id(wrapped.function), id(wrapped.jacobian), wrapped.derivatives, count, *stated
         expected = kernel.arguments if kernel is not None else ()
         parts: list[Any] = [
             id(kernel) if kernel is not None else (id(wrapped.function), id(wrapped.jacobian), wrapped.rows)
@@ -216,13 +234,30 @@ def _by_itself(arguments: Sequence[Any]) -> tuple[Any, ...]:
     return tuple(result)
 
 
+def _compiled_in(trace: Trace, arguments: Sequence[Any]) -> bool:
+    """Whether floats among the arguments are part of a trace and not its parameters."""
+    others = [argument for place, argument in enumerate(arguments) if place not in trace.taken]
+    return any(isinstance(a, Data) or np.asarray(a).dtype.kind == "f" for a in others)
+
+
+def _told(argument: Any) -> Any:
+    """What tells a constant from others that a trace treats differently."""
+    if isinstance(argument, Data):
+        return argument.value.shape, argument.value.dtype, argument.each
+    if isinstance(argument, float | np.floating | np.ndarray) and np.asarray(argument).dtype.kind == "f":
+        return np.shape(argument), "float"
+    return reach_of_value(argument) or id(argument)
+
+
 def _compiled(cost: Cost) -> CompiledTerm:
     """Compile a statement; refuse a function that changes its arguments or leaves rows out, looking at identities."""
     families = [selection.family for selection in cost.selections]
     columns = Columns(families, ())
-    term = CompiledTerm(cost, columns, trace=False)
+    term = CompiledTerm(cost, columns)
     identities = {family: np.tile(family.manifold.identity(), (family.count, 1)) for family in families}
-    term.require_clean(columns.values(identities))
+    values = columns.values(identities)
+    term.require_clean(values)
+    term.stands(values)
     return term
 
 

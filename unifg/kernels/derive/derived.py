@@ -164,7 +164,12 @@ def _traced(
         raise TraceError(f"its constants are {numbers} numbers for each factor")
     changed: list[int] = []
     called = function if is_compiled(function) else _as_called(function, given, scalar, changed)
-    expression = traced(called, arguments, rows, name, reached)
+    try:
+        expression = traced(called, arguments, rows, name, reached)
+    except TraceError:
+        raise
+    except Exception as error:  # of a manifold of the user's own
+        raise TraceError(f"{type(error).__name__}: {error}") from error
     if changed:
         raise TraceError(f"it changes its argument {changed[0]}")
     tape = expression.tape
