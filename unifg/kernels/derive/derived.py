@@ -81,7 +81,7 @@ class DerivedKernel(Kernel):
     @cached_property
     def address(self) -> int:
         """Of the machine code of residual and Jacobian."""
-        with _lock:
+        with generating:
             return self.expression.residual().address
 
     @cached_property
@@ -89,11 +89,11 @@ class DerivedKernel(Kernel):
         """Of the machine code of second derivatives, 0 where all of them are zero."""
         if self.linear:
             return 0
-        with _lock:
+        with generating:
             return self.expression.second().address
 
 
-_lock = RLock()  # tracing rebinds names in copies of functions, and what it writes is one tape
+generating = RLock()  # tracing rebinds names in copies of functions, and what it writes is one tape
 _kernels: OrderedDict[Hashable, DerivedKernel | TraceError] = OrderedDict()
 
 
@@ -122,7 +122,7 @@ def derived(
     Raises:
         TraceError: the function does what cannot be traced.
     """
-    with _lock:
+    with generating:
         fixed = [part for part in given if isinstance(part, Fixed)]
         if reach.key is None or any(part.key is None for part in fixed):
             return _traced(function, given, rows, scalar, name, limit, reached)
@@ -190,7 +190,7 @@ def _traced(
 
 def in_python(function: Callable[..., Any], arguments: Sequence[Any], rows: int) -> Array:
     """(m,) what a compiled function of one factor writes, found without compiling it."""
-    with _lock:
+    with generating:
         return np.array(run(function, arguments, Tape(), Rebound(), rows), dtype=np.float64)
 
 
