@@ -11,10 +11,10 @@ import math
 
 import numpy as np
 
+from unifg.kernels.derive.stated import StatedKernel
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import residual
-from unifg.lie import SO3, Rn, so3
-from unifg.lie.so2 import wrap
+from unifg.lie import SO3, Rn, so3, wrap_angle
 from unifg.machine.calls import local_matrix
 from unifg.machine.jit import compiled
 from unifg.models.quadrotor import STATE
@@ -23,25 +23,13 @@ from unifg.typing import Array, ArrayLike
 __all__ = ["bearing_range", "height", "observe", "tilt"]
 
 
-@compiled
-def _bearing_range(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-    """Write bearing and range of v = (state, landmark), less those measured."""
-    R = local_matrix(3, 3)
-    so3.write_matrix(v[3], v[4], v[5], v[6], R, 0)
-    dx, dy = v[10] - v[0], v[11] - v[1]
-    length = math.hypot(dx, dy)
-    r[0] = wrap(math.atan2(dy, dx) - math.atan2(R[1, 0], R[0, 0]) - p[0])
-    r[1] = length - p[1]
-    if len(J):
-        for i in range(2):
-            for k in range(11):
-                J[i, k] = 0.0
-        x, y = dx / length, dy / length
-        J[0, 0], J[0, 1], J[0, 9], J[0, 10] = y / length, -x / length, -y / length, x / length
-        J[1, 0], J[1, 1], J[1, 9], J[1, 10] = -x, -y, x, y
-        per = 1.0 / (R[0, 0] * R[0, 0] + R[1, 0] * R[1, 0])
-        J[0, 4] = per * (R[0, 0] * R[1, 2] - R[1, 0] * R[0, 2])
-        J[0, 5] = -per * (R[0, 0] * R[1, 1] - R[1, 0] * R[0, 1])
+def _bearing_range(x: Array, l: Array, z: Array) -> Array:  # noqa: E741
+    """Bearing and range of a landmark, less those measured."""
+    w, a, b, c = x[:, 3], x[:, 4], x[:, 5], x[:, 6]
+    dx, dy = l[:, 0] - x[:, 0], l[:, 1] - x[:, 1]
+    heading = np.arctan2(2.0 * (a * b + w * c), 1.0 - 2.0 * (b * b + c * c))
+    bearing = wrap_angle(np.arctan2(dy, dx) - heading - z[:, 0])
+    return np.stack([bearing, np.sqrt(dx * dx + dy * dy) - z[:, 1]], axis=1)
 
 
 @compiled
@@ -81,7 +69,9 @@ def _bearing_range_second(v: Array, p: Array, table: Array, w: Array, S: Array) 
 
 
 bearing_range = residual(
-    Kernel(_bearing_range, (STATE, Rn(2), (2,)), 2, name="landmark bearing and range", second=_bearing_range_second)
+    StatedKernel(
+        _bearing_range, (STATE, Rn(2), (2,)), 2, name="landmark bearing and range", second=_bearing_range_second
+    )
 )
 """``bearing_range(x, l, z)``: bearing [rad], wrapped, and range [m], less z (2,) or (n, 2): (n, 2).
 
@@ -89,14 +79,11 @@ x: quadrotor states. l: (n, 2) landmarks on the ground plane. Not finite where x
 """
 
 
-@compiled
-def _height(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-    r[0] = v[2] - p[0]
-    if len(J):
-        J[0, 0], J[0, 1], J[0, 2] = 0.0, 0.0, 1.0
+def _height(p: Array, z: Array) -> Array:
+    return (p[:, 2] - z)[:, None]
 
 
-height = residual(Kernel(_height, (Rn(3), 0), 1, name="height", linear=True))
+height = residual(StatedKernel(_height, (Rn(3), ()), 1, name="height", linear=True))
 """``height(p, z)``: p_z - z [m], (n, 1), for positions (n, 3), as ``x.p``, and z a number or (n,)."""
 
 

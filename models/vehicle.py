@@ -9,15 +9,14 @@ the model means nothing for v < 0. Time is discretised by one step of Euler's me
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from unifg.kernels.kernel import Kernel
+from unifg.kernels.derive.stated import StatedKernel
 from unifg.kernels.residuals import Residual, residual
 from unifg.lie import Rn
-from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike
 
 SPEED = Rn(1)
@@ -66,34 +65,15 @@ class Vehicle:
         return v
 
 
-@compiled
-def _dynamics(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+def _defect(car: Vehicle, v: Array, force: Array, after: Array, dt: Array, slope: Array) -> Array:
     """v_next - v - dt / m_eq (f - resistance)."""
-    dt, slope = p[0], p[1]
-    gain = dt / table[0]
-    road = table[1] * table[6] * (math.sin(slope) + table[2] * math.cos(slope))
-    resistance = road + table[4] + (table[5] + table[3] * v[0]) * v[0]
-    r[0] = v[2] - v[0] - gain * (v[1] - resistance)
-    if len(J):
-        J[0, 0] = gain * (table[5] + 2.0 * table[3] * v[0]) - 1.0
-        J[0, 1] = -gain
-        J[0, 2] = 1.0
-
-
-@compiled
-def _dynamics_second(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
-    """The drag alone bends."""
-    for i in range(len(S)):
-        for k in range(len(S)):
-            S[i, k] = 0.0
-    S[0, 0] = w[0] * p[0] / table[0] * 2.0 * table[3]
+    road = car.mass * car.gravity * (np.sin(slope) + car.rolling * np.cos(slope))
+    resistance = road + car.drag_constant + (car.drag_linear + car.drag * v[:, 0]) * v[:, 0]
+    defect: Array = after[:, 0] - v[:, 0] - dt / car.equivalent_mass * (force[:, 0] - resistance)
+    return defect[:, None]
 
 
 def dynamics(vehicle: Vehicle) -> Residual:
     """The residual ``f(v, force, v_next, dt, slope)``: v_next minus the speed predicted, (n, 1) [m/s]."""
-    w = vehicle
-    table = np.array(
-        [w.equivalent_mass, w.mass, w.rolling, w.drag, w.drag_constant, w.drag_linear, w.gravity], dtype=np.float64
-    )
-    arguments = SPEED, FORCE, SPEED, 0, 0
-    return residual(Kernel(_dynamics, arguments, 1, table, name="vehicle.dynamics", second=_dynamics_second))
+    arguments = SPEED, FORCE, SPEED, (), ()
+    return residual(StatedKernel(partial(_defect, vehicle), arguments, 1, name="vehicle.dynamics"))

@@ -78,6 +78,11 @@ class Kernel:
         return {name: value for name, value in self.__dict__.items() if name not in ("address", "second_address")}
 
     @property
+    def derived(self) -> bool:
+        """Whether second derivatives are generated when they are first asked for."""
+        return False
+
+    @property
     def manifolds(self) -> list[Manifold]:
         """Of the variables, in order."""
         return [argument for argument in self.arguments if not isinstance(argument, int | tuple)]

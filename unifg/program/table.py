@@ -153,7 +153,7 @@ class TermTable:
             row[PARAMETERS], row[SPREAD], row[WHITEN] = term.parameter_count, term.parameter_spread, term.whitening
             if term.kernel is not None:
                 row[ADDRESS] = term.kernel.address
-                row[SECOND] = 0 if term.trace is not None else term.kernel.second_address
+                row[SECOND] = 0 if term.kernel.derived else term.kernel.second_address
                 row[TABLE], row[TABLE_SIZE] = term.kernel.table.ctypes.data, term.kernel.table.size
             if term.search_kernel is not None:
                 row[SEARCH] = term.search_kernel.address
@@ -225,7 +225,7 @@ class TermTable:
         """Have second derivatives of derived kernels generated, which not every solver needs."""
         if not self._second:
             for term in self._terms:
-                if term.trace is not None and term.kernel is not None:
+                if term.kernel is not None and term.kernel.derived:
                     term.place[SECOND] = term.kernel.second_address
             self._second = True
 

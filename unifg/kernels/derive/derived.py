@@ -78,6 +78,11 @@ class DerivedKernel(Kernel):
     rows: int = 0
     expression: Expression = field(kw_only=True)
 
+    @property
+    def derived(self) -> bool:
+        """They are."""
+        return True
+
     @cached_property
     def address(self) -> int:
         """Of the machine code of residual and Jacobian."""

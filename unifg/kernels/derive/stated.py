@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -17,6 +18,13 @@ class StatedKernel(Kernel):
 
     A second derivative that is given takes the place of the derived one.
     """
+
+    function: Callable[..., Any]
+
+    @property
+    def derived(self) -> bool:
+        """They are, unless they are given."""
+        return self.second is None
 
     @cached_property
     def expression(self) -> Expression:
