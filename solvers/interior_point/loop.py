@@ -16,6 +16,7 @@ from unifg.machine.links import ADDRESS, NOTHING, NUMBER, TRUTH, link, linked, m
 from unifg.program import passes
 from unifg.program.curvature import add_curvature, add_losses
 from unifg.program.retraction import retract_parts
+from unifg.program.scalars import add_scalars, evaluate_scalars
 from unifg.solvers.interior_point import barrier, direction, filter_search
 from unifg.solvers.interior_point.state import (
     ACCEPTED,
@@ -64,9 +65,10 @@ def fill(target: Array, number: float) -> None:
 def advance(address: int) -> None:
     """Move to the trial and evaluate it."""
     fixed, free, links, move, retraction = parts(address, "fixed free links move retraction")
-    scalars, scratch, spread, squares, step = parts(address, "scalars scratch spread squares step")
-    terms, trial, trial_constraints = parts(address, "terms trial trial_constraints")
-    trial_residual, values, weights = parts(address, "trial_residual values weights")
+    scalars, scratch, spread, step, terms, trial = parts(address, "scalars scratch spread step terms trial")
+    trial_constraints, trial_heights = parts(address, "trial_constraints trial_heights")
+    trial_residual, trial_squares = parts(address, "trial_residual trial_squares")
+    values, weights = parts(address, "values weights")
     now = scalars[0]
     alpha = now.alpha
     for k in range(len(free)):
@@ -78,15 +80,18 @@ def advance(address: int) -> None:
         trial[place] = values[place]
     now.trial_cost = number(
         links[0].evaluate,
-        (terms, trial, trial_residual, trial_constraints, squares, weights, False, scratch),
+        (terms, trial, trial_residual, trial_constraints, trial_squares, weights, False, scratch),
     )
+    if len(trial_heights):
+        now.trial_cost += number(links[0].evaluate_scalars, (terms, trial, trial_heights, scratch))
 
 
 @linked
 def renew(address: int) -> None:
     """Linearise at the present iterate."""
-    constraint_jacobian, constraints = parts(address, "constraint_jacobian constraints")
-    gradient, hessian, jacobian, links, norms = parts(address, "gradient hessian jacobian links norms")
+    concavity, constraint_jacobian = parts(address, "concavity constraint_jacobian")
+    constraints, gradient, heights, hessian = parts(address, "constraints gradient heights hessian")
+    jacobian, links, norms = parts(address, "jacobian links norms")
     residual, scalars, scratch, squares = parts(address, "residual scalars scratch squares")
     terms, values, weights = parts(address, "terms values weights")
     fill(gradient, 0.0)
@@ -109,15 +114,22 @@ def renew(address: int) -> None:
             scratch,
         ),
     )
+    if len(heights):
+        fill(concavity, 0.0)
+        arrays = terms, values, heights, gradient, hessian, concavity, scratch
+        scalars[0].cost += number(links[0].add_scalars, arrays)
 
 
 @linked
 def bend(address: int) -> None:
     """Find the second derivatives of the Lagrangian at the present iterate."""
-    curvature, hessian, jacobian, links = parts(address, "curvature hessian jacobian links")
+    concavity, curvature, hessian = parts(address, "concavity curvature hessian")
+    jacobian, links = parts(address, "jacobian links")
     multipliers, residual, squares, terms = parts(address, "multipliers residual squares terms")
     values, weights = parts(address, "values weights")
     copy(hessian, curvature)
+    for k in range(len(concavity)):
+        curvature[k] += concavity[k]
     run(links[0].curve, (terms, values, residual, weights, multipliers, curvature))
     if len(weights):
         run(links[0].weigh, (terms, residual, jacobian, squares, weights, curvature))
@@ -208,6 +220,9 @@ def addresses() -> Records:
     )
     robust = kinds["squares"], kinds["weights"]
     links[0]["weigh"] = link(add_losses, NOTHING, terms, residual, kinds["jacobian"], *robust, kinds["hessian"])
+    heights, added = kinds["heights"], (kinds["gradient"], kinds["hessian"], kinds["concavity"])
+    links[0]["evaluate_scalars"] = link(evaluate_scalars, NUMBER, terms, values, heights, scratch)
+    links[0]["add_scalars"] = link(add_scalars, NUMBER, terms, values, heights, *added, scratch)
     links[0]["retract"] = link(
         retract_parts, NOTHING, kinds["retraction"], kinds["free"], vector, kinds["spread"], values, values
     )

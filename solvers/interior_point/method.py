@@ -208,6 +208,8 @@ class Workspace:
             normal=program.normal.nnz,
             terms=len(program.arrays.fields),
             robust=table.weights,
+            general=table.scalars,
+            concave=program.normal.nnz if table.scalars else 0,
             log=iterations + 2,
             data=len(plan.slots),
         )
@@ -311,9 +313,12 @@ class Workspace:
             rows,
             gradient,
             hessian,
-            program.norms(work.norms),
+            program.norms(work.norms, work.heights),
             work.weights.copy(),
-            squares=work.squares.copy(),
+            work.concavity.copy(),
+            work.squares.copy(),
+            program.by_scalar(work.heights.copy()),
+            np.zeros(program.columns.width if program.scalar_terms else 0),
         )
 
     def take(self, lin: Linearization) -> None:
@@ -323,7 +328,7 @@ class Workspace:
         work.residual[:], work.jacobian[:] = lin.residual, lin.jacobian
         work.constraints[:], work.constraint_jacobian[:] = lin.constraints, lin.constraint_jacobian
         work.gradient[:], work.hessian[:] = lin.gradient, lin.hessian
-        work.squares[:], work.weights[:] = lin.squares, lin.weights
+        work.squares[:], work.weights[:], work.concavity[:] = lin.squares, lin.weights, lin.concavity
 
     def _values(self) -> Values:
         """The present iterate."""

@@ -104,7 +104,7 @@ PAIR = np.dtype(
     ]
 )
 # Addresses of compiled functions.
-FUNCTIONS = "factor solve linearize evaluate curve weigh retract"
+FUNCTIONS = "factor solve linearize evaluate curve weigh add_scalars evaluate_scalars retract"
 FUNCTIONS += " begin measure test bend direct steer advance judge correct restore accept relax renew loop"
 LINKS = np.dtype([(name, np.int64) for name in FUNCTIONS.split()])
 
@@ -163,8 +163,10 @@ class Work(NamedTuple):
         full: (width,) gradient of the Lagrangian over the full tangent space.
         residual, jacobian, constraints, constraint_jacobian, gradient, hessian: as in a linearisation.
         curvature: ``hessian`` with second derivatives, where they are used.
-        trial_residual, trial_constraints: at a trial.
+        trial_residual, trial_constraints, trial_squares, trial_heights: at a trial.
         squares, weights: of robust factors, as in a linearisation.
+        heights: (K,) values of all scalar costs.
+        concavity: as in a linearisation, empty without scalar costs.
         norms: of the terms; not used, but written.
         multipliers: (M,) of the rows, positive at an upper limit.
         rests: (M,) residuals of equality rows, with corrections.
@@ -199,8 +201,12 @@ class Work(NamedTuple):
     curvature: Annotated[Array, "normal"]
     trial_residual: Annotated[Array, "residuals"]
     trial_constraints: Annotated[Array, "rows"]
+    trial_squares: Annotated[Array, "robust"]
+    trial_heights: Annotated[Array, "general"]
     squares: Annotated[Array, "robust"]
     weights: Annotated[Array, "robust"]
+    heights: Annotated[Array, "general"]
+    concavity: Annotated[Array, "concave"]
     norms: Annotated[Array, "terms"]
     multipliers: Annotated[Array, "rows"]
     rests: Annotated[Array, "rows"]

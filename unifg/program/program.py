@@ -27,6 +27,7 @@ from unifg.program.columns import Columns, Values
 from unifg.program.guess import GuessReader
 from unifg.program.linearization import Evaluation, Linearization, Rows
 from unifg.program.retraction import Retraction
+from unifg.program.scalars import add_scalars, evaluate_scalars
 from unifg.program.systems import Systems
 from unifg.program.table import ENTRY, PARAMETER, ROW, WIDTH, TermTable
 from unifg.program.term import CompiledTerm
@@ -93,7 +94,7 @@ class Program:
         self.blocks = variable[self.columns.free]
         self.normal = self._pattern(self.cost_terms + self.scalar_terms + self.constraint_terms, variable, starts)
         stacked = self.cost_terms + self.constraint_terms
-        self.table = TermTable(stacked, self.columns, self.normal)
+        self.table = TermTable(stacked, self.scalar_terms, self.columns, self.normal)
         self.arrays = self.table.arrays
         self.least_squares = bool(self.cost_terms) and not (self.scalar_terms or self.constraint_terms)
         self.differenced = self.table.differenced or any(term.trace is None for term in self.scalar_terms)
@@ -109,7 +110,6 @@ class Program:
         self.bound_rows = np.zeros(self.constraints.count, dtype=bool)
         for term, rows in zip(self.constraint_terms, self.slices, strict=True):
             self.bound_rows[rows] = term.is_bound
-        self._scalar_blocks()
         self._hessian: tuple[Symmetric, IntArray] | None = None
         self.retraction = Retraction(self.columns, graph.fixes)
         self._read = GuessReader(graph, self.columns, self.retraction)
@@ -131,7 +131,12 @@ class Program:
     @property
     def fully_compiled(self) -> bool:
         """Whether a compiled loop can do without Python: every term a kernel, every loss and retraction compiled."""
-        return not (self.batched or self.scalar_terms or self.table.weighed) and self.retraction.compiled
+        return not (self.batched or self._general or self.table.weighed) and self.retraction.compiled
+
+    @property
+    def _general(self) -> list[CompiledTerm]:
+        """Scalar costs that Python evaluates."""
+        return [term for term in self.scalar_terms if term.kernel is None]
 
     @property
     def hessian(self) -> Symmetric:
@@ -230,22 +235,20 @@ class Program:
             if term.trace.outdated:
                 if not term.trace_again(values):
                     self._give_up(term)
-                elif not isinstance(term.term, ScalarCost):
+                else:
                     self.table.renew(term)
                     self.table.bind([term], self.lower, self.upper)
             elif term.trace.moved:
                 term.refresh()
-                if not isinstance(term.term, ScalarCost):
-                    self.table.bind([term], self.lower, self.upper)
+                self.table.bind([term], self.lower, self.upper)
         return values
 
     def _give_up(self, term: CompiledTerm) -> None:
         """Leave a term that was traced to Python."""
         self.differenced = True
-        if not isinstance(term.term, ScalarCost):
-            self.table.give_up(term)
-            if term.kernel is None:
-                self.batched.append(term)
+        self.table.give_up(term)
+        if term.kernel is None and not isinstance(term.term, ScalarCost):
+            self.batched.append(term)
 
     def retract(self, values: Values, step: Array) -> Values:
         """Move the unknowns by a tangent step; fixed variables stay."""
@@ -284,10 +287,12 @@ class Program:
             for loss, part in table.weighed:
                 if not (holding and loss.held):
                     cost += 0.5 * float(loss.value(squares[part]).sum())
-            for term in self.scalar_terms:
+            if self.scalar_terms:
+                cost += evaluate_scalars(table.arrays, values.flat, np.empty(table.scalars), self.scratch)
                 began = perf_counter()
-                cost += float(term.residual(values).sum())
-                self.python_seconds += 0.0 if term.trace else perf_counter() - began
+                for term in self._general:
+                    cost += float(term.residual(values).sum())
+                self.python_seconds += perf_counter() - began
         return Evaluation(cost, constraints)
 
     def linearize(self, values: Mapping[Family, Array], search: bool = False) -> Linearization:
@@ -298,8 +303,7 @@ class Program:
         gradient[:], hessian[:] = 0.0, 0.0
         squares, weights = np.empty(table.weights), np.empty(table.weights)
         size = np.empty(len(table.arrays.fields))
-        norms: dict[str, float] = {}
-        scalars: dict[str, Array] = {}
+        found = np.empty(table.scalars)
         concavity = np.zeros(self.normal.nnz if self.scalar_terms else 0)
         rounding = np.zeros(self.columns.width if self.scalar_terms else 0)
         with np.errstate(all="ignore"):
@@ -329,25 +333,42 @@ class Program:
                     weights[part] = loss.weight(squares[part])
                     cost += 0.5 * float(loss.value(squares[part]).sum())
                 passes.weigh(table.arrays, weights, residual, jacobian, gradient, hessian)
-            for term in self.scalar_terms:
-                began = perf_counter()
-                value = term.residual(values)
-                cost += float(value.sum())
-                scalars[term.name], norms[term.name] = value, float(np.abs(value).sum())
-                slope, curvature, doubt = term.scalar_derivatives(values)
-                self.python_seconds += 0.0 if term.trace else perf_counter() - began
-                columns, factor, a, b, place = self._scalars[term.name]
-                np.add.at(gradient, columns.ravel(), slope.ravel())
-                np.add.at(rounding, columns.ravel(), doubt.ravel())
-                np.add.at(hessian, place, (convex := convexified(curvature))[factor, a, b])
-                np.add.at(concavity, place, (curvature - convex)[factor, a, b])
-        norms |= self.norms(size)
-        found = residual, jacobian, constraints, constraint_jacobian, gradient, hessian
-        return Linearization(values, cost, *found, norms, weights, concavity, squares, scalars, rounding)
+            if self.scalar_terms:
+                cost += self._add_scalars(values, found, gradient, hessian, concavity, rounding)
+        norms, scalars = self.norms(size, found), self.by_scalar(found)
+        arrays = residual, jacobian, constraints, constraint_jacobian, gradient, hessian
+        return Linearization(values, cost, *arrays, norms, weights, concavity, squares, scalars, rounding)
 
-    def norms(self, sizes: Array) -> dict[str, float]:
-        """Residual norms of the terms by name, as compiled loops leave them."""
-        return dict(zip(self._names, sizes.tolist(), strict=True))
+    def _add_scalars(
+        self, values: Values, found: Array, gradient: Array, hessian: Array, concavity: Array, rounding: Array
+    ) -> float:
+        """Add the slopes and second derivatives of costs that are no squares; return what they cost."""
+        cost = float(add_scalars(self.arrays, values.flat, found, gradient, hessian, concavity, self.scratch))
+        began = perf_counter()
+        for term in self._general:
+            value = term.residual(values)
+            cost += float(value.sum())
+            found[term.place[ROW] : term.place[ROW] + term.count] = value
+            slope, curvature, doubt = term.scalar_derivatives(values)
+            columns, factor, a, b, place = self.once(_placed)[term]
+            np.add.at(gradient, columns.ravel(), slope.ravel())
+            np.add.at(rounding, columns.ravel(), doubt.ravel())
+            np.add.at(hessian, place, (convex := convexified(curvature))[factor, a, b])
+            np.add.at(concavity, place, (curvature - convex)[factor, a, b])
+        self.python_seconds += perf_counter() - began
+        return cost
+
+    def norms(self, sizes: Array, scalars: Array) -> dict[str, float]:
+        """Residual norms of the terms by name, as compiled loops leave them, and of the values of scalar costs."""
+        norms = dict(zip(self._names, sizes.tolist(), strict=True))
+        for name, found in self.by_scalar(scalars).items():
+            norms[name] = float(np.abs(found).sum())
+        return norms
+
+    def by_scalar(self, found: Array) -> dict[str, Array]:
+        """(n,) values of every scalar cost by name, of those of all."""
+        starts = [(term, int(term.place[ROW])) for term in self.scalar_terms]
+        return {term.name: found[start : start + term.count] for term, start in starts}
 
     def rows_of(self, term: CompiledTerm, residual: Array, constraints: Array) -> Array:
         """(n, m) rows of a term in the stacked residuals."""
@@ -461,18 +482,17 @@ class Program:
                 self._hessian = pattern, self.normal.positions(pattern.indices, columns)
         return self._hessian
 
-    def _scalar_blocks(self) -> None:
-        """Where gradient and Hessian blocks of scalar costs go."""
-        self._scalars: dict[str, tuple[IntArray, IntArray, IntArray, IntArray, IntArray]] = {}
-        for term in self.scalar_terms:
-            if term.trace is not None:
-                _ = term.trace.kernel.address, term.trace.kernel.second_address  # every linearisation takes both
-            full = np.concatenate(term.columns, axis=1)
-            mapped = self.columns.unknown[full]
-            keep = (mapped[:, :, None] <= mapped[:, None, :]) & (mapped[:, :, None] >= 0)
-            factor, a, b = np.nonzero(keep)
-            place = self.normal.positions(mapped[factor, a], mapped[factor, b])
-            self._scalars[term.name] = full, factor, a, b, place
+
+def _placed(program: Program) -> dict[CompiledTerm, tuple[IntArray, IntArray, IntArray, IntArray, IntArray]]:
+    """Where gradient and Hessian blocks of scalar costs go."""
+    places = {}
+    for term in program.scalar_terms:
+        full = np.concatenate(term.columns, axis=1)
+        mapped = program.columns.unknown[full]
+        keep = (mapped[:, :, None] <= mapped[:, None, :]) & (mapped[:, :, None] >= 0)
+        factor, a, b = np.nonzero(keep)
+        places[term] = full, factor, a, b, program.normal.positions(mapped[factor, a], mapped[factor, b])
+    return places
 
 
 def _slices(terms: Sequence[CompiledTerm]) -> list[slice]:

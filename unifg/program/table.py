@@ -14,14 +14,14 @@ import numpy as np
 from unifg.elimination.symmetric import Symmetric
 from unifg.kernels.robust import Loss, form_of
 from unifg.kernels.steps import as_table, movable_parts
-from unifg.language.terms import Constraint, Cost
+from unifg.language.terms import Constraint, Cost, ScalarCost
 from unifg.machine.jit import compiled
 from unifg.program.columns import Columns
 from unifg.program.term import CompiledTerm
 from unifg.typing import Array, IntArray
 
 (
-    KIND,  # COST, CONSTRAINT or BOUND
+    KIND,  # COST, CONSTRAINT, BOUND or SCALAR
     ADDRESS,  # of the kernel; 0: NumPy has evaluated the term already
     SEARCH,  # address of the kernel with the search Jacobian
     COUNT,  # factors
@@ -42,7 +42,7 @@ from unifg.typing import Array, IntArray
     WHITENER,  # first whitener
     ACTIVE,  # first flag; -1: all active
     WEIGHT,  # first robust weight; -1: not robust
-    ROW,  # first row of the stacked residual
+    ROW,  # first row of the stacked residual; of scalar costs, first value
     ENTRY,  # first entry of the stacked Jacobian
     COLUMN,  # first column in TermArrays.columns
     POSITION,  # first place in TermArrays.positions
@@ -55,7 +55,7 @@ from unifg.typing import Array, IntArray
     FIELDS,
 ) = range(32)
 
-COST, CONSTRAINT, BOUND = 0, 1, 2
+COST, CONSTRAINT, BOUND, SCALAR = range(4)
 PYTHON, HELD = -1, -2  # losses whose formulas are Python; HELD: line searches keep the weights of a linearisation
 
 
@@ -64,6 +64,7 @@ class TermArrays(NamedTuple):
 
     Attributes:
         fields: (T, FIELDS) one row per term, in the order of the program.
+        scalars: (S, FIELDS) the same of costs that are no squares.
         gather: where each variable of each factor starts in the stored values; negative: constants.
         sizes: storage sizes of variables, and columns kept.
         columns: (n, D) full tangent columns of each factor, term after term.
@@ -78,6 +79,7 @@ class TermArrays(NamedTuple):
     """
 
     fields: IntArray
+    scalars: IntArray
     gather: IntArray
     sizes: IntArray
     columns: IntArray
@@ -97,6 +99,7 @@ class TermTable:
     Attributes:
         arrays: for the compiled loops.
         residuals, weights: number of rows of all costs, number of robust factors.
+        scalars: number of factors of costs that are no squares.
         constraints: number of constraint rows.
         entries, constraint_entries: lengths of the stacked Jacobians.
         sizes: lengths of the stacked residual, its Jacobian, the stacked constraints and theirs.
@@ -107,22 +110,24 @@ class TermTable:
         holding: whether any loss holds its weights during line searches.
     """
 
-    def __init__(self, terms: Sequence[CompiledTerm], columns: Columns, normal: Symmetric) -> None:
+    def __init__(
+        self, terms: Sequence[CompiledTerm], scalars: Sequence[CompiledTerm], columns: Columns, normal: Symmetric
+    ) -> None:
         """Lay everything out; numbers come with :meth:`bind`."""
-        self._terms = terms
+        self._terms = [*terms, *scalars]
         self._second = False
         self._columns = columns
-        fields = np.zeros((len(terms), FIELDS), dtype=np.int64)
+        self._fields = fields = np.zeros((len(self._terms), FIELDS), dtype=np.int64)
         gather, sizes, tangent = [], [], []
         parts: list[tuple[int, ...]] = []
         starts = {"gather": 0, "sizes": 0, "tangent": 0, "positions": 0, "parameters": 0, "whiteners": 0, "active": 0}
-        self.residuals = self.weights = self.constraints = self.entries = self.constraint_entries = 0
+        self.residuals = self.weights = self.scalars = self.constraints = self.entries = self.constraint_entries = 0
         self.scratch = 1
         self.differenced = any(term.differenced for term in terms)
         self.robust: list[tuple[CompiledTerm, slice]] = []
         self.weighed: list[tuple[Loss, slice]] = []
         losses: dict[int, tuple[float, float]] = {}
-        for row, term in zip(fields, terms, strict=True):
+        for row, term in zip(fields, self._terms, strict=True):
             layout = term.layout(starts["parameters"])
             count, m, width = layout.count, layout.rows, layout.columns.shape[1]
             row[COUNT], row[ROWS], row[WIDTH] = count, m, width
@@ -174,6 +179,9 @@ class TermTable:
                     row[LOSS], row[LOSS_AT] = form[0], starts["parameters"]
                     losses[starts["parameters"]] = form[1:]
                     starts["parameters"] += 2
+            elif isinstance(term.term, ScalarCost):
+                row[KIND], row[ROW] = SCALAR, self.scalars
+                self.scalars += count
             else:
                 assert isinstance(term.term, Constraint)
                 row[KIND] = BOUND if term.is_bound else CONSTRAINT
@@ -188,7 +196,8 @@ class TermTable:
         counts = fields[:, COUNT]
         self._active_starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         self.arrays = TermArrays(
-            fields,
+            fields[: len(terms)],
+            fields[len(terms) :],
             _joined(gather),
             np.array(sizes or [0], dtype=np.int64),
             _joined(tangent),
@@ -210,7 +219,7 @@ class TermTable:
         row, kernel = term.place, term.kernel
         assert kernel is not None
         row[ADDRESS] = kernel.address
-        row[SECOND] = kernel.second_address if self._second else 0
+        row[SECOND] = kernel.second_address if self._second or row[KIND] == SCALAR else 0
         row[PARTS] = 0 if kernel.linear else len(movable_parts(kernel.manifolds))
 
     def give_up(self, term: CompiledTerm) -> None:
@@ -233,7 +242,7 @@ class TermTable:
         """Copy limits and everything that some terms have bound; their parameters live here from then on."""
         arrays = self.arrays
         arrays.lower[:], arrays.upper[:] = lower, upper
-        for row, term, start in zip(arrays.fields, self._terms, self._active_starts, strict=False):
+        for row, term, start in zip(self._fields, self._terms, self._active_starts, strict=False):
             if term not in rebound:
                 continue
             parameters = arrays.parameters[row[PARAMETER] : row[PARAMETER] + term.parameters.size]

@@ -179,8 +179,8 @@ class CompiledTerm:
             self.trace, why = find(self._batch, own.function, asked)
         if self.trace is None:
             return self._by_python(why)
-        if not isinstance(self.term, ScalarCost):
-            self.kernel, self._taken, self._jacobian = self.trace.kernel, self.trace.taken, self._exact
+        self.kernel, self._taken = self.trace.kernel, self.trace.taken
+        self._jacobian = None if isinstance(self.term, ScalarCost) else self._exact
         return self._traced()
 
     def _choose_single(self) -> str:
@@ -277,9 +277,7 @@ class CompiledTerm:
         if found is None:
             self._leave(why)
             return False
-        self.trace = found
-        if self.kernel is not None:
-            self.kernel = found.kernel
+        self.trace, self.kernel = found, found.kernel
         self._bind_parameters(self._data)
         return same or self.stands(values)
 
@@ -351,10 +349,7 @@ class CompiledTerm:
 
     def residual(self, values: Values) -> Array:
         """(n, m) residuals, zero where inactive, not whitened; (n,) for a scalar cost."""
-        points = self.points(values)
-        if self.trace is not None and self.kernel is None:  # a scalar cost
-            return self._masked(self.trace.kernel(*self._for_kernel(points))[:, 0])
-        return self._masked(self._checked(self._batched.at(points)))
+        return self._masked(self._checked(self._batched.at(self.points(values))))
 
     def jacobians(self, values: Values, numerical: bool = False, search: bool = False) -> list[Array]:
         """One (n, m, d_k) array per variable argument, zero where inactive.
