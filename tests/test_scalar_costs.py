@@ -11,11 +11,13 @@ import unifg as fg
 from unifg.kernels.differences import convexified
 from unifg.program.curvature import lagrangian_hessian
 from unifg.program.scalars import positive_part
-from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
+from unifg.solvers import SQP, InteriorPoint
 from unifg.solvers.interior_point.method import Workspace
 from unifg.typing import Array
 
 Hessian = Literal["gauss-newton", "exact"]
+Derivatives = Literal["trace", "differences"]
+BOTH: tuple[Derivatives, ...] = ("trace", "differences")
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6, 13])
@@ -24,9 +26,10 @@ def test_the_positive_part_is_that_of_the_eigenvalues(n: int) -> None:
     for spectrum in ("mixed", "positive", "negative", "zero", "singular", "graded"):
         Q = np.linalg.qr(rng.standard_normal((n, n)))[0]
         values = rng.standard_normal(n)
-        values = {"positive": np.abs(values) + 0.1, "negative": -np.abs(values), "zero": 0.0 * values}.get(
-            spectrum, values
-        )
+        if spectrum in ("positive", "negative"):
+            values = (np.abs(values) + 0.1) * (1.0 if spectrum == "positive" else -1.0)
+        if spectrum == "zero":
+            values[:] = 0.0
         if spectrum == "singular":
             values[0] = 0.0
         if spectrum == "graded":
@@ -47,15 +50,17 @@ def test_the_positive_part_is_that_of_the_eigenvalues(n: int) -> None:
 def inverse_distance(place: Array, mark: Array, weight: Array) -> Array:
     """(n,) weight over distance: saddles everywhere."""
     offset = place - mark
-    return weight[:, 0] / np.sqrt((offset**2).sum(axis=1))
+    value: Array = weight[:, 0] / np.sqrt((offset**2).sum(axis=1))
+    return value
 
 
 def saddle(pose: Array, shared: Array) -> Array:
     """(n,) of a pose and a number that all factors share."""
-    return np.cos(pose[:, 2]) * pose[:, 0] * shared[:, 0] + pose[:, 1] ** 2 * shared[:, 0]
+    value: Array = np.cos(pose[:, 2]) * pose[:, 0] * shared[:, 0] + pose[:, 1] ** 2 * shared[:, 0]
+    return value
 
 
-def repelled(derivatives: Literal["trace", "differences"]) -> tuple[fg.Graph, dict[fg.Family, Array]]:
+def repelled(derivatives: Derivatives) -> tuple[fg.Graph, dict[fg.Family, Array]]:
     """Poses pushed by marks that come and go; a fixed pose, a shared number, a variable twice in one factor."""
     rng = np.random.default_rng(3)
     graph = fg.Graph()
@@ -78,8 +83,8 @@ def repelled(derivatives: Literal["trace", "differences"]) -> tuple[fg.Graph, di
 
 def test_compiled_passes_are_those_of_numpy() -> None:
     found = []
-    for derivatives in ("trace", "differences"):
-        graph, guess = repelled(derivatives)  # type: ignore[arg-type]
+    for derivatives in BOTH:
+        graph, guess = repelled(derivatives)
         program = graph.compile()
         values = program.values_from(guess)
         assert program.fully_compiled == (derivatives == "trace")
@@ -109,25 +114,30 @@ def test_compiled_passes_are_those_of_numpy() -> None:
     np.testing.assert_allclose(upper, np.triu(0.5 * (wanted + wanted.T)), atol=1e-6)
 
 
+def course(solution: fg.Solution) -> list[float]:
+    """Cost of every iterate."""
+    return [row.cost for row in solution.history]
+
+
 @pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
 def test_the_compiled_loop_takes_the_steps_of_python(hessian: Hessian) -> None:
     """Alone and watched, traced and differenced, with factors that data switch."""
-    mine, others = [], []
-    for derivatives, kept in (("trace", mine), ("differences", others)):
-        graph, guess = repelled(derivatives)  # type: ignore[arg-type]
+    found: dict[Derivatives, list[fg.Solution]] = {"trace": [], "differences": []}
+    for derivatives, kept in found.items():
+        graph, guess = repelled(derivatives)
         run = InteriorPoint(hessian=hessian).prepare(graph)
         on, marks = graph._data["on"], graph._data["marks"]
         for data in ({}, {on: np.array([False, True, True, True])}, {marks: marks.value - 0.7}):
             kept.append(run.solve(guess, data=data))
             kept.append(run.solve(guess, data=data, callback=lambda row: None))
+    mine, others = found.values()
     assert len({round(solution.cost, 6) for solution in mine}) == 3
     for one, other in zip(mine, others, strict=True):
         assert one.converged, one.report()
         assert one.iterations == other.iterations > 3
-        costs = [[row.cost for row in solution.history] for solution in (one, other)]
-        np.testing.assert_allclose(*costs, rtol=1e-5)
+        np.testing.assert_allclose(course(one), course(other), rtol=1e-5)
     for alone, watched in zip(mine[::2], mine[1::2], strict=True):
-        np.testing.assert_allclose(*([row.cost for row in s.history] for s in (alone, watched)), rtol=1e-12)
+        np.testing.assert_allclose(course(alone), course(watched), rtol=1e-12)
         assert alone.history[-1].terms == pytest.approx(watched.history[-1].terms, rel=1e-6)
 
 
@@ -135,7 +145,7 @@ def test_every_backend_that_takes_them_agrees() -> None:
     graph, guess = repelled("trace")
     costs = [
         solver.solve(graph, guess, check=True).cost
-        for solver in (InteriorPoint(), SQP(), SQP(hessian="exact"), AugmentedLagrangian())
+        for solver in (InteriorPoint(), SQP(), SQP(hessian="exact"), SQP(qp="graph"))
     ]
     np.testing.assert_allclose(costs, costs[0], rtol=1e-6)
 

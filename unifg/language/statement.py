@@ -110,7 +110,8 @@ class Statement:
     ) -> str:
         """Add a cost that is not a square: ``function`` returns (n,) values, added as they are.
 
-        Gradient and Hessian blocks come from batched differentiation. Least-squares backends refuse it.
+        Gradient and Hessian are exact where the function can be traced, and come from differences elsewhere.
+        Least-squares backends refuse it.
         """
         wrapped = complete(function, arguments, name)
         unique = self._unique(name, wrapped.name)
