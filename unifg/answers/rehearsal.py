@@ -16,7 +16,7 @@ import numpy as np
 
 from unifg.errors import UnifgError
 from unifg.kernels.residuals import residual
-from unifg.kernels.robust import Huber
+from unifg.kernels.robust import Huber, Reweighted
 from unifg.language.factors import between, prior
 from unifg.language.statement import Statement
 from unifg.language.variables import Family
@@ -99,6 +99,7 @@ def scenes(constraints: str, scalar_costs: bool) -> Iterator[Scene]:
     """
     yield _chain()
     yield _chain(loops=True)
+    yield _chain(plain=True)
     if scalar_costs:
         yield _chain(scalar=True)
     if constraints == "none":
@@ -132,7 +133,7 @@ def _chain(
         contradiction: they must be in two places at once.
         scalar: a cost is no square.
         loops: the last knows the first, through a robust loss.
-        plain: functions of NumPy that are not traced take the place of compiled ones.
+        plain: functions of NumPy that are not traced take the place of compiled ones, and a loss of Python's.
     """
     graph = Statement()
     x = graph.variables("x", SE2, STAGES)
@@ -142,7 +143,7 @@ def _chain(
     graph.minimize(prior, u, [0.1, 0.2], sigma=1.0, name=MARK + "effort")
     if plain:
         goal = residual(lambda pose: pose[:, :2] - [3.0, 0.5], derivatives="differences")
-        graph.minimize(goal, x[-1], sigma=0.3, name=MARK + "goal")
+        graph.minimize(goal, x[-1], sigma=0.3, robust=Reweighted(np.ones_like), name=MARK + "goal")
     if loops:
         graph.minimize(between, x[0], x[-1], [2.5, 0.5, 0.4], sigma=0.1, robust=Huber(1.0), name=MARK + "closure")
     if scalar:

@@ -358,11 +358,11 @@ class Program:
         self.python_seconds += perf_counter() - began
         return cost
 
-    def norms(self, sizes: Array, scalars: Array) -> dict[str, float]:
+    def norms(self, sizes: Array, scalars: Array | None = None) -> dict[str, float]:
         """Residual norms of the terms by name, as compiled loops leave them, and of the values of scalar costs."""
         norms = dict(zip(self._names, sizes.tolist(), strict=True))
-        for name, found in self.by_scalar(scalars).items():
-            norms[name] = float(np.abs(found).sum())
+        if scalars is not None and len(scalars):
+            norms |= {name: float(np.abs(found).sum()) for name, found in self.by_scalar(scalars).items()}
         return norms
 
     def by_scalar(self, found: Array) -> dict[str, Array]:
