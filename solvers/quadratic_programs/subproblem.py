@@ -7,17 +7,19 @@ Whatever route solves it, the answer is measured here, in the problem's own unit
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from unifg.elimination.symmetric import Symmetric
+from unifg.machine.jit import compiled
 from unifg.program.curvature import lagrangian_hessian
-from unifg.program.linearization import Linearization
+from unifg.program.linearization import Linearization, all_finite
 from unifg.program.passes import add_constraints
 from unifg.program.program import Program
-from unifg.typing import Array
+from unifg.typing import Array, BoolArray
 
 
 @dataclass(frozen=True)
@@ -137,22 +139,35 @@ class Route(Protocol):
 
 def qp_error(qp: QP, step: Array, multipliers: Array) -> float:
     """Largest of stationarity, infeasibility and complementarity, scaled as in :mod:`unifg.answers.optimality`."""
-    if not (np.isfinite(step).all() and np.isfinite(multipliers).all()):
+    if not (all_finite(step) and all_finite(multipliers)):
         return np.inf
-    scale = max(1.0, float(np.abs(multipliers).mean()) / 100.0) if len(multipliers) else 1.0
     program = qp.program
-    dual = qp.curved(step) + qp.gradient
-    dual = dual + program.constraints.transposed_times(qp.jacobian, multipliers)[program.columns.free]
-    value = qp.linear(step)
-    outside = np.maximum(np.maximum(value - qp.upper, qp.lower - value), 0.0)
-    limit = np.where(multipliers > 0.0, qp.upper, qp.lower)
-    slack = np.where(np.isfinite(limit), np.abs(value - limit), 1.0)
-    slip = np.where(program.equality, 0.0, np.abs(multipliers) * slack)
-    return max(
-        float(np.abs(dual).max(initial=0.0)) / scale,
-        float(outside.max(initial=0.0)),
-        float(slip.max(initial=0.0)) / scale,
-    )
+    slope = qp.curved(step) + qp.gradient
+    slope += program.constraints.transposed_times(qp.jacobian, multipliers)[program.columns.free]
+    return float(_largest_residual(slope, qp.linear(step), qp.lower, qp.upper, multipliers, program.equality))
+
+
+@compiled
+def _largest_residual(
+    slope: Array, value: Array, lower: Array, upper: Array, multipliers: Array, equality: BoolArray
+) -> float:
+    """The same of a gradient of the Lagrangian and of values of the rows; infinite where one is not a number."""
+    stationarity = infeasibility = complementarity = size = 0.0
+    for entry in slope:
+        if entry != entry:
+            return np.inf
+        stationarity = max(stationarity, abs(entry))
+    for row in range(len(value)):
+        if value[row] != value[row]:
+            return np.inf
+        size += abs(multipliers[row])
+        infeasibility = max(infeasibility, max(value[row] - upper[row], lower[row] - value[row]))
+        if not equality[row]:
+            limit = upper[row] if multipliers[row] > 0.0 else lower[row]
+            slack = abs(value[row] - limit) if math.isfinite(limit) else 1.0
+            complementarity = max(complementarity, abs(multipliers[row]) * slack)
+    scale = max(1.0, size / max(len(value), 1) / 100.0)
+    return max(max(stationarity / scale, infeasibility), complementarity / scale)
 
 
 def solve_convex(route: Route, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:

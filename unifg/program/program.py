@@ -25,6 +25,7 @@ from unifg.program.binding import Binding
 from unifg.program.by_term import ByTerm, Places
 from unifg.program.columns import Columns, Values
 from unifg.program.guess import GuessReader
+from unifg.program.limits import outside
 from unifg.program.linearization import Evaluation, Linearization, Rows
 from unifg.program.retraction import Retraction
 from unifg.program.scalars import add_scalars, evaluate_scalars
@@ -406,7 +407,9 @@ class Program:
 
     def violation(self, constraints: Array) -> Array:
         """(M,) signed distance outside the limits: positive above, negative below, zero inside."""
-        return np.maximum(constraints - self.upper, 0.0) - np.maximum(self.lower - constraints, 0.0)
+        found = np.empty(len(constraints))
+        outside(constraints, self.lower, self.upper, found)
+        return found
 
     def once(self, find: Callable[[Program], T]) -> T:
         """What a function finds out about this program, found when first asked for and kept as long as the program."""
