@@ -188,6 +188,9 @@ class Open(np.ndarray[Any, np.dtype[Any]]):
     def __gt__(self, other: Any) -> Any:
         return np.frompyfunc(lambda a, b: a > b, 2, 1)(self, other)
 
+    def __ge__(self, other: Any) -> Any:
+        return np.frompyfunc(lambda a, b: a >= b, 2, 1)(self, other)
+
     def __eq__(self, other: object) -> Any:
         return np.frompyfunc(lambda a, b: a == b, 2, 1)(self, other)
 
@@ -195,13 +198,14 @@ class Open(np.ndarray[Any, np.dtype[Any]]):
         return np.frompyfunc(lambda a, b: a * b, 2, 1)(self, other)
 
 
-def oracle(function: Function) -> Function:
-    """The same function, where NumPy's names mean CasADi's."""
+def numpy_of_casadi() -> Any:
+    """NumPy for CasADi's numbers."""
     ca = pytest.importorskip("casadi")
     ca.GlobalOptions.setNumpyMode(-1)
 
     def each(scalar: Function, count: int) -> Function:
-        return np.frompyfunc(scalar, count, 1)
+        batch = np.frompyfunc(scalar, count, 1)
+        return lambda *a: batch(*a) if any(isinstance(part, np.ndarray) for part in a) else scalar(*a)
 
     def norm(a: Any, axis: int) -> Any:
         return each(ca.sqrt, 1)(np.sum(a * a, axis=axis))
@@ -210,6 +214,15 @@ def oracle(function: Function) -> Function:
         array = np.empty(shape, dtype=object)
         array[...] = ca.SX(0)
         return array
+
+    def array(values: Any) -> Any:  # NumPy's own would look into them
+        if not isinstance(values, list | tuple | np.ndarray):
+            return values
+        parts = [array(value) for value in values]
+        whole = np.empty((len(parts), *np.shape(parts[0] if isinstance(parts[0], np.ndarray) else 0)), dtype=object)
+        for k, part in enumerate(parts):
+            whole[k] = part
+        return whole.view(Open)
 
     def inverse(a: Any) -> Any:
         found = ca.inv(ca.vertcat(*(ca.horzcat(*row) for row in a[0])))
@@ -226,7 +239,7 @@ def oracle(function: Function) -> Function:
         "remainder": each(lambda a, b: a - ca.floor(a / b) * b, 2),
         "logaddexp": each(lambda a, b: ca.log(ca.exp(a) + ca.exp(b)), 2), "reciprocal": lambda a: 1 / a,
         "square": lambda a: a * a, "deg2rad": lambda a: a * (math.pi / 180), "rad2deg": lambda a: a * (180 / math.pi),
-        "zeros": like_numpy, "full": lambda shape, x: like_numpy(shape) + x,
+        "array": array, "zeros": like_numpy, "full": lambda shape, x: like_numpy(shape) + x,
         "max": lambda a, axis, keepdims: np.array([[ca.mmax(ca.vertcat(*a[0]))]], dtype=object),
         "min": lambda a, axis, keepdims: np.array([[ca.mmin(ca.vertcat(*a[0]))]], dtype=object),
         "linalg": SimpleNamespace(norm=norm, inv=inverse, det=determinant),
@@ -236,10 +249,16 @@ def oracle(function: Function) -> Function:
         def __getattr__(self, name: str) -> Any:
             return names.get(name, getattr(np, name))
 
+    return Namespace()
+
+
+def oracle(function: Function) -> Function:
+    """The same function, where NumPy's names mean CasADi's."""
+
     def rebound(f: FunctionType) -> FunctionType:
         inside = {k: rebound(v) if isinstance(v, FunctionType) and v is not f and v.__module__ == f.__module__ else v
                   for k, v in f.__globals__.items() if k in f.__code__.co_names}  # fmt: skip
-        return FunctionType(f.__code__, {**f.__globals__, **inside, "np": Namespace()}, f.__name__)
+        return FunctionType(f.__code__, {**f.__globals__, **inside, "np": numpy_of_casadi()}, f.__name__)
 
     return rebound(function)  # type: ignore[arg-type]
 

@@ -22,6 +22,8 @@ LEADING = float(np.float32(TWO_PI))  # so short that its multiples are exact, an
 TRAILING = TWO_PI - LEADING
 SWITCH = 0.25  # squared angle [rad^2]
 TERMS = 10
+BERNOULLI = [1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510, 43867 / 798, 174611 / 330]
+"""|B_2k|, k = 1, 2, ..."""
 
 _sqrt, _sin, _cos, _arctan2, _rint = (UFUNCS[name] for name in ("sqrt", "sin", "cos", "arctan2", "rint"))
 
@@ -99,8 +101,7 @@ def sine_rest(square: Any) -> Any:
 
 def half_cotangent(square: Any) -> Any:
     """(t / 2) cot(t / 2) of t^2: 1 - sum |B_2k| t^2k / (2k)!."""
-    bernoulli = [1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510, 43867 / 798, 174611 / 330]
-    coefficients = [1.0, *(-b / math.factorial(2 * k) for k, b in enumerate(bernoulli, 1))]
+    coefficients = [1.0, *(-b / math.factorial(2 * k) for k, b in enumerate(BERNOULLI, 1))]
     return _series(square, coefficients, lambda s: 0.5 * _sqrt(s) * _cos(0.5 * _sqrt(s)) / _sin(0.5 * _sqrt(s)))
 
 
@@ -202,19 +203,35 @@ def _se3_exp(d: Numbers) -> list[Any]:
     return [*(v[i] + b * once[i] + c * twice[i] for i in range(3)), *_so3_exp(w)]
 
 
+def tangent_rest(square: Any) -> Any:
+    """(1 - (t / 2) cot(t / 2)) / t^2 of t^2: what ad^2 is multiplied by in the inverse of a right Jacobian."""
+    coefficients = [b / math.factorial(2 * k) for k, b in enumerate(BERNOULLI, 1)]
+    return _series(square, coefficients, lambda s: (1.0 - half_cotangent(s)) / s)
+
+
 def _se3_log(x: Numbers) -> list[Any]:
     p, w = x[:3], _so3_log(x[3:])
-    square = _dot(w, w)
     once = _cross(w, p)
     twice = _cross(w, once)
-    near = UFUNCS["less"](square, SWITCH)
-    safe = choose(near, 1.0, square)
-    bernoulli = [1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510, 43867 / 798, 174611 / 330]
-    total: Any = 0.0
-    for k in range(len(bernoulli), 0, -1):
-        total = total * square + bernoulli[k - 1] / math.factorial(2 * k)
-    k_value = choose(near, total, (1.0 - half_cotangent(safe)) / safe)
-    return [*(p[i] - 0.5 * once[i] + k_value * twice[i] for i in range(3)), *w]
+    k = tangent_rest(_dot(w, w))
+    return [*(p[i] - 0.5 * once[i] + k * twice[i] for i in range(3)), *w]
+
+
+def _polynomial(a: list[list[Any]], first: Any, second: Any) -> list[list[Any]]:
+    """I + first a + second a^2."""
+    size = range(len(a))
+    square = [[sum((a[i][j] * a[j][k] for j in size), 0.0) for k in size] for i in size]
+    return [[(1.0 if i == k else 0.0) + first * a[i][k] + second * square[i][k] for k in size] for i in size]
+
+
+def _turning(w: Numbers) -> list[list[Any]]:
+    """The small adjoint of SO(3)."""
+    return [[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]]
+
+
+def _sliding(d: Numbers) -> list[list[Any]]:
+    """The small adjoint of SE(2)."""
+    return [[0.0, -d[2], d[1]], [d[2], 0.0, -d[0]], [0.0, 0.0, 0.0]]
 
 
 def _se3_act(x: Numbers, p: Numbers) -> list[Any]:
@@ -236,6 +253,8 @@ FORMS: dict[Hashable, dict[str, Callable[..., list[Any]]]] = {
         "inverse": lambda x: [*(-a for a in _turn(-x[2], x[:2])), wrap(-x[2])],
         "between": lambda x, y: [*_turn(-x[2], [y[0] - x[0], y[1] - x[1]]), wrap(y[2] - x[2])],
         "act": lambda x, p: [a + b for a, b in zip(x[:2], _turn(x[2], p), strict=True)],
+        "right_jacobian": lambda d: _polynomial(_sliding(d), -versine(d[2] * d[2]), sine_rest(d[2] * d[2])),
+        "right_jacobian_inverse": lambda d: _polynomial(_sliding(d), 0.5, tangent_rest(d[2] * d[2])),
     },
     SO3: {
         "exp": _so3_exp,
@@ -243,6 +262,8 @@ FORMS: dict[Hashable, dict[str, Callable[..., list[Any]]]] = {
         "compose": lambda x, y: _upright(_product(x, y)),
         "inverse": lambda x: _upright(_conjugate(x)),
         "act": _rotate,
+        "right_jacobian": lambda w: _polynomial(_turning(w), -versine(_dot(w, w)), sine_rest(_dot(w, w))),
+        "right_jacobian_inverse": lambda w: _polynomial(_turning(w), 0.5, tangent_rest(_dot(w, w))),
     },
     SE3: {
         "exp": _se3_exp,

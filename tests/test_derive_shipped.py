@@ -1,0 +1,586 @@
+"""Every shipped residual, written as its definition says and traced: CasADi's derivatives, and those of what ships."""
+
+import math
+from collections.abc import Callable
+from functools import reduce
+from types import CellType, CodeType, FunctionType
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.special import zeta
+
+import unifg as fg
+from test_derive import Open, compared, curved, evaluated, numpy_of_casadi
+from test_jacobians import CAR, CASES, COUNT, GRID
+from unifg.kernels.derive.expression import traced
+from unifg.kernels.derive.lookup import Lookup
+from unifg.kernels.kernel import Argument, evaluate_rows
+from unifg.kernels.residuals import Residual
+from unifg.lie import SE2, SE3, SO2, SO3, Rn, wrap_angle
+from unifg.models import bicycle, cart_pole, manipulator, quadrotor
+from unifg.models.distance_map import HEADER, RING
+from unifg.models.tableau import METHODS, Tableau
+from unifg.typing import Array
+
+ca = pytest.importorskip("casadi")
+Function = Callable[..., Any]
+
+# ---------------------------------------------------------------- definitions
+
+
+def prior(group: Any) -> Function:
+    return lambda x, z: group.log(group.compose(group.inverse(z), x))
+
+
+def between(group: Any) -> Function:
+    return lambda x, y, z: group.log(group.compose(group.inverse(z), group.compose(group.inverse(x), y)))
+
+
+def difference(group: Any) -> Function:
+    return lambda x, y: group.log(group.compose(group.inverse(x), y))
+
+
+def unicycle_dynamics(x: Array, u: Array, y: Array, dt: Array) -> Any:
+    middle = x[:, 2] + 0.5 * dt * u[:, 1]
+    return np.stack(
+        [
+            y[:, 0] - x[:, 0] - dt * u[:, 0] * np.cos(middle),
+            y[:, 1] - x[:, 1] - dt * u[:, 0] * np.sin(middle),
+            wrap_angle(y[:, 2] - x[:, 2] - dt * u[:, 1]),
+        ],
+        axis=1,
+    )
+
+
+def tracking(x: Array, z: Array) -> Any:
+    return np.concatenate([x[:, :2] - z[:, :2], wrap_angle(x[:, 2:] - z[:, 2:])], axis=1)
+
+
+def discs(x: Array, centre: Array, radius: Array) -> Any:
+    return np.linalg.norm(x[:, None, :2] - centre, axis=2) - radius
+
+
+def spheres(x: Array, centre: Array, radius: Array) -> Any:
+    return np.linalg.norm(x[:, None, :] - centre, axis=2) - radius
+
+
+def landmark_clearance(p: Array, mark: Array, radius: Array) -> Any:
+    return (np.linalg.norm(p[:, :2] - mark, axis=1) - radius)[:, None]
+
+
+def segments(x: Array, ends: Array, margin: Array) -> Any:
+    along, to = ends[:, :, 1] - ends[:, :, 0], x[:, None, :2] - ends[:, :, 0]
+    part = np.clip(np.sum(along * to, axis=2) / np.sum(along * along, axis=2), 0.0, 1.0)
+    return np.linalg.norm(to - part[:, :, None] * along, axis=2) - margin
+
+
+def root_of_inverse(distance: Function, nearest: float) -> Function:
+    def root(*arguments: Array) -> Any:
+        d = distance(*arguments)
+        depth = d / nearest - 1.0
+        phi = np.where(d >= nearest, 1.0 / d, (1.0 - depth + depth * depth) / nearest)
+        return np.sqrt(2.0 * phi)
+
+    return root
+
+
+def repulsion(distance: Function) -> Function:
+    scale, near, far = 0.075, 0.05, 0.8
+    return lambda *arguments: scale * (1.0 / np.clip(distance(*arguments), near, far) - 1.0 / far)
+
+
+def shortfall(distance: Function) -> Function:
+    return lambda x: np.maximum(0.0, 0.3 - distance(x))
+
+
+class Splines(Lookup):
+    """Quadratic B-splines over the cells of a map, or their bilinear interpolant."""
+
+    def place(self, p: Array) -> tuple[Any, Any]:
+        t = self.table
+        return t[0] * p[:, 0] + t[1] * p[:, 1] + t[2], t[3] * p[:, 0] + t[4] * p[:, 1] + t[5]
+
+    def entry(self, row: Any, column: Any) -> Any:
+        stride = self.table[6] + 2 * RING
+        return self.take(HEADER + (row + RING - 1) * stride + column + RING - 1)
+
+    def quadratic(self, p: Array) -> Any:
+        u, v = self.place(p)
+        column, row = np.floor(u), np.floor(v)
+
+        def weights(t: Any) -> list[Any]:
+            return [0.5 * (1.0 - t) ** 2, 0.75 - (t - 0.5) ** 2, 0.5 * t * t]
+
+        across, along = weights(u - column), weights(v - row)
+        total: Any = 0.0
+        for i in range(3):
+            total = total + along[i] * sum(across[k] * self.entry(row + i, column + k) for k in range(3))
+        return total
+
+    def bilinear(self, p: Array) -> Any:
+        u, v = self.place(p)
+        column, row = np.floor(u + 0.5), np.floor(v + 0.5)
+        s, t = u + 0.5 - column, v + 0.5 - row
+        low = self.entry(row, column) * (1.0 - s) + self.entry(row, column + 1) * s
+        high = self.entry(row + 1, column) * (1.0 - s) + self.entry(row + 1, column + 1) * s
+        return low * (1.0 - t) + high * t
+
+
+TABLE = Splines(GRID.table)
+
+
+def wall_distance(x: Array) -> Any:
+    return TABLE.quadratic(x[:, :2])[:, None]
+
+
+def endpoint(x: Array, beam: Array) -> Any:
+    return TABLE.bilinear(SE2.act(x, beam))[:, None]
+
+
+def vehicle(v: Array, force: Array, after: Array, dt: Array, slope: Array) -> Any:
+    road = CAR.mass * CAR.gravity * (np.sin(slope) + CAR.rolling * np.cos(slope))
+    drag = CAR.drag_constant + CAR.drag_linear * v[:, 0] + CAR.drag * v[:, 0] ** 2
+    return (after[:, 0] - v[:, 0] - dt / CAR.equivalent_mass * (force[:, 0] - road - drag))[:, None]
+
+
+def quadrotor_field(x: Array, u: Array, w: Array, mass: Array, drag: Array, wind: Array, updraft: Array) -> Any:
+    R, v = SO3.matrix(x[:, 3:7]), x[:, 7:]
+    force = u[:, 3:] * np.array([0.0, 0.0, 1.0]) - drag * np.einsum("nij,ni->nj", R, v)
+    lift = np.concatenate([wind, updraft - 9.81], axis=1)
+    a = np.einsum("nij,nj->ni", R, force) / mass + lift + w[:, 3:]
+    return np.concatenate([v, u[:, :3] + w[:, :3], a], axis=1)
+
+
+def disturbed(x: Array, u: Array, w: Array, m: Array, d: Array, wind: Array, up: Array, y: Array, h: Array) -> Any:
+    first, second = quadrotor_field(x, u, w, m, d, wind, up), quadrotor_field(y, u, w, m, d, wind, up)
+    turn = SO3.log(SO3.compose(SO3.inverse(x[:, 3:7]), y[:, 3:7]))
+    moved = np.concatenate([y[:, :3] - x[:, :3], turn, y[:, 7:] - x[:, 7:]], axis=1)
+    return moved - 0.5 * h[:, None] * (first + second)
+
+
+def undisturbed(x: Array, u: Array, y: Array, rho: Array, h: Array) -> Any:
+    calm = 0.0 * np.concatenate([u, u[:, :2]], axis=1)
+    return disturbed(x, u, calm, rho[:, :1], rho[:, 1:4], rho[:, 4:6], rho[:, 6:], y, h)
+
+
+def bearing_range(x: Array, mark: Array, z: Array) -> Any:
+    R, d = SO3.matrix(x[:, 3:7]), mark - x[:, :2]
+    bearing = np.arctan2(d[:, 1], d[:, 0]) - np.arctan2(R[:, 1, 0], R[:, 0, 0])
+    return np.stack([wrap_angle(bearing - z[:, 0]), np.hypot(d[:, 0], d[:, 1]) - z[:, 1]], axis=1)
+
+
+def height(p: Array, z: Array) -> Any:
+    return (p[:, 2] - z)[:, None]
+
+
+def tilt(R: Array, z: Array) -> Any:
+    return SO3.matrix(R)[:, 2] - z
+
+
+def planar(x: Array, mark: Array) -> Any:
+    return SE2.act(SE2.inverse(x), mark)
+
+
+def planar_bearing(x: Array, mark: Array, z: Array) -> Any:
+    local = planar(x, mark)
+    return wrap_angle(np.arctan2(local[:, 1], local[:, 0]) - z[:, 0])[:, None]
+
+
+def planar_distance(x: Array, mark: Array, z: Array) -> Any:
+    return (np.hypot(mark[:, 0] - x[:, 0], mark[:, 1] - x[:, 1]) - z[:, 0])[:, None]
+
+
+def planar_both(x: Array, mark: Array, z: Array) -> Any:
+    return np.concatenate([planar_bearing(x, mark, z), planar_distance(x, mark, z[:, 1:])], axis=1)
+
+
+def sighting(group: Any) -> Function:
+    return lambda x, mark, z: group.act(group.inverse(x), mark) - z
+
+
+def planar_chart(x: Array, y: Array, z: Array) -> Any:
+    return SE2.compose(SE2.inverse(z), SE2.compose(SE2.inverse(x), y))
+
+
+def spatial_chart(x: Array, y: Array, z: Array) -> Any:
+    error = SE3.compose(SE3.inverse(z), SE3.compose(SE3.inverse(x), y))
+    return np.concatenate([error[:, :3], error[:, 4:] * np.where(error[:, 3:4] < 0.0, -1.0, 1.0)], axis=1)
+
+
+def step(group: Any, F: Function, tableau: Tableau) -> Function:
+    """The defect of a step, as the tableau says."""
+    weights, matrix, ends, flat = tableau.weights, tableau.matrix, tableau.ends, tableau.flat
+
+    def defect(x: Array, *rest: Array) -> Any:
+        *inputs, y, h = rest
+        h = h[:, None]
+        xi = group.log(group.compose(group.inverse(x), y))
+        total, speeds = xi, list[Any]()
+        for s, weight in enumerate(weights):
+            sigma = (ends[s] if ends else 0.0) * xi
+            for t, speed in enumerate(speeds):
+                if matrix[s][t] != 0.0:
+                    sigma = sigma + h * matrix[s][t] * speed
+            still = not (ends and ends[s]) and not any(matrix[s])
+            speed = F(x if still else group.compose(x, group.exp(sigma)), *inputs)
+            if not still and s not in flat:
+                speed = np.einsum("nij,nj->ni", group.right_jacobian_inverse(sigma), speed)
+            speeds.append(speed)
+            total = total - weight * h * speed
+        return total
+
+    return defect
+
+
+def swept(x: Array, u: Array) -> Any:
+    return np.stack([u[:, 0] * (1.2 + np.sin(x[:, 1])), 0.4 * np.cos(x[:, 2]), u[:, 1] + 0.2 * x[:, 0]], axis=1)
+
+
+def unicycle_field(x: Array, u: Array) -> Any:
+    return np.stack([u[:, 0], 0.0 * u[:, 0], u[:, 1]], axis=1)
+
+
+def accelerated(x: Array, u: Array) -> Any:
+    return np.concatenate([unicycle_field(x, x[:, 3:]), u - 0.3 * x[:, 3:] ** 2], axis=1)
+
+
+MOVING = fg.Product(pose=fg.SE2, v=fg.Rn(2))
+FULL, SIMPLE, HERMITE = METHODS["full trapezoid"], METHODS["simplified trapezoid"], METHODS["hermite-simpson"]
+DEFINED: dict[str, Function] = {
+    "unicycle.dynamics": unicycle_dynamics, "unicycle.tracking": tracking, "unicycle.rate": difference(Rn(2)),
+    "obstacles.disc_clearance": discs, "obstacles.wall_distance": wall_distance, "lidar.endpoint": endpoint,
+    "obstacles.shortfall": shortfall(wall_distance), "potential.potential": repulsion(discs),
+    "potential.potential, walls": repulsion(wall_distance), "potential.potential, vortex": repulsion(discs),
+    "vehicle.dynamics": vehicle, "quadrotor.dynamics": undisturbed, "quadrotor.disturbed_dynamics": disturbed,
+    "landmarks.bearing_range": bearing_range, "landmarks.height": height, "landmarks.tilt": tilt,
+    "avoidance.cylinder_clearance": discs, "avoidance.landmark_clearance": landmark_clearance,
+    "avoidance.segment_clearance": segments, "avoidance.sphere_clearance": spheres,
+    "avoidance.inverse_distance_root": root_of_inverse(discs, 0.8),
+    "avoidance.inverse_distance_root, landmark": root_of_inverse(landmark_clearance, 0.2),
+    "bearing": planar_bearing, "distance": planar_distance, "bearing and range": planar_both,
+    "chart_between on SE2": planar_chart, "chart_between on SE3": spatial_chart,
+    "sighting on SE2": sighting(SE2), "sighting on SE3": sighting(SE3),
+    "rkmk.trapezoid": step(SE2, swept, FULL), "rkmk.trapezoid, simplified": step(SE2, swept, SIMPLE),
+    "rkmk.trapezoid, given derivative": step(SE2, unicycle_field, FULL),
+    "rkmk.trapezoid, pose and velocity": step(MOVING, accelerated, FULL),
+    "rkmk.trapezoid, compiled": step(SE2, swept, FULL),
+    "rkmk.trapezoid, compiled, simplified": step(SE2, swept, SIMPLE),
+    "rkmk.trapezoid, compiled, by differences": step(SE2, swept, FULL),
+    "rkmk.integrator": step(SE2, swept, METHODS["rk4"]),
+    "rkmk.trapezoid, quadrotor": step(quadrotor.STATE, quadrotor_field, FULL),
+    "bicycle.dynamics": step(bicycle.STATE, bicycle.field(bicycle.Bicycle()), HERMITE),
+    "cart_pole.dynamics": step(cart_pole.STATE, cart_pole.field(cart_pole.CartPole()), HERMITE),
+    "manipulator.dynamics": step(manipulator.STATE, manipulator.field(manipulator.Arm()), HERMITE),
+}  # fmt: skip
+for group in (Rn(3), SO2, SE2, MOVING):
+    DEFINED[f"prior on {group.name}"] = prior(group)
+    DEFINED[f"between on {group.name}"] = between(group)
+    DEFINED[f"difference on {group.name}"] = difference(group)
+# What ships has derivatives of F by differences: those of the definition are better.
+DIFFERENCED = {
+    "rkmk.trapezoid", "rkmk.trapezoid, simplified", "rkmk.trapezoid, pose and velocity", "bicycle.dynamics",
+    "rkmk.trapezoid, compiled, by differences", "cart_pole.dynamics", "manipulator.dynamics",
+}  # fmt: skip
+# Their tables are read by no function of CasADi's: compared with what ships, and with differences of that.
+TABLES = {"obstacles.wall_distance", "lidar.endpoint", "obstacles.shortfall", "potential.potential, walls"}
+
+
+def test_every_shipped_residual_has_a_definition() -> None:
+    assert set(CASES) == set(DEFINED)
+    assert len(DEFINED) > 50
+
+
+# ---------------------------------------------------------------- the oracle: groups in closed form, for one element
+
+C = numpy_of_casadi()
+
+
+def series(square: Any) -> tuple[Any, Any]:
+    """sin(t) / t and (1 - cos(t)) / t^2 near zero, to the order that second derivatives of an exponential take."""
+    return 1.0 - square / 6.0, 0.5 - square / 24.0
+
+
+def closed(square: Any) -> tuple[Any, Any]:
+    t = square**0.5
+    return C.sin(t) / t, (1.0 - C.cos(t)) / square
+
+
+def rest(square: Any) -> Any:
+    """(1 - (t / 2) cot(t / 2)) / t^2; near zero, where that cancels, by its series."""
+    half, total = 0.5 * square**0.5, 0.0
+    for n in range(14, 0, -1):
+        total = total * square + 2.0 * float(zeta(2 * n)) / (2.0 * math.pi) ** (2 * n)
+    return C.where(square < 1.0, total, (1.0 - half * C.cos(half) / C.sin(half)) / square)
+
+
+def times(s: Any, array: Any) -> Any:
+    """A multiple: CasADi would take the array for one of its own."""
+    return np.frompyfunc(lambda a: s * a, 1, 1)(array).view(Open)
+
+
+def cross(a: Any, b: Any) -> Any:
+    return C.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def wrapped_angle(t: Any) -> Any:
+    return C.arctan2(C.sin(t), C.cos(t))
+
+
+class Planar:
+    def exp(self, d: Any, of: Function = closed) -> Any:
+        a, b = of(d[2] * d[2])
+        b = b * d[2]
+        return C.array([a * d[0] - b * d[1], b * d[0] + a * d[1], d[2]])
+
+    def log(self, x: Any) -> Any:
+        t = wrapped_angle(x[2])
+        k = 1.0 - t * t * rest(t * t)
+        return C.array([k * x[0] + 0.5 * t * x[1], k * x[1] - 0.5 * t * x[0], t])
+
+    def compose(self, x: Any, y: Any) -> Any:
+        return C.array([*self.act(x, y), x[2] + y[2]])
+
+    def inverse(self, x: Any) -> Any:
+        return C.array([*(-part for part in self.turn(-x[2], x)), -x[2]])
+
+    def turn(self, t: Any, p: Any) -> Any:
+        return C.array([C.cos(t) * p[0] - C.sin(t) * p[1], C.sin(t) * p[0] + C.cos(t) * p[1]])
+
+    def act(self, x: Any, p: Any) -> Any:
+        return self.turn(x[2], p) + x[:2]
+
+    def right_jacobian_inverse(self, d: Any) -> Any:
+        v, t = d[:2], d[2]
+        ad = C.array([[0 * t, -t, v[1]], [t, 0 * t, -v[0]], [0 * t, 0 * t, 0 * t]])
+        return C.array(np.eye(3)) + times(0.5, ad) + times(rest(t * t), ad @ ad)
+
+
+class Angle:
+    def exp(self, d: Any, of: Function = closed) -> Any:
+        return d
+
+    def log(self, x: Any) -> Any:
+        return wrapped_angle(x)
+
+    def compose(self, x: Any, y: Any) -> Any:
+        return x + y
+
+    def inverse(self, x: Any) -> Any:
+        return -x
+
+    def right_jacobian_inverse(self, d: Any) -> Any:
+        return C.array(np.eye(len(d)))
+
+
+class Vector(Angle):
+    def log(self, x: Any) -> Any:
+        return x
+
+
+class Rotation:
+    def exp(self, d: Any, of: Function = closed) -> Any:
+        a, b = of(0.25 * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]))
+        square = 0.25 * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+        return C.array([1.0 - b * square, *(0.5 * a * part for part in d)])
+
+    def log(self, q: Any) -> Any:
+        sign = C.where(q[0] < 0.0, -1.0, 1.0)
+        n = (q[1] * q[1] + q[2] * q[2] + q[3] * q[3]) ** 0.5
+        return times(2.0 * sign * C.arctan2(n, sign * q[0]) / n, q[1:])
+
+    def compose(self, p: Any, q: Any) -> Any:
+        inner = p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3]
+        return C.array([inner, *(times(p[0], q[1:]) + times(q[0], p[1:]) + cross(p[1:], q[1:]))])
+
+    def inverse(self, q: Any) -> Any:
+        return C.array([q[0], -q[1], -q[2], -q[3]])
+
+    def act(self, q: Any, p: Any) -> Any:
+        twice = times(2.0, cross(q[1:], p))
+        return p + times(q[0], twice) + cross(q[1:], twice)
+
+    def matrix(self, q: Any) -> Any:
+        return C.stack([self.act(q, e) for e in np.eye(3)], axis=1)
+
+    def right_jacobian_inverse(self, d: Any) -> Any:
+        x, y, z = d
+        ad = C.array([[0 * x, -z, y], [z, 0 * x, -x], [-y, x, 0 * x]])
+        square = x * x + y * y + z * z
+        return C.array(np.eye(3)) + times(0.5, ad) + times(rest(square), ad @ ad)
+
+
+class Rigid(Rotation):
+    """Of SE(3), what the cases need; steps by their series alone."""
+
+    def exp(self, d: Any, of: Function = closed) -> Any:
+        v, w = d[:3], d[3:]
+        bent = v + times(0.5, cross(w, v)) + times(1.0 / 6.0, cross(w, cross(w, v)))
+        return C.array([*bent, *Rotation.exp(self, w, of)])
+
+    def compose(self, x: Any, y: Any) -> Any:
+        moved = x[:3] + Rotation.act(self, x[3:], y[:3])
+        return C.array([*moved, *Rotation.compose(self, x[3:], y[3:])])
+
+    def inverse(self, x: Any) -> Any:
+        back = Rotation.inverse(self, x[3:])
+        return C.array([*(-Rotation.act(self, back, x[:3])), *back])
+
+    def act(self, x: Any, p: Any) -> Any:
+        return x[:3] + Rotation.act(self, x[3:], p)
+
+
+class SideBySide:
+    def __init__(self, product: Any) -> None:
+        self.parts = [(part, theirs(part.manifold)) for part in product.components.values()]
+
+    def __getattr__(self, name: str) -> Any:
+        by = {"exp": ["tangent"], "right_jacobian_inverse": ["tangent"], "compose": ["storage"] * 2}
+        places = by.get(name, ["storage"])
+
+        def method(*arguments: Any, **options: Any) -> Any:
+            found = []
+            for part, group in self.parts:
+                cut = [a[getattr(part, place)] for a, place in zip(arguments, places, strict=False)]
+                found.append(getattr(group, name)(*cut, *arguments[len(places) :]))
+            if name != "right_jacobian_inverse":
+                return C.concatenate(found)
+            size = sum(len(block) for block in found)
+            whole, at = C.zeros((size, size)), 0
+            for block in found:
+                whole[at : at + len(block), at : at + len(block)] = block
+                at += len(block)
+            return whole
+
+        return method
+
+
+def theirs(manifold: Any) -> Any:
+    if isinstance(manifold, fg.Product):
+        return SideBySide(manifold)
+    if isinstance(manifold, Rn):
+        return Vector()
+    return {"SO2": Angle, "SE2": Planar, "SO3": Rotation, "SE3": Rigid}[manifold.name]()
+
+
+class Batch:
+    """A group of the oracle for arrays of one element."""
+
+    def __init__(self, manifold: Any) -> None:
+        self.group = theirs(manifold)
+
+    def __getattr__(self, name: str) -> Any:
+        method = getattr(self.group, name)
+
+        def batched(*arguments: Any) -> Any:
+            return method(*(np.asarray(a, dtype=object).reshape(-1).view(Open) for a in arguments))[None].view(Open)
+
+        return batched
+
+
+def in_casadi(thing: Any, seen: dict[int, Any]) -> Any:
+    """What a function of this file, of test problems or of models computes, in CasADi's numbers."""
+    if thing is np:
+        return C
+    if thing is wrap_angle:
+        return wrapped_angle
+    if isinstance(thing, fg.LieGroup | fg.Product):
+        return Batch(thing)
+    if not isinstance(thing, FunctionType) or thing.__module__.startswith("numpy"):
+        return thing
+    if id(thing) not in seen:
+        names = dict(thing.__globals__)
+        cells = tuple(CellType() for _ in thing.__closure__ or ())
+        copy = seen[id(thing)] = FunctionType(thing.__code__, names, thing.__name__, thing.__defaults__, cells)
+        for name in used(thing.__code__):
+            if name in names and (
+                names[name] is np or not str(getattr(names[name], "__module__", "")).startswith("numpy")
+            ):
+                names[name] = in_casadi(names[name], seen)
+        for cell, original in zip(cells, thing.__closure__ or (), strict=True):
+            cell.cell_contents = in_casadi(original.cell_contents, seen)
+        return copy
+    return seen[id(thing)]
+
+
+def used(code: CodeType) -> set[str]:
+    inner = [used(part) for part in code.co_consts if isinstance(part, CodeType)]
+    return reduce(set.union, inner, set(code.co_names))
+
+
+# ---------------------------------------------------------------- definitions against what ships, and the oracle
+
+
+def shape_of(constant: Any) -> tuple[int, ...]:
+    shape: tuple[int, ...] = np.shape(constant)
+    return shape[1:] if shape[:1] == (COUNT,) else shape
+
+
+@pytest.mark.parametrize("name", DEFINED)
+def test_shipped_residuals_are_their_definitions_with_casadis_derivatives(name: str) -> None:
+    case, points, manifolds, constants = CASES[name]
+    parameters = [np.asarray(c, dtype=np.float64) for c in constants]
+    arguments: tuple[Argument, ...] = (*manifolds, *(shape_of(c) for c in constants))
+    expression = traced(DEFINED[name], arguments, name=name)
+    variables = np.ascontiguousarray(np.concatenate(points, axis=1))
+    rows = [np.broadcast_to(c, (COUNT, *shape_of(c))).reshape(COUNT, -1) for c in parameters]
+    shared = np.ascontiguousarray(np.concatenate([np.zeros((COUNT, 0)), *rows], axis=1))
+    r, J = evaluated(expression, variables, shared)
+    weights = np.random.default_rng(1).normal(size=r.shape)
+    H = curved(expression, variables, shared, weights)
+
+    assert case.jacobian is not None
+    compared(r, case.function(*points, *constants))
+    slopes = np.concatenate(case.jacobian(*points, *constants), axis=2)
+    if name in DIFFERENCED:
+        np.testing.assert_allclose(J, slopes, rtol=0, atol=1e-8 * (1.0 + np.abs(J).max()))
+    else:
+        compared(J, slopes)
+    if case.kernel is not None and case.kernel.second is not None and name not in TABLES:
+        compared(H, shipped_hessian(case, points, manifolds, parameters, weights))
+    if name not in TABLES:
+        slopes, bends = of_casadi(name, manifolds, variables, [shape_of(c) for c in constants], shared, weights)
+        compared(J, slopes)
+        compared(H, bends)
+
+
+def shipped_hessian(
+    case: Residual, points: list[Array], manifolds: list[fg.Manifold], parameters: list[Array], weights: Array
+) -> Array:
+    assert case.kernel is not None
+    variables, width = np.concatenate(points, axis=1), sum(m.dim for m in manifolds)
+    S = np.zeros((COUNT, width, width))
+    for k in range(COUNT):
+        own = [p[k] if p.shape[:1] == (COUNT,) else p for p in parameters]
+        flat = np.concatenate([np.zeros(0), *(np.ravel(p) for p in own)])[None]
+        evaluate_rows(
+            case.kernel.second_address, variables[k : k + 1].copy(), flat, case.kernel.table, weights[k : k + 1].copy(),
+            S[k : k + 1],
+        )  # fmt: skip
+    return S
+
+
+def of_casadi(
+    name: str, manifolds: list[Any], variables: Array, shapes: list[tuple[int, ...]], shared: Array, weights: Array
+) -> tuple[Array, Array]:
+    v, p = ca.SX.sym("v", variables.shape[1]), ca.SX.sym("p", shared.shape[1])
+    d, w = ca.SX.sym("d", sum(m.dim for m in manifolds)), ca.SX.sym("w", weights.shape[1])
+
+    def take(symbol: Any, start: int, size: int) -> Any:
+        return np.array([symbol[start + k] for k in range(size)], dtype=object).view(Open)
+
+    given, stored, moved = [], 0, 0
+    for manifold in manifolds:
+        group = theirs(manifold)
+        point, along = take(v, stored, manifold.storage), take(d, moved, manifold.dim)
+        given.append(np.asarray(group.compose(point, group.exp(along, series)), dtype=object)[None].view(Open))
+        stored, moved = stored + manifold.storage, moved + manifold.dim
+    at = 0
+    for shape in shapes:
+        given.append(take(p, at, math.prod(shape)).reshape(1, *shape))
+        at += math.prod(shape)
+    rows = ca.vertcat(*np.asarray(in_casadi(DEFINED[name], {})(*given), dtype=object).ravel())
+    J, H = ca.jacobian(rows, d), ca.hessian(ca.dot(w, rows), d)[0]
+    both = ca.Function("both", [v, p, w], [ca.substitute(J, d, 0 * d), ca.substitute(H, d, 0 * d)])
+    found = [[np.array(part) for part in both(*row)] for row in zip(variables, shared, weights, strict=True)]
+    return np.array([f[0] for f in found]), np.array([f[1] for f in found])
