@@ -312,6 +312,20 @@ def test_plots_draw_into_the_axes_they_get_without_global_state(log: EpisodeLog)
     assert ("matplotlib.pyplot" in sys.modules) == before
 
 
+def test_times_stand_on_a_logarithmic_axis_and_ticks_that_compiled_are_marked(log: EpisodeLog) -> None:
+    def drawn(log: EpisodeLog) -> Axes:
+        return plot_times(log, log.solve_ms, {"localise": (log.localise_ms, "estimate")})
+
+    assert drawn(log).get_yscale() == "log"
+    assert "compiled" not in [line.get_label() for line in drawn(log).get_lines()]
+    compiled = np.zeros(log.ticks, dtype=np.intp)
+    compiled[2] = 3
+    marked = replace(log, compiled=compiled)
+    (marks,) = [line for line in drawn(marked).get_lines() if line.get_label() == "compiled"]
+    np.testing.assert_array_equal(np.asarray(marks.get_xdata()), log.time[[2]])
+    np.testing.assert_array_equal(np.asarray(marks.get_ydata()), log.solve_ms[[2]])
+
+
 def test_plotted_error_is_the_error(log: EpisodeLog) -> None:
     line = plot_localisation(log).get_lines()[0]
     np.testing.assert_allclose(np.asarray(line.get_ydata()), 5.0)  # [cm]

@@ -36,7 +36,6 @@ def overview(log: EpisodeLog) -> Figure:
         plot_controls(log, ax=(panels[1], panels[2]))
         plot_clearance(log, ax=panels[3])
         plot_times(log, log.solve_ms, {"localise": (log.localise_ms, "estimate")}, ax=panels[4])
-        panels[4].set_ylim(0.0, 1.25 * float(np.max(log.solve_ms)) + 1e-9)
         panels[-1].set_xlabel("time [s]")
         right.align_ylabels(panels)
         headline(figure, _title(log))

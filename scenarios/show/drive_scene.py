@@ -174,6 +174,7 @@ def _page(log: EpisodeLog, ticks: IntArray) -> Page:
             Readout("goal", [f"{goal + 1} of {len(log.goals)}" for goal in log.goal_index[ticks]]),
             Readout("localisation error", [f"{100 * e:.1f} cm" for e in error[ticks]]),
             Readout("clearance", [f"{c:.2f} m" if np.isfinite(c) else "\u2013" for c in log.clearance[ticks]]),
+            Readout("localise, plan", _times(log, ticks), (log.compiled[ticks] > 0).tolist()),
             Readout(
                 "plan",
                 [log.status[k].replace("_", " ") + (": stored one driven" if log.emergency[k] else "") for k in ticks],
@@ -186,3 +187,11 @@ def _page(log: EpisodeLog, ticks: IntArray) -> Page:
         ],
         speeds=(1, 2, 4, 8),
     )
+
+
+def _times(log: EpisodeLog, ticks: IntArray) -> list[str]:
+    """What both took in each tick, and whether that is more than their work."""
+    return [
+        f"{log.localise_ms[k]:.1f} ms, {log.plan_ms[k]:.1f} ms" + (" (compiled)" if log.compiled[k] else "")
+        for k in ticks
+    ]

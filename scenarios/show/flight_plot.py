@@ -126,7 +126,6 @@ def control(log: FlightLog) -> Figure:
             parts = {"plan": (log.plan_ms, "horizon"), "estimate": (log.estimate_ms, "estimate")}
             ax = plot_times(log, total, parts, ax=others[3])
             ax.axhline(1e3 * log.dt, color=css("moving"), lw=1.1, label="control period")
-            ax.set_yscale("log")
             ax.legend(loc="upper right", ncols=4, markerscale=3, borderpad=0.0)
         for part, axes in ((left, panels), (right, others)):
             axes[-1].set_xlabel("time [s]")

@@ -303,7 +303,9 @@ def _readouts(log: FlightLog, ticks: IntArray) -> list[Readout]:
         rows.append(Readout("landmarks", [str(len(log.landmarks[tick].ids)) for tick in ticks]))
     if (log.estimate_ms + log.plan_ms).max() > 0.0:
         spent = zip(texts(log.estimate_ms, "{:.1f} ms"), texts(log.plan_ms, "{:.1f} ms"), strict=True)
-        rows.append(Readout("estimate, plan", [f"{estimate}, {plan}" for estimate, plan in spent]))
+        new = log.compiled[ticks] > 0
+        spent_in = [f"{e}, {p}{' (compiled)' * bool(c)}" for (e, p), c in zip(spent, new, strict=True)]
+        rows.append(Readout("estimate, plan", spent_in, new.tolist()))
     plans = [log.statuses[k].lower() + (": stored one flown" if log.emergency[k] else "") for k in ticks]
     return [*rows, Readout("plan", plans, log.emergency[ticks].tolist())]
 

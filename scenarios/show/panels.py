@@ -12,7 +12,7 @@ import numpy as np
 
 from unifg.answers.history import Iteration
 from unifg.scenarios.show.style import GREY, css, new_axes
-from unifg.typing import Array, ArrayLike, BoolArray
+from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,6 +47,7 @@ class Timed(Protocol):
     dt: float
     clearance: Array
     emergency: BoolArray
+    compiled: IntArray
 
 
 def face(ax: Axes, title: str, y: str = "", x: str = "") -> Axes:
@@ -91,7 +92,9 @@ def plot_clearance(log: Timed, ax: Axes | None = None) -> Axes:
 
 
 def plot_times(log: Timed, total: Array, parts: Mapping[str, tuple[Array, str]], ax: Axes | None = None) -> Axes:
-    """Time spent in each tick, in all and on each part [ms].
+    """Time spent in each tick, in all and on each part [ms], on a logarithmic axis.
+
+    Ticks in which something was compiled, or read from the disk, are marked: their time is not that of the others.
 
     Args:
         log: the run.
@@ -104,8 +107,12 @@ def plot_times(log: Timed, total: Array, parts: Mapping[str, tuple[Array, str]],
         if (values > 0.0).any():
             spent = np.where(values > 0.0, values, np.nan)
             ax.plot(log.time, spent, ".", color=css(colour), ms=3.6 if values is total else 2.4, label=name)
+    new = (log.compiled > 0) & (total > 0.0)
+    if new.any():
+        ax.plot(log.time[new], total[new], "o", mfc="none", mec=css("moving"), ms=8.0, label="compiled")
     p50, p99 = np.percentile(total, [50.0, 99.0])
     dashes(ax, (p50, p99), 0.9)
+    ax.set_yscale("log")
     ax.legend(loc="upper right", ncols=4, markerscale=3, borderpad=0.0)
     return over_time(log, ax, f"Time per tick: median {p50:.1f} ms, 99 % within {p99:.0f} ms", "time [ms]")
 
