@@ -21,6 +21,7 @@ from unifg.kernels.batched import Batched, changes
 from unifg.kernels.derive.derived import DerivedKernel, Each, Fixed, Given, Shared, derived, in_python
 from unifg.kernels.derive.reach import Reach, reach_of
 from unifg.kernels.derive.symbols import TraceError
+from unifg.kernels.steps import ANGLE, OTHER, TURN, parts_of
 from unifg.language.variables import Data, Selection
 from unifg.lie import Manifold
 from unifg.typing import Array, BoolArray, IntArray
@@ -119,7 +120,7 @@ class Batch:
         result = []
         for manifold, point, shared in zip(self.manifolds, points, self.shared, strict=True):
             step = rng.uniform(-far, far, (1 if shared else self.count, manifold.dim))
-            result.append(manifold.retract(np.array(point), np.broadcast_to(step, (self.count, manifold.dim))))
+            result.append(_moved(manifold, point, np.broadcast_to(step, (self.count, manifold.dim))))
         return result
 
 
@@ -356,6 +357,24 @@ def _given(batch: Batch, place: int, each: bool, fixed: bool) -> Given:
     if isinstance(value, float | np.floating | np.ndarray) and kind is not None and kind.kind == "f" and not fixed:
         return Shared(shape)
     return Fixed(value, reach_of_value(value))
+
+
+def _moved(manifold: Manifold, point: Array, step: Array) -> Array:
+    """Elements about as far from others as the step says, without compiled functions that would have to be loaded."""
+    moved = np.array(point)
+    for part, leaf in parts_of(manifold):
+        here = moved[:, part.start : part.start + part.storage]
+        along = step[:, part.column : part.column + part.dim]
+        if part.kind == OTHER:
+            here[:] = leaf.retract(here, along)
+        elif part.kind == TURN:
+            here[:, 1:] += 0.5 * along
+            here *= np.where(here[:, :1] < 0.0, -1.0, 1.0) / np.sqrt((here**2).sum(axis=1, keepdims=True))
+        else:
+            here += along
+            if part.kind == ANGLE:
+                here -= 2.0 * np.pi * np.rint(here / (2.0 * np.pi))
+    return moved
 
 
 def _contents(arrays: Sequence[Array]) -> Contents:
