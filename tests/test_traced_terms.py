@@ -95,6 +95,34 @@ def test_an_element_of_a_group_may_be_a_constant() -> None:
     np.testing.assert_allclose(found, np.tile(pose, (N, 1)), atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "length",
+    [
+        lambda x: np.linalg.norm(x, axis=1, keepdims=True),
+        lambda x: np.sqrt((x**2).sum(axis=1, keepdims=True)),
+        lambda x: np.hypot(np.hypot(x[:, :1], x[:, 1:2]), x[:, 2:]),
+        lambda x: np.abs(x).sum(axis=1, keepdims=True),
+    ],
+)
+def test_a_norm_is_flat_where_it_is_zero(length: Function) -> None:
+    """Differences say so too; and guesses at rest are common."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(3), 2)
+    graph.minimize(length, x)
+    program = graph.compile()
+    lin = program.linearize(program.values_from({x: np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0]])}))
+    assert program.terms[0].route.startswith("traced")
+    expected = [1.0, 0.0, 1.0] if "abs" in length.__code__.co_names else [0.6, 0.0, 0.8]
+    np.testing.assert_allclose(lin.jacobian.reshape(2, 3), [[0.0] * 3, expected], atol=1e-15)
+    assert np.isfinite(lagrangian_hessian(program, lin, np.zeros(0))).all()
+
+
+def test_derivatives_that_do_not_exist_at_the_guess_are_left_to_differences() -> None:
+    graph, x = stated(lambda x: np.arctan2(x**3, np.abs(x) ** 3.5) * x)
+    solution = GaussNewton().solve(graph, {x: np.zeros((N, 3))})
+    assert "not finite at the guess (factor 0)" in graph.compile().terms[0].route and solution.cost == 0.0
+
+
 def test_lambdas_made_in_a_loop_keep_what_they_mean() -> None:
     """All of them mean the last number, as anywhere in Python, unless it is a default."""
     graph = fg.Graph()

@@ -253,10 +253,28 @@ class CompiledTerm:
         if self.trace is None:
             return True
         points = self.points(values)
-        if self.trace.agrees(self._batch, points):
+        if not self.trace.agrees(self._batch, points):
+            self._leave(reason(self._batch, points))
+            return False
+        if (index := self._undefined(points)) is None:
             return True
-        self._leave(reason(self._batch, points))
+        self._leave(f"its derivatives are not finite at the guess (factor {index}), where those by differences are")
         return False
+
+    def _undefined(self, points: list[Array]) -> int | None:
+        """The first active factor whose exact derivatives are not finite though differences are; None for none."""
+        assert self.trace is not None
+        with np.errstate(all="ignore"):
+            exact = np.concatenate(self.trace.kernel.jacobian(*self._for_kernel(points)), axis=2)
+            wrong = ~np.isfinite(self._masked(exact)).all(axis=(1, 2))
+            if not wrong.any() or self.term.residual.rows:
+                return None
+            if isinstance(self.term, ScalarCost):
+                found = scalar_slopes(self._batched, self._directions, points)[0]
+            else:
+                found = np.concatenate(slopes(self._batched, self._directions, points), axis=2)
+            wrong &= np.isfinite(found.reshape(self.count, -1)).all(axis=1)
+        return int(np.argmax(wrong)) if wrong.any() else None
 
     def trace_again(self, values: Values) -> bool:
         """Trace a function anew that reads something else than before; whether the term has a trace still.

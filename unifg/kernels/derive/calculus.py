@@ -290,11 +290,19 @@ def _vanishing_length(tape: Tape, i: int) -> tuple[float, int] | None:
     return (scale * scale, tape.a[i]) if node == still.zero else None
 
 
+def _squares(t: Tape, a: int) -> bool:
+    """Whether a node is a sum of squares: its root is a norm, whose slope at zero is taken for zero, as that of abs."""
+    if t.op[a] == Op.ADD:
+        return _squares(t, t.a[a]) and _squares(t, t.b[a])
+    return t.op[a] == Op.MULTIPLY and t.a[a] == t.b[a]
+
+
 def _slope(t: Tape, op: int, i: int, a: int) -> int:
     """Derivative of a function of one argument; ``i`` is its value."""
     one = t.one
     if op == Op.SQRT:
-        return t.divide(t.constant(0.5), i)
+        slope = t.divide(t.constant(0.5), i)
+        return t.select(t.apply(Op.EQUAL, i, t.zero), t.zero, slope) if _squares(t, a) else slope
     if op == Op.SIN:
         return t.apply(Op.COS, a)
     if op == Op.COS:
