@@ -1,6 +1,7 @@
 """Tracing on manifolds of one's own, and of functions that decide: against closed forms that are known."""
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,9 @@ from own_manifolds import OWN
 from test_derive import compared, curved, evaluated, packed, points
 from unifg.kernels.derive.expression import traced
 from unifg.kernels.derive.symbols import TraceError
-from unifg.kernels.kernel import Argument
-from unifg.lie import SE2, SO2, SO3, Rn
+from unifg.kernels.kernel import Argument, evaluate_rows
+from unifg.lie import SE2, SE3, SO2, SO3, Rn
+from unifg.machine.native import Native
 from unifg.typing import Array, ArrayLike
 
 # ---------------------------------------------------------------- groups of one's own
@@ -333,3 +335,108 @@ def forked(x: Array, r: Array) -> None:
 def test_what_decides_too_often_is_said(function: Any, words: str) -> None:
     with pytest.raises(TraceError, match=rf"test_derive_manifolds\.py:\d+: decides .*{words}"):
         traced(function, (Rn(1),), rows=1)
+
+
+# ---------------------------------------------------------------- near turns of zero, half pi and pi, and far away
+
+
+def in_digits(kind: str) -> tuple[Any, Any]:
+    """Exponential and logarithm of x^-1 y of SE(2) or SE(3) in sixty digits, from lists to lists."""
+    mp = pytest.importorskip("mpmath")
+    mp.mp.dps = 60
+
+    def sines(t: Any) -> tuple[Any, Any, Any]:
+        if t == 0:
+            return mp.mpf(1), mp.mpf(1) / 2, mp.mpf(1) / 6
+        return mp.sin(t) / t, (1 - mp.cos(t)) / t**2, (t - mp.sin(t)) / t**3
+
+    def cross(a: Any, b: Any) -> Any:
+        return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+    def rotated(q: Any, p: Any) -> Any:
+        twice = [2 * c for c in cross(q[1:], p)]
+        return [a + q[0] * b + c for a, b, c in zip(p, twice, cross(q[1:], twice), strict=True)]
+
+    def product(p: Any, q: Any) -> Any:
+        inner = p[0] * q[0] - sum(a * b for a, b in zip(p[1:], q[1:], strict=True))
+        return [inner, *(p[0] * b + q[0] * a + c for a, b, c in zip(p[1:], q[1:], cross(p[1:], q[1:]), strict=True))]
+
+    def planar_retract(x: Any, d: Any) -> Any:
+        a, b, _ = sines(d[2])
+        u, v = a * d[0] - b * d[2] * d[1], b * d[2] * d[0] + a * d[1]
+        c, s = mp.cos(x[2]), mp.sin(x[2])
+        return [x[0] + c * u - s * v, x[1] + s * u + c * v, x[2] + d[2]]
+
+    def planar_local(x: Any, y: Any) -> Any:
+        t, c, s = y[2] - x[2], mp.cos(x[2]), mp.sin(x[2])
+        t -= 2 * mp.pi * mp.nint(t / (2 * mp.pi))
+        px, py = y[0] - x[0], y[1] - x[1]
+        u, v = c * px + s * py, c * py - s * px
+        k = t / 2 * mp.cot(t / 2) if t else mp.mpf(1)
+        return [k * u + t / 2 * v, k * v - t / 2 * u, t]
+
+    def spatial_retract(x: Any, d: Any) -> Any:
+        t = mp.sqrt(sum(a * a for a in d[3:]))
+        _, b, c = sines(t)
+        half, _, _ = sines(t / 2)
+        once = cross(d[3:], d[:3])
+        step = [v + b * e + c * f for v, e, f in zip(d[:3], once, cross(d[3:], once), strict=True)]
+        moved = [a + e for a, e in zip(x[:3], rotated(x[3:], step), strict=True)]
+        return [*moved, *product(x[3:], [mp.cos(t / 2), *(half * a / 2 for a in d[3:])])]
+
+    def spatial_local(x: Any, y: Any) -> Any:
+        back = [x[3], -x[4], -x[5], -x[6]]
+        p, q = rotated(back, [b - a for a, b in zip(x[:3], y[:3], strict=True)]), product(back, y[3:])
+        q = [-a for a in q] if q[0] < 0 else q
+        n = mp.sqrt(sum(a * a for a in q[1:]))
+        w = [2 * (mp.atan2(n, q[0]) / n if n else 1 / q[0]) * a for a in q[1:]]
+        t = mp.sqrt(sum(a * a for a in w))
+        k = (1 - t / 2 * mp.cot(t / 2)) / t**2 if t else mp.mpf(1) / 12
+        once = cross(w, p)
+        return [*(a - b / 2 + k * c for a, b, c in zip(p, once, cross(w, once), strict=True)), *w]
+
+    return (planar_retract, planar_local) if kind == "SE2" else (spatial_retract, spatial_local)
+
+
+@cache
+def local_code(group: Any) -> tuple[Native, Native]:
+    expression = traced(lambda x, y: group.local(x, y), (group, group))
+    return expression.residual(), expression.second()
+
+
+@pytest.mark.parametrize("far", [0.0, 1e6])
+@pytest.mark.parametrize("turn", [0.0, 1e-9, 1e-4, 0.3, 0.4999, 0.5001, np.pi / 2, np.pi - 1e-2, np.pi - 1e-5])
+@pytest.mark.parametrize("group", [SE2, SE3], ids=["SE2", "SE3"])
+def test_derivatives_keep_their_digits(group: Any, turn: float, far: float) -> None:
+    """First and second derivatives of Log(x^-1 y) against differences in sixty digits along one direction."""
+    mp = pytest.importorskip("mpmath")
+    retract, local = in_digits(group.name)
+    rng = np.random.default_rng(2)
+    x = group.random(rng)
+    d = rng.normal(size=group.dim)
+    axis = d[group.dim // 2 :] if group.dim == 6 else d[2:]
+    axis *= turn / np.linalg.norm(axis)
+    x[: 2 if group.dim == 3 else 3] += far
+    y = group.retract(x, d)
+    if group.dim == 6:  # of unit length in sixty digits too, or the oracle leaves the group
+        x[3:] /= np.linalg.norm(x[3:])
+    w, along = rng.normal(size=group.dim), rng.normal(size=2 * group.dim)
+    variables, nothing = np.concatenate([x, y])[None], np.zeros((1, 0))
+    r, J, S = np.empty((1, group.dim)), np.empty((1, group.dim, 2 * group.dim)), np.empty((1, *[2 * group.dim] * 2))
+    first, second = local_code(group)
+    evaluate_rows(first.address, variables, nothing, nothing[0], r, J)
+    evaluate_rows(second.address, variables, nothing, nothing[0], w[None], S)
+
+    h = mp.mpf(10) ** -18
+    exact = [[mp.mpf(float(a)) for a in part] for part in (x, y)]
+    steps = [[mp.mpf(float(a)) for a in part] for part in np.split(along, 2)]
+
+    def at(t: Any) -> Any:
+        moved = [retract(p, [t * a for a in step]) for p, step in zip(exact, steps, strict=True)]
+        return sum(mp.mpf(float(a)) * b for a, b in zip(w, local(*moved), strict=True))
+
+    middle, ahead, behind = at(mp.mpf(0)), at(h), at(-h)
+    size = 1.0 + float(np.abs(S).max())
+    assert abs(w @ r[0] - float(middle)) < 1e-12 * (1.0 + abs(float(middle)))
+    assert abs(w @ J[0] @ along - float((ahead - behind) / (2 * h))) < 1e-12 * size
+    assert abs(along @ S[0] @ along - float((ahead - 2 * middle + behind) / (h * h))) < 1e-11 * size
