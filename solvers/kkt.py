@@ -103,7 +103,8 @@ class KKT(Solver):
             found = workspace.step(run.lin, run.multipliers, damping, slackness)
             if found is None and self.full_steps:
                 return settle(run, Status.SINGULAR)
-            taken = None if found is None else self._search(run, workspace, merit, *found)
+            # Damping tells of steps that were shortened: without it the full one will probably be taken.
+            taken = None if found is None else self._search(run, workspace, merit, *found, hopeful=damping == 0.0)
             if (taken is None or slackness) and run.infeasible_stationary():
                 if (ending := leave(run)) is not None:
                     return ending
@@ -179,7 +180,7 @@ class KKT(Solver):
         return None
 
     def _search(
-        self, run: SolveState, workspace: Newton, merit: OnePrice, step: Array, change: Array
+        self, run: SolveState, workspace: Newton, merit: OnePrice, step: Array, change: Array, hopeful: bool
     ) -> tuple[Linearization, Array, Array, float, bool] | None:
         """New linearisation, step and change of multipliers as taken, length, whether corrected; None for no step."""
         program, lin = run.program, run.lin
@@ -196,7 +197,7 @@ class KKT(Solver):
             return workspace.resolve(lin, run.multipliers, bend)
 
         wanted = correct if self.second_order_correction else None
-        found = search(lin, step, merit, here, slope, slack, linear, wanted)
+        found = search(lin, step, merit, here, slope, slack, linear, wanted, eager=hopeful)
         if found is None:
             return None
         change = found.length * change if found.dual is None else found.dual

@@ -10,8 +10,10 @@ import pytest
 
 import unifg as fg
 from judge import judge
+from problems.control import Unicycle
 from problems.known import STARTS, ecg2o, pose_chain, short_drive, three_variable_qp
 from unifg.models import unicycle
+from unifg.program.program import Program
 from unifg.solvers import KKT, SQP
 from unifg.typing import Array
 
@@ -343,3 +345,18 @@ def test_words_that_make_no_sense_are_refused() -> None:
         KKT(globalization="filter")  # type: ignore[arg-type]
     with pytest.raises(fg.BackendError, match="choose one"):
         KKT(full_steps=True, globalization="levenberg-marquardt")
+
+
+def test_a_full_step_that_will_probably_be_taken_is_linearised_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is not evaluated before, unless steps have been shortened of late."""
+    stated = Unicycle("straight", False, 20).formulation()
+    graph = fg.Graph()
+    x, u = graph.variables("x", fg.SE2, 21), graph.variables("u", fg.Rn(2), 20)
+    graph.fix(x[0], [0.0, 0.5, -0.4])
+    reference, cruise = stated.problem.reference()
+    graph.minimize(unicycle.tracking, x, reference, sigma=1.0)
+    graph.minimize(fg.prior, u, cruise, sigma=1.0)
+    graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], 0.1, lower=0.0, upper=0.0)
+    monkeypatch.setattr(Program, "evaluate", None)
+    solution = KKT().solve(graph, {x: reference, u: cruise}, check=True)
+    assert all(row.step_length == 1.0 for row in solution.history[1:]) and solution.iterations > 2
