@@ -103,6 +103,14 @@ def test_a_default_may_be_changed_in_place_or_replaced() -> None:
     np.testing.assert_allclose(run.solve(stated.guess)[stated.x[1]][0], [1.0, 1.0], atol=1e-6)
 
 
+def test_a_default_of_another_shape_is_refused() -> None:
+    stated = Stated()
+    run = InteriorPoint().prepare(stated.graph)
+    stated.wanted.value = np.zeros(2)  # would fit by broadcasting
+    with pytest.raises(fg.GraphError, match="'wanted' has a default of shape"):
+        run.solve(stated.guess)
+
+
 def test_a_refused_datum_changes_nothing_and_is_named() -> None:
     stated = Stated()
     run = InteriorPoint(tolerance=1e-9).prepare(stated.graph)

@@ -85,6 +85,11 @@ class Binding:
                 slot[...] = handle.check(value)
         for handle, slot in slots.items():
             if handle not in data:
+                if handle.value.shape != slot.shape:
+                    raise GraphError(
+                        f"data '{handle.name}' has a default of shape {handle.value.shape} now, but the graph was "
+                        f"compiled for {slot.shape}: declare new data"
+                    )
                 slot[...] = handle.value
         flags = {handle: handle.check(data.get(handle, handle.value)) for handle in self._flags}
         count = _renew(
