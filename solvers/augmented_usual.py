@@ -17,7 +17,7 @@ from unifg.elimination.plan import Plan
 from unifg.machine.jit import compiled
 from unifg.machine.links import NOTHING, NUMBER, link_like, number, run
 from unifg.program.columns import Values
-from unifg.program.curvature import add_curvature
+from unifg.program.curvature import add_curvature, add_losses
 from unifg.program.linearization import Linearization, all_finite
 from unifg.program.passes import linearize, times
 from unifg.program.program import Program
@@ -28,7 +28,7 @@ from unifg.solvers.augmented_step import ROUNDING, WELL, minimize
 from unifg.solvers.globalize.damping import SUFFICIENT, Damping, gain
 from unifg.typing import Array, BoolArray, IntArray
 
-(BARRIER, CURVE, LINEARIZE, MINIMIZE, RETRACT, SLOPE, TIMES, UPDATE, LINKS) = range(9)
+(BARRIER, CURVE, WEIGH, LINEARIZE, MINIMIZE, RETRACT, SLOPE, TIMES, UPDATE, LINKS) = range(10)
 (COST, DAMPING, GOAL, UNIT, PREDICTED, ACTUAL, SLACK, STEEP, NUMBERS) = range(9)
 UNUSUAL, EXPECTED, FIRST_ORDER = range(3)
 
@@ -69,6 +69,8 @@ class Point(NamedTuple):
     constraint_jacobian: Array
     gradient: Array
     hessian: Array
+    squares: Array
+    weights: Array
 
 
 class Work(NamedTuple):
@@ -124,13 +126,13 @@ class UsualPrimal(Primal):
     """The augmented objective, with usual iterations on it.
 
     Attributes:
-        fast: whether compiled code can do without Python, and without weights that a trial must hold.
+        fast: whether compiled code can do without Python.
     """
 
     def __init__(self, program: Program) -> None:
         """Make room."""
         super().__init__(program)
-        self.fast = program.fully_compiled and program.table.weights == 0
+        self.fast = program.fully_compiled
         self._bend = np.empty(program.normal.nnz)
         self._step, self._spread = np.empty(program.size), np.zeros(program.columns.width)
         self._rows = [np.empty(program.constraints.count) for _ in range(3)]
@@ -155,7 +157,8 @@ class UsualPrimal(Primal):
             return None
         program = self.program
         values = Values(program.columns, lin.values.flat.copy())
-        here, there = _point(lin), Point(values.flat, *program.buffers.take())
+        robust = np.empty((2, program.table.weights))
+        here, there = _point(lin), Point(values.flat, *program.buffers.take(), *robust)
         numbers = np.empty(NUMBERS)
         unit = 0.0 if program.least_squares else 1.0
         numbers[COST], numbers[DAMPING], numbers[GOAL], numbers[UNIT] = lin.cost, damping.value, goal, unit
@@ -186,25 +189,30 @@ class UsualPrimal(Primal):
         damping.share = 1.0
         damping.accept(min(gained, 1.0))
         damping.base = lin.constraints
-        reached = Linearization(values, numbers[COST], *there[1:], program.norms(self._norms))
+        norms = program.norms(self._norms)
+        reached = Linearization(values, numbers[COST], *there[1:7], norms, there.weights, squares=there.squares)
         return Taken(reached, self._step, expected, expected if how == EXPECTED else plus, slope)
 
 
 def _point(lin: Linearization) -> Point:
     return Point(
-        lin.values.flat, lin.residual, lin.jacobian, lin.constraints, lin.constraint_jacobian, lin.gradient, lin.hessian
-    )
+        lin.values.flat, lin.residual, lin.jacobian, lin.constraints, lin.constraint_jacobian, lin.gradient,
+        lin.hessian, lin.squares, lin.weights,
+    )  # fmt: skip
 
 
 def _addresses(problem: Problem, here: Point, work: Work) -> IntArray:
     """Compile what an iteration calls, for arrays like these, and say where it stands."""
-    terms, rows, none = problem.terms, here.constraints, problem.none
+    terms, rows = problem.terms, here.constraints
     links = np.zeros(LINKS, dtype=np.int64)
     links[BARRIER] = link_like(barrier, NUMBER, rows, rows, rows, rows, rows)
-    links[CURVE] = link_like(add_curvature, NOTHING, terms, here.values, here.residual, none, rows, work.bend)
+    links[CURVE] = link_like(add_curvature, NOTHING, terms, here.values, here.residual, here.weights, rows, work.bend)
+    links[WEIGH] = link_like(
+        add_losses, NOTHING, terms, here.residual, here.jacobian, here.squares, here.weights, work.bend
+    )
     links[LINEARIZE] = link_like(
         linearize, NUMBER, terms, here.values, False, here.residual, here.jacobian, rows, here.constraint_jacobian,
-        none, none, work.norms, here.gradient, here.hessian, problem.scratch,
+        here.squares, here.weights, work.norms, here.gradient, here.hessian, problem.scratch,
     )  # fmt: skip
     links[MINIMIZE] = link_like(
         minimize, NUMBER, terms, problem.plan, problem.free, problem.indptr, problem.indices, problem.equality,
@@ -230,7 +238,9 @@ def usual_iteration(links: IntArray, problem: Problem, here: Point, there: Point
     if len(work.bent_by):
         for k in range(len(bend)):
             bend[k] = here.hessian[k]
-        run(links[CURVE], (terms, here.values, here.residual, problem.none, work.bent_by, bend))
+        run(links[CURVE], (terms, here.values, here.residual, here.weights, work.bent_by, bend))
+        if len(here.weights):
+            run(links[WEIGH], (terms, here.residual, here.jacobian, here.squares, here.weights, bend))
     total, curved = 0.0, False
     for k in range(len(bend) if len(work.bent_by) else 0):
         bend[k] -= here.hessian[k]
@@ -261,7 +271,7 @@ def usual_iteration(links: IntArray, problem: Problem, here: Point, there: Point
         links[LINEARIZE],
         (
             terms, there.values, False, there.residual, there.jacobian, there.constraints, there.constraint_jacobian,
-            problem.none, problem.none, work.norms, there.gradient, there.hessian, problem.scratch,
+            there.squares, there.weights, work.norms, there.gradient, there.hessian, problem.scratch,
         ),
     )  # fmt: skip
     finite = math.isfinite(cost) and all_finite(there.gradient) and all_finite(there.constraints)

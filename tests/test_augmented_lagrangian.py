@@ -410,12 +410,12 @@ def test_fixed_variables_stay_and_limits_may_change_in_kind(monkeypatch: pytest.
         np.testing.assert_allclose(turns[:, 0], limits[0], atol=1e-5)
 
 
-@pytest.mark.parametrize("what", ["robust", "numpy"])
+@pytest.mark.parametrize("what", ["loss of one's own", "numpy"])
 def test_what_compiled_code_does_not_know_is_not_asked_of_it(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
     graph, guess = short_drive()
     x = graph.families["x"]
-    if what == "robust":
-        graph.minimize(fg.prior, x[0], [0.0, 0.0, 0.0], sigma=1.0, robust=fg.Huber(1.0), name="anchor")
+    if what != "numpy":
+        graph.minimize(fg.prior, x[0], [0.0, 0.0, 0.0], sigma=1.0, robust=fg.Reweighted(np.ones_like), name="anchor")
     else:
         own = fg.residual(lambda v: np.tanh(v[:, :1]), derivatives="differences")
         graph.minimize(own, x[0], sigma=1.0, name="anchor")
