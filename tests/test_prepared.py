@@ -6,8 +6,12 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+import unifg as fg
+from unifg.solvers import GaussNewton
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 
@@ -75,6 +79,24 @@ with counting() as new:
     log = run.run(progress)
 print(json.dumps([int(log.emergency.sum()), log.compiled.tolist(), new.compiled, new.generated, new.read]))
 """
+
+
+class Particular(GaussNewton):
+    """A backend of one's own that takes nothing but the graph it was made for."""
+
+    def iterate(self, run: Any, workspace: Any) -> Any:
+        """Refuse graphs of several variables."""
+        if run.program.size > 1:
+            raise ValueError("one variable, please")
+        return super().iterate(run, workspace)
+
+
+def test_a_rehearsal_that_fails_fails_nothing() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [2.0], sigma=1.0)
+    solution = Particular().prepare(graph).solve({x: [[0.0]]})
+    assert solution.converged and solution[x][0, 0] == pytest.approx(2.0)
 
 
 def said(source: str, *words: str) -> object:

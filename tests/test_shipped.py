@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import importlib.util
 import logging
+import os
 import sys
 import zipfile
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from unifg.errors import UnifgError
 from unifg.machine import shipped, tally
 from unifg.machine.jit import compiled, in_order
 from unifg.machine.tally import Tally, counting
@@ -51,8 +53,9 @@ def forgotten() -> Iterator[None]:
 def archive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Of the function ``twice``, made in another folder, in the place of the library's own."""
     path = tmp_path / "kernels.zip"
+    there = module(tmp_path / "there" / "doubling.py", SOURCE)
     with shipped.recording() as recorder:
-        assert compiled(module(tmp_path / "there" / "doubling.py", SOURCE).twice)(3.0) == 6.0
+        assert compiled(there.twice)(3.0) == 6.0
     recorder.write(path, tmp_path)
     monkeypatch.setattr(shipped, "ARCHIVE", path)
     shipped.archive.cache_clear()
@@ -116,6 +119,16 @@ def test_an_archive_names_the_files_that_have_changed_since(archive: Path, tmp_p
     assert shipped.outdated(tmp_path, archive) == ["there/doubling.py"]
     (tmp_path / "there" / "doubling.py").unlink()
     assert shipped.outdated(tmp_path, archive) == ["there/doubling.py"]
+
+
+def test_no_archive_is_made_of_files_that_change_meanwhile(tmp_path: Path) -> None:
+    there = module(tmp_path / "there" / "doubling.py", SOURCE)
+    with shipped.recording() as recorder:
+        assert compiled(there.twice)(3.0) == 6.0
+    os.utime(tmp_path / "there" / "doubling.py", (2e9, 2e9))
+    with pytest.raises(UnifgError, match=r"doubling\.py was written while"):
+        recorder.write(tmp_path / "kernels.zip", tmp_path)
+    assert not (tmp_path / "kernels.zip").exists()
 
 
 def test_members_are_numbered_beyond_those_of_a_process(archive: Path) -> None:

@@ -109,7 +109,7 @@ def plot_times(log: Timed, total: Array, parts: Mapping[str, tuple[Array, str]],
             ax.plot(log.time, spent, ".", color=css(colour), ms=3.6 if values is total else 2.4, label=name)
     new = (log.compiled > 0) & (total > 0.0)
     if new.any():
-        ax.plot(log.time[new], total[new], "o", mfc="none", mec=css("moving"), ms=8.0, label="compiled")
+        ax.plot(log.time[new], total[new], "o", mfc="none", mec=css("moving"), ms=5.0, label="compiled")
     p50, p99 = np.percentile(total, [50.0, 99.0])
     dashes(ax, (p50, p99), 0.9)
     ax.set_yscale("log")

@@ -73,7 +73,8 @@ def _play(solver: Any, scene: Scene) -> None:
         again = prepared.solve(solution.shifted(*scene.guess))
         prepared.solve(scene.guess, callback=lambda row: None)
         replace(solver, max_iterations=1).bound(scene.graph).solve(again)
-    except UnifgError:  # this backend, or this installation, cannot; a real graph will hear why
+    except Exception as error:  # a backend of one's own may refuse anything; a real graph will hear why
+        logger.info("%s does not rehearse: %s", solver.name, error)
         return
     x = next(iter(scene.guess))
     questions: tuple[Callable[[], object], ...] = (

@@ -15,8 +15,10 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import os
 import pickle
 import sys
+import time
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,6 +31,8 @@ from llvmlite import binding as llvm
 from numba.core.bytecode import FunctionIdentity
 from numba.core.registry import cpu_target
 from numba.core.serialize import dumps
+
+from unifg.errors import UnifgError
 
 logger = logging.getLogger("unifg")
 
@@ -128,6 +132,7 @@ class Recorder:
         """Nothing has been compiled."""
         self.members: dict[str, bytes] = {}
         self.sources: set[str] = set()
+        self._began = time.time()
 
     def keep(self, key: str, source: str, result: Any, reduced: tuple[Any, ...]) -> None:
         """Add a function: its key, its file, what Numba made of it, and what the cache keeps of that."""
@@ -141,7 +146,13 @@ class Recorder:
         Args:
             path: of the file.
             root: folder of the library; functions of other files are left out of the list of sources.
+
+        Raises:
+            UnifgError: a file was written meanwhile: what was compiled of it may be found under what stands there now.
         """
+        changed = [source for source in self.sources if os.path.getmtime(source) > self._began]
+        if changed:
+            raise UnifgError(f"{min(changed)} was written while it was compiled: begin again")
         inside = sorted(Path(source) for source in self.sources if Path(source).is_relative_to(root))
         about = {
             "versions": versions(),
