@@ -459,6 +459,29 @@ def test_what_cannot_be_traced_is_said(function: Function, words: str) -> None:
         traced(function, (Rn(3),))
 
 
+class Gain:
+    """A method, and names that only what stands inside a function looks up."""
+
+    def __init__(self, gain: float) -> None:
+        self.gain = gain
+
+    def turned(self, x: Array) -> Any:
+        def column(k: int) -> Any:
+            filled = np.zeros((len(x), 2))
+            filled[:, 0] = self.gain * x[:, k]
+            return fg.SE2.act(np.array([1.0, 2.0, 0.3]), filled)[:, 1]
+
+        return np.stack([column(k) for k in range(2)] + [fg.SO2.log(x[:, k : k + 1])[:, 0] for k in range(2)], axis=1)
+
+
+def test_names_inside_functions_inside_methods() -> None:
+    function, x = Gain(3.0).turned, np.array([[0.3, -2.0]])
+    r, J = evaluated(traced(function, (Rn(2),)), x, np.zeros((1, 0)))
+    np.testing.assert_allclose(r, function(x), rtol=0, atol=1e-15)
+    slope = 3.0 * math.sin(0.3)
+    np.testing.assert_allclose(J, [[[slope, 0.0], [0.0, slope], [1.0, 0.0], [0.0, 1.0]]], rtol=0, atol=1e-15)
+
+
 def test_functions_without_a_file() -> None:
     names: dict[str, Any] = {"np": np}
     exec("def f(x):\n    return np.sin(x)\ndef g(x):\n    y = x\n    return y if y[0, 0] > 0 else -y", names)

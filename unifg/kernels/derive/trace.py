@@ -13,7 +13,7 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
-from types import CellType, FunctionType, ModuleType
+from types import CellType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -109,6 +109,8 @@ class Rebound:
             return self.function(thing)
         if isinstance(thing, partial):
             return partial(self.callable(thing.func), *thing.args, **thing.keywords)
+        if isinstance(thing, MethodType) and isinstance(thing.__func__, FunctionType):
+            return MethodType(self.function(thing.__func__), thing.__self__)
         return thing
 
     def function(self, function: Any) -> Any:
@@ -129,7 +131,7 @@ class Rebound:
                 cell.cell_contents = self.thing(original.cell_contents)
             except ValueError:  # not assigned yet
                 continue
-        for name in python.__code__.co_names:
+        for name in _names_of(python.__code__):
             if name in python.__globals__:
                 names[name] = self.thing(python.__globals__[name])
         return copy
@@ -157,9 +159,15 @@ class Rebound:
         if isinstance(thing, FunctionType):
             module = str(thing.__module__ or "")
             return thing if module.partition(".")[0] == "numpy" else self.function(thing)
-        if isinstance(thing, partial):
+        if isinstance(thing, partial | MethodType):
             return self.callable(thing)
-        return CONSTRUCTORS.get(_identity(thing), thing) if callable(thing) else thing
+        return CONSTRUCTORS.get(id(thing), thing) if callable(thing) else thing
+
+
+def _names_of(code: CodeType) -> set[str]:
+    """Names that a function looks up, and that functions and comprehensions inside it do."""
+    inner = (_names_of(part) for part in code.co_consts if isinstance(part, CodeType))
+    return set(code.co_names).union(*inner)
 
 
 class _Names(dict[str, Any]):
@@ -178,10 +186,6 @@ class _Names(dict[str, Any]):
 
 def _wrapped(angle: Any) -> Any:
     return wrap(angle) if isinstance(angle, Symbol | float) else wrapped(np.frompyfunc(wrap, 1, 1)(plain(angle)))
-
-
-def _identity(thing: Any) -> int:
-    return id(thing)
 
 
 def _greatest(*values: Any, **options: Any) -> Any:
