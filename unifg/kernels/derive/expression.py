@@ -11,8 +11,8 @@ import numpy as np
 
 from unifg.kernels.derive.calculus import bent, hessian, jacobian
 from unifg.kernels.derive.emit import residual_code, second_code
+from unifg.kernels.derive.manifolds import moved
 from unifg.kernels.derive.operations import Op
-from unifg.kernels.derive.symbolic import moved
 from unifg.kernels.derive.symbols import Symbol, TraceError, node_of, symbols
 from unifg.kernels.derive.tape import Tape
 from unifg.kernels.derive.trace import Rebound, run

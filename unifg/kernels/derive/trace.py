@@ -21,7 +21,7 @@ import numpy as np
 from unifg.kernels.derive.array_functions import TABLE
 from unifg.kernels.derive.branches import every_way
 from unifg.kernels.derive.groups import wrap
-from unifg.kernels.derive.symbolic import Symbolic, stated_closed
+from unifg.kernels.derive.manifolds import Symbolic, stated_closed
 from unifg.kernels.derive.symbols import (
     FUNCTIONS,
     UFUNCS,
