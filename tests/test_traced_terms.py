@@ -1,5 +1,6 @@
 """Plain functions as users write them: traced where that is right, left alone where not, never wrong in silence."""
 
+import copy
 import functools
 import logging
 import math
@@ -510,6 +511,28 @@ def test_a_kernel_is_pickled_with_its_tape() -> None:
     np.testing.assert_array_equal(copy(x, t), kernel(x, t))
     np.testing.assert_array_equal(copy.jacobian(x, t)[0], kernel.jacobian(x, t)[0])
     assert copy.address != before
+
+
+OFFSET = np.arange(3.0)
+
+
+def from_offset(x: Array) -> Array:
+    return x - GAIN * OFFSET
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda thing: pickle.loads(pickle.dumps(thing))])
+def test_programs_with_traces_are_copied(copied: Function, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What they watch is watched still; a copy in another process finds its own names."""
+    graph, x = stated(from_offset)
+    prepared = GaussNewton().prepare(graph)
+    solution = prepared.solve({x: np.zeros((N, 3))})
+    twin = copied((prepared, solution, x))
+    assert twin[1].cost == solution.cost
+    np.testing.assert_array_equal(twin[0].solve({twin[2]: np.zeros((N, 3))})[twin[2]], solution[x])
+    assert twin[0].program.terms[0].route.startswith("traced")
+    np.testing.assert_allclose(solution[x], np.tile(GAIN * OFFSET, (N, 1)), atol=1e-9)
+    monkeypatch.setitem(globals(), "GAIN", 3.0)
+    np.testing.assert_allclose(twin[0].solve({twin[2]: np.zeros((N, 3))})[twin[2]][0], 3.0 * OFFSET, atol=1e-9)
 
 
 def test_second_derivatives_wait_until_somebody_asks() -> None:

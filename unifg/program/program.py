@@ -30,7 +30,7 @@ from unifg.program.linearization import Evaluation, Linearization, Rows
 from unifg.program.retraction import Retraction
 from unifg.program.scalars import add_scalars, evaluate_scalars
 from unifg.program.systems import Systems
-from unifg.program.table import ENTRY, PARAMETER, ROW, WIDTH, TermTable
+from unifg.program.table import ENTRY, PARAMETER, ROW, WIDTH, TermArrays, TermTable
 from unifg.program.term import CompiledTerm
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
@@ -68,7 +68,6 @@ class Program:
         bound_rows: (M,) whether a row bounds an unknown itself.
         systems: the normal equations and KKT matrices, their structure found once.
         table: all terms as compiled loops take them.
-        arrays: what these need to know about the terms, with the present data.
         least_squares: whether the objective is a sum of squares, robust or not, and nothing constrains it.
         differenced: whether some derivative comes from differences, which round.
         batched: terms without a kernel, evaluated by NumPy.
@@ -96,7 +95,6 @@ class Program:
         self.normal = self._pattern(self.cost_terms + self.scalar_terms + self.constraint_terms, variable, starts)
         stacked = self.cost_terms + self.constraint_terms
         self.table = TermTable(stacked, self.scalar_terms, self.columns, self.normal)
-        self.arrays = self.table.arrays
         self.least_squares = bool(self.cost_terms) and not (self.scalar_terms or self.constraint_terms)
         self.differenced = self.table.differenced or any(term.trace is None for term in self.scalar_terms)
         self.batched = [term for term in stacked if term.kernel is None and not term.is_bound]
@@ -123,6 +121,11 @@ class Program:
         read |= {fix.value for fix in graph.fixes if isinstance(fix.value, Data)}
         self._binding, self._vetted = Binding(graph._data, filter(read.__contains__, graph._data.values())), False
         self._bind_first()
+
+    @property
+    def arrays(self) -> TermArrays:
+        """What compiled loops need to know about the terms, with the present data."""
+        return self.table.arrays
 
     @property
     def left_to_python(self) -> list[str]:

@@ -7,7 +7,7 @@ entries of the Jacobian, columns, and the places of J'J in the matrix of the nor
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -213,6 +213,16 @@ class TermTable:
         for place, pair in losses.items():
             self.arrays.parameters[place : place + 2] = pair
         locate(fields, self.arrays.columns, self.arrays.unknown, normal.indptr, normal.indices, self.arrays.positions)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """In a copy the rows of the terms are those of the copy."""
+        self.__dict__.update(state)
+        arrays = self.arrays
+        self._fields = np.concatenate([arrays.fields, arrays.scalars])
+        first = len(arrays.fields)
+        self.arrays = arrays._replace(fields=self._fields[:first], scalars=self._fields[first:])
+        for row, term in zip(self._fields, self._terms, strict=True):
+            term.place = row
 
     def renew(self, term: CompiledTerm) -> None:
         """Take the machine code of a traced term; the numbers of its parameters have not changed."""

@@ -49,10 +49,21 @@ class Reach:
     _cells: tuple[tuple[CellType, Any], ...]
     _names: tuple[tuple[dict[str, Any], str, Any], ...]
     _arrays: tuple[tuple[Array, bytes], ...]
+    _elsewhere: bool = False
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """In another process names mean what they mean there: look at everything anew."""
+        return Reach, (None, self.refusal, self.size, (), (), (), (), True)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Reach:
+        """A copy watches the same names."""
+        return self
 
     @property
     def changed(self) -> bool:
         """Whether a name means something else by now, or an array holds other numbers."""
+        if self._elsewhere:
+            return True
         for cell, value in self._cells:
             if _inside(cell) is not value:
                 return True
@@ -64,7 +75,7 @@ class Reach:
     @property
     def fixed(self) -> bool:
         """Whether there is nothing that could change."""
-        return not (self._cells or self._names or self._arrays)
+        return not (self._cells or self._names or self._arrays or self._elsewhere)
 
 
 def reach_of(function: Callable[..., Any], given: Sequence[Array] = ()) -> Reach:
