@@ -258,7 +258,7 @@ class CompiledTerm:
             return False
         if (index := self._undefined(points)) is None:
             return True
-        self._leave(f"its derivatives are not finite at the guess (factor {index}), where those by differences are")
+        self._leave(f"its derivatives are not finite at the guess (factor {index})")
         return False
 
     def _undefined(self, points: list[Array]) -> int | None:
@@ -267,8 +267,10 @@ class CompiledTerm:
         with np.errstate(all="ignore"):
             exact = np.concatenate(self.trace.kernel.jacobian(*self._for_kernel(points)), axis=2)
             wrong = ~np.isfinite(self._masked(exact)).all(axis=(1, 2))
-            if not wrong.any() or self.term.residual.rows:
+            if not wrong.any():
                 return None
+            if self.term.residual.rows:  # its differences would have to be compiled to be looked at
+                return int(np.argmax(wrong))
             if isinstance(self.term, ScalarCost):
                 found = scalar_slopes(self._batched, self._directions, points)[0]
             else:

@@ -225,6 +225,12 @@ class Tape:
                 return self.select(condition, self.scaled(b, partial), c)
             if b == self.zero:
                 return self.select(condition, b, self.scaled(c, partial))
+        if self.op[partial] == Op.SELECT:
+            condition, b, c = self.a[partial], self.b[partial], self.c[partial]
+            if c == self.zero:
+                return self.select(condition, self.scaled(a, b), c)
+            if b == self.zero:
+                return self.select(condition, b, self.scaled(a, c))
         return self.multiply(a, partial)
 
     # ---------------------------------------------------------------- whole tapes
