@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 
 import numpy as np
 
 from unifg.errors import ModelError
-from unifg.kernels.steps import FIRST, OTHER, TURN, compiled_parts, move, rotation, step_for, step_of, to_body
-from unifg.lie import Manifold
-from unifg.lie.functions import functions_of
-from unifg.machine.calls import local_matrix, local_vector
-from unifg.machine.jit import compiled, in_order
+from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 
@@ -77,6 +73,10 @@ class CompiledField:
         ends = np.cumsum((0, *self.lengths))
         return [by_x, *(by_u[:, :, start:end] for start, end in pairwise(ends))]
 
+    def for_one(self) -> Callable[..., Array]:
+        """The field as a batched function that can be traced."""
+        return partial(_one_by_one, self.function, self.dim)
+
     def _rows(self, x: Array, inputs: Sequence[Array]) -> tuple[Array, Array]:
         """States and inputs side by side: contiguous, as many rows in both."""
         if len(inputs) != len(self.lengths):
@@ -93,6 +93,14 @@ class CompiledField:
             at += length
         states = np.broadcast_to(np.asarray(x, dtype=np.float64), (count, x.shape[1]))
         return np.ascontiguousarray(states), u
+
+
+def _one_by_one(function: Callable[..., None], dim: int, x: Array, *inputs: Array) -> Array:
+    """(n, dim) velocities, state by state."""
+    velocity = np.zeros((len(x), dim))
+    for i in range(len(x)):
+        function(x[i], np.concatenate([part[i] for part in (*inputs, np.zeros((len(x), 0)))]), velocity[i])
+    return velocity
 
 
 @cache
@@ -117,71 +125,3 @@ def _derivatives(derivative: Callable[..., None]) -> Callable[..., None]:
             derivative(x[i], u[i], by_x[i], by_u[i])
 
     return loop
-
-
-def _moving_as_one(group: Manifold) -> Callable[..., None]:
-    """Move all of a state at once, where parts of it have retractions of their own."""
-    functions = functions_of(group)
-    assert functions is not None
-    retract = functions.retract
-
-    @compiled
-    def shift(x: Array, kind: int, start: int, width: int, direction: Array, column: int, out: Array) -> None:
-        retract(x, direction, out)
-
-    return shift
-
-
-def differences(field: CompiledField, group: Manifold) -> Callable[..., None]:
-    """``dF(x, u, by_x, by_u)`` of a field by central differences.
-
-    Args:
-        field: F.
-        group: of x, with compiled functions.
-    """
-    function, dim, controls, storage = field.function, field.dim, field.controls, group.storage
-    parts = tuple(tuple(part) for part in compiled_parts([group])) or ((OTHER, 0, storage, dim, 0, -1),)
-    shift = move if parts[0][0] != OTHER else _moving_as_one(group)
-
-    @in_order
-    def derivative(x: Array, u: Array, by_x: Array, by_u: Array) -> None:
-        ahead, behind, direction = local_vector(dim), local_vector(dim), local_vector(dim)
-        moved, control, R = local_vector(storage), local_vector(controls), local_matrix(3, 3)
-        for i in range(dim):
-            direction[i] = 0.0
-        for i in range(storage):
-            moved[i] = x[i]
-        for i in range(controls):
-            control[i] = u[i]
-        for part in range(len(parts)):
-            kind, start, size, width, column, turn = parts[part]
-            for c in range(width):
-                j = column + c
-                step = step_of(x, kind, start, size, turn, c, FIRST)
-                direction[j] = step
-                shift(x, kind, start, width, direction, column, moved)
-                function(moved, control, ahead)
-                direction[j] = -step
-                shift(x, kind, start, width, direction, column, moved)
-                function(moved, control, behind)
-                direction[j] = 0.0
-                stepped = 2.0 * step if kind == TURN or kind == OTHER else (x[start + c] + step) - (x[start + c] - step)
-                for i in range(dim):
-                    by_x[i, j] = (ahead[i] - behind[i]) / stepped
-            for k in range(start, start + size):
-                moved[k] = x[k]
-            if turn >= 0:
-                rotation(x, turn, width, R)
-                to_body(R, width, by_x, dim, column)
-        for j in range(controls):
-            step = step_for(abs(u[j]), FIRST)
-            control[j] = u[j] + step
-            function(x, control, ahead)
-            control[j] = u[j] - step
-            function(x, control, behind)
-            control[j] = u[j]
-            stepped = (u[j] + step) - (u[j] - step)
-            for i in range(dim):
-                by_u[i, j] = (ahead[i] - behind[i]) / stepped
-
-    return derivative

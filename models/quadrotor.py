@@ -27,7 +27,8 @@ from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import residual
 from unifg.lie import SO3, Product, Rn
 from unifg.models import quadrotor_dynamics, quadrotor_second
-from unifg.models.quadrotor_dynamics import GRAVITY, field
+from unifg.models.quadrotor_dynamics import GRAVITY
+from unifg.models.rkmk_batch import alike
 from unifg.typing import Array, ArrayLike
 
 __all__ = [
@@ -126,6 +127,18 @@ class Parameters:
             raise ModelError(f"a quadrotor has 7 parameters, found shape {numbers.shape}")
         mass, *rest = numbers.tolist()
         return cls(mass, (rest[0], rest[1], rest[2]), (rest[3], rest[4]), rest[5])
+
+
+def field(x: Array, u: Array, w: Array, mass: Array, drag: Array, wind: Array, updraft: Array) -> Array:
+    """F, (n, 9), for :func:`unifg.models.rkmk.integrator` on :data:`STATE`; an argument with one row is shared by all.
+
+    The trapezoid made of it has the defect of :data:`disturbed_dynamics`; the other integrators are there to compare.
+    """
+    x, u, w, mass, drag, wind, updraft = alike(x, u, w, mass, drag, wind, updraft)
+    attitude, speed, up = x[:, 3:7], x[:, 7:], np.array([0.0, 0.0, 1.0])
+    force = u[:, 3:] * up - drag * SO3.act(SO3.inverse(attitude), speed)
+    acceleration = SO3.act(attitude, force) / mass - GRAVITY * up + np.concatenate([wind, updraft], axis=1) + w[:, 3:]
+    return np.concatenate([speed, u[:, :3] + w[:, :3], acceleration], axis=1)
 
 
 def step(x: ArrayLike, u: ArrayLike, dt: ArrayLike, parameters: Parameters) -> Array:

@@ -27,23 +27,28 @@ trapezoid's own error: both are of second order. All methods are exact where F d
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from functools import partial
 from typing import Literal, TypeAlias
 
 import numpy as np
 
 from unifg.errors import ModelError, UnifgError
-from unifg.kernels.kernel import Argument, Kernel
+from unifg.kernels.derive.derived import Each, Given, derived
+from unifg.kernels.derive.reach import reach_of
+from unifg.kernels.derive.symbols import TraceError
 from unifg.kernels.residuals import Residual, residual
 from unifg.lie import LieGroup, Rn
 from unifg.lie.functions import functions_of
+from unifg.machine.calls import RETRACTION, address, call_residual, call_retraction, vector
 from unifg.machine.jit import compiled
 from unifg.models.compiled_field import CompiledField
-from unifg.models.rkmk_batch import Field, FieldJacobian, StepDefect
-from unifg.models.rkmk_kernel import rollout_kernel, step_kernel
+from unifg.models.rkmk_batch import Field, FieldJacobian, StepJacobian, step_defect, travel
 from unifg.models.tableau import METHODS, Tableau
 from unifg.typing import Array, ArrayLike
 
+logger = logging.getLogger("unifg")
 Form: TypeAlias = Literal["full", "simplified"]
 Method: TypeAlias = (
     Literal[
@@ -57,7 +62,7 @@ Method: TypeAlias = (
     ]
     | Tableau
 )
-ROOM = 4  # kernels are compiled for multiples of so many stages
+FEW = 100  # steps that a simulation takes in NumPy: machine code for its step costs more
 NEWTON_STEPS = 30
 ENOUGH = 1e-13  # of the last Newton step, relative to the state: what rounding leaves
 
@@ -87,15 +92,17 @@ def integrator(
     if isinstance(field, CompiledField):
         if field.dim != group.dim:
             raise ModelError(f"{tableau.name}: the field has {field.dim} velocities, {group.name} takes {group.dim}")
-        functions = functions_of(group)
-        if functions is not None and hasattr(functions, "bend") and jacobian in (None, field.jacobian):
-            kernel = step_kernel(functions, field, group, ROOM * -(-tableau.stages // ROOM))
-            arguments: tuple[Argument, ...] = (group, *(Rn(length) for length in field.lengths), group, 0)
-            differenced = field.derivative is None
-            return residual(Kernel(kernel, arguments, group.dim, tableau.rows, tableau.name, differenced=differenced))
+        if jacobian in (None, field.jacobian):
+            step = partial(step_defect, group, field.for_one(), tableau.numbers)
+            given: list[Given] = [group, *(Rn(length) for length in field.lengths), group, Each(())]
+            try:
+                return residual(derived(step, given, reach_of(step), name=tableau.name, limit=False))
+            except TraceError as error:
+                logger.info("%s: the field is not traced: %s", tableau.name, error)
         jacobian = jacobian or (field.jacobian if field.derivative is not None else None)
-    function = StepDefect(group, field, tableau, jacobian)
-    return residual(function, function.jacobian, tableau.name)
+    blocks = StepJacobian(group, field, tableau.numbers, jacobian)
+    step = partial(step_defect, group, field, tableau.numbers)
+    return residual(step, blocks, tableau.name, derivatives="trace first")
 
 
 def trapezoid(group: LieGroup, field: Field, form: Form = "full", jacobian: FieldJacobian | None = None) -> Residual:
@@ -147,7 +154,7 @@ def advance(group: LieGroup, field: Field, x: Array, *inputs: Array, h: ArrayLik
         UnifgError: when Newton's method does not converge: the step is too long.
         ModelError: on an unknown method, or a field or inputs that do not fit.
     """
-    return _advance(group, integrator(group, field, method), _tableau(method), x, inputs, h)
+    return _advance(group, field, integrator(group, field, method), _tableau(method), x, inputs, h)
 
 
 def rollout(
@@ -176,36 +183,77 @@ def rollout(
         UnifgError: when Newton's method does not converge in a step of an implicit method.
         ModelError: on an unknown method, or a field or inputs that do not fit.
     """
-    tableau, defect = _tableau(method), integrator(group, field, method)
+    tableau = _tableau(method)
     parts = [np.atleast_2d(np.asarray(part, dtype=np.float64)) for part in inputs]
     count = max([len(part) for part in parts], default=1) if count is None else count
     parts = [np.broadcast_to(part, (count, part.shape[1])) for part in parts]
     states = np.empty((count + 1, group.storage))
     states[0] = start
-    functions = functions_of(group)
-    if isinstance(field, CompiledField) and tableau.explicit and functions is not None and defect.kernel is not None:
+    code = _stepping(group, field, tableau, states[0], parts, h / substeps) if count * substeps > FEW else None
+    if code is not None:
         u = np.concatenate([*parts, np.empty((count, 0))], axis=1)
-        if u.shape[1] != field.controls:
-            raise ModelError(f"the inputs have {u.shape[1]} numbers, the field takes {field.controls}")
-        loop = rollout_kernel(defect.kernel.function, functions, group.storage, group.dim)
-        loop(states[0].copy(), h / substeps, defect.kernel.table, u, substeps, states)
+        _follow(*code, u, h / substeps, substeps, np.empty(group.dim), states)
         return states
+    defect = integrator(group, field, method)
     for n in range(count):
         x, held = states[n : n + 1], [part[n : n + 1] for part in parts]
         for _ in range(substeps):
-            x = _advance(group, defect, tableau, x, held, h / substeps)
+            x = _advance(group, field, defect, tableau, x, held, h / substeps)
         states[n + 1] = x[0]
     return states
 
 
+def _stepping(
+    group: LieGroup, field: Field, tableau: Tableau, start: Array, inputs: Sequence[Array], h: float
+) -> tuple[int, int] | None:
+    """Machine code of an explicit step and of the group's retraction; None where there is none."""
+    functions = functions_of(group)
+    if not tableau.explicit or functions is None:
+        return None
+    step = partial(travel, group, field.for_one() if isinstance(field, CompiledField) else field, tableau.numbers)
+    first = [start[None], *(part[:1] for part in inputs), np.array([h])]
+    reach = reach_of(step)
+    if reach.refusal and not isinstance(field, CompiledField):
+        return None
+    try:
+        kernel = derived(step, [Each(part.shape[1:]) for part in first], reach, name=tableau.name)
+    except TraceError:
+        return None
+    if not np.allclose(kernel(*first), travel(group, field, tableau.numbers, *first), rtol=1e-9, atol=1e-12):
+        return None
+    return kernel.address, address(functions.retract, RETRACTION)
+
+
+@compiled
+def _follow(where: int, retraction: int, u: Array, h: float, substeps: int, moves: Array, states: Array) -> None:
+    """Take explicit steps, several for every row of the inputs."""
+    storage, inputs = states.shape[1], u.shape[1]
+    p, nothing, empty = np.empty(storage + inputs + 1), np.empty(0), np.empty((0, 0))
+    p[storage + inputs] = h
+    p[:storage] = states[0]
+    x = vector(p, 0, storage)
+    for n in range(len(u)):
+        p[storage : storage + inputs] = u[n]
+        for _ in range(substeps):
+            call_residual(where, nothing, p, nothing, moves, empty)
+            call_retraction(retraction, x, moves, x)
+        states[n + 1] = x
+
+
 def _advance(
-    group: LieGroup, defect: Residual, tableau: Tableau, x: Array, inputs: Sequence[Array], h: ArrayLike
+    group: LieGroup,
+    field: Field,
+    defect: Residual,
+    tableau: Tableau,
+    x: Array,
+    inputs: Sequence[Array],
+    h: ArrayLike,
 ) -> Array:
-    """Solve for the end of the step; from x to itself an explicit defect is -h Phi."""
+    """Solve for the end of the step."""
     count = max(len(part) for part in (x, *inputs))
     x = np.array(np.broadcast_to(x, (count, x.shape[1])), dtype=np.float64)
     if tableau.explicit:
-        return group.retract(x, -defect(x, *inputs, x, h))
+        return group.retract(x, travel(group, field, tableau.numbers, x, *inputs, h))
     assert defect.jacobian is not None
     after, value = x, defect(x, *inputs, x, h)
     for _ in range(NEWTON_STEPS):
@@ -223,24 +271,6 @@ def _advance(
 # ---------------------------------------------------------------- the unicycle
 
 
-@compiled
-def _unicycle(x: Array, u: Array, out: Array) -> None:
-    out[0] = u[0]
-    out[1] = 0.0
-    out[2] = u[1]
-
-
-@compiled
-def _unicycle_derivative(x: Array, u: Array, by_x: Array, by_u: Array) -> None:
-    for i in range(3):
-        for j in range(3):
-            by_x[i, j] = 0.0
-        by_u[i, 0] = 1.0 if i == 0 else 0.0
-        by_u[i, 1] = 1.0 if i == 2 else 0.0
-
-
-unicycle_field = CompiledField(_unicycle, 3, 2, _unicycle_derivative)
-"""F of a unicycle on SE(2), (n, 3): (v, 0, omega) for controls (n, 2) [m/s, rad/s], whatever the pose."""
-
-unicycle_field_jacobian = unicycle_field.jacobian
-"""Derivatives of :data:`unicycle_field` along the pose (n, 3, 3) and the control (n, 3, 2)."""
+def unicycle_field(x: Array, u: Array) -> Array:
+    """F of a unicycle on SE(2), (n, 3): (v, 0, omega) for controls (n, 2) [m/s, rad/s], whatever the pose."""
+    return np.stack([u[:, 0], 0.0 * u[:, 0], u[:, 1]], axis=1)

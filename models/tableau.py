@@ -83,6 +83,11 @@ class Tableau:
             result[s, 3 : 3 + s] = row
         return result
 
+    @cached_property
+    def numbers(self) -> tuple[tuple[float, ...], ...]:
+        """The same as :attr:`rows`."""
+        return tuple(map(tuple, self.rows.tolist()))
+
 
 METHODS = {
     tableau.name: tableau

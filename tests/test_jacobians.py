@@ -91,6 +91,13 @@ def accelerated(x: Array, u: Array) -> Array:
     return np.concatenate([rkmk.unicycle_field(x, x[:, 3:]), u - 0.3 * x[:, 3:] ** 2], axis=1)
 
 
+def unicycle_slopes(x: Array, u: Array) -> list[Array]:
+    """Derivatives of the field of a unicycle."""
+    by_u = np.zeros((len(x), 3, 2))
+    by_u[:, 0, 0] = by_u[:, 2, 1] = 1.0
+    return [np.zeros((len(x), 3, 3)), by_u]
+
+
 NEARBY = fg.SE2.retract(poses(), RNG.normal(size=(COUNT, 3)))
 STEP = [poses(), vectors(2), NEARBY]
 MOVING = fg.Product(pose=fg.SE2, v=fg.Rn(2))
@@ -100,7 +107,7 @@ CASES["rkmk.trapezoid, simplified"] = (
     rkmk.trapezoid(fg.SE2, current, "simplified"), STEP, [fg.SE2, fg.Rn(2), fg.SE2], [0.3],
 )  # fmt: skip
 CASES["rkmk.trapezoid, given derivative"] = (
-    rkmk.trapezoid(fg.SE2, rkmk.unicycle_field, jacobian=rkmk.unicycle_field_jacobian),
+    rkmk.trapezoid(fg.SE2, rkmk.unicycle_field, jacobian=unicycle_slopes),
     STEP, [fg.SE2, fg.Rn(2), fg.SE2], [0.3],
 )  # fmt: skip
 CASES["rkmk.trapezoid, pose and velocity"] = (
@@ -280,6 +287,7 @@ def test_models_are_kernels_unless_their_functions_are_batched() -> None:
         if name.partition(".")[0] in {module.name for module in pkgutil.iter_modules(unifg.models.__path__)}
     }
     batched = {"rkmk.trapezoid", "rkmk.trapezoid, simplified", "rkmk.trapezoid, pose and velocity"}
+    batched |= {"rkmk.trapezoid, given derivative", "rkmk.trapezoid, quadrotor"}
     batched |= {f"{robot}.dynamics" for robot in ("bicycle", "cart_pole", "manipulator")}
     assert models - set(KERNELS) == batched
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,12 @@ import pytest
 
 import unifg as fg
 from unifg.errors import GraphError
+from unifg.kernels.derive.stated import StatedKernel
 from unifg.models import quadrotor, rkmk
 from unifg.models.quadrotor import CONTROL, DRAG, GRAVITY, MASS, STATE, UPDRAFT, WIND, Parameters
 from unifg.models.rkmk import Method
+from unifg.models.rkmk_batch import step_defect
+from unifg.models.tableau import METHODS
 from unifg.solvers import GaussNewton, InteriorPoint
 from unifg.typing import Array
 
@@ -209,9 +213,14 @@ def noisy_step() -> tuple[Array, ...]:
 
 def test_the_kernel_is_the_simplified_trapezoid_of_the_field() -> None:
     given = noisy_step()
-    general = rkmk.trapezoid(STATE, quadrotor.field, "simplified")
-    assert general.kernel is not None and general.jacobian is not None
-    assert quadrotor.disturbed_dynamics.jacobian is not None
+    shipped = quadrotor.disturbed_dynamics.kernel
+    assert shipped is not None and quadrotor.disturbed_dynamics.jacobian is not None
+    step = partial(step_defect, STATE, quadrotor.field, METHODS["simplified trapezoid"].numbers)
+    general = StatedKernel(step, tuple(() if a == 0 else a for a in shipped.arguments), 9)
+    weights = RNG.normal(size=(COUNT, 9))
+    np.testing.assert_allclose(
+        shipped.second_derivatives(weights, *given, 0.2), general.second_derivatives(weights, *given, 0.2), atol=1e-11
+    )
     np.testing.assert_allclose(quadrotor.disturbed_dynamics(*given, 0.2), general(*given, 0.2), atol=1e-12)
     for own, other in zip(
         quadrotor.disturbed_dynamics.jacobian(*given, 0.2), general.jacobian(*given, 0.2), strict=True

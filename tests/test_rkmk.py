@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
@@ -90,7 +91,7 @@ def test_the_constraint_leads_to_the_exponential(form: Form) -> None:
     graph.fix(nodes[0], x[0])
     graph.fix(control, u[0])
     graph.minimize(
-        rkmk.trapezoid(fg.SE2, rkmk.unicycle_field, form, rkmk.unicycle_field_jacobian),
+        rkmk.trapezoid(fg.SE2, rkmk.unicycle_field, form),
         nodes[:-1], control, nodes[1:], h,
     )  # fmt: skip
     solution = LevenbergMarquardt(tolerance=1e-15).solve(graph, {nodes: np.tile(x, (2, 1)), control: u})
@@ -234,9 +235,10 @@ def test_compiled_fields_agree_with_batched_ones(group: fg.LieGroup, form: Form)
 
 
 def test_compiled_fields_with_derivatives_of_somebody_else_are_batched() -> None:
-    given = rkmk.trapezoid(fg.SE2, rkmk.unicycle_field, jacobian=lambda x, u: rkmk.unicycle_field_jacobian(x, u))
-    assert given.kernel is None
-    assert rkmk.trapezoid(fg.SE2, rkmk.unicycle_field, jacobian=rkmk.unicycle_field_jacobian).kernel is not None
+    field = CompiledField(spiral, 3, 1)
+    exact = rkmk.trapezoid(fg.SE2, lambda x, u: field(x, u))
+    assert rkmk.trapezoid(fg.SE2, field, jacobian=exact.jacobian).kernel is None
+    assert rkmk.trapezoid(fg.SE2, field).kernel is not None
 
 
 def test_compiled_fields_are_checked_and_pickle() -> None:
@@ -249,3 +251,57 @@ def test_compiled_fields_are_checked_and_pickle() -> None:
         field(START, CONTROL)
     copy = pickle.loads(pickle.dumps(rkmk.trapezoid(fg.SE2, rkmk.unicycle_field)))
     np.testing.assert_allclose(copy(START, CONTROL, START, 0.1), [[-0.1, 0.0, -0.08]], rtol=1e-15)
+
+
+# ---------------------------------------------------------------- traced
+
+
+def turning(x: Array, u: Array) -> Array:
+    """A field on SE(2) that depends on the pose."""
+    return np.stack([u[:, 0] * (1.2 + np.sin(x[:, 1])), 0.4 * np.cos(x[:, 2]), u[:, 0] + 0.2 * x[:, 0]], axis=1)
+
+
+class Turning:
+    """The same, of an instance: nobody traces it unasked."""
+
+    def __call__(self, x: Array, u: Array) -> Array:
+        return turning(x, u)
+
+
+@pytest.mark.parametrize(("field", "route"), [(turning, "traced, its derivatives exact"), (Turning(), "attached")])
+def test_steps_are_traced_and_differenced_where_f_cannot_be(field: Any, route: str) -> None:
+    rng = np.random.default_rng(3)
+    x, u = fg.SE2.random(rng, (5,)), rng.normal(size=(4, 1))
+    x[1] = x[0]  # where the logarithm is zero
+    graph = fg.Graph()
+    poses, controls = graph.variables("x", fg.SE2, 5), graph.variables("u", fg.Rn(1), 4)
+    defect = rkmk.integrator(fg.SE2, field, "hermite-simpson")
+    graph.minimize(defect, poses[:-1], controls, poses[1:], 0.3)
+    program = graph.compile()
+    assert route in program.terms[0].route
+    lin = program.linearize({poses: x, controls: u})
+    assert defect.jacobian is not None
+    blocks = np.concatenate(defect.jacobian(x[:-1], u, x[1:], 0.3), axis=2)
+    np.testing.assert_allclose(lin.residual.reshape(4, 3), defect(x[:-1], u, x[1:], 0.3), atol=1e-15)
+    np.testing.assert_allclose(lin.jacobian.reshape(4, 3, 7), blocks, atol=1e-9)
+
+
+def test_long_simulations_are_those_of_numpy() -> None:
+    rng = np.random.default_rng(4)
+    u = rng.normal(size=(30, 1))
+    start = np.array([1e6, -2.0, 0.4])
+    quick = rkmk.rollout(fg.SE2, turning, start, u, h=0.05, substeps=rkmk.FEW)
+    slow = rkmk.rollout(fg.SE2, Turning(), start, u, h=0.05, substeps=rkmk.FEW)
+    np.testing.assert_allclose(quick, slow, rtol=1e-13, atol=1e-9)
+
+
+def test_a_field_that_writes_outside_itself_is_run_step_by_step() -> None:
+    calls = []
+
+    def counted(x: Array, u: Array) -> Array:
+        calls.append(len(x))
+        return np.concatenate([u, 0.0 * u, u], axis=1)
+
+    u = np.ones((2, 1))
+    rkmk.rollout(fg.SE2, counted, np.zeros(3), u, h=0.01, substeps=rkmk.FEW, method="explicit euler")
+    assert calls == [1] * 2 * rkmk.FEW

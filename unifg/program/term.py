@@ -170,13 +170,15 @@ class CompiledTerm:
         if own.kernel is not None:
             return "a kernel that ships, its derivatives exact" if self.kernel is not None else _SEARCHED
         asked = own.derivatives == "trace"
-        if own.jacobian is not None and not asked:
+        if own.jacobian is not None and not asked and own.derivatives != "trace first":
             return "evaluated by Python, its derivatives attached"
         why = "it has a search Jacobian" if own.search else ""
         if own.derivatives == "differences":
             why = "as it was asked to be"
         if not why:
             self.trace, why = find(self._batch, own.function, asked)
+        if self.trace is None and own.jacobian is not None:
+            return f"evaluated by Python, its derivatives attached: {why}"
         if self.trace is None:
             return self._by_python(why)
         self.kernel, self._taken = self.trace.kernel, self.trace.taken

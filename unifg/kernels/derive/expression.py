@@ -113,7 +113,12 @@ def traced(
             point = [Symbol(tape, tape.leaf(Op.VARIABLE, stored + k)) for k in range(argument.storage)]
             step = [Symbol(tape, tape.leaf(Op.TANGENT, width + k)) for k in range(argument.dim)]
             array = symbols((argument.storage,))
-            array[:] = moved(argument, point, step, rebound.callable)
+            try:
+                array[:] = moved(argument, point, step, rebound.callable)
+            except TraceError:
+                raise
+            except Exception as error:  # whatever a manifold of somebody else makes of symbols
+                raise TraceError(f"a variable lies on {argument.name}: {type(error).__name__}: {error}") from error
             given.append(array if single else array[None])
             stored, width = stored + argument.storage, width + argument.dim
     first = len(given) - len(reached)

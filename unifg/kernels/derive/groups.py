@@ -105,6 +105,16 @@ def half_cotangent(square: Any) -> Any:
     return _series(square, coefficients, lambda s: 0.5 * _sqrt(s) * _cos(0.5 * _sqrt(s)) / _sin(0.5 * _sqrt(s)))
 
 
+def tangent_rest_slope(square: Any) -> Any:
+    """Derivative of :func:`tangent_rest` by t^2: with g = (t / 2) cot(t / 2), g' = (g - g^2 - t^2 / 4) / (2 t^2)."""
+
+    def closed(s: Any) -> Any:
+        g = half_cotangent(s)
+        return -((g - g * g - 0.25 * s) / (2.0 * s) + (1.0 - g) / s) / s
+
+    return _series(square, [(k - 1) * b / math.factorial(2 * k) for k, b in enumerate(BERNOULLI, 1)][1:], closed)
+
+
 def log_factor(w: Any, square: Any) -> Any:
     """2 atan2(n, w) / n of n^2, w the real part of a quaternion and n the norm of the others; 2 atan(n / w) / n near 0.
 
@@ -234,6 +244,25 @@ def _sliding(d: Numbers) -> list[list[Any]]:
     return [[0.0, -d[2], d[1]], [d[2], 0.0, -d[0]], [0.0, 0.0, 0.0]]
 
 
+def _se3_inverse_jacobian(d: Numbers) -> list[list[Any]]:
+    """That of SO(3) over dual numbers: beside it stands its derivative as w moves by v."""
+    v, w = d[:3], d[3:]
+    square, along = _dot(w, w), _dot(w, v)
+    k, slope = tangent_rest(square), 2.0 * along * tangent_rest_slope(square)
+    turn, slide = _polynomial(_turning(w), 0.5, k), _turning(v)
+    beside = [
+        [
+            0.5 * slide[i][j]
+            + k * (v[i] * w[j] + w[i] * v[j])
+            + slope * w[i] * w[j]
+            - (2.0 * k * along + slope * square if i == j else 0.0)
+            for j in range(3)
+        ]
+        for i in range(3)
+    ]
+    return [*([*turn[i], *beside[i]] for i in range(3)), *([0.0, 0.0, 0.0, *turn[i]] for i in range(3))]
+
+
 def _se3_act(x: Numbers, p: Numbers) -> list[Any]:
     return [a + b for a, b in zip(x[:3], _rotate(x[3:], p), strict=True)]
 
@@ -275,6 +304,7 @@ FORMS: dict[Hashable, dict[str, Callable[..., list[Any]]]] = {
             *_upright(_product(_conjugate(x[3:]), y[3:])),
         ],
         "act": _se3_act,
+        "right_jacobian_inverse": _se3_inverse_jacobian,
     },
 }
 """Group, operation -> what it computes of single elements."""

@@ -108,7 +108,9 @@ class Rebound:
         if isinstance(thing, FunctionType) or is_compiled(thing):
             return self.function(thing)
         if isinstance(thing, partial):
-            return partial(self.callable(thing.func), *thing.args, **thing.keywords)
+            given = [self.thing(part) for part in thing.args]
+            named = {name: self.thing(part) for name, part in thing.keywords.items()}
+            return partial(self.callable(thing.func), *given, **named)
         if isinstance(thing, MethodType) and isinstance(thing.__func__, FunctionType):
             return MethodType(self.function(thing.__func__), thing.__self__)
         return thing
@@ -199,7 +201,7 @@ def _least(*values: Any, **options: Any) -> Any:
 def _fold(name: str, plain: Callable[..., Any], values: tuple[Any, ...], options: dict[str, Any]) -> Any:
     items = list(values[0]) if len(values) == 1 else list(values)
     if options or not any(isinstance(item, Symbol | Symbols) for item in items):
-        return plain(*values, **options)
+        return plain(items, **options)
     total = items[0]
     for item in items[1:]:
         total = getattr(np, name)(total, item) if isinstance(item, Symbols) else UFUNCS[name](total, item)
