@@ -1,0 +1,66 @@
+"""Warming up: once, again when something is missing or has changed, and told by the command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from unifg import warming
+from unifg.machine.tally import tally
+from unifg.scenarios import command
+from unifg.scenarios.commands import warm
+
+
+@pytest.fixture
+def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What has been done by jobs that leave one file in a cache of their own."""
+    monkeypatch.setattr(warming, "folder_of", lambda function: tmp_path / "cache")
+    return []
+
+
+def warmed(done: list[str], kept: Path) -> list[float]:
+    """Do two jobs, of which one keeps something; the shares that were told."""
+
+    def keep() -> None:
+        kept.write_text("machine code", encoding="utf-8")
+        tally.files.append(str(kept))
+        done.append("keep")
+
+    told: list[float] = []
+    works = [("keep", keep), ("more", lambda: done.append("more"))]
+    warming.perform("some", lambda: works, lambda share, title: told.append(share))
+    return told
+
+
+def test_what_is_there_is_left_alone(done: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = tmp_path / "kept.nbi"
+    assert warmed(done, kept) == [0.0, 0.5, 1.0] and done == ["keep", "more"]
+    assert warmed(done, kept) == [] and len(done) == 2
+    kept.unlink()  # somebody has emptied the cache
+    assert warmed(done, kept) and len(done) == 4
+    monkeypatch.setattr(warming, "processor", lambda: "of another machine")
+    assert warmed(done, kept) and len(done) == 6
+    (mark,) = (tmp_path / "cache").iterdir()
+    mark.write_text("cut o", encoding="utf-8")
+    assert warmed(done, kept) and len(done) == 8
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(done: list[str], tmp_path: Path) -> None:
+    (tmp_path / "cache").write_text("a file where the folder should be", encoding="utf-8")
+    assert warmed(done, tmp_path / "kept.nbi") and warmed(done, tmp_path / "kept.nbi")
+
+
+def test_every_job_has_a_title_and_every_mode_is_rehearsed() -> None:
+    titles = [title for title, _ in warming.jobs()]
+    assert len(titles) == len(set(titles)) and all(titles)
+    assert {"InteriorPoint", "SQP graph", "SQP exact", "AugmentedLagrangian", "group SE3", "models"} <= set(titles)
+
+
+@pytest.mark.parametrize("changed", [[], ["unifg/program/passes.py"]])
+def test_the_command_says_what_the_archive_is_behind(
+    changed: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(warm, "outdated", lambda: changed)
+    assert command.main(["warmup", "--check"]) == (1 if changed else 0)
+    assert all(name in capsys.readouterr().out for name in changed)
