@@ -5,7 +5,7 @@ directly or not, wherever in a file the import stands, and the data that lie bes
 and blank lines do not count. Where a package's ``__init__`` only hands names on, ``from package import Name`` follows
 that name alone: a page about KKT does not age with the interior point.
 
-What presents numbers (:data:`PRESENTATION`) does not count either, nor do peers: their versions stand on the pages.
+What presents numbers (:data:`PRESENTATION`) or compiles ahead (:data:`AHEAD`) does not count either, nor do peers: their versions stand on the pages.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ FOLDERS = {
 BARE = CHECKOUT / "tests"
 """Its modules are imported by their bare names: problems that tests and measurements share."""
 PRESENTATION = {"benchmarks", "benchmarks.pages", "benchmarks.report", "benchmarks.sources"}
+AHEAD = {"unifg.warming"}
+"""Takes everything through something small: what is compiled before a measurement is no part of it."""
 DATA = (".pgm", ".yaml", ".csv", ".json")
 
 
@@ -48,7 +50,7 @@ def depends_on(modules: Iterable[str]) -> set[Path]:
     while waiting:
         name = waiting.pop()
         path = located(name)
-        if name in seen or path is None or name in PRESENTATION:
+        if name in seen or path is None or name in PRESENTATION | AHEAD:
             continue
         seen.add(name)
         files.add(path)
