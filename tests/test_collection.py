@@ -45,7 +45,7 @@ UNSOLVED: dict[str, set[str]] = {
     },
     "AugmentedLagrangian": {"HS13"},  # no multipliers
     # Convexified costs without curvature send the first steps far away; where they land decides, to the last digit.
-    "SQP": {"HS56", "HS93", "Powell's singular function"},
+    "SQP": {"HS93", "Powell's singular function"},
     "SQP, exact": {"HS93", "Powell's singular function"},
     "InteriorPoint": {"HS13", "HS56", "discs that touch"},  # HS13, discs: no multipliers
 }
