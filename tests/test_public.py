@@ -14,7 +14,14 @@ from fences import PYTHON, documents, fences
 
 # Rooms whose modules a user imports by name; all others are organs, but for what a backend of one's own is made of.
 OPEN = ("unifg.lie", "unifg.solvers", "unifg.models", "unifg.scenarios", "unifg.pose_graphs", "unifg.files")
-OPEN_MODULES = {"unifg", "unifg.errors", "unifg.answers.solver", "unifg.answers.status", "unifg.program.curvature"}
+OPEN_MODULES = {
+    "unifg",
+    "unifg.machine.tally",
+    "unifg.errors",
+    "unifg.answers.solver",
+    "unifg.answers.status",
+    "unifg.program.curvature",
+}
 
 
 def test_dir_lists_what_is_public() -> None:

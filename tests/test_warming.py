@@ -28,7 +28,7 @@ def warmed(done: list[str], kept: Path) -> list[float]:
         done.append("keep")
 
     told: list[float] = []
-    works = [("keep", keep), ("more", lambda: done.append("more"))]
+    works: list[warming.Job] = [("keep", keep), ("more", lambda: done.append("more"))]
     warming.perform("some", lambda: works, lambda share, title: told.append(share))
     return told
 
