@@ -5,7 +5,8 @@ directly or not, wherever in a file the import stands, and the data that lie bes
 and blank lines do not count. Where a package's ``__init__`` only hands names on, ``from package import Name`` follows
 that name alone: a page about KKT does not age with the interior point.
 
-What presents numbers (:data:`PRESENTATION`) or compiles ahead (:data:`AHEAD`) does not count either, nor do peers: their versions stand on the pages.
+What presents numbers (:data:`PRESENTATION`) or compiles ahead (:data:`AHEAD`) does not count either, nor do peers:
+their versions stand on the pages.
 """
 
 from __future__ import annotations
