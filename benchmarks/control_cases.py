@@ -32,8 +32,8 @@ def render(results: Results, rounds: int) -> str:
         f"Cold: from the listed guess, tolerance {RULES.tolerance:.0e} of every solver, median processor time of "
         f"{rounds} interleaved solves (one where it took more than {RULES.slow:.0f} ms). The cost of an interior point "
         "is above the optimum by about the tolerance times the number of active limits; listed optima were found at "
-        f"1e-9. Same optimum: within {RULES.same:.0e}. Our residuals are shipped kernels, which bring their "
-        "derivatives; fatrop runs in casadi's virtual machine and compiled "
+        f"1e-9. Same optimum: within {RULES.same:.0e}. Our residuals are those that ship; "
+        "fatrop runs in casadi's virtual machine and compiled "
         f"({compiled_peers.described()}), IPOPT in the virtual machine. "
         f"{machine('numpy', 'numba', *(('casadi',) if available() else ()))}"
     )
