@@ -7,6 +7,7 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,13 +15,15 @@ import pytest
 
 import unifg as fg
 from unifg.errors import GraphError
+from unifg.kernels.derive.stated import StatedKernel
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import Residual
 from unifg.kernels.robust import Huber
-from unifg.models import lidar, unicycle
+from unifg.models import landmarks, lidar, unicycle
 from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.models.obstacles import disc_clearance, shortfall, wall_distance
 from unifg.models.potential import potential
+from unifg.models.quadrotor import STATE
 from unifg.typing import Array
 
 RNG = np.random.default_rng(23)
@@ -322,3 +325,40 @@ def test_positions_that_are_no_numbers_or_far_away(case: Residual) -> None:
     assert np.abs(slopes[2:4]).max() < 1e-12 and np.isfinite(slopes[4]).all()
     corner = SmoothField(GRID).distance(np.array([[100.0, -100.0]]))
     np.testing.assert_allclose(WALLS(strange[2:3])[0], corner, atol=1e-12)
+
+
+# ---------------------------------------------------------------- stated in NumPy
+
+
+def _bowl(x: Array, depth: Array) -> Array:
+    return (depth * np.sin(x[:, 0]) * x[:, 1])[:, None]
+
+
+def test_stated_kernels_are_derived_when_they_are_needed() -> None:
+    kernel = StatedKernel(_bowl, (fg.Rn(2), ()), 1, name="bowl")
+    assert kernel.derived and "expression" not in vars(kernel)
+    x = np.array([[0.3, -0.7], [1.2, 0.4]])
+    np.testing.assert_allclose(kernel(x, 2.0), _bowl(x, np.array(2.0)), rtol=1e-15)
+    (by_x,) = kernel.jacobian(x, 2.0)
+    np.testing.assert_allclose(by_x[:, 0], 2.0 * np.stack([np.cos(x[:, 0]) * x[:, 1], np.sin(x[:, 0])], axis=1))
+    assert "second_address" not in vars(kernel)
+    second = kernel.second_derivatives(np.ones((2, 1)), x, 2.0)
+    np.testing.assert_allclose(second[:, 0, 1], 2.0 * np.cos(x[:, 0]))
+    np.testing.assert_allclose(second[:, 0, 0], -2.0 * np.sin(x[:, 0]) * x[:, 1])
+    copy = pickle.loads(pickle.dumps(kernel))
+    assert not {"expression", "address", "second_address"} & set(vars(copy))
+    np.testing.assert_array_equal(copy(x, 2.0), kernel(x, 2.0))
+    with pytest.raises(GraphError, match=r"bowl: argument 0 has shape \(2, 3\), expected \(n, 2\) for Rn\(2\)"):
+        kernel(np.zeros((2, 3)), 2.0)
+
+
+def test_stated_kernels_take_second_derivatives_that_are_given() -> None:
+    assert landmarks.bearing_range.kernel is not None
+    given = landmarks.bearing_range.kernel
+    assert isinstance(given, StatedKernel) and not given.derived
+    derived = replace(given, second=None)
+    x, mark, seen = STATE.random(np.random.default_rng(0), (4,)), np.full((4, 2), 3.0), np.zeros(2)
+    weights = np.random.default_rng(1).normal(size=(4, 2))
+    np.testing.assert_allclose(
+        given.second_derivatives(weights, x, mark, seen), derived.second_derivatives(weights, x, mark, seen), atol=1e-12
+    )
