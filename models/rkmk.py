@@ -79,11 +79,11 @@ def integrator(
 
     Args:
         group: of the states x and x_next, (n, storage).
-        field: F(x, u, ...), velocities in the body frame, (n, dim), for states (n, storage) and inputs (n, k). A
-            :class:`CompiledField` makes the residual a kernel, where the group has compiled functions too.
+        field: F(x, u, ...), velocities in the body frame, (n, dim), for states (n, storage) and inputs (n, k). It is
+            traced with all stages; a :class:`CompiledField`, whose lengths are known, at once: a kernel.
         method: its name, or a :class:`Tableau` of your own.
         jacobian: (n, dim, dim) and, for each input, (n, dim, k) derivatives of F along the right perturbation of x and
-            along the input; by differences when absent. A compiled field brings its own.
+            along the input, where F cannot be traced; by differences when absent. A compiled field brings its own.
 
     Raises:
         ModelError: on an unknown method, or a compiled field whose dimension is not that of the group.
