@@ -280,7 +280,8 @@ for group in (Rn(3), SO2, SE2, MOVING):
 # What ships has derivatives of F by differences: those of the definition are better.
 DIFFERENCED = {
     "rkmk.trapezoid", "rkmk.trapezoid, simplified", "rkmk.trapezoid, pose and velocity", "bicycle.dynamics",
-    "rkmk.trapezoid, compiled, by differences", "cart_pole.dynamics", "manipulator.dynamics",
+    "rkmk.trapezoid, compiled, by differences", "rkmk.trapezoid, quadrotor", "cart_pole.dynamics",
+    "manipulator.dynamics",
 }  # fmt: skip
 # Their tables are read by no function of CasADi's: compared with what ships, and with differences of that.
 TABLES = {"obstacles.wall_distance", "lidar.endpoint", "obstacles.shortfall", "potential.potential, walls"}

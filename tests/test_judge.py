@@ -104,14 +104,17 @@ def test_derivatives_do_not_vanish_far_out(size: float) -> None:
 @pytest.mark.parametrize("solver", [InteriorPoint(), SQP()], ids=lambda s: s.name)
 @pytest.mark.parametrize("scale", [1.0, 1e8])
 def test_rounding_above_the_tolerance_is_said(solver: Solver, scale: float) -> None:
-    """Of 1e8 cosh(x - 1) differences know the slope to 1e-4: 1e-6 cannot be claimed."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
-    graph.minimize_scalar(lambda p: scale * np.cosh(p[:, 0] - 1.0), x)
-    solution = solver.solve(graph, {x: np.full((1, 1), 1.3)})
-    assert solution[x][0, 0] == pytest.approx(1.0, abs=1e-5)
-    assert solution.converged is (scale == 1.0)
-    assert (solution.rounding > solver.tolerance) is (scale != 1.0)
+    """Of 1e8 cosh(x - 1) differences know the slope to 1e-4: 1e-6 cannot be claimed. What was derived is exact."""
+    for derivatives in ("differences", "trace"):
+        graph = fg.Graph()
+        x = graph.variables("x", fg.Rn(1), 1)
+        cost = fg.residual(lambda p: scale * np.cosh(p[:, 0] - 1.0), derivatives=derivatives)  # type: ignore[arg-type]
+        graph.minimize_scalar(cost, x)
+        solution = solver.solve(graph, {x: np.full((1, 1), 1.3)})
+        assert solution[x][0, 0] == pytest.approx(1.0, abs=1e-5)
+        rounded = derivatives == "differences" and scale != 1.0
+        assert solution.converged is not rounded
+        assert (solution.rounding > solver.tolerance) is rounded
 
 
 @numba.njit  # type: ignore[untyped-decorator]
@@ -124,21 +127,24 @@ def far_above_slope(p: Array, J: Array) -> None:
     J[0, 0] = 1e3 * np.sinh(p[0] - 1.0)
 
 
-@pytest.mark.parametrize("stated", ["njit", "NumPy", "attached"])
+@pytest.mark.parametrize("stated", ["njit", "NumPy", "attached", "traced", "NumPy, traced"])
 def test_rounding_of_residuals(stated: str) -> None:
-    """A residual of 1e3 at the solution, beside a constraint; with its Jacobian attached it is as good as any."""
+    """A residual of 1e3 at the solution, beside a constraint; with a Jacobian that is exact it is as good as any."""
     residuals: dict[str, Any] = {
-        "njit": fg.residual(far_above, rows=1),
-        "NumPy": lambda p: 1e3 * np.cosh(p - 1.0),
+        "njit": fg.residual(far_above, rows=1, derivatives="differences"),
+        "NumPy": fg.residual(lambda p: 1e3 * np.cosh(p - 1.0), derivatives="differences"),
         "attached": fg.residual(far_above, far_above_slope, rows=1),
+        "traced": fg.residual(far_above, rows=1),
+        "NumPy, traced": lambda p: 1e3 * np.cosh(p - 1.0),
     }
+    exact = stated in ("attached", "traced", "NumPy, traced")
     graph = fg.Graph()
     x = graph.variables("x", fg.Rn(1), 1)
     graph.minimize(residuals[stated], x)
     graph.constrain(fg.prior, x, [0.0], upper=1.0)
     solution = InteriorPoint().solve(graph, {x: np.full((1, 1), 1.0)})
-    assert solution.converged is (stated == "attached")
-    assert solution.status is (fg.Status.CONVERGED if stated == "attached" else fg.Status.IMPRECISE)
+    assert solution.converged is exact
+    assert solution.status is (fg.Status.CONVERGED if exact else fg.Status.IMPRECISE)
 
 
 @pytest.mark.parametrize("solver", EVERY, ids=lambda s: s.name)

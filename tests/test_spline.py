@@ -159,7 +159,7 @@ def test_a_field_does_not_change() -> None:
     for part in (field.table, field.values):
         with pytest.raises(ValueError, match="read-only"):
             part[0] = 1.0
-    with pytest.raises(AttributeError, match="never changes"):
+    with pytest.raises(fg.ModelError, match="never changes"):
         field.origin = (1.0, 0.0, 0.0)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from unifg.errors import ModelError
 from unifg.kernels.derive.operations import Op
 from unifg.kernels.derive.symbols import Symbol, holds_symbols, plain, wrapped
 from unifg.typing import Array, ArrayLike
@@ -37,7 +38,7 @@ class Lookup:
     def __setattr__(self, name: str, value: Any) -> None:
         """Only until the table is there."""
         if "table" in vars(self) and name != "digest":
-            raise AttributeError(f"a {type(self).__name__} never changes: make another one")
+            raise ModelError(f"a {type(self).__name__} never changes: make another one")
         super().__setattr__(name, value)
 
     @cached_property
