@@ -619,3 +619,42 @@ def test_derivatives_do_not_mind_where_the_origin_is(offset: float) -> None:
     away = offset + 0.25 - beacons
     expected = away / np.linalg.norm(away, axis=1, keepdims=True)
     np.testing.assert_allclose(lin.jacobian[:6].reshape(3, 2), expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("kind", ["data", "constant", "named"])
+@pytest.mark.parametrize(
+    ("function", "first"),
+    [
+        (lambda x, t: x - t, np.zeros(3)),
+        (lambda x, t: t * (x - 1.0) + x, np.ones(3)),
+        (lambda x, t: x @ t - 1.0, np.zeros((3, 3))),
+        (lambda x, t: x - t, np.zeros((3, 3))),
+        (lambda x, t: x - t[0], np.zeros((3, 3))),
+        (lambda x, t: x - t.mean(axis=0), np.zeros((3, 3))),
+    ],
+)
+def test_equal_rows_do_not_say_whether_they_belong_to_factors(function: Function, first: Array, kind: str) -> None:
+    """As many as factors; what stands in them later does."""
+    graph, array = fg.Graph(), first.copy()
+    x = graph.variables("x", fg.Rn(3), 3)
+    datum = graph.data("t", array)
+    if kind == "named":
+        graph.minimize(lambda x: function(x, array), x)
+    else:
+        graph.minimize(function, x, datum if kind == "data" else array)
+    prepared = GaussNewton().prepare(graph)
+    start = {x: np.zeros((3, 3))}
+    prepared.solve(start)
+    array[...] = np.random.default_rng(1).uniform(1.0, 2.0, first.shape)
+    found = prepared.solve(start, data={datum: array})[x]
+    again = fg.Graph()
+    y = again.variables("x", fg.Rn(3), 3)
+    again.minimize(fg.residual(function, derivatives="differences"), y, array)
+    np.testing.assert_allclose(found, GaussNewton().solve(again, {y: np.zeros((3, 3))})[y], atol=1e-6)
+
+
+def test_equal_elements_of_a_group_stay_elements() -> None:
+    """The logarithm of what is none is not what a trace computes."""
+    same, group = np.tile(fg.SE3.identity(), (4, 1)), fg.SE3
+    route, _ = solved(lambda x, t: group.log(group.compose(group.inverse(t), x)), same, manifold=group, count=4)
+    assert route.startswith("traced")

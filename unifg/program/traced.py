@@ -21,6 +21,7 @@ from unifg.kernels.batched import Batched, changes
 from unifg.kernels.derive.derived import DerivedKernel, Each, Fixed, Given, Shared, derived, in_python
 from unifg.kernels.derive.reach import Reach, reach_of
 from unifg.kernels.derive.symbols import TraceError
+from unifg.kernels.derive.trace import Rebound
 from unifg.kernels.steps import ANGLE, OTHER, TURN, parts_of
 from unifg.language.variables import Data, Selection
 from unifg.lie import Manifold
@@ -263,16 +264,57 @@ def _found(batch: Batch, function: Callable[..., Any], everything: Reach, asked:
         fixed = [array for k, array in arrays.items() if k not in taken]
         free = [*(array for k, array in arrays.items() if k in taken), *(array for array, _ in reached)]
         trace = Trace(kernel, taken, tuple(array for array, _ in reached), reach, _contents(fixed), _contents(free))
-        try:
-            wrong = bool(trace.differs(batch, batch.anywhere(np.random.default_rng(0))).any())
-        except GraphError:
-            raise
-        except Exception:  # it refuses points that nobody asked for
-            wrong = False
-        if not wrong:
+        if not any(_differs_anywhere(*pair) for pair in ((trace, batch), _with_other_rows(trace, batch, function))):
             return trace, ""
         different = True
     return None, reason(batch, batch.anywhere(np.random.default_rng(0))) if different else why
+
+
+def _differs_anywhere(trace: Trace, batch: Batch) -> bool:
+    try:
+        return bool(trace.differs(batch, batch.anywhere(np.random.default_rng(0))).any())
+    except GraphError:
+        raise
+    except Exception:  # it refuses points that nobody asked for
+        return False
+
+
+def _with_other_rows(trace: Trace, batch: Batch, function: Callable[..., Any]) -> tuple[Trace, Batch]:
+    """The same with other numbers in arrays of as many equal rows as factors.
+
+    Goals of zeros and weights of ones do not say whether a row belongs to a factor, and their content may change later.
+    """
+    if batch.single is not None or batch.count == 1:
+        return trace, batch
+    rng = np.random.default_rng(3)
+    present = list(batch.present)
+    for place in trace.taken:
+        if not isinstance(batch.arguments[place], Selection):
+            present[place] = _with_distinct_rows(present[place], batch, rng)
+    reached = tuple(_with_distinct_rows(array, batch, rng) for array in trace.reached)
+    rebound = Rebound()
+    rebound.given = {id(old): new for old, new in zip(trace.reached, reached, strict=True) if old is not new}
+    batched = Batched(batch.name, rebound.callable(function) if rebound.given else batch.batched.function)
+    places = [k for k, argument in enumerate(batch.arguments) if isinstance(argument, Selection)]
+    batched.bind(present, places, [])
+    return replace(trace, reached=reached), replace(batch, batched=batched, present=present)
+
+
+def _with_distinct_rows(array: Any, batch: Batch, rng: np.random.Generator) -> Any:
+    """The array itself, unless it has as many rows as there are factors and two are equal; elements stay elements."""
+    count = batch.count
+    if not isinstance(array, np.ndarray) or not array.ndim or len(array) != count or not array.size:
+        return array
+    if len(np.unique(array.reshape(count, -1), axis=0)) == count:
+        return array
+    if array.dtype.kind == "b":
+        return rng.random(array.shape) < 0.5
+    for manifold in batch.manifolds:
+        turns = [slice(p.start, p.start + p.storage) for p, _ in parts_of(manifold) if p.kind == TURN]
+        if turns and array.shape == (count, manifold.storage):
+            if all(np.allclose((array[:, turn] ** 2).sum(axis=1), 1.0) for turn in turns):
+                return _moved(manifold, array, rng.uniform(-0.5, 0.5, (count, manifold.dim)))
+    return array + rng.uniform(0.0, 0.5, array.shape) if array.dtype.kind == "f" else array
 
 
 def reason(batch: Batch, points: Sequence[Array]) -> str:

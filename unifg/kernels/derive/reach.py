@@ -25,7 +25,7 @@ from unifg.typing import Array
 
 TRUSTED = ("numpy", "math", "unifg", "builtins", "numba", "operator")
 """Packages whose functions and classes nobody changes."""
-OUTWARD = frozenset({"print", "open", "input", "eval", "exec", "globals", "vars", "setattr", "id"})
+OUTWARD = frozenset({"print", "open", "input", "eval", "exec", "globals", "vars", "getattr", "setattr", "id"})
 """Built-in functions that do or see more than numbers."""
 _MISSING = object()
 _PLAIN = (bool, int, float, complex, str, bytes, type(None), type(Ellipsis), range)
