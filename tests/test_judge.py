@@ -108,7 +108,7 @@ def test_rounding_above_the_tolerance_is_said(solver: Solver, scale: float) -> N
     for derivatives in ("differences", "trace"):
         graph = fg.Graph()
         x = graph.variables("x", fg.Rn(1), 1)
-        cost = fg.residual(lambda p: scale * np.cosh(p[:, 0] - 1.0), derivatives=derivatives)  # type: ignore[arg-type]
+        cost = fg.residual(lambda p: scale * np.cosh(p[:, 0] - 1.0), derivatives=derivatives)
         graph.minimize_scalar(cost, x)
         solution = solver.solve(graph, {x: np.full((1, 1), 1.3)})
         assert solution[x][0, 0] == pytest.approx(1.0, abs=1e-5)
