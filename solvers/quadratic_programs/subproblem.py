@@ -19,6 +19,7 @@ from unifg.program.curvature import lagrangian_hessian
 from unifg.program.linearization import Linearization, all_finite
 from unifg.program.passes import add_constraints
 from unifg.program.program import Program
+from unifg.solvers.globalize.sizes import largest
 from unifg.typing import Array, BoolArray
 
 
@@ -144,6 +145,8 @@ def qp_error(qp: QP, step: Array, multipliers: Array) -> float:
     program = qp.program
     slope = qp.curved(step) + qp.gradient
     slope += program.constraints.transposed_times(qp.jacobian, multipliers)[program.columns.free]
+    if program.least_squares:
+        return largest(slope) / (largest(qp.gradient) or 1.0)  # measured without units there, and here
     return float(_largest_residual(slope, qp.linear(step), qp.lower, qp.upper, multipliers, program.equality))
 
 
