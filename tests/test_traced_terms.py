@@ -7,8 +7,9 @@ import math
 import pickle
 import re
 import threading
+import types
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -658,3 +659,65 @@ def test_equal_elements_of_a_group_stay_elements() -> None:
     same, group = np.tile(fg.SE3.identity(), (4, 1)), fg.SE3
     route, _ = solved(lambda x, t: group.log(group.compose(group.inverse(t), x)), same, manifold=group, count=4)
     assert route.startswith("traced")
+
+
+class Gains(NamedTuple):
+    """A record whose property is not its own."""
+
+    gain: float = 1.0
+
+    @property
+    def present(self) -> float:
+        """The present one."""
+        return float(box.far)
+
+
+def _late(x: Array) -> Array:
+    """Asks a module for what the function that calls it does not."""
+    return x * float(box.far)
+
+
+def _early(x: Array) -> Array:
+    return float(box.near) * _late(x) - 1.0
+
+
+box = types.ModuleType("box")
+GAINS = Gains()
+
+
+def _again(x: Array, gain: float = 2.0) -> Array:
+    return x * gain - 1.0
+
+
+def _outer(x: Array) -> Array:
+    return _again(x)
+
+
+@pytest.mark.parametrize(
+    ("function", "first", "change"),
+    [
+        (_early, None, lambda _: setattr(box, "far", 5.0)),
+        (lambda x: x * GAINS.present - 1.0, None, lambda _: setattr(box, "far", 5.0)),
+        (lambda x: x * getattr(box, "far") - 1.0, None, lambda _: setattr(box, "far", 5.0)),  # noqa: B009
+        (_outer, None, lambda _: setattr(_again, "__defaults__", (5.0,))),
+        (lambda x, t: x * t[0] - 1.0, [2.0], lambda t: t.__setitem__(0, 5.0)),
+        (lambda x, t: x * t["k"][0] - 1.0, {"k": [2.0]}, lambda t: t["k"].__setitem__(0, 5.0)),
+        (lambda x, t: x * t[0] - 1.0, (np.array([2.0]),), lambda t: t[0].fill(5.0)),
+        (lambda x, t: x * t.k - 1.0, types.SimpleNamespace(k=2.0), lambda t: setattr(t, "k", 5.0)),
+        (lambda x, t: t(x) - 1.0, lambda x: x * box.far, lambda _: setattr(box, "far", 5.0)),
+        (lambda x, t: x * t.present - 1.0, GAINS, lambda _: setattr(box, "far", 5.0)),
+        (lambda x, t: x * t.far - 1.0, box, lambda _: setattr(box, "far", 5.0)),
+    ],
+)
+def test_what_changes_between_solves_is_noticed(
+    function: Function, first: Any, change: Function, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(box, "far", 2.0, raising=False)
+    monkeypatch.setattr(box, "near", 1.0, raising=False)
+    monkeypatch.setattr(_again, "__defaults__", (2.0,))
+    given = copy.deepcopy(first) if isinstance(first, list | dict | tuple | types.SimpleNamespace) else first
+    graph, x = stated(function, *(() if given is None else (given,)))
+    prepared = GaussNewton().prepare(graph)
+    np.testing.assert_allclose(prepared.solve({x: np.zeros((N, 3))})[x], 0.5, atol=1e-6)
+    change(given)
+    np.testing.assert_allclose(prepared.solve({x: np.zeros((N, 3))})[x], 0.2, atol=1e-6)

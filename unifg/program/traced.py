@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import pickle
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
@@ -135,6 +136,8 @@ class Trace:
         reached: named arrays of the function that the kernel takes after these.
         reach: what else the function reaches, which is compiled in.
         fixed, free: arrays of the user that are compiled in, or are parameters, and what stood in them.
+        given: what other arguments that are compiled in reach.
+        lists: lists, dictionaries and tuples of numbers among them, and what stood in them.
     """
 
     kernel: DerivedKernel
@@ -143,6 +146,8 @@ class Trace:
     reach: Reach
     fixed: Contents
     free: Contents
+    given: tuple[Reach, ...] = ()
+    lists: tuple[tuple[Any, bytes], ...] = ()
 
     @property
     def layout(self) -> tuple[Any, ...]:
@@ -152,12 +157,14 @@ class Trace:
     @property
     def constant(self) -> bool:
         """Whether there is nothing that could change."""
-        return self.reach.fixed and not (self.fixed or self.free)
+        return not (self.fixed or self.free or self.lists) and all(r.fixed for r in (self.reach, *self.given))
 
     @property
     def outdated(self) -> bool:
         """Whether something has changed that is compiled in."""
-        return self.reach.changed or _changed(self.fixed)
+        if self.reach.changed or _changed(self.fixed) or any(reach.changed for reach in self.given):
+            return True
+        return any(_listed(value) != content for value, content in self.lists)
 
     @property
     def moved(self) -> bool:
@@ -251,6 +258,10 @@ def _found(batch: Batch, function: Callable[..., Any], everything: Reach, asked:
             why = why or f"it reaches {reach.size} numbers, which would be looked at again before each solve"
             continue
         rows = batch.size if batch.single else 0
+        beyond, lists, refusal = _reached_by(given, reach)
+        if refusal and not asked:
+            why = why or refusal
+            continue
         try:
             kernel = derived(function, given, reach, rows, batch.scalar, name, not asked, reached)
         except TraceError as error:
@@ -263,11 +274,45 @@ def _found(batch: Batch, function: Callable[..., Any], everything: Reach, asked:
         arrays = {k: a for k, a in enumerate(batch.arguments) if isinstance(a, np.ndarray) and not a.dtype.hasobject}
         fixed = [array for k, array in arrays.items() if k not in taken]
         free = [*(array for k, array in arrays.items() if k in taken), *(array for array, _ in reached)]
-        trace = Trace(kernel, taken, tuple(array for array, _ in reached), reach, _contents(fixed), _contents(free))
+        named = tuple(array for array, _ in reached)
+        trace = Trace(kernel, taken, named, reach, _contents(fixed), _contents(free), beyond, lists)
         if not any(_differs_anywhere(*pair) for pair in ((trace, batch), _with_other_rows(trace, batch, function))):
             return trace, ""
         different = True
     return None, reason(batch, batch.anywhere(np.random.default_rng(0))) if different else why
+
+
+def _reached_by(
+    given: Sequence[Given], function: Reach
+) -> tuple[tuple[Reach, ...], tuple[tuple[Any, bytes], ...], str]:
+    """What arguments that are compiled in reach, the content of lists, and what may change with nobody noticing."""
+    beyond, lists, refusal = [], [], ""
+    for place, part in enumerate(given):
+        if not isinstance(part, Fixed) or isinstance(part.value, np.ndarray):
+            continue
+        reach = reach_of(lambda value=part.value: value, (), function.attributes)
+        if not reach.refusal:
+            beyond.append(reach)
+        elif (content := _listed(part.value)) is not None:
+            lists.append((part.value, content))
+        else:
+            refusal = refusal or f"its argument {place} may change with nobody noticing: {reach.refusal}"
+    return tuple(beyond), tuple(lists), refusal
+
+
+def _listed(value: Any) -> bytes | None:
+    """The content of lists, tuples and dictionaries of numbers, text and arrays; None of anything else."""
+
+    def plain(part: Any) -> bool:
+        if type(part) in (list, tuple):
+            return all(map(plain, part))
+        if type(part) is dict:
+            return all(map(plain, part)) and all(map(plain, part.values()))
+        if isinstance(part, np.ndarray):
+            return not part.dtype.hasobject
+        return part is None or isinstance(part, bool | int | float | complex | str | bytes | np.generic)
+
+    return pickle.dumps(value) if plain(value) else None
 
 
 def _differs_anywhere(trace: Trace, batch: Batch) -> bool:

@@ -40,20 +40,23 @@ class Reach:
         refusal: why it is not traced unless its user asks; empty where it is.
         size: how many numbers stand in the arrays.
         named: arrays of floats that have a name of their own in the function or in one that it calls.
+        attributes: what it asks modules and instances for.
     """
 
     key: Hashable | None
     refusal: str
     size: int
     named: tuple[Array, ...]
+    attributes: frozenset[str]
     _cells: tuple[tuple[CellType, Any], ...]
     _names: tuple[tuple[dict[str, Any], str, Any], ...]
     _arrays: tuple[tuple[Array, bytes], ...]
+    _functions: tuple[tuple[FunctionType, tuple[Any, ...]], ...]
     _elsewhere: bool = False
 
     def __reduce__(self) -> tuple[Any, ...]:
         """In another process names mean what they mean there: look at everything anew."""
-        return Reach, (None, self.refusal, self.size, (), (), (), (), True)
+        return Reach, (None, self.refusal, self.size, (), self.attributes, (), (), (), (), True)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Reach:
         """A copy watches the same names."""
@@ -70,41 +73,54 @@ class Reach:
         for names, name, value in self._names:
             if names.get(name, _MISSING) is not value:
                 return True
+        for function, written in self._functions:
+            if any(now is not before for now, before in zip(_written(function), written, strict=True)):
+                return True
         return any(array.tobytes() != content for array, content in self._arrays)
 
     @property
     def fixed(self) -> bool:
         """Whether there is nothing that could change."""
-        return not (self._cells or self._names or self._arrays or self._elsewhere)
+        return not (self._cells or self._names or self._arrays or self._functions or self._elsewhere)
 
 
-def reach_of(function: Callable[..., Any], given: Sequence[Array] = ()) -> Reach:
+def reach_of(
+    function: Callable[..., Any], given: Sequence[Array] = (), attributes: frozenset[str] = frozenset()
+) -> Reach:
     """Look at a function, and at everything it refers to.
 
     Args:
         function: in Python, or compiled by Numba.
         given: named arrays whose content does not matter, because a kernel is given it each time.
+        attributes: what others ask for that take what it returns.
     """
-    walk = _Walk(given)
-    if isinstance(function, MethodType):
-        walk.refuse(f"it is a method of {_kind(function.__self__)}, which may change")
-        function = function.__func__
-    key = walk.value(function, "it")
+    whole = function
+    while True:  # what a module or a record is asked for, functions say that are met after it
+        walk = _Walk(given, attributes)
+        if isinstance(whole, MethodType):
+            walk.refuse(f"it is a method of {_kind(whole.__self__)}, which may change")
+            function = whole.__func__
+        key = walk.value(function, "it")
+        if walk.complete:
+            break
+        attributes = walk.attributes
     return Reach(
         None if walk.refusal else key,
         walk.refusal,
         walk.size,
         tuple(walk.named.values()),
+        walk.attributes,
         tuple(walk.cells),
         tuple(walk.names),
         tuple(walk.arrays),
+        tuple(walk.functions),
     )
 
 
 class _Walk:
     """Follows references, each once."""
 
-    def __init__(self, given: Sequence[Array]) -> None:
+    def __init__(self, given: Sequence[Array], attributes: frozenset[str]) -> None:
         self._given = {id(array): k for k, array in enumerate(given)}
         self.named: dict[int, Array] = {}
         self.refusal = ""
@@ -112,8 +128,20 @@ class _Walk:
         self.cells: list[tuple[CellType, Any]] = []
         self.names: list[tuple[dict[str, Any], str, Any]] = []
         self.arrays: list[tuple[Array, bytes]] = []
+        self.functions: list[tuple[FunctionType, tuple[Any, ...]]] = []
         self._seen: dict[int, int] = {}
-        self._attributes: set[str] = set()
+        self._attributes = set(attributes)
+        self._asked = len(attributes)
+
+    @property
+    def attributes(self) -> frozenset[str]:
+        """Names that functions ask modules and instances for."""
+        return frozenset(self._attributes)
+
+    @property
+    def complete(self) -> bool:
+        """Whether all of them were known from the beginning."""
+        return len(self._attributes) == self._asked
 
     def named_value(self, value: Any, where: str) -> Hashable:
         """What tells the value of a name from others."""
@@ -137,6 +165,8 @@ class _Walk:
         if isinstance(value, tuple | frozenset):
             if type(value) not in (tuple, frozenset) and not hasattr(value, "_fields"):
                 self.refuse(f"{where} is {_kind(value)}, which may change")
+            if hasattr(value, "_fields"):
+                self._refuse_methods(value, where)
             return type(value), tuple(self.value(item, f"an entry of {where}") for item in value)
         if isinstance(value, slice):
             return "slice", tuple(self.value(part, where) for part in (value.start, value.stop, value.step))
@@ -166,14 +196,19 @@ class _Walk:
         if type(value).__module__.partition(".")[0] == "numpy" and callable(value) and hasattr(value, "__name__"):
             return "numpy", value.__name__, id(value)  # functions of NumPy that are not written in Python
         if is_dataclass(value) and getattr(vars(type(value)).get("__dataclass_params__"), "frozen", False):
-            used = [name for name in vars(type(value)) if name in self._attributes and not name.startswith("__")]
-            for name in used:
-                if isinstance(vars(type(value))[name], FunctionType | property):
-                    self.refuse(f"{where} is {_kind(value)}, whose method {name} it uses")
+            self._refuse_methods(value, where)
             parts = tuple(self.value(getattr(value, f.name), f"{where}.{f.name}") for f in fields(value))
             return type(value), parts
         self.refuse(f"{where} is {_kind(value)}, which may change")
         return id(value)
+
+    def _refuse_methods(self, value: Any, where: str) -> None:
+        """Refuse a record that is more than numbers."""
+        for owner in type(value).__mro__:
+            used = [name for name in vars(owner) if name in self._attributes and not name.startswith("__")]
+            for name in used:
+                if isinstance(vars(owner)[name], FunctionType | property):
+                    self.refuse(f"{where} is {_kind(value)}, whose method {name} it uses")
 
     def _array(self, array: Array, where: str) -> Hashable:
         if array.dtype.hasobject or type(array) is not np.ndarray:
@@ -208,6 +243,7 @@ class _Walk:
         seen = _scanned(code)
         parts: list[Hashable] = [code]
         if own:
+            self.functions.append((python, _written(python)))
             if seen.trouble:
                 self.refuse(f"{seen.trouble}")
             self._attributes |= seen.attributes
@@ -263,6 +299,11 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
             yield from _codes(constant)
+
+
+def _written(function: FunctionType) -> tuple[Any, ...]:
+    """What notebooks replace when a module is loaded again."""
+    return function.__code__, function.__defaults__, function.__kwdefaults__
 
 
 def _inside(cell: CellType) -> Any:
