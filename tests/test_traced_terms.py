@@ -721,3 +721,16 @@ def test_what_changes_between_solves_is_noticed(
     np.testing.assert_allclose(prepared.solve({x: np.zeros((N, 3))})[x], 0.5, atol=1e-6)
     change(given)
     np.testing.assert_allclose(prepared.solve({x: np.zeros((N, 3))})[x], 0.2, atol=1e-6)
+
+
+@pytest.mark.parametrize("off", [np.zeros(()), np.zeros(1), np.zeros((), dtype=bool)])
+def test_what_is_switched_off_is_looked_at_too(off: Array) -> None:
+    """A row of another factor that counts for nothing yet."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(3), N)
+    gain, target = graph.data("gain", off), graph.data("target", TARGETS, each=True)
+    graph.minimize(lambda x, s, t: x - np.where(s, t[0], t), x, gain, target)
+    prepared = GaussNewton().prepare(graph)
+    np.testing.assert_allclose(prepared.solve({x: np.zeros((N, 3))})[x], TARGETS, atol=1e-6)
+    found = prepared.solve({x: np.zeros((N, 3))}, data={gain: np.ones_like(off)})[x]
+    np.testing.assert_allclose(found, np.tile(TARGETS[0], (N, 1)), atol=1e-6)

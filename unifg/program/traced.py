@@ -325,9 +325,10 @@ def _differs_anywhere(trace: Trace, batch: Batch) -> bool:
 
 
 def _with_other_rows(trace: Trace, batch: Batch, function: Callable[..., Any]) -> tuple[Trace, Batch]:
-    """The same with other numbers in arrays of as many equal rows as factors.
+    """The same with other numbers in arrays of as many equal rows as factors, and in those of zeros.
 
-    Goals of zeros and weights of ones do not say whether a row belongs to a factor, and their content may change later.
+    Goals of zeros and weights of ones do not say whether a row belongs to a factor, a gain of zero hides what it
+    multiplies, and their content may change later.
     """
     if batch.single is not None or batch.count == 1:
         return trace, batch
@@ -346,8 +347,10 @@ def _with_other_rows(trace: Trace, batch: Batch, function: Callable[..., Any]) -
 
 
 def _with_distinct_rows(array: Any, batch: Batch, rng: np.random.Generator) -> Any:
-    """The array itself, unless it has as many rows as there are factors and two are equal; elements stay elements."""
+    """Another array, where two rows of as many as factors are equal or all is zero; elements stay elements."""
     count = batch.count
+    if isinstance(array, np.ndarray) and array.dtype.kind in "bf" and not array.any():
+        return np.asarray(~array if array.dtype.kind == "b" else rng.uniform(0.1, 0.5, array.shape))
     if not isinstance(array, np.ndarray) or not array.ndim or len(array) != count or not array.size:
         return array
     if len(np.unique(array.reshape(count, -1), axis=0)) == count:
