@@ -28,7 +28,8 @@ import unifg as fg
 from benchmarks import control_loops
 from benchmarks.casadi_peer import available
 from benchmarks.cold import Outcome, attempt, attempt_peer, runnable
-from benchmarks.obstacle_fields import Field
+from benchmarks.hard_guesses import STUDIES
+from benchmarks.hard_guesses import Outcome as Ending
 from benchmarks.report import CHECKOUT, command, machine, publish, table
 from benchmarks.timing import interleave, number, shown, spread
 from problems.cart_pole import CartPole, CartPoleGraph, cart_pole_dynamics, cart_pole_dynamics_of_one
@@ -274,34 +275,30 @@ def render_loop(drives: Mapping[str, control_loops.Drive]) -> str:
 
 
 def fields(count: int) -> str:
-    """Random fields of discs with NumPy functions, beside fatrop."""
-    solver = InteriorPoint(tolerance=TOLERANCE)
-    outcomes: dict[str, list[Outcome]] = {}
+    """The random fields of :mod:`benchmarks.hard_guesses`, stated with functions of one factor, beside fatrop."""
+    study = STUDIES["discs"]
+    solves = {"njit": study.ours(InteriorPoint())} | {name: study.peer(name) for name in runnable(("fatrop",))}
+    ended: dict[str, list[Ending]] = {name: [] for name in solves}
+    times: dict[str, list[float]] = {name: [] for name in solves}
+    for solve in solves.values():  # whatever is found out once
+        solve(0)
     for seed in tqdm(range(count), unit="field"):
-        problem = Field("straight", True, 50, seed)
-        attempts: dict[str, Callable[[Outcome], float]] = {"numpy": attempt(solver, Way(problem, "numpy"), True)}
-        for peer in runnable(("fatrop",)):
-            attempts[peer] = attempt_peer(peer, problem, TOLERANCE)
-        found = {way: Outcome(problem, way) for way in attempts}
-        times = interleave({way: partial(solve, found[way]) for way, solve in attempts.items()}, 3)
-        for way, outcome in found.items():
-            outcome.times = times[way].tolist()
-            outcomes.setdefault(way, []).append(outcome)
+        for name, solve in solves.items():
+            begin = time.thread_time()
+            ended[name].append(solve(seed))
+            times[name].append(1e3 * (time.thread_time() - begin))
     rows = []
-    for way, mine in outcomes.items():
-        solved = [outcome for outcome in mine if outcome.status == "converged"]
-        both = [
-            (outcome, other)
-            for outcome, other in zip(mine, outcomes.get("fatrop", mine), strict=True)
-            if outcome.status == other.status == "converged"
-        ]
-        ratios = np.array([outcome.median / other.median for outcome, other in both])
-        steps = np.array([outcome.iterations / max(other.iterations, 1) for outcome, other in both])
+    for name, mine in ended.items():
+        others = ended.get("fatrop", mine)
+        solved = np.array([one.solved for one in mine])
+        both = solved & np.array([one.solved for one in others])
+        spent, steps = np.array(times[name]), np.array([one.iterations for one in mine])
+        ratios = spent[both] / np.array(times.get("fatrop", times[name]))[both]
+        counts = steps[both] / np.array([one.iterations for one in others])[both]
         rows.append(
             (
-                NAMES[way], f"{len(solved)} / {count}", f"{np.median([o.iterations for o in solved]):.0f}",
-                number(float(np.median([o.median for o in solved]))), str(len(both)),
-                shown(spread(ratios)), shown(spread(steps)),
+                NAMES[name], f"{solved.sum()} / {count}", f"{np.median(steps[solved]):.0f}",
+                number(float(np.median(spent[solved]))), str(both.sum()), shown(spread(ratios)), shown(spread(counts)),
             )
         )  # fmt: skip
     head = ("functions", "converged", "iterations", "solve [ms]", "both converged")
@@ -324,7 +321,9 @@ def main(arguments: list[str] | None = None) -> int:
         "cache.",
         "### A cart-pole in closed loop", render_loop(loop()),
         f"Horizon of {LOOP} steps, {control_loops.STEPS} ticks after a cold one, warm starts, interleaved.",
-        "### Fields of discs", fields(options.fields),
+        "### Fields of twenty discs", fields(options.fields),
+        "Forty steps, the guess is the straight line through the discs, tolerance 1e-6; dynamics and clearance are "
+        "functions of one factor (tests/problems/disc_fields.py). One solve each, with what its call costs.",
         machine("numpy", "numba", *peers),
     ]  # fmt: skip
     publish("own-functions", "\n\n".join(parts), docs=options.fields >= 200)

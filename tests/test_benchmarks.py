@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from benchmarks import chains, collection, elimination, gtsam_peer, marginals, own_residuals, pose_graphs
+from benchmarks import chains, collection, elimination, gtsam_peer, marginals, own_functions, own_residuals, pose_graphs
 from benchmarks.section import Result, goal, met
 from benchmarks.timing import Split, interleave, number, shown, spread
 from problems.collection import BACKENDS, CASES, attempt
 from unifg.pose_graphs import manhattan
 from unifg.program.program import Program
-from unifg.solvers import GaussNewton
+from unifg.solvers import GaussNewton, InteriorPoint
 
 
 @pytest.mark.parametrize("name", elimination.SECTIONS)
@@ -146,3 +146,22 @@ def test_the_page_of_the_collection_counts_what_was_found(monkeypatch: pytest.Mo
     assert "| GaussNewton | singular | Beale |" in text
     outcome = attempt("HS21", BACKENDS["SQP"])
     assert outcome is not None and f"| HS21 | {outcome.iterations} |" in text
+
+
+@pytest.mark.parametrize("title", own_functions.problems())
+def test_every_way_to_state_a_problem_is_the_same_problem(title: str) -> None:
+    """The same iterations and the same answer; only differences are Python's."""
+    problem, found = own_functions.problems()[title], {}
+    for way in own_functions.ways(problem):
+        stated = own_functions.stated(problem, way)
+        solution = InteriorPoint(tolerance=own_functions.TOLERANCE).solve(stated.graph, stated.guess)
+        assert solution.converged
+        found[way] = solution
+        routes = stated.graph.check(stated.guess.values).routes
+        own = [routes[name] for name in ("dynamics", "tracking", "discs") if name in routes and way != "shipped"]
+        said = "asked to be" if way == "differences" else "traced"
+        assert all(said in route for route in own)
+    first = next(iter(found.values()))
+    for solution in found.values():
+        assert solution.iterations == first.iterations
+        assert solution.cost == pytest.approx(first.cost, rel=1e-7)
