@@ -132,13 +132,17 @@ class UsualPrimal(Primal):
     def __init__(self, program: Program) -> None:
         """Make room."""
         super().__init__(program)
-        self.fast = program.fully_compiled
         self._bend = np.empty(program.normal.nnz)
         self._step, self._spread = np.empty(program.size), np.zeros(program.columns.width)
         self._rows = [np.empty(program.constraints.count) for _ in range(3)]
         self._norms, self._none = np.empty(len(program.arrays.fields)), np.zeros(0)
         self._links = np.zeros(0, dtype=np.int64)
         self._problem: Problem | None = None
+
+    @property
+    def fast(self) -> bool:
+        """See the class: a term that was traced may be given up between two solves."""
+        return self.program.fully_compiled
 
     def take(
         self, lin: Linearization, multipliers: Array, bent_by: Array, penalty: Array, damping: Damping, goal: float

@@ -422,3 +422,25 @@ def test_what_compiled_code_does_not_know_is_not_asked_of_it(what: str, monkeypa
     primal = AugmentedLagrangian().prepare(graph)
     primal.solve(guess)
     assert not primal._workspace.fast
+
+
+def test_a_trace_that_is_given_up_between_two_solves_is_left_to_python() -> None:
+    factor = np.array([1.0])
+
+    def own(v: Array) -> Array:
+        if factor[0] > 2.0:
+            return np.array([[factor[0] * float(row[0]) - 1.0] for row in v])
+        found: Array = factor[0] * v[:, :1] - 1.0
+        return found
+
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(own, x, name="own")
+    graph.minimize(fg.prior, x, [0.0, 0.0])
+    graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, upper=4.0, name="disc")
+    run = AugmentedLagrangian().prepare(graph)
+    assert run.solve({x: [[1.0, 1.0]]}, check=True)[x][0, 0] == pytest.approx(0.5, abs=1e-6)
+    assert run._workspace.fast
+    factor[0] = 3.0
+    assert run.solve({x: [[1.0, 1.0]]}, check=True)[x][0, 0] == pytest.approx(0.3, abs=1e-6)
+    assert not run._workspace.fast
