@@ -336,7 +336,7 @@ def _bowl(x: Array, depth: Array) -> Array:
 
 def test_stated_kernels_are_derived_when_they_are_needed() -> None:
     kernel = StatedKernel(_bowl, (fg.Rn(2), ()), 1, name="bowl")
-    assert kernel.derived and "expression" not in vars(kernel)
+    assert kernel.derived and "_expression" not in vars(kernel)
     x = np.array([[0.3, -0.7], [1.2, 0.4]])
     np.testing.assert_allclose(kernel(x, 2.0), _bowl(x, np.array(2.0)), rtol=1e-15)
     (by_x,) = kernel.jacobian(x, 2.0)
@@ -346,7 +346,7 @@ def test_stated_kernels_are_derived_when_they_are_needed() -> None:
     np.testing.assert_allclose(second[:, 0, 1], 2.0 * np.cos(x[:, 0]))
     np.testing.assert_allclose(second[:, 0, 0], -2.0 * np.sin(x[:, 0]) * x[:, 1])
     copy = pickle.loads(pickle.dumps(kernel))
-    assert not {"expression", "address", "second_address"} & set(vars(copy))
+    assert not {"_expression", "address", "second_address"} & set(vars(copy))
     np.testing.assert_array_equal(copy(x, 2.0), kernel(x, 2.0))
     with pytest.raises(GraphError, match=r"bowl: argument 0 has shape \(2, 3\), expected \(n, 2\) for Rn\(2\)"):
         kernel(np.zeros((2, 3)), 2.0)

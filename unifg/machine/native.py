@@ -7,13 +7,16 @@ object of Python for each instruction costs more than generating it.
 
 from __future__ import annotations
 
-import itertools
+import hashlib
 import struct
 from collections.abc import Iterable, Sequence
 from functools import cache
-from typing import Any
+from pathlib import Path
+from typing import Any, NoReturn
 
+import llvmlite
 import llvmlite.binding as binding
+import numba
 from llvmlite import ir
 from numba import types
 from numba.core.registry import cpu_target
@@ -21,34 +24,67 @@ from numba.core.registry import cpu_target
 POINTER = str(ir.DoubleType().as_pointer())
 """How LLVM's language spells the address of floats."""
 LONG = 20_000  # lines
+SOURCES = (__file__, str(Path(__file__).with_name("calls.py")))
+"""Files that say what is generated."""
 _MARK = "the body"
-_count = itertools.count()
-_engines: list[Any] = []  # own the machine code: nothing is ever taken back
+_NAME = "derived"  # of every function: each has an engine of its own
 
 
 class Native:
-    """Machine code of one function.
+    """Machine code of one function, which is there for as long as this object is, and no longer.
+
+    Whoever keeps its address keeps this object too, or what keeps it. Compiled loops hold the interpreter's lock while
+    they run, so nothing that they call can be taken back meanwhile.
 
     Attributes:
-        address: where it stands, for as long as the process runs.
+        address: where it stands.
     """
 
-    def __init__(
-        self, name: str, arguments: tuple[Any, ...], body: Sequence[str], declarations: Iterable[str] = ()
-    ) -> None:
-        """Generate.
+    def __init__(self, code: bytes) -> None:
+        """Load.
 
         Args:
-            name: for profilers.
-            arguments: Numba types of the arrays it takes.
-            body: instructions. They find the numbers of the k-th array at ``%data<k>`` and the length of its a-th axis
-                in ``%shape<k>_<a>``, and leave by the end.
-            declarations: of the functions that the body calls, as they stand in a module.
+            code: what :func:`generated` returned, in this process or in another one on such a processor.
         """
-        unique = f"{''.join(c if c.isalnum() else '_' for c in name)}_{next(_count)}"
-        head, before, after = _frame(arguments)
-        function = "\n".join((head.replace(_MARK, unique), before, *body, after))
-        self.address = _generated("\n".join((*declarations, function)), unique)
+        # An engine of its own, and in it what generates code, though it will not: an engine takes that along when it
+        # goes. Libraries of one engine for all would be loaded sooner, and leave ten kilobytes each behind.
+        machine = binding.Target.from_triple(_processor()[0]).create_target_machine()
+        self._engine = binding.create_mcjit_compiler(binding.parse_assembly(""), machine)
+        self._engine.add_object_file(binding.ObjectFileRef.from_data(code))
+        self._engine.finalize_object()
+        self.address = int(self._engine.get_function_address(_NAME))
+
+    def __reduce__(self) -> NoReturn:
+        """Refuse: in a copy the address would be good for nothing."""
+        raise TypeError("machine code is neither copied nor pickled: its owner generates it anew")
+
+
+def generated(arguments: tuple[Any, ...], body: Sequence[str], declarations: Iterable[str] = ()) -> bytes:
+    """Object code of one function.
+
+    No optimiser runs: what is written states nothing twice and has nothing to move. The second level of code generation
+    gives code no quicker than the first, the lowest four times slower code ten times sooner, which serves functions so
+    long that the first takes seconds.
+
+    Args:
+        arguments: Numba types of the arrays it takes.
+        body: instructions. They find the numbers of the k-th array at ``%data<k>`` and the length of its a-th axis
+            in ``%shape<k>_<a>``, and leave by the end.
+        declarations: of the functions that the body calls, as they stand in a module.
+    """
+    head, before, after = _frame(arguments)
+    source = "\n".join((*declarations, head.replace(_MARK, _NAME), before, *body, after))
+    with binding.parse_assembly(source, binding.create_context()) as module:  # numbers stay with a context for ever
+        module.triple = binding.get_default_triple()
+        machine = _machine(0 if source.count("\n") > LONG else 1)
+        module.data_layout = str(machine.target_data)
+        return bytes(machine.emit_object(module))
+
+
+@cache
+def generation() -> str:
+    """Digest of what object code depends on, besides the sources of what writes it: versions and the processor."""
+    return hashlib.sha256(repr((llvmlite.__version__, numba.__version__, *_processor())).encode()).hexdigest()
 
 
 def number(value: float) -> str:
@@ -62,6 +98,7 @@ def _frame(arguments: tuple[Any, ...]) -> tuple[str, str, str]:
     context = cpu_target.target_context
     module = ir.Module(_MARK, context=ir.Context())
     function = ir.Function(module, context.call_conv.get_function_type(types.none, arguments), _MARK)
+    function.attributes.add("nounwind")  # and no tables for unwinding
     builder = ir.IRBuilder(function.append_basic_block("entry"))
     nothing = ir.Constant(ir.IntType(64), 0)
     arrays = context.call_conv.decode_arguments(builder, arguments, function)
@@ -80,25 +117,14 @@ def _frame(arguments: tuple[Any, ...]) -> tuple[str, str, str]:
 
 
 @cache
+def _processor() -> tuple[str, str, str]:
+    """What code is generated for: triple, name and features."""
+    features = binding.get_host_cpu_features().flatten()
+    return binding.get_default_triple(), binding.get_host_cpu_name(), features
+
+
+@cache
 def _machine(level: int) -> Any:
     """What generates code for this processor."""
-    return binding.Target.from_default_triple().create_target_machine(
-        cpu=binding.get_host_cpu_name(), features=binding.get_host_cpu_features().flatten(), opt=level
-    )
-
-
-def _generated(source: str, name: str) -> int:
-    """Generate code; the address of the function.
-
-    No optimiser runs: what is written states nothing twice and has nothing to move. The second level of code generation
-    gives code no quicker than the first, the lowest four times slower code ten times sooner, which serves functions so
-    long that the first takes seconds.
-    """
-    module = binding.parse_assembly(source)
-    module.triple = binding.get_default_triple()
-    machine = _machine(0 if source.count("\n") > LONG else 1)
-    module.data_layout = str(machine.target_data)
-    engine = binding.create_mcjit_compiler(module, machine)
-    engine.finalize_object()
-    _engines.append(engine)
-    return int(engine.get_function_address(name))
+    triple, name, features = _processor()
+    return binding.Target.from_triple(triple).create_target_machine(cpu=name, features=features, opt=level)

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from unifg.elimination.symmetric import Symmetric
+from unifg.kernels.kernel import Kernel
 from unifg.kernels.robust import Loss, form_of
 from unifg.kernels.steps import as_table, movable_parts
 from unifg.language.terms import Constraint, Cost, ScalarCost
@@ -96,6 +97,8 @@ class TermArrays(NamedTuple):
 class TermTable:
     """Builds :class:`TermArrays` once and renews what data can change.
 
+    It owns the kernels whose addresses stand in its rows, whatever becomes of the terms meanwhile.
+
     Attributes:
         arrays: for the compiled loops.
         residuals, weights: number of rows of all costs, number of robust factors.
@@ -115,6 +118,7 @@ class TermTable:
     ) -> None:
         """Lay everything out; numbers come with :meth:`bind`."""
         self._terms = [*terms, *scalars]
+        self._owned: dict[CompiledTerm, tuple[Kernel | None, Kernel | None]] = {}
         self._second = False
         self._columns = columns
         self._fields = fields = np.zeros((len(self._terms), FIELDS), dtype=np.int64)
@@ -156,12 +160,6 @@ class TermTable:
             starts["whiteners"] += term.whitener.size
             self.scratch = max(self.scratch, sum(layout.sizes) + m * layout.kernel_width)
             row[PARAMETERS], row[SPREAD], row[WHITEN] = term.parameter_count, term.parameter_spread, term.whitening
-            if term.kernel is not None:
-                row[ADDRESS] = term.kernel.address
-                row[SECOND] = 0 if term.kernel.derived else term.kernel.second_address
-                row[TABLE], row[TABLE_SIZE] = term.kernel.table.ctypes.data, term.kernel.table.size
-            if term.search_kernel is not None:
-                row[SEARCH] = term.search_kernel.address
             entries = count * m * width
             if isinstance(term.term, Cost):
                 row[KIND], row[ROW], row[ENTRY] = COST, self.residuals, self.entries
@@ -191,6 +189,8 @@ class TermTable:
             term.place = row
             if term.trace is not None:
                 self.renew(term)
+            else:
+                self._take(term)
         self.holding = HELD in fields[:, LOSS]
         self.sizes = self.residuals, self.entries, self.constraints, self.constraint_entries
         counts = fields[:, COUNT]
@@ -215,10 +215,15 @@ class TermTable:
         locate(fields, self.arrays.columns, self.arrays.unknown, normal.indptr, normal.indices, self.arrays.positions)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """In a copy the rows of the terms are those of the copy."""
+        """In a copy the rows of the terms are those of the copy.
+
+        It describes a linearisation and runs nothing: addresses belong to what it is a copy of.
+        """
         self.__dict__.update(state)
+        self._owned = {}
         arrays = self.arrays
         self._fields = np.concatenate([arrays.fields, arrays.scalars])
+        self._fields[:, [ADDRESS, SEARCH, SECOND, TABLE, TABLE_SIZE]] = 0
         first = len(arrays.fields)
         self.arrays = arrays._replace(fields=self._fields[:first], scalars=self._fields[first:])
         for row, term in zip(self._fields, self._terms, strict=True):
@@ -226,19 +231,27 @@ class TermTable:
 
     def renew(self, term: CompiledTerm) -> None:
         """Take the machine code of a traced term; the numbers of its parameters have not changed."""
-        row, kernel = term.place, term.kernel
-        assert kernel is not None
-        row[ADDRESS] = kernel.address
-        row[SECOND] = kernel.second_address if self._second or row[KIND] == SCALAR else 0
-        row[PARTS] = 0 if kernel.linear else len(movable_parts(kernel.manifolds))
+        assert term.kernel is not None
+        self._take(term)
+        term.place[PARTS] = 0 if term.kernel.linear else len(movable_parts(term.kernel.manifolds))
 
     def give_up(self, term: CompiledTerm) -> None:
         """Leave a term that was traced to its own function; its rows, entries and parameters stay where they are."""
-        row, kernel = term.place, term.kernel
-        row[ADDRESS] = row[SECOND] = row[PARTS] = 0
+        self._take(term)
+        term.place[PARTS] = 0 if term.kernel is None else len(movable_parts(term.kernel.manifolds))
+        term.place[DIFFERENCED] = self.differenced = True
+
+    def _take(self, term: CompiledTerm) -> None:
+        """Write where the machine code of a term and its table stand, and only then let go of what stood there."""
+        row, kernel, search = term.place, term.kernel, term.search_kernel
+        first = second = table = size = 0
         if kernel is not None:
-            row[ADDRESS], row[PARTS] = kernel.address, len(movable_parts(kernel.manifolds))
-        row[DIFFERENCED] = self.differenced = True
+            wanted = self._second or row[KIND] == SCALAR or not kernel.derived
+            first, second = kernel.address, kernel.second_address if wanted else 0
+            table, size = kernel.table.ctypes.data, kernel.table.size
+        searching = 0 if search is None else search.address
+        row[[ADDRESS, SECOND, TABLE, TABLE_SIZE, SEARCH]] = first, second, table, size, searching
+        self._owned[term] = kernel, search
 
     def require_second(self) -> None:
         """Have second derivatives of derived kernels generated, which not every solver needs."""

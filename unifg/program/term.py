@@ -256,6 +256,8 @@ class CompiledTerm:
             return True
         points = self.points(values)
         if not self.trace.agrees(self._batch, points):
+            if self.trace.outdated:  # since it was traced, which it will be again
+                return True
             self._leave(reason(self._batch, points))
             return False
         if (index := self._undefined(points)) is None:
@@ -301,7 +303,12 @@ class CompiledTerm:
             return False
         self.trace, self.kernel = found, found.kernel
         self._bind_parameters(self._data)
-        return same or self.stands(values)
+        try:
+            return same or self.stands(values)
+        except BaseException:  # the old trace is still the one that runs, and out of date: the next solve looks again
+            self.trace, self.kernel, self._changes = old, old.kernel, self._changes - (not same)
+            self._bind_parameters(self._data)
+            raise
 
     def refresh(self) -> None:
         """Take the present content of arrays that are parameters of a trace and belong to the user."""

@@ -81,9 +81,19 @@ class Types:
         self.fields: list[tuple[float, ...]] = []
         self.slots: list[tuple[int, ...]] = []
         self.scratch = 8
-        self._numbers: dict[tuple[Any, ...], int] = {}
+        self._numbers: dict[tuple[Any, ...], int] = {}  # by kernels, which are kept: compiled code has their addresses
         self._kernels: dict[tuple[Any, ...], tuple[Kernel, Residual, Trace | None]] = {}
-        self._kept: dict[int, Kernel] = {}  # ids stay theirs, and addresses good
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copy without what is found by the ids of objects, which are others in a copy."""
+        return {**self.__dict__, "_kernels": {}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """The kernels of a copy stand elsewhere."""
+        self.__dict__.update(state)
+        for (kernel, *_), number in self._numbers.items():
+            row, (where, table, size) = self.fields[number], _places(kernel)
+            self.fields[number] = (where, *row[1:6], table, size, *row[8:])
 
     def stage(
         self,
@@ -176,23 +186,21 @@ class Types:
         first: float,
         second: float,
     ) -> int:
-        """Number of a type; kernels are kept, because compiled code knows only where they stand."""
+        """Number of a type."""
         parameters, numbers, whitening, size = counts
         reads = tuple([(s.storage.start, s.manifold.storage, s.tangent.start, s.manifold.dim) for s in selections])
-        if kernel is not None:
-            self._kept[id(kernel)] = kernel
-        key = id(kernel), counts, reads, shapes, loss, first, second
+        key = kernel, counts, reads, shapes, loss, first, second
         kind = self._numbers.get(key)
         if kind is not None:
             return kind
         width = sum(read[3] for read in reads)
         storage = sum(read[1] for read in reads) + max(s.family.manifold.storage for s in selections)
         self.scratch = max(self.scratch, storage + size * (1 + width) + 8)
-        where, table = (0, NOBODY) if kernel is None else (kernel.address, kernel.table)
+        where, table, table_size = _places(kernel)
         self.fields.append(
             (
-                where, size, len(self.slots), len(reads), width, parameters, table.ctypes.data, table.size, whitening,
-                loss, numbers, first, second,
+                where, size, len(self.slots), len(reads), width, parameters, table, table_size, whitening, loss,
+                numbers, first, second,
             )
         )  # fmt: skip
         self.slots += reads
@@ -220,6 +228,13 @@ class Types:
                 each = argument.each if isinstance(argument, Data) else len(shape) > 1
                 parts.append(shape[1:] if each else shape)
         return tuple(parts)
+
+
+def _places(kernel: Kernel | None) -> tuple[int, int, int]:
+    """Where machine code and table of a kernel stand, and the length of the table."""
+    if kernel is None:
+        return 0, NOBODY.ctypes.data, 0
+    return kernel.address, kernel.table.ctypes.data, kernel.table.size
 
 
 def _by_itself(arguments: Sequence[Any]) -> tuple[Any, ...]:
@@ -285,6 +300,16 @@ class Parts:
         self.fields: list[tuple[int, ...]] = []
         self._known: list[tuple[Manifold, tuple[int, int]]] = []
         self._kept: list[Any] = []  # addresses are good for as long as the functions live
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle the manifolds; their functions stand elsewhere in a copy."""
+        return {"manifolds": [manifold for manifold, _ in self._known]}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Find them again, in the same places."""
+        self.__init__()  # type: ignore[misc]
+        for manifold in state["manifolds"]:
+            self.of(manifold)
 
     def of(self, manifold: Manifold) -> tuple[int, int]:
         """First part of a manifold, and how many it has; the whole is one part where NumPy has to move it."""

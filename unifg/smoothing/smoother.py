@@ -84,10 +84,12 @@ class Smoother:
         self._written = 0  # types of factors that compiled code knows
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """A copy has arrays of its own, which stand elsewhere."""
+        """A copy has arrays of its own, which stand elsewhere, and so have its kernels."""
         self.__dict__.update(state)
         self._memory = self._words.ctypes.data
-        self._hold(self._state)
+        self._state.types[: self._written] = np.array(self._types.fields[: self._written], dtype=TYPE)
+        parts = np.array(self._parts.fields, dtype=PART) if self._parts.fields else self._state.parts
+        self._hold(self._state._replace(parts=parts))
 
     def variables(self, name: str, manifold: Manifold, *, keep: bool = False) -> GrowingFamily:
         """Add a family of unknowns, empty at first.

@@ -12,12 +12,11 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import prod
-from threading import RLock
 from typing import Any, NoReturn, TypeAlias
 
 import numpy as np
 
-from unifg.kernels.derive.expression import Expression, traced
+from unifg.kernels.derive.expression import Expression, generating, traced
 from unifg.kernels.derive.operations import Op
 from unifg.kernels.derive.reach import Reach
 from unifg.kernels.derive.symbols import TraceError
@@ -68,6 +67,7 @@ class DerivedKernel(Kernel):
     """A kernel whose Jacobian and second derivatives are exact, because they were derived.
 
     Machine code is generated when its address is first asked for; that of second derivatives most programs never ask.
+    It belongs to the expression, and so to the kernel.
 
     Attributes:
         expression: what it computes.
@@ -86,19 +86,16 @@ class DerivedKernel(Kernel):
     @cached_property
     def address(self) -> int:
         """Of the machine code of residual and Jacobian."""
-        with generating:
-            return self.expression.residual().address
+        return self.expression.residual().address
 
     @cached_property
     def second_address(self) -> int:
         """Of the machine code of second derivatives, 0 where all of them are zero."""
         if self.linear:
             return 0
-        with generating:
-            return self.expression.second().address
+        return self.expression.second().address
 
 
-generating = RLock()  # tracing rebinds names in copies of functions, and what it writes is one tape
 _kernels: OrderedDict[Hashable, DerivedKernel | TraceError] = OrderedDict()
 
 

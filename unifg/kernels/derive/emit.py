@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from unifg.kernels.derive.operations import Op
 from unifg.kernels.derive.tape import Tape
 from unifg.machine.calls import MATRIX, RESIDUAL, VECTOR
-from unifg.machine.native import POINTER, Native, number
+from unifg.machine.native import POINTER, generated, number
 
 _INSTRUCTIONS = {Op.ADD: "fadd", Op.SUBTRACT: "fsub", Op.MULTIPLY: "fmul", Op.DIVIDE: "fdiv"}
 _LIBRARY = {  # functions of the C library, and those that processors know
@@ -21,7 +21,7 @@ _COMPARISONS = {Op.LESS: "olt", Op.LESS_EQUAL: "ole", Op.EQUAL: "oeq"}
 _ONE, _MINUS, _ZERO = number(1.0), number(-1.0), number(0.0)
 
 
-def residual_code(name: str, tape: Tape, rows: Sequence[int], slopes: dict[tuple[int, int], int], width: int) -> Native:
+def residual_code(tape: Tape, rows: Sequence[int], slopes: dict[tuple[int, int], int], width: int) -> bytes:
     """``f(v, p, table, r, J)``: the rows, and their derivatives unless J has no rows."""
     line = _Line(tape, {Op.VARIABLE: "%data0", Op.PARAMETER: "%data1"})
     line.compute(rows)
@@ -33,10 +33,10 @@ def residual_code(name: str, tape: Tape, rows: Sequence[int], slopes: dict[tuple
     for place in range(len(rows) * width):
         line.store("%data4", place, slopes.get(divmod(place, width), tape.zero))
     line.write("br label %done", "done:")
-    return line.native(name, RESIDUAL)
+    return line.generated(RESIDUAL)
 
 
-def second_code(name: str, tape: Tape, entries: dict[tuple[int, int], int], width: int) -> Native:
+def second_code(tape: Tape, entries: dict[tuple[int, int], int], width: int) -> bytes:
     """``second(v, p, table, w, S)``: the symmetric matrix whose upper half is given."""
     line = _Line(tape, {Op.VARIABLE: "%data0", Op.PARAMETER: "%data1", Op.WEIGHT: "%data3"})
     line.contract()
@@ -44,7 +44,7 @@ def second_code(name: str, tape: Tape, entries: dict[tuple[int, int], int], widt
     for place in range(width * width):
         row, column = divmod(place, width)
         line.store("%data4", place, entries.get((min(row, column), max(row, column)), tape.zero))
-    return line.native(name, (VECTOR, VECTOR, VECTOR, VECTOR, MATRIX))
+    return line.generated((VECTOR, VECTOR, VECTOR, VECTOR, MATRIX))
 
 
 class _Line:
@@ -58,13 +58,13 @@ class _Line:
         self._called = dict[str, int]()  # number of arguments
         self._liberty = ""
 
-    def native(self, name: str, arguments: tuple[object, ...]) -> Native:
-        """What is written, as machine code."""
+    def generated(self, arguments: tuple[object, ...]) -> bytes:
+        """What is written, as object code."""
         declarations = [
             f"declare double @{called}({', '.join(['double'] * count)}) nounwind readnone"
             for called, count in self._called.items()
         ]
-        return Native(name, arguments, self._lines, declarations)
+        return generated(arguments, self._lines, declarations)
 
     def write(self, *lines: str) -> None:
         """Put down instructions."""

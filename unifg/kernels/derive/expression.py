@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from pathlib import Path
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -16,15 +19,39 @@ from unifg.kernels.derive.operations import Op
 from unifg.kernels.derive.symbols import Symbol, TraceError, node_of, symbols
 from unifg.kernels.derive.tape import Tape
 from unifg.kernels.derive.trace import Rebound, run
-from unifg.kernels.kernel import Argument
-from unifg.machine.jit import is_compiled
-from unifg.machine.native import Native
-from unifg.typing import Array
+from unifg.kernels.kernel import Argument, evaluate_rows
+from unifg.machine.jit import folder_of, is_compiled
+from unifg.machine.native import SOURCES, Native, generation
+from unifg.machine.objects import Objects
+from unifg.typing import Array, IntArray
+
+generating = RLock()  # tracing rebinds names in copies of functions, and what it writes is one tape
+
+
+def _digest() -> str:
+    """Of the sources that make machine code of a tape; empty where there are none."""
+    own = [Path(__file__).with_name(f"{name}.py") for name in ("calculus", "emit", "expression", "operations", "tape")]
+    own += map(Path, SOURCES)
+    try:
+        return hashlib.sha256(b"".join(file.read_bytes() for file in own)).hexdigest()
+    except OSError:
+        return ""
+
+
+_WRITERS = _digest()  # as they are when they are loaded: they may be edited while the process runs
+
+
+@cache
+def _objects() -> Objects:
+    """Beside what Numba keeps."""
+    return Objects(folder_of(evaluate_rows) / "derived")
 
 
 @dataclass(frozen=True)
 class Expression:
     """A residual on a tape, with every variable moved along its tangent coordinates.
+
+    It owns its machine code: an address is good for as long as the expression lives.
 
     Attributes:
         tape: the nodes.
@@ -37,16 +64,16 @@ class Expression:
     rows: tuple[int, ...]
     width: int
     name: str
+    _natives: dict[str, Native] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle without machine code, which copies load for themselves."""
+        return {**self.__dict__, "_natives": {}}
 
     @cached_property
     def linear_rows(self) -> tuple[bool, ...]:
         """Which rows have no second derivatives, being linear in the tangent coordinates or made of linear pieces."""
         return tuple(not row for row in bent(self.tape, self.rows))
-
-    @property
-    def linear(self) -> bool:
-        """Whether no row has second derivatives: there is no need for :meth:`second`."""
-        return all(self.linear_rows) or not self.curvature
 
     @cached_property
     def table(self) -> Array:
@@ -65,15 +92,54 @@ class Expression:
 
     def residual(self) -> Native:
         """``f(v, p, table, r, J)`` as machine code."""
-        tape, nodes = self.tape.at_rest([*self.rows, *self.slopes.values()])
-        count = len(self.rows)
-        slopes = dict(zip(self.slopes, nodes[count:], strict=True))
-        return residual_code(self.name, tape, nodes[:count], slopes, self.width)
+        return self._native("residual", self._residual)
 
     def second(self) -> Native:
         """``second(v, p, table, w, S)`` as machine code."""
+        return self._native("second", self._second)
+
+    def _native(self, which: str, generate: Callable[[], bytes]) -> Native:
+        """Load code from disk, or generate it, once: what is handed out is never replaced."""
+        with generating:
+            native = self._natives.get(which)
+            if native is None:
+                key = hashlib.sha256(f"{which} {self._stated} {_WRITERS} {generation()}".encode()).hexdigest()
+                code = _objects().find(key) if _WRITERS else None
+                if code is None:
+                    code = generate()
+                    if _WRITERS:
+                        _objects().keep(key, code)
+                native = self._natives[which] = Native(code)
+            return native
+
+    @cached_property
+    def _stated(self) -> str:
+        """Digest of the tape as far as the rows go, however its nodes are numbered: all that code depends on."""
+        tape = self.tape
+        live = tape.live(self.rows)
+        end = live[-1] + 1 if live else 0
+        place = np.full(end + 1, -1)  # the last stands for no node
+        place[live] = np.arange(len(live))
+        op = np.array(tape.op[:end], dtype=np.int64)[live]
+        inner = op > Op.TANGENT
+        digest = hashlib.sha256(op.tobytes())
+        for column in (tape.a, tape.b, tape.c):
+            taken: IntArray = np.array(column[:end], dtype=np.int64)[live]
+            taken[inner] = place[taken[inner]]
+            digest.update(taken.tobytes())
+        digest.update(np.array(tape.value[:end], dtype=np.float64)[live].tobytes())
+        digest.update(repr((place[list(self.rows)].tolist(), self.width, tape.size)).encode())
+        return digest.hexdigest()
+
+    def _residual(self) -> bytes:
+        tape, nodes = self.tape.at_rest([*self.rows, *self.slopes.values()])
+        count = len(self.rows)
+        slopes = dict(zip(self.slopes, nodes[count:], strict=True))
+        return residual_code(tape, nodes[:count], slopes, self.width)
+
+    def _second(self) -> bytes:
         tape, nodes = self.tape.at_rest(list(self.curvature.values()))
-        return second_code(self.name, tape, dict(zip(self.curvature, nodes, strict=True)), self.width)
+        return second_code(tape, dict(zip(self.curvature, nodes, strict=True)), self.width)
 
 
 def traced(

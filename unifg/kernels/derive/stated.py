@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
-from unifg.kernels.derive.derived import generating
-from unifg.kernels.derive.expression import Expression, traced
+from unifg.kernels.derive.expression import Expression, generating, traced
 from unifg.kernels.kernel import Kernel
 
 
@@ -26,26 +25,27 @@ class StatedKernel(Kernel):
         """They are, unless they are given."""
         return self.second is None
 
-    @cached_property
+    @property
     def expression(self) -> Expression:
-        """What it computes."""
+        """What it computes; one for all threads, for it owns the machine code."""
         with generating:
-            return traced(self.function, self.arguments, name=self.name)
+            found = self.__dict__.get("_expression")
+            if found is None:
+                found = self.__dict__["_expression"] = traced(self.function, self.arguments, name=self.name)
+            return cast(Expression, found)
 
     @cached_property
     def address(self) -> int:
         """Of the machine code of residual and Jacobian."""
-        with generating:
-            return self.expression.residual().address
+        return self.expression.residual().address
 
     @cached_property
     def second_address(self) -> int:
         """Of the machine code of second derivatives, 0 where all of them are zero."""
         if self.second is not None:
             return Kernel.second_address.func(self)  # type: ignore[attr-defined, no-any-return]
-        with generating:
-            return 0 if self.linear or self.expression.linear else self.expression.second().address
+        return 0 if self.linear or all(self.expression.linear_rows) else self.expression.second().address
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle what is stated; another process derives it anew."""
-        return {name: value for name, value in super().__getstate__().items() if name != "expression"}
+        return {name: value for name, value in super().__getstate__().items() if name != "_expression"}
