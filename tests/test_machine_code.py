@@ -147,6 +147,7 @@ def test_copies_run_code_of_their_own(copied: Function, monkeypatch: pytest.Monk
         again = prepared.solve({x: guess})[x]
         forget()
         np.testing.assert_array_equal(twin.solve({y: guess})[y], again)
+        assert twin.program.terms[0].route.startswith("traced"), "what changed before its first solve, too"
     np.testing.assert_array_equal(again, before)
     del prepared, graph, solution, x
     forget()
