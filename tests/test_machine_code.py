@@ -104,6 +104,19 @@ def test_a_graph_keeps_its_machine_code_and_nobody_else_does() -> None:
     assert native() is None
 
 
+def test_a_table_owns_what_its_rows_name() -> None:
+    """Also between a term's change of mind and the table's."""
+    graph, _ = stated(lambda x: np.sin(x) + x - 1.0)
+    program, native = graph.compile(), native_of(graph)
+    (term,) = program.terms
+    term.trace = term.kernel = None
+    forget()
+    assert native() is not None
+    program.table.give_up(term)
+    gc.collect()
+    assert native() is None
+
+
 def resident() -> int:
     """Kilobytes."""
     with open("/proc/self/statm", encoding="ascii") as file:
@@ -235,7 +248,7 @@ def test_the_graph_goes_while_another_thread_solves() -> None:
 
 @pytest.mark.parametrize("copied", COPIES)
 def test_copies_of_smoothers_run_code_of_their_own(copied: Function) -> None:
-    smoother = Incremental()
+    smoother = Incremental(relinearize=0.0)
     x = smoother.variables("x", fg.SE2)
     smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.1)
     smoother.minimize(stepped, x[0], x[1], np.ones(3), sigma=0.1)
@@ -244,6 +257,7 @@ def test_copies_of_smoothers_run_code_of_their_own(copied: Function) -> None:
 
     def go_on(one: Any) -> Array:
         y = one.families["x"]
+        one.update()  # nothing new is stated: what is there is evaluated again
         one.minimize(stepped, y[1], y[2], np.ones(3), sigma=0.1)
         one.minimize(lambda x: np.sin(x) - 0.2, y[2], sigma=0.3)
         one.update({y: np.zeros(3)})
