@@ -73,7 +73,9 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "solvers/augmented_usual.py": ("augmented_lagrangian", "solvers"),
     "solvers/augmented_step.py": ("augmented_lagrangian", "penalty", "solvers"),
     "solvers/quadratic_programs/exact_hessian.py": ("sqp_exact", "solvers"),
+    "solvers/sqp_usual.py": ("sqp_usual", "sqp_steps", "solvers"),
     "solvers/sqp.py": (
+        "sqp_usual",
         "sqp_decisions",
         "sqp_steps",
         "sqp_exact",

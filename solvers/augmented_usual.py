@@ -162,7 +162,7 @@ class UsualPrimal(Primal):
         program = self.program
         values = Values(program.columns, lin.values.flat.copy())
         robust = np.empty((2, program.table.weights))
-        here, there = _point(lin), Point(values.flat, *program.buffers.take(), *robust)
+        here, there = point_at(lin), Point(values.flat, *program.buffers.take(), *robust)
         numbers = np.empty(NUMBERS)
         unit = 0.0 if program.least_squares else 1.0
         numbers[COST], numbers[DAMPING], numbers[GOAL], numbers[UNIT] = lin.cost, damping.value, goal, unit
@@ -198,7 +198,8 @@ class UsualPrimal(Primal):
         return Taken(reached, self._step, expected, expected if how == EXPECTED else plus, slope)
 
 
-def _point(lin: Linearization) -> Point:
+def point_at(lin: Linearization) -> Point:
+    """The arrays of a linearisation."""
     return Point(
         lin.values.flat, lin.residual, lin.jacobian, lin.constraints, lin.constraint_jacobian, lin.gradient,
         lin.hessian, lin.squares, lin.weights,

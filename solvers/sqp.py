@@ -21,16 +21,14 @@ from unifg.errors import BackendError
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.solvers.globalize.least_violation import Watch, leave, settle
-from unifg.solvers.globalize.line_search import search
+from unifg.solvers.globalize.line_search import Taken, search
 from unifg.solvers.globalize.merit import RowPrices
 from unifg.solvers.globalize.sizes import largest, norm
-from unifg.solvers.quadratic_programs.routes import Subproblems
 from unifg.solvers.quadratic_programs.scaling import Scaling
 from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, subproblem
+from unifg.solvers.sqp_usual import NOISE, ROUNDING, UsualSubproblems
 from unifg.typing import Array
 
-ROUNDING = 1e-13
-NOISE = 1e-8
 FAILURES = 4  # damped attempts at one step before giving up
 FIRST_DAMPING = 1e-3
 DAMPING_GROWTH = 10.0
@@ -92,9 +90,9 @@ class SQP(Solver):
         if self.qp == "elimination":
             require(program, f"{self.name}(qp='elimination')", "equalities")
 
-    def workspace(self, program: Program) -> Subproblems:
+    def workspace(self, program: Program) -> UsualSubproblems:
         """QP workspaces."""
-        return Subproblems(
+        return UsualSubproblems(
             program,
             hessian=self.hessian,
             qp=self.qp,
@@ -104,14 +102,14 @@ class SQP(Solver):
             tolerance=self.tolerance,
         )
 
-    def search_step(self, run: SolveState, workspace: Subproblems, lin: Linearization) -> Array | None:
+    def search_step(self, run: SolveState, workspace: UsualSubproblems, lin: Linearization) -> Array | None:
         """The full step of the subproblem."""
         workspace.start(lin)
         qp = subproblem(run.program, lin, SMALLEST_DAMPING * workspace.scaling.metric, workspace.pattern)
         answer = workspace.solve(qp, run.multipliers, self._accuracy(run, workspace))
         return answer.step if np.isfinite(answer.error) else None
 
-    def iterate(self, run: SolveState, workspace: Subproblems) -> Status | None:
+    def iterate(self, run: SolveState, workspace: UsualSubproblems) -> Status | None:
         """Iterate to convergence."""
         # Bounds are linear: once they hold they hold along every step, and leave the line search to the rest.
         within = run.program.within_bounds(run.values)
@@ -171,27 +169,36 @@ class SQP(Solver):
         return None
 
     def _attempt(
-        self, run: SolveState, workspace: Subproblems, merit: RowPrices, qp: QP
+        self, run: SolveState, workspace: UsualSubproblems, merit: RowPrices, qp: QP
     ) -> tuple[QPAnswer, Linearization, Array, Array, float, bool] | None:
         """Solve the subproblem and search along its step; None when there is no answer or no length helps."""
         accuracy = self._accuracy(run, workspace)
-        answer = workspace.solve(qp, run.multipliers, accuracy)
-        if not np.isfinite(answer.error):
-            return None
-        merit.raise_above(answer.multipliers)
-        found = self._search(run, workspace, merit, qp, answer, accuracy)
-        return None if found is None else (answer, *found)
+        used = None if self.full_steps else workspace.take(run, merit, qp, accuracy, self.second_order_correction)
+        if used is None:
+            answer = workspace.solve(qp, run.multipliers, accuracy)
+            if not np.isfinite(answer.error):
+                return None
+            merit.raise_above(answer.multipliers)
+            found = self._search(run, workspace, merit, qp, answer, accuracy)
+            if found is None:
+                return None
+        else:
+            answer, found = used
+        multipliers = answer.multipliers if found.dual is None else found.dual
+        if found.length < 1.0:
+            multipliers = run.multipliers + found.length * (multipliers - run.multipliers)
+        return answer, found.reached, multipliers, found.step, found.length, found.dual is not None
 
-    def _bounded(self, run: SolveState, workspace: Subproblems, damping: float) -> float:
+    def _bounded(self, run: SolveState, workspace: UsualSubproblems, damping: float) -> float:
         """With the exact Hessian damping must vanish with the error, or convergence would be linear."""
         return damping if self.hessian != "exact" else max(min(damping, _size(run, workspace)), SMALLEST_DAMPING)
 
-    def _accuracy(self, run: SolveState, workspace: Subproblems) -> float:
+    def _accuracy(self, run: SolveState, workspace: UsualSubproblems) -> float:
         """Ask the QP for what the outer iteration can use."""
         size = _size(run, workspace)
         share = min(1e-3, size) if self.hessian == "exact" else 1e-3
         # Where a scaled unit is worth many of the graph's, the test of the graph needs more digits.
-        return float(np.clip(share * size, 0.1 * self.tolerance * workspace.scaling.smallest, 1e-4))
+        return min(max(share * size, 0.1 * self.tolerance * workspace.scaling.smallest), 1e-4)
 
     def _next_damping(self, damping: float, length: float) -> float:
         """A shortened step means curvature that H does not know: damp, and forget it slowly."""
@@ -200,13 +207,13 @@ class SQP(Solver):
         return max((EXACT_DECAY if self.hessian == "exact" else DAMPING_DECAY) * damping, SMALLEST_DAMPING)
 
     def _search(
-        self, run: SolveState, workspace: Subproblems, merit: RowPrices, qp: QP, answer: QPAnswer, accuracy: float
-    ) -> tuple[Linearization, Array, Array, float, bool] | None:
-        """Where to go: linearisation, multipliers, step and its length, and whether it is a correction."""
+        self, run: SolveState, workspace: UsualSubproblems, merit: RowPrices, qp: QP, answer: QPAnswer, accuracy: float
+    ) -> Taken | None:
+        """How far to go."""
         program, lin = run.program, run.lin
         if self.full_steps:
             reached = program.linearize(program.retract(lin.values, answer.step))
-            return reached, answer.multipliers, answer.step, 1.0, False
+            return Taken(reached, answer.step, 1.0)
         here, linear = merit.value(lin), qp.linear(answer.step)
         slope = merit.slope(float(qp.gradient @ answer.step), lin, linear)
         # The QP meets its conditions to its own accuracy only; what that costs in merit is noise.
@@ -221,13 +228,7 @@ class SQP(Solver):
             return None if corrected is None else (corrected.step, corrected.multipliers)
 
         wanted = correct if self.second_order_correction else None
-        found = search(lin, answer.step, merit, here, slope, slack, linear, wanted)
-        if found is None:
-            return None
-        multipliers = answer.multipliers if found.dual is None else found.dual
-        if found.length < 1.0:
-            multipliers = run.multipliers + found.length * (multipliers - run.multipliers)
-        return found.reached, multipliers, found.step, found.length, found.dual is not None
+        return search(lin, answer.step, merit, here, slope, slack, linear, wanted)
 
 
 def missing_curvature(
@@ -256,7 +257,7 @@ def missing_curvature(
     return missing if missing > SECANT_MATTERS * known else 0.0
 
 
-def _size(run: SolveState, workspace: Subproblems) -> float:
+def _size(run: SolveState, workspace: UsualSubproblems) -> float:
     """The largest KKT number of the present iterate, in scaled units."""
     program, scaling, measured = run.program, workspace.scaling, run.optimality
     if scaling.neutral:

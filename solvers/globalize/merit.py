@@ -46,6 +46,7 @@ class RowPrices(Merit):
 
     Attributes:
         prices: (M,).
+        farthest: scaled violation that no step may exceed.
     """
 
     def __init__(self, program: Program, units: Array, multipliers: Array, start: Linearization) -> None:
@@ -60,7 +61,7 @@ class RowPrices(Merit):
         super().__init__(program)
         self._units = units
         self.prices = np.abs(multipliers)
-        self._worst = FARTHEST * max(1.0, self._size(start.constraints))
+        self.farthest = FARTHEST * max(1.0, self._size(start.constraints))
 
     @property
     def price(self) -> float:
@@ -89,7 +90,7 @@ class RowPrices(Merit):
 
     def accepts(self, trial: Point, here: float, slope: float, length: float, slack: float) -> bool:
         """Armijo's condition, not too far from the constraints: the merit may be unbounded out there."""
-        if not trial.finite or self._size(trial.constraints) > self._worst:
+        if not trial.finite or self._size(trial.constraints) > self.farthest:
             return False
         return super().accepts(trial, here, slope, length, slack)
 

@@ -23,6 +23,7 @@ from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, qp_error
 from unifg.typing import Array, BoolArray, IntArray
 
 ITERATIONS = 60
+TIGHTEST = 1e-12  # accuracy
 BOUNDARY = 0.995  # fraction of the way to the boundary
 SHIFT = 1e-10  # keeps the KKT matrix quasi-definite, relative to nothing: rows are in the problem's own units
 RESIDUAL = 1e-8  # relative, of a linear system without a solution: the rows contradict each other
@@ -34,6 +35,7 @@ class GraphRoute:
 
     Attributes:
         name: "graph".
+        system: the KKT matrix with the equalities of the last subproblem.
     """
 
     name = "graph"
@@ -41,14 +43,14 @@ class GraphRoute:
     def __init__(self, program: Program) -> None:
         """Analyse the KKT matrix."""
         self.program = program
-        self._system = program.systems.kkt(program.equality)
+        self.system = program.systems.kkt(program.equality)
 
     def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
         """Solve to ``accuracy`` and measure."""
         program = self.program
         equality = qp.lower == qp.upper
-        if not np.array_equal(equality, self._system.held):
-            self._system = program.systems.kkt(equality)
+        if not np.array_equal(equality, self.system.held):
+            self.system = program.systems.kkt(equality)
         below = np.flatnonzero(np.isfinite(qp.lower) & ~equality)
         above = np.flatnonzero(np.isfinite(qp.upper) & ~equality)
         step, dual = np.zeros(program.size), np.where(equality, multipliers, 0.0)
@@ -59,35 +61,37 @@ class GraphRoute:
         if not len(below) and not len(above):
             error = self._linear(qp, hessian, dual, step)
             return QPAnswer(step, dual, self.name, 1, qp_error(qp, step, dual), not error <= RESIDUAL)
-        iterations = _minimize(
-            program.arrays,
-            self._system.arrays,
-            program.columns.free,
-            hessian,
-            qp.gradient,
-            qp.jacobian,
-            np.concatenate([below, above]),
-            np.repeat([1.0, -1.0], [len(below), len(above)]),
-            np.concatenate([qp.lower[below], qp.upper[above]]),
-            qp.lower,
-            equality,
-            max(accuracy, 1e-12),
-            step,
-            dual,
+        iterations = int(
+            minimize_quadratic(
+                program.arrays,
+                self.system.arrays,
+                program.columns.free,
+                hessian,
+                qp.gradient,
+                qp.jacobian,
+                np.concatenate([below, above]),
+                np.repeat([1.0, -1.0], [len(below), len(above)]),
+                np.concatenate([qp.lower[below], qp.upper[above]]),
+                qp.lower,
+                equality,
+                max(accuracy, TIGHTEST),
+                step,
+                dual,
+            )
         )
         infeasible = bool(np.abs(dual).max(initial=0.0) > HOPELESS) or iterations < 0
         return QPAnswer(step, dual, self.name, abs(iterations), qp_error(qp, step, dual), infeasible)
 
     def _linear(self, qp: QP, hessian: Array, dual: Array, step: Array) -> float:
         """Solve the KKT system: sets ``step``, moves ``dual``, returns the relative residual."""
-        program, arrays, n = self.program, self._system.arrays, self.program.size
-        data, right = np.zeros(self._system.pattern.nnz), np.empty(n + len(arrays.rows))
+        program, arrays, n = self.program, self.system.arrays, self.program.size
+        data, right = np.zeros(self.system.pattern.nnz), np.empty(n + len(arrays.rows))
         fill(arrays, hessian, qp.jacobian, data)
-        if not self._system.saddle.factor(data):
+        if not self.system.saddle.factor(data):
             return np.inf
         pull = program.constraints.transposed_times(qp.jacobian, dual)[program.columns.free]
         right[:n], right[n:] = -(qp.gradient + pull), qp.lower[arrays.rows]
-        found, error = self._system.saddle.solve(right)
+        found, error = self.system.saddle.solve(right)
         step[:] = found[:n]
         dual[arrays.rows] += found[n:]
         return error
@@ -125,7 +129,7 @@ class Polish:
 
 
 @compiled
-def _minimize(
+def minimize_quadratic(
     terms: TermArrays,
     kkt: KktArrays,
     free: IntArray,
@@ -140,7 +144,7 @@ def _minimize(
     accuracy: float,
     step: Array,
     dual: Array,
-) -> int:
+) -> float:
     """Mehrotra's method from step zero, with sides; returns the iterations, negative when a system was singular."""
     n, equalities, sides, count = kkt.size[0], kkt.size[1], len(side_row), len(lower)
     linear, row_terms, weights, move = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count)
@@ -176,7 +180,7 @@ def _minimize(
         add_constraints(terms, jacobian, weights, matrix)
         fill(kkt, matrix, jacobian, data)
         if not factor(kkt.plan, data, shift):
-            return -iteration - 1
+            return -iteration - 1.0
         # Predictor: aim at complementarity zero; corrector: at what the predictor suggests is within reach.
         centre = 0.0
         for corrector in range(2):
@@ -213,7 +217,7 @@ def _minimize(
             step[k] += length * found[k]
             largest = max(largest, abs(found[k]))
         if not math.isfinite(largest):
-            return -iteration - 1
+            return -iteration - 1.0
         for k in range(equalities):
             dual[kkt.rows[k]] += length * found[n + k]
         for k in range(sides):
@@ -221,7 +225,7 @@ def _minimize(
             y[k] += length * dy[k]
     for k in range(sides):
         dual[side_row[k]] -= side_sign[k] * y[k]
-    return iteration
+    return float(iteration)
 
 
 @compiled

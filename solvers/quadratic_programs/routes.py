@@ -35,6 +35,7 @@ class Subproblems:
         program: the compiled graph.
         pattern: of the Hessians.
         scaling: units in which subproblems are solved, found at the start of each solve.
+        tolerance: of the KKT test.
         elastic_asked: whether the last subproblem went to the elastic route.
     """
 
@@ -56,7 +57,7 @@ class Subproblems:
         """
         self.program = program
         self.elastic_asked = False
-        self._tolerance = tolerance
+        self.tolerance = tolerance
         self._exact = ExactHessian(program) if hessian == "exact" else None
         self.pattern = program.hessian if self._exact is None else program.normal
         linear = bool(program.equality.all()) and qp != "elimination"
@@ -105,13 +106,13 @@ class Subproblems:
         self.elastic_asked = self._first_answered = False
         enough = max(10.0 * accuracy, GOOD_ENOUGH)
         if self.fallback is None or self.elastic is None:
-            answer = solve_convex(self.first, qp, multipliers, accuracy)
+            answer = self.by_first(qp, multipliers, accuracy)
             return answer if holds(qp, answer, enough) else replace(answer, error=np.inf)
         answers = []
         if self._resting:
             self._resting -= 1
         else:
-            answers.append(solve_convex(self.first, qp, multipliers, accuracy))
+            answers.append(self.by_first(qp, multipliers, accuracy))
             if not holds(qp, answers[-1], enough):
                 return replace(answers[-1], error=np.inf)
             if answers[-1].error <= 10.0 * accuracy and not self._contradicts(qp, answers[-1]):
@@ -131,13 +132,17 @@ class Subproblems:
         self.elastic_asked = True
         return self.elastic.solve(elastic(), max(10.0 * float(np.abs(multipliers).max(initial=0.0)), 1e3))
 
+    def by_first(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
+        """What the first route says."""
+        return solve_convex(self.first, qp, multipliers, accuracy)
+
     def _contradicts(self, qp: QP, answer: QPAnswer) -> bool:
         """Whether an answer leaves most of the violation, as the least error of contradicting rows does."""
-        if answer.error <= 0.1 * self._tolerance:  # which is no less than what is left
+        if answer.error <= 0.1 * self.tolerance:  # which is no less than what is left
             return False
         linear = qp.linear(answer.step)
         left = largest(np.maximum(linear - qp.upper, 0.0) + np.maximum(qp.lower - linear, 0.0))
-        return left > max(LEFT * largest(np.maximum(-qp.upper, 0.0) + np.maximum(qp.lower, 0.0)), 0.1 * self._tolerance)
+        return left > max(LEFT * largest(np.maximum(-qp.upper, 0.0) + np.maximum(qp.lower, 0.0)), 0.1 * self.tolerance)
 
     def distrust(self) -> bool:
         """Leave the first route out for a while, after a step of it that led nowhere; whether it gave the last step."""

@@ -90,7 +90,7 @@ class Scaling:
     def jacobian(self, entries: Array) -> Array:
         """Entries of the scaled constraint Jacobian, in evaluation order."""
         constraints = self.program.constraints
-        scaled: Array = entries * self.rows[constraints.rows] * self._full[constraints.columns]
+        scaled: Array = entries * self.rows[constraints.rows] * self.full[constraints.columns]
         return scaled
 
     def scaled(self, qp: QP) -> QP:
@@ -114,8 +114,8 @@ class Scaling:
         return replace(answer, step=self.columns * answer.step, multipliers=self.rows * answer.multipliers)
 
     @cached_property
-    def _full(self) -> Array:
-        """Factors of all tangent coordinates, one for fixed ones."""
+    def full(self) -> Array:
+        """(width,) factors of all tangent coordinates, one for fixed ones."""
         full = np.ones(self.program.columns.width)
         full[self.program.columns.free] = self.columns
         return full

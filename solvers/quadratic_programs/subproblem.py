@@ -147,11 +147,11 @@ def qp_error(qp: QP, step: Array, multipliers: Array) -> float:
     slope += program.constraints.transposed_times(qp.jacobian, multipliers)[program.columns.free]
     if program.least_squares:
         return largest(slope) / (largest(qp.gradient) or 1.0)  # measured without units there, and here
-    return float(_largest_residual(slope, qp.linear(step), qp.lower, qp.upper, multipliers, program.equality))
+    return float(largest_residual(slope, qp.linear(step), qp.lower, qp.upper, multipliers, program.equality))
 
 
 @compiled
-def _largest_residual(
+def largest_residual(
     slope: Array, value: Array, lower: Array, upper: Array, multipliers: Array, equality: BoolArray
 ) -> float:
     """The same of a gradient of the Lagrangian and of values of the rows; infinite where one is not a number."""
