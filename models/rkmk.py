@@ -35,7 +35,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from unifg.errors import ModelError, UnifgError
-from unifg.kernels.derive.derived import Each, Given, derived
+from unifg.kernels.derive.derived import DerivedKernel, Each, Given, derived
 from unifg.kernels.derive.reach import reach_of
 from unifg.kernels.derive.symbols import TraceError
 from unifg.kernels.residuals import Residual, residual
@@ -189,10 +189,12 @@ def rollout(
     parts = [np.broadcast_to(part, (count, part.shape[1])) for part in parts]
     states = np.empty((count + 1, group.storage))
     states[0] = start
-    code = _stepping(group, field, tableau, states[0], parts, h / substeps) if count * substeps > FEW else None
-    if code is not None:
+    functions = functions_of(group) if count * substeps > FEW and tableau.explicit else None
+    step = _stepping(group, field, tableau, states[0], parts, h / substeps) if functions is not None else None
+    if functions is not None and step is not None:  # which goes, and its machine code with it, when its name does
+        code, retraction = step.address, address(functions.retract, RETRACTION)
         u = np.concatenate([*parts, np.empty((count, 0))], axis=1)
-        _follow(*code, u, h / substeps, substeps, np.empty(group.dim), states)
+        _follow(code, retraction, u, h / substeps, substeps, np.empty(group.dim), states)
         return states
     defect = integrator(group, field, method)
     for n in range(count):
@@ -205,11 +207,8 @@ def rollout(
 
 def _stepping(
     group: LieGroup, field: Field, tableau: Tableau, start: Array, inputs: Sequence[Array], h: float
-) -> tuple[int, int] | None:
-    """Machine code of an explicit step and of the group's retraction; None where there is none."""
-    functions = functions_of(group)
-    if not tableau.explicit or functions is None:
-        return None
+) -> DerivedKernel | None:
+    """An explicit step as a kernel; None where its field cannot be traced."""
     step = partial(travel, group, field.for_one() if isinstance(field, CompiledField) else field, tableau.numbers)
     first = [start[None], *(part[:1] for part in inputs), np.array([h])]
     reach = reach_of(step)
@@ -221,7 +220,7 @@ def _stepping(
         return None
     if not np.allclose(kernel(*first), travel(group, field, tableau.numbers, *first), rtol=1e-9, atol=1e-12):
         return None
-    return kernel.address, address(functions.retract, RETRACTION)
+    return kernel
 
 
 @compiled

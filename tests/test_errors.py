@@ -45,6 +45,7 @@ def plain(source: str) -> list[str]:
             asked = (
                 name in ("NotImplementedError", "KeyboardInterrupt")
                 or (name == "AttributeError" and function == "__getattr__")
+                or (name == "TypeError" and function == "__reduce__")
                 or (name == "ImportError" and handled == "ImportError")
             )
             if name in EXCEPTIONS and not asked:
