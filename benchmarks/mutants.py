@@ -100,7 +100,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "scenarios/log/columns.py": ("metrics",),
     "scenarios/options.py": ("cli",),
     "scenarios/show/drive_scene.py": ("scene",),
-    "scenarios/show/stage.py": ("scene", "quadrotor_scene"),
+    "unifg/view/stage.py": ("scene", "quadrotor_scene"),
     "scenarios/worlds/placement.py": ("unforeseen",),
     "scenarios/driving/drive_window.py": ("joint", "control_decisions"),
     "scenarios/flying/arrival.py": ("quadrotor_mpc", "quadrotor_flights"),

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from unifg.scenarios.show.recorder import viewer_script
+from unifg.view.recorder import viewer_script
 
 Commands = list[dict[str, Any]]
 Tracks = dict[str, dict[str, list[tuple[int, Any]]]]

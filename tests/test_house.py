@@ -21,7 +21,7 @@ SIDES = ("solvers", "models", "scenarios")
 # From the ground up. A room knows the floors below it; rooms of one floor do not know each other.
 FLOORS: tuple[tuple[str, ...], ...] = (
     ("errors", "typing"),
-    ("machine",),
+    ("machine", "style"),
     ("lie", "elimination"),
     ("kernels",),
     ("language",),
@@ -29,6 +29,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("answers",),
     ("solvers", "smoothing", "pose_graphs", "models"),
     ("files",),
+    ("view",),
     ("warming",),
     ("unifg",),  # the names of the user's script, gathered
     ("scenarios",),

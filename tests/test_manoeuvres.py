@@ -25,8 +25,8 @@ from unifg.scenarios.manoeuvres import (
     table,
 )
 from unifg.scenarios.show import manoeuvre_plot as manoeuvre_plots
-from unifg.scenarios.show.style import css
 from unifg.solvers import SQP, names
+from unifg.style.colours import css
 
 SOLVERS = ("alm", "sqp")
 BEHIND = 59.47520  # J of the path behind the robot without a cost on changes, by IPOPT and by Crocoddyl's Box-FDDP

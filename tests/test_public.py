@@ -13,7 +13,15 @@ import unifg as fg
 from fences import PYTHON, documents, fences
 
 # Rooms whose modules a user imports by name; all others are organs, but for what a backend of one's own is made of.
-OPEN = ("unifg.lie", "unifg.solvers", "unifg.models", "unifg.scenarios", "unifg.pose_graphs", "unifg.files")
+OPEN = (
+    "unifg.lie",
+    "unifg.solvers",
+    "unifg.models",
+    "unifg.scenarios",
+    "unifg.pose_graphs",
+    "unifg.files",
+    "unifg.view",
+)
 OPEN_MODULES = {
     "unifg",
     "unifg.machine.tally",

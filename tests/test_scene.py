@@ -13,15 +13,15 @@ from matplotlib.axes import Axes
 
 from episodes import HORIZON, episode, room
 from scenes import check_offline, commands_of, data_of, tracks_of, without_viewer
-from unifg.errors import ScenarioError
+from unifg.errors import ViewError
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.show.drive_plot import overview, plot_controls, plot_localisation, plot_map
 from unifg.scenarios.show.drive_scene import drive_scene, scan_points
 from unifg.scenarios.show.panels import plot_clearance, plot_times
-from unifg.scenarios.show.recorder import Recorder, viewer_script
-from unifg.scenarios.show.shapes import cover, extrude, flat, known_corners, ribbon
-from unifg.scenarios.show.stage import frame_ticks
-from unifg.scenarios.show.style import write_figure
+from unifg.style.figures import write_figure
+from unifg.view.recorder import Recorder, viewer_script
+from unifg.view.shapes import cover, extrude, flat, known_corners, ribbon
+from unifg.view.stage import frame_ticks
 
 umsgpack = pytest.importorskip("umsgpack")
 
@@ -216,7 +216,7 @@ def test_odd_episodes_are_drawn_too(log: EpisodeLog) -> None:
     lost = replace(log, horizon=np.full_like(log.horizon, np.nan), scan=np.full_like(log.scan, np.nan))
     paths = {command.get("path") for command in commands_of(drive_scene(lost).html())}
     assert "/meshcat/frames/0/horizon" not in paths and "/meshcat/frames/0/scan" not in paths
-    with pytest.raises(ScenarioError, match="no tick"):
+    with pytest.raises(ViewError, match="no tick"):
         drive_scene(replace(log, time=log.time[:0]))
 
 

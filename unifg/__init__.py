@@ -29,6 +29,7 @@ from unifg.errors import (
     ModelError,
     ScenarioError,
     UnifgError,
+    ViewError,
 )
 from unifg.kernels.derive.casadi_function import from_casadi
 from unifg.kernels.kernel import Kernel
@@ -110,6 +111,7 @@ __all__ = [
     "Tukey",
     "UnifgError",
     "Verdict",
+    "ViewError",
     "between",
     "check_manifold",
     "compiled",

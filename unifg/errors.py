@@ -56,5 +56,9 @@ class ScenarioError(UnifgError):
     """A scenario was asked for something its world cannot offer."""
 
 
+class ViewError(UnifgError):
+    """Something cannot be drawn or shown as it was given."""
+
+
 class FileFormatError(UnifgError):
     """A file does not say what its format promises."""

@@ -29,8 +29,8 @@ from unifg.models.lidar import in_world  # noqa: E402
 from unifg.pose_graphs import manhattan  # noqa: E402
 from unifg.scenarios.log.drive_log import EpisodeLog  # noqa: E402
 from unifg.scenarios.navigation import NavigationSettings, run_navigation  # noqa: E402
-from unifg.scenarios.show.style import css  # noqa: E402
 from unifg.solvers import GaussNewton  # noqa: E402
+from unifg.style.colours import css  # noqa: E402
 from unifg.typing import Array, IntArray  # noqa: E402
 
 Point = tuple[float, float]

@@ -10,7 +10,8 @@ from draw import COST, HARD, beside, factor, frame, variable
 
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.show.flight_plot import overview
-from unifg.scenarios.show.style import css, write_figure
+from unifg.style.colours import css
+from unifg.style.figures import write_figure
 
 HERE = Path(__file__).resolve().parent
 SEED = 1003

@@ -15,7 +15,7 @@ from unifg.scenarios.log.metrics import table, write_metrics
 from unifg.scenarios.show.course_log import course_log
 from unifg.scenarios.show.course_plot import picture
 from unifg.scenarios.show.flight_scene import flight_scene
-from unifg.scenarios.show.style import write_figure
+from unifg.style.figures import write_figure
 
 __all__ = ["SETTINGS", "course_metrics", "run", "summary", "write_results"]
 

@@ -12,7 +12,7 @@ from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.log.metrics import table, write_metrics
 from unifg.scenarios.show.drive_plot import overview
 from unifg.scenarios.show.drive_scene import drive_scene
-from unifg.scenarios.show.style import write_figure
+from unifg.style.figures import write_figure
 
 __all__ = ["SETTINGS", "run", "summary", "write_results"]
 
@@ -44,7 +44,7 @@ def write_results(folder: Path, log: EpisodeLog) -> list[Path]:
         ``estimate.tum``.
 
     Raises:
-        ScenarioError: the episode has no tick.
+        ViewError: the episode has no tick.
     """
     # The cheapest and most precious first, in case the user loses patience.
     metrics = write_metrics(folder / "metrics.json", episode_metrics(log))

@@ -12,7 +12,7 @@ from unifg.scenarios.log.flight_metrics import flight_metrics, has_estimate
 from unifg.scenarios.log.metrics import table, write_metrics
 from unifg.scenarios.show.flight_plot import control, estimates, overview
 from unifg.scenarios.show.flight_scene import flight_scene
-from unifg.scenarios.show.style import write_figure
+from unifg.style.figures import write_figure
 
 __all__ = ["SETTINGS", "run", "summary", "write_results"]
 
@@ -45,7 +45,7 @@ def write_results(folder: str | Path, log: FlightLog, metrics: Mapping[str, obje
         ``control.png``, ``metrics.json`` and ``flight.npz``, which `FlightLog.load` reads.
 
     Raises:
-        ScenarioError: the flight has no tick, or meshcat is not installed.
+        ViewError: the flight has no tick, or meshcat is not installed.
     """
     folder = Path(folder)
     # The cheapest and most precious first, in case the user loses patience.

@@ -15,7 +15,7 @@ from unifg.scenarios.log.metrics import table, write_metrics
 from unifg.scenarios.pose_graph import SolvedGraph
 from unifg.scenarios.show.graph_plot import picture
 from unifg.scenarios.show.graph_scene import graph_scene
-from unifg.scenarios.show.style import write_figure
+from unifg.style.figures import write_figure
 
 __all__ = ["SETTINGS", "metrics", "run", "summary", "write_results"]
 

@@ -10,7 +10,7 @@ from unifg.scenarios import manoeuvres
 from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations
 from unifg.scenarios.options import option
 from unifg.scenarios.show.manoeuvre_plot import picture
-from unifg.scenarios.show.style import write_figure
+from unifg.style.figures import write_figure
 
 __all__ = ["SETTINGS", "run"]
 

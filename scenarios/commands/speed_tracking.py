@@ -7,8 +7,8 @@ from pathlib import Path
 from unifg.answers.status import Status
 from unifg.scenarios import velocity_tracking
 from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations
-from unifg.scenarios.show.style import write_figure
 from unifg.scenarios.show.velocity_plot import picture
+from unifg.style.figures import write_figure
 
 __all__ = ["SETTINGS", "run"]
 

@@ -9,10 +9,11 @@ import numpy as np
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors
 from unifg.scenarios.log.metrics import collision_words
-from unifg.scenarios.show.panels import dashes, discs, ground, over_time, plot_clearance, plot_times, word
-from unifg.scenarios.show.shapes import known_corners
-from unifg.scenarios.show.style import INK, css, headline, new_axes, new_figure
+from unifg.scenarios.show.panels import over_time, plot_clearance, plot_times
+from unifg.style.colours import INK, css
+from unifg.style.figures import dashes, discs, ground, headline, new_axes, new_figure, word
 from unifg.typing import Array
+from unifg.view.shapes import known_corners
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,7 +26,7 @@ def overview(log: EpisodeLog) -> Figure:
     """The map on the left; errors, controls, clearance and solve times over time on the right.
 
     Raises:
-        ScenarioError: the drive has no tick.
+        ViewError: the drive has no tick.
     """
     with new_figure((15.0, 9.4), log.ticks) as figure:
         left, right = figure.subfigures(1, 2, width_ratios=(1.75, 1.0), squeeze=False)[0]

@@ -9,9 +9,9 @@ import numpy as np
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors
 from unifg.scenarios.log.metrics import collision_words
-from unifg.scenarios.show import shapes
-from unifg.scenarios.show.stage import Key, Label, Page, Readout, Stage, View
 from unifg.typing import Array, IntArray
+from unifg.view import shapes
+from unifg.view.stage import Key, Label, Page, Readout, Stage, View
 
 __all__ = ["drive_scene", "scan_points"]
 
@@ -26,7 +26,7 @@ def drive_scene(log: EpisodeLog) -> Stage:
     """The scene of a drive.
 
     Raises:
-        ScenarioError: the drive has no tick, or meshcat is not installed.
+        ViewError: the drive has no tick, or meshcat is not installed.
     """
     stage = Stage(log.ticks, log.dt)
     extent = float(np.ptp(shapes.known_corners(log.occupancy), axis=0).max())

@@ -13,16 +13,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from unifg.errors import ScenarioError
+from unifg.errors import ViewError
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import PARAMETERS, estimated_parameters, has_estimate, state_errors
 from unifg.scenarios.log.metrics import collision_words
 from unifg.scenarios.show.flight_scene import SIGMAS, first_sights, sensor_reach
-from unifg.scenarios.show.panels import dashes, discs, ground, over_time, plot_clearance, plot_times
-from unifg.scenarios.show.shapes import ellipse_axes
-from unifg.scenarios.show.style import GREY, INK, css, headline, key_of, new_axes, new_figure
+from unifg.scenarios.show.panels import over_time, plot_clearance, plot_times
 from unifg.scenarios.worlds.air import VEHICLE_RADIUS
+from unifg.style.colours import GREY, INK, css
+from unifg.style.figures import dashes, discs, ground, headline, key_of, new_axes, new_figure
 from unifg.typing import Array, IntArray
+from unifg.view.shapes import ellipse_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,7 +61,7 @@ def overview(log: FlightLog) -> Figure:
     """Six moments from above, evenly spread from the first tick to the last.
 
     Raises:
-        ScenarioError: the flight has no tick.
+        ViewError: the flight has no tick.
     """
     width, height = np.ptp(log.layout.size, axis=0) + 2.0 * _MARGIN
     columns = 2 if width >= _WIDE * height else 3
@@ -83,10 +84,10 @@ def estimates(log: FlightLog) -> Figure:
     """Every parameter that is estimated, then the errors of position, velocity and attitude.
 
     Raises:
-        ScenarioError: the flight has no tick or no estimate.
+        ViewError: the flight has no tick or no estimate.
     """
     if log.ticks and not has_estimate(log):
-        raise ScenarioError("nobody estimated in this flight: it has neither sigmas nor windows")
+        raise ViewError("nobody estimated in this flight: it has neither sigmas nor windows")
     parameters = np.flatnonzero(estimated_parameters(log)).tolist()
     rows = math.ceil(len(parameters) / _COLUMNS) + len(_STATES) // _COLUMNS
     with new_figure((15.0, 2.05 * rows + 0.9), log.ticks) as figure:
@@ -109,7 +110,7 @@ def control(log: FlightLog) -> Figure:
     """Body rates and thrust on the left; speed and height, clearance and timing on the right.
 
     Raises:
-        ScenarioError: the flight has no tick.
+        ViewError: the flight has no tick.
     """
     total = log.estimate_ms + log.plan_ms
     clock = float(total.max(initial=0.0)) > 0.0

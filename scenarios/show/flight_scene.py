@@ -13,11 +13,11 @@ import numpy as np
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import estimated_parameters, flight_metrics, has_estimate
 from unifg.scenarios.log.metrics import collision_words
-from unifg.scenarios.show import drone, shapes
-from unifg.scenarios.show.stage import Key, Label, Page, Readout, Stage, View
 from unifg.scenarios.worlds.air import VEHICLE_RADIUS
 from unifg.scenarios.worlds.bearing_range import SensorModel
 from unifg.typing import Array, IntArray
+from unifg.view import drone, shapes
+from unifg.view.stage import Key, Label, Page, Readout, Stage, View
 
 __all__ = ["first_sights", "flight_scene", "sensor_reach"]
 
@@ -34,7 +34,7 @@ def flight_scene(log: FlightLog) -> Stage:
     """The scene of a flight.
 
     Raises:
-        ScenarioError: the flight has no tick, or meshcat is not installed.
+        ViewError: the flight has no tick, or meshcat is not installed.
     """
     stage = Stage(log.ticks, log.dt)
     for layer in (_ground, _walls, _cylinders, _ends, _landmarks, _movers, _drone, _trail, _frames):

@@ -10,8 +10,8 @@ import numpy as np
 
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.scenarios.pose_graph import SolvedGraph
-from unifg.scenarios.show.panels import face
-from unifg.scenarios.show.style import INK, css, headline, key_of, new_figure
+from unifg.style.colours import INK, css
+from unifg.style.figures import face, headline, key_of, new_figure
 from unifg.typing import Array, BoolArray
 
 if TYPE_CHECKING:

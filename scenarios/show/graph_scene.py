@@ -7,9 +7,9 @@ import numpy as np
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.scenarios.pose_graph import SolvedGraph
 from unifg.scenarios.show.graph_plot import segments
-from unifg.scenarios.show.shapes import strips
-from unifg.scenarios.show.stage import Key, Page, Readout, Stage, View
 from unifg.typing import Array
+from unifg.view.shapes import strips
+from unifg.view.stage import Key, Page, Readout, Stage, View
 
 __all__ = ["graph_scene", "shown_steps"]
 
@@ -24,7 +24,7 @@ def graph_scene(solved: SolvedGraph) -> Stage:
     """The scene of a solved pose graph: ``start``, and one group ``steps/k`` for each iterate shown.
 
     Raises:
-        ScenarioError: meshcat is not installed.
+        ViewError: meshcat is not installed.
     """
     graph, shown = solved.after, shown_steps(solved)
     stage = Stage(len(shown), _STEP)

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from unifg.scenarios.manoeuvres import Manoeuvre
-from unifg.scenarios.show.panels import discs, face, ground, plot_convergence, shade_distance, word
-from unifg.scenarios.show.style import GREY, INK, css, headline, new_figure
+from unifg.scenarios.show.panels import plot_convergence, shade_distance
+from unifg.style.colours import GREY, INK, css
+from unifg.style.figures import discs, face, ground, headline, new_figure, word
 from unifg.typing import Array
 
 if TYPE_CHECKING:

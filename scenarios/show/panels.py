@@ -5,29 +5,25 @@ Panels over time take any log with time, clearance and marks on ticks that had t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from unifg.answers.history import Iteration
-from unifg.scenarios.show.style import GREY, css, new_axes
+from unifg.style.colours import GREY, css
+from unifg.style.figures import dashes, face, new_axes
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = [
-    "dashes",
-    "discs",
-    "face",
-    "ground",
     "over_time",
     "plot_clearance",
     "plot_convergence",
     "plot_times",
     "shade_distance",
-    "word",
 ]
 
 
@@ -50,16 +46,6 @@ class Timed(Protocol):
     compiled: IntArray
 
 
-def face(ax: Axes, title: str, y: str = "", x: str = "") -> Axes:
-    """Title, labels and grid."""
-    ax.set_title(title)
-    ax.set_xlabel(x)
-    ax.set_ylabel(y)
-    ax.set_axisbelow(True)
-    ax.grid(True)
-    return ax
-
-
 def over_time(log: Timed, ax: Axes, title: str, y: str) -> Axes:
     """The face of a panel over the time of a run, shaded where a stored plan was followed."""
     ax.set_xlim(0.0, log.ticks * log.dt)
@@ -67,12 +53,6 @@ def over_time(log: Timed, ax: Axes, title: str, y: str) -> Axes:
     for begin, end in zip(np.flatnonzero(steps == 1), np.flatnonzero(steps == -1), strict=True):
         ax.axvspan(begin * log.dt, end * log.dt, color="#000000", alpha=0.12, lw=0)
     return face(ax, title, y)
-
-
-def dashes(ax: Axes, levels: Iterable[float], width: float = 1.0) -> None:
-    """Dashed lines across, for limits and quantiles."""
-    for level in levels:
-        ax.axhline(level, color=GREY, lw=width, ls="--")
 
 
 def plot_clearance(log: Timed, ax: Axes | None = None) -> Axes:
@@ -141,23 +121,6 @@ def plot_convergence(
     return face(ax, "What is wrong with each iterate", x="iterate")
 
 
-def discs(ax: Axes, rows: ArrayLike, label: str | None = None, **style: Any) -> None:
-    """Circles x, y, radius [m]; the first one is named in the legend."""
-    from matplotlib.patches import Circle
-
-    for index, (x, y, radius) in enumerate(np.asarray(rows).reshape(-1, 3).tolist()):
-        ax.add_patch(Circle((x, y), radius, label=None if index else label, **style))
-
-
-def word(ax: Axes, at: Array, text: str, offset: tuple[int, int], **style: Any) -> None:
-    """A word beside a place."""
-    box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8}
-    ax.annotate(
-        text, (float(at[0]), float(at[1])), xytext=offset, textcoords="offset points",
-        **{"ha": "center", "va": "center", "fontsize": 9, "fontweight": "bold", "zorder": 11, "bbox": box, **style},
-    )  # fmt: skip
-
-
 def shade_distance(
     ax: Axes, low: Array, high: Array, distance: Callable[[Array], Array], reach: float, dark: str
 ) -> tuple[Array, Array, Array]:
@@ -181,13 +144,3 @@ def shade_distance(
     colours = LinearSegmentedColormap.from_list("near", [dark, "#ffffff"])
     ax.contourf(x, y, np.clip(gap, 0.0, reach), levels=np.linspace(0.0, reach, 9), cmap=colours, zorder=0)
     return x, y, gap
-
-
-def ground(ax: Axes, low: ArrayLike, high: ArrayLike) -> None:
-    """Equal axes in metres between two corners (2,) [m]."""
-    (left, bottom), (right, top) = np.asarray(low).tolist(), np.asarray(high).tolist()
-    ax.set_xlim(left, right)
-    ax.set_ylim(bottom, top)
-    ax.set_aspect("equal")
-    ax.set_xlabel("x [m]")
-    ax.set_ylabel("y [m]")

@@ -15,7 +15,7 @@ import numpy as np
 
 from unifg.answers.history import Iteration
 from unifg.errors import UnifgError
-from unifg.scenarios.show.style import new_figure, write_figure
+from unifg.style.figures import new_figure, write_figure
 from unifg.typing import Array
 
 if TYPE_CHECKING:

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from unifg.scenarios.show.panels import face, plot_convergence
-from unifg.scenarios.show.style import GREY, INK, css, headline, new_figure
+from unifg.scenarios.show.panels import plot_convergence
 from unifg.scenarios.velocity_tracking import Drive, metrics
+from unifg.style.colours import GREY, INK, css
+from unifg.style.figures import face, headline, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

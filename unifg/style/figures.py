@@ -1,6 +1,5 @@
-"""One look for all pictures: colours, fonts, new figures and axes, and the file a figure becomes.
+"""One look for all pictures: fonts, new figures and axes, the face and marks of axes, and the file a figure becomes.
 
-One colour stands for one thing, in scenes and plots alike; chosen from colour-blind-safe sets (Okabe and Ito 2008).
 Figures are made without matplotlib's global state (no ``pyplot``), so drawing works in threads and on machines without
 a screen.
 """
@@ -12,47 +11,29 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unifg.errors import ScenarioError
+import numpy as np
+
+from unifg.errors import ViewError
+from unifg.style.colours import GREY, INK
+from unifg.typing import Array, ArrayLike
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["COLOURS", "GREY", "INK", "css", "headline", "key_of", "new_axes", "new_figure", "write_figure"]
+__all__ = [
+    "dashes",
+    "discs",
+    "face",
+    "ground",
+    "headline",
+    "key_of",
+    "new_axes",
+    "new_figure",
+    "word",
+    "write_figure",
+]
 
-COLOURS = {
-    "floor": 0xF6F4EF,
-    "metres": 0xE2DFD6,
-    "wall": 0x9AA3AE,
-    "ink": 0x1D2430,
-    "dark": 0x2B3340,
-    "plan": 0x4D4D4D,
-    "start": 0x4D4D4D,
-    "goal": 0xF0C000,
-    "pole": 0x4D4D4D,
-    "robot": 0x0A56A8,
-    "heading": 0xFFFFFF,
-    "trail": 0x3D95E0,
-    "estimate": 0x8A3FD0,
-    "odometry": 0x7F7F7F,
-    "horizon": 0x009E4F,
-    "scan": 0xE6007E,
-    "fixed": 0xF09000,
-    "moving": 0xD62718,
-    "detected": 0x000000,
-    "closure": 0x009E4F,
-    "outlier": 0xD62718,
-    "landmark": 0xF09000,
-}
-"""Name to 0xRRGGBB."""
-
-
-def css(name: str) -> str:
-    """The colour as ``#rrggbb``."""
-    return f"#{COLOURS[name]:06x}"
-
-
-INK, GREY = css("ink"), "#6b7280"
 _STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],  # ships with matplotlib: the same picture everywhere
@@ -82,14 +63,14 @@ def new_figure(size: tuple[float, float], ticks: int = 1) -> Iterator[Figure]:
         ticks: of the run to be drawn.
 
     Raises:
-        ScenarioError: there is no tick.
+        ViewError: there is no tick.
     """
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     if ticks == 0:
-        raise ScenarioError("there is no tick, and nothing to draw")
+        raise ViewError("there is no tick, and nothing to draw")
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(figure)
@@ -117,6 +98,49 @@ def key_of(axes: Iterable[Axes]) -> tuple[list[Any], list[str]]:
         handles, labels = ax.get_legend_handles_labels()
         named |= dict(zip(labels, handles, strict=True))
     return list(named.values()), list(named)
+
+
+def face(ax: Axes, title: str, y: str = "", x: str = "") -> Axes:
+    """Title, labels and grid."""
+    ax.set_title(title)
+    ax.set_xlabel(x)
+    ax.set_ylabel(y)
+    ax.set_axisbelow(True)
+    ax.grid(True)
+    return ax
+
+
+def dashes(ax: Axes, levels: Iterable[float], width: float = 1.0) -> None:
+    """Dashed lines across, for limits and quantiles."""
+    for level in levels:
+        ax.axhline(level, color=GREY, lw=width, ls="--")
+
+
+def ground(ax: Axes, low: ArrayLike, high: ArrayLike) -> None:
+    """Equal axes in metres between two corners (2,) [m]."""
+    (left, bottom), (right, top) = np.asarray(low).tolist(), np.asarray(high).tolist()
+    ax.set_xlim(left, right)
+    ax.set_ylim(bottom, top)
+    ax.set_aspect("equal")
+    ax.set_xlabel("x [m]")
+    ax.set_ylabel("y [m]")
+
+
+def discs(ax: Axes, rows: ArrayLike, label: str | None = None, **style: Any) -> None:
+    """Circles x, y, radius [m]; the first one is named in the legend."""
+    from matplotlib.patches import Circle
+
+    for index, (x, y, radius) in enumerate(np.asarray(rows).reshape(-1, 3).tolist()):
+        ax.add_patch(Circle((x, y), radius, label=None if index else label, **style))
+
+
+def word(ax: Axes, at: Array, text: str, offset: tuple[int, int], **style: Any) -> None:
+    """A word beside a place."""
+    box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8}
+    ax.annotate(
+        text, (float(at[0]), float(at[1])), xytext=offset, textcoords="offset points",
+        **{"ha": "center", "va": "center", "fontsize": 9, "fontweight": "bold", "zorder": 11, "bbox": box, **style},
+    )  # fmt: skip
 
 
 def write_figure(path: str | Path, figure: Figure, dpi: int) -> Path:

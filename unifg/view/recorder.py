@@ -16,7 +16,7 @@ from typing import Protocol
 
 import numpy as np
 
-from unifg.errors import ScenarioError
+from unifg.errors import ViewError
 
 __all__ = ["Recorder", "load_meshcat", "viewer_script"]
 
@@ -74,7 +74,7 @@ def viewer_script() -> str:
     """The browser side of meshcat, to be written into the page itself.
 
     Raises:
-        ScenarioError: meshcat is not installed.
+        ViewError: meshcat is not installed.
     """
     load_meshcat()
     return resources.files("meshcat").joinpath("viewer", "dist", "main.min.js").read_text(encoding="utf-8")
@@ -84,11 +84,11 @@ def load_meshcat() -> None:
     """Import meshcat, an optional dependency, with its warnings about its own imports kept quiet.
 
     Raises:
-        ScenarioError: meshcat is not installed.
+        ViewError: meshcat is not installed.
     """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)
             import meshcat  # noqa: F401
     except ModuleNotFoundError as error:
-        raise ScenarioError("a scene needs meshcat: pip install 'unifg[scenarios]'") from error
+        raise ViewError("a scene needs meshcat: pip install 'unifg[view]'") from error

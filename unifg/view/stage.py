@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from unifg.errors import ScenarioError
-from unifg.scenarios.show.recorder import Recorder, load_meshcat, viewer_script
-from unifg.scenarios.show.shapes import Mesh
-from unifg.scenarios.show.style import COLOURS, css
+from unifg.errors import ViewError
+from unifg.style.colours import COLOURS, css
 from unifg.typing import Array, ArrayLike, IntArray
+from unifg.view.recorder import Recorder, load_meshcat, viewer_script
+from unifg.view.shapes import Mesh
 
 __all__ = ["Key", "Label", "Page", "Readout", "Stage", "View", "frame_ticks"]
 
@@ -144,10 +144,10 @@ class Stage:
         """Set an empty stage of so many ticks.
 
         Raises:
-            ScenarioError: there is no tick, or meshcat is not installed.
+            ViewError: there is no tick, or meshcat is not installed.
         """
         if ticks == 0:
-            raise ScenarioError("there is no tick, and nothing to show")
+            raise ViewError("there is no tick, and nothing to show")
         load_meshcat()
         from meshcat.animation import Animation
         from meshcat.visualizer import Visualizer
@@ -306,7 +306,7 @@ class Stage:
             "COMMANDS": json.dumps(self.recorder.packed_base64(), indent=0),
             "VIEWER": viewer_script(),
         }
-        text = resources.files("unifg.scenarios.show").joinpath("page.html").read_text(encoding="utf-8")
+        text = resources.files("unifg.view").joinpath("page.html").read_text(encoding="utf-8")
         for name, part in parts.items():  # the viewer last: it is code in which no placeholder may be looked for
             text = text.replace(f"@@{name}@@", part)
         return text

@@ -1,11 +1,11 @@
-"""Meshes of the quadrotor, as in `unifg.scenarios.show.shapes`; of a vehicle of a radius [m], its nose along x."""
+"""Meshes of the quadrotor, as in `unifg.view.shapes`; of a vehicle of a radius [m], its nose along x."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from unifg.scenarios.show.shapes import Mesh, box, merge, ring, tube
 from unifg.typing import Array
+from unifg.view.shapes import Mesh, box, merge, ring, tube
 
 __all__ = ["arms", "body", "nose", "rotors", "swept"]
 
