@@ -1,0 +1,457 @@
+"""Measurements between nodes: interpolation on the group, stamps in any order, and one structure for all ticks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.random import Generator
+
+import unifg as fg
+from unifg.errors import ModelError
+from unifg.kernels.differences import jacobian
+from unifg.machine.jit import compiled
+from unifg.machine.tally import counting
+from unifg.models import landmarks
+from unifg.models.interpolation import Interpolation, cubic, geodesic
+from unifg.models.quadrotor import STATE
+from unifg.models.stamped import Counts, StampedMeasurements
+from unifg.solvers import GaussNewton, LevenbergMarquardt
+from unifg.typing import Array
+
+TWIST2 = fg.Product(pose=fg.SE2, velocity=fg.Rn(3))
+TWIST3 = fg.Product(bias=fg.Rn(1), velocity=fg.Rn(6), pose=fg.SE3)
+INERTIAL = fg.Product(R=fg.SO3, p=fg.Rn(3), bias=fg.Rn(2), v=fg.Rn(3))
+WAYS: dict[str, tuple[fg.Manifold, Interpolation]] = {
+    "geodesic on SE2": (fg.SE2, geodesic(fg.SE2)),
+    "geodesic on SE3": (fg.SE3, geodesic(fg.SE3)),
+    "geodesic on a product": (INERTIAL, geodesic(INERTIAL)),
+    "cubic on SE2": (TWIST2, cubic(TWIST2)),
+    "cubic on SE3": (TWIST3, cubic(TWIST3)),
+    "cubic in space": (INERTIAL, cubic(INERTIAL)),
+}
+
+
+def place(x: Array, z: Array) -> Array:
+    return x[:, :2] - z
+
+
+def near(manifold: fg.Manifold, rng: Generator, count: int, size: float = 0.4) -> tuple[Array, Array]:
+    x = manifold.random(rng, (count,))
+    return x, manifold.retract(x, size * rng.standard_normal((count, manifold.dim)))
+
+
+# ---------------------------------------------------------------- interpolation
+
+
+@pytest.mark.parametrize("name", WAYS)
+def test_interpolation_passes_through_both_nodes(name: str, rng: Generator) -> None:
+    manifold, between = WAYS[name]
+    x, y = near(manifold, rng, 20)
+    h = np.full(20, 0.3)
+    for s, node in ((0.0, x), (1.0, y)):
+        found = between(x, y, np.full(20, s), h)
+        assert manifold.is_valid(found).all()
+        assert np.abs(manifold.local(found, node)).max() < 1e-13
+    assert not np.shares_memory(between(x, y, np.zeros(20), h), x)
+
+
+@pytest.mark.parametrize("name", WAYS)
+def test_interpolation_is_traced_with_exact_derivatives(name: str, rng: Generator) -> None:
+    """On symbols it is what it is on numbers, with the derivatives of differences."""
+    manifold, between = WAYS[name]
+    count = 7
+    x, y = near(manifold, rng, count)
+    s, h = np.linspace(-0.1, 1.1, count), np.linspace(0.1, 0.5, count)
+    here = manifold.random(rng, (count,))
+
+    def error(a: Array, b: Array, s: Array, h: Array, here: Array) -> Array:
+        return manifold.local(here, between(a, b, s, h))
+
+    graph = fg.Graph()
+    a, b = graph.variables("a", manifold, count), graph.variables("b", manifold, count)
+    given = [graph.data(str(k), part, each=True) for k, part in enumerate((s, h, here))]
+    graph.minimize(fg.residual(error, derivatives="trace"), a, b, *given)
+    lin = graph.compile().linearize({a: x, b: y})
+    np.testing.assert_allclose(lin.residual.reshape(count, -1), error(x, y, s, h, here), atol=1e-13)
+    wanted = jacobian(lambda a, b: error(a, b, s, h, here), [x, y], [manifold, manifold])
+    found = lin.jacobian.reshape(count, manifold.dim, 2 * manifold.dim)
+    np.testing.assert_allclose(found, np.concatenate(wanted, axis=2), atol=3e-8)
+
+
+@pytest.mark.parametrize("group", [fg.SE2, fg.SE3, fg.SO3], ids=lambda g: g.name)
+def test_constant_twists_are_exact(group: fg.LieGroup, rng: Generator) -> None:
+    """A quarter of the way, near a whole half turn, with headings across the cut and 1e6 m away."""
+    twist = rng.standard_normal((30, group.dim))
+    angles = slice(2, 3) if group is fg.SE2 else slice(-3, None)
+    twist[:, angles] *= (np.pi - 1e-6) / np.linalg.norm(twist[:, angles], axis=1, keepdims=True)
+    x = group.random(rng, (30,))
+    if group is not fg.SO3:
+        x[:, 0] += 1e6
+    states = fg.Product(pose=group, velocity=fg.Rn(group.dim))
+    y, quarter = group.exp(twist), group.retract(x, 0.25 * twist)
+    y = group.compose(x, y)
+    s, h = np.full(30, 0.25), np.full(30, 0.1)
+    tight = 1e-9 if group is not fg.SO3 else 1e-12
+    assert np.abs(group.local(quarter, geodesic(group)(x, y, s, h))).max() < tight
+    first, last = (states.pack(pose=pose, velocity=10.0 * twist) for pose in (x, y))
+    found = states.unpack(cubic(states)(first, last, s, h))
+    assert np.abs(group.local(quarter, found["pose"])).max() < 10.0 * tight
+    np.testing.assert_allclose(found["velocity"], 10.0 * twist, atol=1e-7)
+
+
+def test_constant_acceleration_is_exact_for_cubics_and_off_by_an_eighth_for_geodesics() -> None:
+    h, a, v = 0.5, np.array([0.3, -0.2, 0.7]), np.array([1.0, 2.0, -1.0])
+    zero = INERTIAL.identity()[None]
+    states = [zero.copy(), zero.copy(), zero.copy()]
+    for t, state in zip((0.0, h, 0.5 * h), states, strict=True):
+        state[0, INERTIAL.component("p").storage] = v * t + 0.5 * a * t**2
+        state[0, INERTIAL.component("v").storage] = v + a * t
+    x, y, middle = states
+    half, step = np.array([0.5]), np.array([h])
+    assert np.abs(INERTIAL.local(middle, cubic(INERTIAL)(x, y, half, step))).max() < 1e-14
+    straight = INERTIAL.unpack(geodesic(INERTIAL)(x, y, half, step))["p"] - INERTIAL.unpack(middle)["p"]
+    np.testing.assert_allclose(straight[0], a * h**2 / 8.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("states", [TWIST2, TWIST3, INERTIAL], ids=lambda m: m.name)
+def test_cubics_are_of_fourth_order_and_their_velocities_of_third(states: fg.Product) -> None:
+    """A body under a twist that swings, integrated finely; halving the step divides the errors by 16 and by 8."""
+    group = states.components["pose"].manifold if "pose" in states.components else fg.SE3
+    assert isinstance(group, fg.LieGroup)
+
+    def twist(t: float) -> Array:
+        return np.array([np.sin(1.3 * k + 2.0 * t) for k in range(group.dim)])
+
+    def at(t: float) -> Array:
+        pose, count = group.identity(), max(int(t / 1e-3), 1) if t else 0
+        for k in range(count):  # fourth order: Magnus with two Gauss points
+            d = t / count
+            one, two = (twist(d * (k + 0.5 + c * np.sqrt(3.0) / 6.0)) for c in (-1.0, 1.0))
+            bracket = group.ad(one) @ two
+            pose = group.retract(pose, 0.5 * d * (one + two) + np.sqrt(3.0) / 12.0 * d**2 * bracket)
+        if states is INERTIAL:
+            q, velocity = pose[3:], fg.SO3.act(pose[3:], twist(t)[:3])
+            return states.pack(R=q, p=pose[:3], bias=np.zeros(2), v=velocity)
+        parts = {"pose": pose, "velocity": twist(t)}
+        return states.pack(**(parts | ({"bias": np.zeros(1)} if "bias" in states.components else {})))
+
+    errors = []
+    for h in (0.2, 0.1):
+        x, y, middle = (at(t)[None] for t in (0.0, h, 0.4 * h))
+        found = cubic(states)(x, y, np.array([0.4]), np.array([h]))
+        off = states.local(middle, found)[0]
+        moving = "velocity" if states is not INERTIAL else "v"
+        position = "pose" if states is not INERTIAL else "p"
+        errors.append([np.abs(off[states.component(name).tangent]).max() for name in (position, moving)])
+    orders = np.log2(np.array(errors[0]) / errors[1])
+    assert orders[0] > 3.7 and orders[1] > 2.7, orders
+
+
+def test_cubics_need_velocities() -> None:
+    for manifold in (fg.SE3, fg.Product(pose=fg.SE3, velocity=fg.Rn(3)), fg.Product(p=fg.Rn(3), R=fg.SO3)):
+        with pytest.raises(ModelError, match="cubic needs velocities"):
+            cubic(manifold)
+
+
+# ---------------------------------------------------------------- a graph with fixes
+
+
+def window(count: int = 5, capacity: int = 3) -> tuple[fg.Graph, fg.Family, StampedMeasurements]:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE2, count)
+    fixes = StampedMeasurements(place, 2, capacity=capacity, sigma=0.05, name="fixes")
+    fixes.state(graph, x)
+    moved = graph.data("moved", np.tile([0.1, 0.0, 0.05], (count - 1, 1)), each=True)
+    graph.minimize(fg.between, x[:-1], x[1:], moved, sigma=[0.02, 0.02, 0.02], name="wheels")
+    graph.minimize(fg.prior, x[0], fg.SE2.identity(), sigma=1.0, name="start")
+    return graph, x, fixes
+
+
+TIMES = 0.1 * np.arange(5)
+ZERO = np.zeros((5, 3))
+
+
+def test_a_stamp_on_a_node_is_a_factor_of_that_node(rng: Generator) -> None:
+    """On the oldest, one inside, the newest; bit for bit the same structure, answers as of unary factors."""
+    values = rng.normal(size=(3, 2))
+    graph, x, fixes = window()
+    fixes.add(TIMES[[4, 0, 2]], values)
+    solution = GaussNewton().solve(graph, {x: ZERO}, data=fixes.data(TIMES), check=True)
+    assert fixes.counts == Counts(placed=3)
+
+    plain, y, _ = window()
+    plain.minimize(place, y[[4, 0, 2]], values, sigma=0.05)
+    expected = GaussNewton().solve(plain, {y: ZERO}, check=True)
+    assert np.abs(fg.SE2.local(solution[x], expected[y])).max() < 1e-9
+    assert graph.check({x: ZERO}).routes["fixes"] == "traced, its derivatives exact"
+
+
+def test_order_of_arrival_changes_no_bit(rng: Generator) -> None:
+    stamps, values = rng.uniform(0.0, 0.4, 8), rng.normal(size=(8, 2))
+    stamps[3] = stamps[5]  # equal stamps
+    values[3] = values[5]
+    answers = []
+    for order in (np.arange(8), np.argsort(stamps), rng.permutation(8)):
+        _, _, fixes = window(capacity=8)
+        for k in order:
+            fixes.add(stamps[k], values[k])
+        answers.append(list(fixes.data(TIMES).values()))
+        assert fixes.counts.placed == 8
+    for other in answers[1:]:
+        for found, wanted in zip(other, answers[0], strict=True):
+            assert np.array_equal(found, wanted)
+
+
+def test_what_is_refused_is_counted() -> None:
+    _, _, fixes = window(capacity=2)
+    value = np.zeros(2)
+    fixes.add(np.nan, value)
+    fixes.add(0.1, [np.inf, 0.0])
+    fixes.add([0.22, 0.24, 0.23, 0.25], np.zeros((4, 2)))  # two too many
+    fixes.add(-0.01, value)  # before the oldest node
+    fixes.add(0.41, value)  # after the newest
+    fixes.add(np.full(9, 1e12), np.zeros((9, 2)))  # a clock gone mad
+    fixes.data(TIMES)
+    assert fixes.counts == Counts(placed=2, waiting=8, late=1, full=2, ahead=2, invalid=2)
+    fixes.data(TIMES)  # nothing is counted twice
+    assert fixes.counts == Counts(placed=2, waiting=8, late=1, full=2, ahead=2, invalid=2)
+    given = fixes.data(TIMES + 0.1)  # what waited near is placed; all that was placed stays
+    assert fixes.counts == Counts(placed=3, waiting=7, late=1, full=2, ahead=2, invalid=2)
+    filled = next(value for data, value in given.items() if data.name == "fixes: filled")
+    assert filled.tolist() == [False, False, True, True, False, False, True, False]
+    fixes.data(TIMES + 0.45)  # placed ones leave with their nodes: not late
+    assert fixes.counts == Counts(placed=0, waiting=7, late=1, full=2, ahead=2, invalid=2)
+    fixes.add(0.3, value)
+    fixes.data(TIMES + 0.45)
+    assert fixes.counts == Counts(placed=0, waiting=7, late=2, full=2, ahead=2, invalid=2)
+
+
+def test_first_come_keeps_its_slot() -> None:
+    _, _, fixes = window(capacity=1)
+    fixes.add(0.15, [1.0, 1.0])
+    fixes.data(TIMES)
+    fixes.add(0.12, [2.0, 2.0])
+    given = fixes.data(TIMES)
+    assert next(value for data, value in given.items() if data.name == "fixes: values")[1].tolist() == [1.0, 1.0]
+    assert fixes.counts == Counts(placed=1, full=1)
+
+
+@pytest.mark.parametrize("epoch", [0.0, 1.7e9])
+def test_rounding_of_node_times_keeps_measurements_on_the_ends(epoch: float) -> None:
+    """Times counted back from now differ from those counted forward by rounding; so do stamps of other clocks."""
+    _, _, fixes = window()
+    end = epoch + 0.1 * 3 + 0.1  # 0.4 and a little
+    fixes.add([np.nextafter(end, np.inf), np.nextafter(epoch, -np.inf)], np.zeros((2, 2)))
+    fixes.data(epoch + TIMES)
+    assert fixes.counts == Counts(placed=2)
+
+
+def test_shapes_and_times_are_checked() -> None:
+    graph, x, fixes = window()
+    with pytest.raises(ModelError, match=r"need values \(2,\), found \(3,\)"):
+        fixes.add(0.1, np.zeros(3))
+    with pytest.raises(ModelError, match=r"need values \(3, 2\), found \(2, 2\)"):
+        fixes.add(np.zeros(3), np.zeros((2, 2)))
+    with pytest.raises(ModelError, match="stated already"):
+        fixes.state(graph, x)
+    for times in (TIMES[:4], TIMES[::-1], np.zeros(5), [0.0, 0.1, np.nan, 0.3, 0.4]):
+        with pytest.raises(ModelError, match="5 finite, increasing numbers"):
+            fixes.data(times)
+    with pytest.raises(ModelError, match="finite, increasing"):
+        fixes.data(TIMES, offset=np.nan)
+    fresh = StampedMeasurements(place, 2, capacity=1, sigma=1.0)
+    with pytest.raises(ModelError, match="has not been stated"):
+        fresh.data(TIMES)
+    with pytest.raises(ModelError, match="two nodes or more"):
+        fresh.state(graph, x[0])
+    with pytest.raises(ModelError, match=r"one variable on Rn\(1\)"):
+        fresh.state(graph, x, offset=x[0])
+    for size, capacity in ((0, 1), (1, 0)):
+        with pytest.raises(ModelError, match="must be at least 1"):
+            StampedMeasurements(place, size, capacity=capacity, sigma=1.0)
+    ranges = StampedMeasurements(place, 1, capacity=2, sigma=1.0, name="ranges")
+    ranges.add([0.1, 0.2], [1.0, 2.0])  # single numbers need no second axis
+    ranges.add(0.3, 3.0)
+    ranges.state(graph, x)
+    ranges.data(TIMES)
+    assert ranges.counts.placed == 3
+
+
+# ---------------------------------------------------------------- tick after tick
+
+
+def drive(t: float) -> Array:
+    """A circle: one constant twist, headings past the cut at pi, 1e6 m from the origin."""
+    return fg.SE2.compose([1e6, 0.0, 2.8], fg.SE2.exp(t * np.array([1.0, 0.0, 0.6])))
+
+
+def test_a_sliding_window_with_delays_is_the_batch_of_what_has_come(rng: Generator) -> None:
+    """Three sensors at their own rates and delays; one loses readings; each tick equals a graph built for it alone."""
+
+    def fix(x: Array, z: Array) -> Array:
+        return x[:, :2] - z
+
+    def direction(x: Array, z: Array) -> Array:
+        return fg.wrap_angle(x[:, 2:] - z)
+
+    def gap(x: Array, beacon: Array, z: Array) -> Array:
+        found: Array = np.linalg.norm(x[:, :2] - beacon, axis=1, keepdims=True) - z
+        return found
+
+    beacon = drive(1.0)[:2] + np.array([3.0, 2.0])
+    step, count = 0.1, 6
+    readings: list[tuple[float, str, float, Array]] = []  # arrival, sensor, stamp, value
+    for rate, name, lag in ((7.3, "fix", 0.17), (23.0, "direction", 0.0), (4.0, "gap", 0.6)):
+        for stamp in np.arange(0.01, 2.0, 1.0 / rate):
+            pose = drive(stamp)
+            reach = np.atleast_1d(np.linalg.norm(pose[:2] - beacon))
+            value = {"fix": pose[:2], "direction": pose[2:], "gap": reach}[name]
+            if name == "fix" and 0.8 < stamp < 1.1:
+                continue  # an outage
+            arrival = stamp + lag * rng.uniform(0.5, 1.0)
+            readings.append((arrival, name, stamp, value + 0.01 * rng.standard_normal(len(value))))
+    readings.sort(key=lambda r: r[0])
+
+    def stated(graph: fg.Graph, x: fg.Family) -> dict[str, StampedMeasurements]:
+        sensors = {
+            "fix": StampedMeasurements(fix, 2, capacity=1, sigma=0.01, name="fix"),
+            "direction": StampedMeasurements(direction, 1, capacity=3, sigma=0.01, name="direction"),
+            "gap": StampedMeasurements(gap, 1, capacity=1, sigma=0.01, name="gap", robust=fg.Huber(3.0)),
+        }
+        for name, sensor in sensors.items():
+            sensor.state(graph, x, *((beacon,) if name == "gap" else ()))
+        odometry = fg.SE2.exp(step * np.array([1.0, 0.0, 0.6]))
+        graph.minimize(fg.between, x[:-1], x[1:], odometry, sigma=[0.01, 0.01, 0.01])
+        return sensors
+
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE2, count)
+    sensors = stated(graph, x)
+    start = graph.data("start", drive(0.0))
+    graph.minimize(fg.prior, x[0], start, sigma=0.02)
+    run = LevenbergMarquardt().prepare(graph)
+    program, waiting, ticks = graph.compile(), list(readings), 0
+    for tick in range(count - 1, 20):
+        times = step * np.arange(tick - count + 1, tick + 1)
+        while waiting and waiting[0][0] <= times[-1]:
+            _, name, stamp, value = waiting.pop(0)
+            sensors[name].add(stamp, value)
+        data = {key: part for sensor in sensors.values() for key, part in sensor.data(times).items()}
+        guess = {x: np.array([drive(t) for t in times])}
+        data[start] = guess[x][0]
+        if tick == count:
+            with counting() as tally:
+                solution = run.solve(guess, data=data)
+            assert tally.everything == 0  # nothing is compiled or read
+        solution = run.solve(guess, data=data)
+        assert solution.converged and graph.compile() is program
+
+        own = fg.Graph()
+        y = own.variables("x", fg.SE2, count)
+        own.minimize(fg.prior, y[0], data[start], sigma=0.02)
+        own.minimize(fg.between, y[:-1], y[1:], fg.SE2.exp(step * np.array([1.0, 0.0, 0.6])), sigma=[0.01, 0.01, 0.01])
+        for arrival, name, stamp, value in readings:
+            if not (arrival <= times[-1] and times[0] <= stamp <= times[-1]):
+                continue
+            k = min(int(np.searchsorted(times, stamp, side="right")) - 1, count - 2)
+            s = (stamp - times[k]) / step
+
+            def between(a: Array, b: Array, s: float = s) -> Array:
+                return fg.SE2.compose(a, fg.SE2.exp(s * fg.SE2.log(fg.SE2.compose(fg.SE2.inverse(a), b))))
+
+            error = {"fix": fix, "direction": direction, "gap": lambda x, z: gap(x, beacon, z)}[name]
+            own.minimize(
+                fg.residual(lambda a, b, z, e=error, m=between: e(m(a, b), z), derivatives="differences"),
+                y[k], y[k + 1], value, sigma=0.01, robust=fg.Huber(3.0) if name == "gap" else None,
+            )  # fmt: skip
+        if tick % 5 == 0:
+            expected = LevenbergMarquardt().solve(own, {y: guess[x]}, check=True)
+            assert np.abs(fg.SE2.local(solution[x], expected[y])).max() < 1e-6
+            ticks += 1
+        assert np.abs(fg.SE2.local(solution[x], guess[x])).max() < 0.06
+    assert ticks == 3
+    assert sensors["gap"].counts.late > 0 and sensors["fix"].counts.late == 0
+    assert sum(getattr(s.counts, name) for s in sensors.values() for name in ("full", "invalid", "ahead")) == 0
+
+
+@pytest.mark.parametrize("between", [None, cubic(TWIST2)], ids=["geodesic", "cubic"])
+def test_the_offset_of_a_clock_is_estimated(between: Interpolation | None, rng: Generator) -> None:
+    """The sensor's clock is 37 ms behind: the truth at a stamp is that at the stamp plus 37 ms."""
+    offset, count, step = 0.037, 21, 0.1
+    manifold = TWIST2 if between else fg.SE2
+    truth = np.array([drive(t) for t in step * np.arange(count)])
+    if between:
+        truth = np.concatenate([truth, np.tile([1.0, 0.0, 0.6], (count, 1))], axis=1)
+    graph = fg.Graph()
+    x, late = graph.variables("x", manifold, count), graph.variables("late", fg.Rn(1), 1)
+    fixes = StampedMeasurements(place, 2, capacity=2, sigma=0.01, between=between, name="fixes")
+    fixes.state(graph, x, offset=late)
+    graph.minimize(fg.prior, x, truth, sigma=0.01, name="own clock")
+    graph.minimize(fg.prior, late, [0.0], sigma=1.0, name="offset")
+    stamps = np.arange(0.02, 1.95, 0.07)
+    fixes.add(stamps, np.array([drive(t + offset)[:2] for t in stamps]))
+    believed = 0.0
+    for _ in range(2):  # placed anew by what is believed
+        data = fixes.data(step * np.arange(count), offset=believed)
+        solution = LevenbergMarquardt().solve(graph, {x: truth, late: [[0.0]]}, data=data, check=True)
+        believed = float(solution[late][0, 0])
+    assert abs(believed - offset) < 1e-4
+    assert fixes.counts.placed == len(stamps)
+
+
+def test_an_offset_that_is_known_moves_the_stamps() -> None:
+    _, _, fixes = window()
+    fixes.add([0.02, 0.39], np.zeros((2, 2)))
+    given = {data.name: value for data, value in fixes.data(TIMES, offset=0.09).items()}
+    assert fixes.counts == Counts(placed=1, waiting=1)
+    np.testing.assert_allclose(given["fixes: time into step"][3], 0.01, atol=1e-15)
+
+
+def test_errors_may_be_shipped_residuals_with_landmarks(rng: Generator) -> None:
+    """The bearing and range of a landmark, itself unknown, seen between two nodes of a quadrotor."""
+    graph = fg.Graph()
+    x, mark = graph.variables("x", STATE, 4), graph.variables("mark", fg.Rn(2), 1)
+    seen = StampedMeasurements(
+        landmarks.bearing_range, 2, capacity=2, sigma=[0.01, 0.02], between=cubic(STATE), name="seen"
+    )
+    seen.state(graph, x, mark)
+    truth = np.tile(STATE.identity(), (4, 1))
+    truth[:, 0], truth[:, 7] = [0.0, 1.0, 2.0, 3.0], 10.0
+    graph.minimize(fg.prior, x, truth, sigma=0.001)
+    place = np.array([1.5, 2.0])
+    for t in (0.05, 0.17, 0.22):
+        state = STATE.identity()
+        state[0] = 10.0 * t
+        seen.add(t, landmarks.observe(state, place[None])[0])
+    data = seen.data([0.0, 0.1, 0.2, 0.3])
+    solution = LevenbergMarquardt().solve(graph, {x: truth, mark: [[1.0, 1.0]]}, data=data, check=True)
+    np.testing.assert_allclose(solution[mark][0], place, atol=1e-9)
+    assert graph.check({x: truth, mark: [[1.0, 1.0]]}).routes["seen"] == "traced, its derivatives exact"
+
+
+def test_functions_of_one_factor_are_refused() -> None:
+    @compiled
+    def one(x: Array, z: Array, r: Array) -> None:
+        r[:] = x[:2] - z
+
+    with pytest.raises(ModelError, match="give a batched function"):
+        StampedMeasurements(fg.residual(one, rows=2), 2, capacity=1, sigma=1.0)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("solver", [GaussNewton, LevenbergMarquardt])
+def test_untraceable_errors_still_work(solver: Callable[[], fg.Solver]) -> None:
+    """What branches on numbers is left to Python, empty slots among them."""
+
+    def odd(x: Array, z: Array) -> Array:
+        return x[:, :2] - z if float(z[0, 0]) < 1e9 else x[:, :2]
+
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE2, 3)
+    fixes = StampedMeasurements(odd, 2, capacity=2, sigma=0.1, name="fixes")
+    fixes.state(graph, x)
+    graph.minimize(fg.prior, x, np.zeros(3), sigma=1.0)
+    fixes.add(0.05, [0.1, 0.2])
+    solution = solver().solve(graph, {x: np.zeros((3, 3))}, data=fixes.data([0.0, 0.1, 0.2]), check=True)
+    assert solution[x][0, 0] > 0.04
