@@ -225,7 +225,7 @@ def test_the_graph_goes_while_another_thread_solves() -> None:
     expected, found, begun = prepared.solve(guess)[x], [], threading.Event()
 
     def work(own: Any, given: dict[Any, Array]) -> None:
-        for _ in range(30):
+        for _ in range(10):
             begun.set()
             found.append(own.solve(given)[next(iter(given))])
 
@@ -234,7 +234,7 @@ def test_the_graph_goes_while_another_thread_solves() -> None:
     begun.wait()
     native = native_of(graph)
     del graph, prepared, guess, x
-    for k in range(20):
+    for k in range(6):
         forget()
         evaluated(bowl(float(k)))  # takes the place of what has gone
     for thread in threads:
@@ -243,7 +243,7 @@ def test_the_graph_goes_while_another_thread_solves() -> None:
     for values in found:
         np.testing.assert_array_equal(values, expected)
     gc.collect()
-    assert len(found) == 30 and native() is None
+    assert len(found) == 10 and native() is None
 
 
 @pytest.mark.parametrize("copied", COPIES)
