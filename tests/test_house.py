@@ -28,6 +28,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("program",),
     ("answers",),
     ("solvers", "smoothing", "pose_graphs", "models"),
+    ("horizon",),
     ("files",),
     ("view",),
     ("warming",),

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 import unifg as fg
+from unifg.horizon.spread import JointCovariance
 from unifg.models import quadrotor
 from unifg.scenarios.flying.flight_terms import Shared, StateTerms
 from unifg.scenarios.flying.flight_window import PARAMETER_SIZE, STATE_SIZE, StateWindow, WindowSettings
-from unifg.scenarios.flying.spread import JointCovariance
 from unifg.scenarios.options import option
 from unifg.scenarios.seeing.association import DOUBTFUL, NEW, Gates, expected, nearest, places
 from unifg.scenarios.seeing.atlas import Atlas

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-import unifg as fg
-from unifg.language.variables import as_selection
+from unifg.language.variables import Family, Variable, as_selection
 from unifg.program.program import Program
 from unifg.program.systems import fill
 from unifg.typing import Array
@@ -18,7 +17,7 @@ SHIFT = 1e-10  # constraints are softened by a standard deviation of 1e-5, in th
 class JointCovariance:
     """A block of the inverse KKT matrix of a graph whose constraints are equalities: structure once."""
 
-    def __init__(self, program: Program, *variables: fg.Family | fg.Selection) -> None:
+    def __init__(self, program: Program, *variables: Variable) -> None:
         """Choose the variables, in the order of the rows and columns; fixed ones have no variance."""
         columns = np.concatenate([program.columns.of(as_selection(variable)).ravel() for variable in variables])
         unknown = program.columns.unknown[columns]
@@ -26,13 +25,21 @@ class JointCovariance:
         self._free = np.flatnonzero(unknown >= 0)
         self._chosen = unknown[self._free].astype(np.int64)
         self._size = len(columns)
-        self._system = program.systems.kkt(program.equality)
+        self._held = program.equality.copy()
+        self._arrange()
+
+    def _arrange(self) -> None:
+        """Lay the matrix out for the equalities that are held now."""
+        self._system = self._program.systems.kkt(self._held)
         self._data = np.zeros(self._system.pattern.nnz)
         n, m = int(self._system.arrays.size[0]), int(self._system.arrays.size[1])
         self._shift = np.repeat([SHIFT, -SHIFT], [n, m])
 
-    def __call__(self, values: Mapping[fg.Family, Array]) -> Array | None:
+    def __call__(self, values: Mapping[Family, Array]) -> Array | None:
         """(D, D) covariance at ``values``, with the data of the last solve; None when it does not exist."""
+        if not np.array_equal(self._held, self._program.equality):  # some were switched on or off
+            self._held = self._program.equality.copy()
+            self._arrange()
         lin = self._program.linearize(values)
         fill(self._system.arrays, lin.hessian, lin.constraint_jacobian, self._data)
         if not self._system.factorization.factor(self._data, self._shift):

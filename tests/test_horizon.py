@@ -1,0 +1,636 @@
+"""Windows against whole histories, plans against deadlines and failures: past and future of any robot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.horizon import (
+    Choice,
+    ControlCost,
+    Dynamics,
+    KeepThenBrake,
+    Loop,
+    Measurement,
+    Now,
+    Plan,
+    Robot,
+    Starts,
+    Static,
+    Term,
+    Window,
+)
+from unifg.machine.tally import counting
+from unifg.models import unicycle
+from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, InteriorPoint
+from unifg.typing import Array, ArrayLike
+
+# ---------------------------------------------------------------- a linear robot, and what everybody knows about it
+
+T, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]])
+NOISE, GPS, START = np.array([0.02, 0.05]), 0.3, np.array([0.5, 1.0])
+BIAS = 0.4
+
+
+def step(x: Array, u: Array, y: Array, h: float) -> Array:
+    return np.asarray(y - x @ T.T - u @ B.T)
+
+
+def biased(x: Array, u: Array, b: Array, y: Array, h: float) -> Array:
+    return np.asarray(y - x @ T.T - (u + b) @ B.T)
+
+
+def position(x: Array, z: Array) -> Array:
+    return x[:, :1] - z
+
+
+LINE = Robot(fg.Rn(2), fg.Rn(1), predict=lambda x, u: T @ x + B @ u)
+BIASED = replace(LINE, statics=(Static("bias", fg.Rn(1), [0.0], 0.5),))
+
+
+class Drive:
+    """Controls and measurements of a linear robot; some are missing."""
+
+    def __init__(self, ticks: int, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        self.controls, self.seen = rng.normal(size=(ticks, 1)), rng.random(ticks + 1) < 0.7
+        self.positions = np.where(self.seen, rng.normal(size=ticks + 1), np.nan)[:, None]
+
+    def batch(self, ticks: int, static: bool) -> tuple[Array, Array, Array]:
+        """State, covariance and bias after some ticks, from everything at once."""
+        graph = fg.Graph()
+        x = graph.variables("x", fg.Rn(2), ticks + 1)
+        graph.minimize(fg.prior, x[0], START, sigma=0.8)
+        about: list[fg.Family | fg.Selection] = [x[-1]]
+        guess = {x: np.zeros((ticks + 1, 2))}
+        u = self.controls[:ticks]
+        if static:
+            b = graph.variables("b", fg.Rn(1), 1)
+            graph.minimize(fg.prior, b, [0.0], sigma=0.5)
+            about.append(b)
+            guess[b] = np.zeros((1, 1))
+            if ticks:
+                each = graph.data("u", u, each=True)
+                graph.minimize(biased, x[:-1], each, b, x[1:], 0.1, sigma=NOISE)
+        elif ticks:
+            graph.minimize(step, x[:-1], graph.data("u", u, each=True), x[1:], 0.1, sigma=NOISE)
+        k = np.flatnonzero(self.seen[: ticks + 1])
+        if len(k):
+            graph.minimize(position, x[k], graph.data("z", self.positions[k], each=True), sigma=GPS)
+        solution = GaussNewton(tolerance=1e-12).solve(graph, guess)
+        bias = solution[b][0] if static else np.zeros(1)
+        return solution[x[-1]][0], solution.covariance(*about), bias
+
+
+def line_window(length: int, robot: Robot = LINE, **options: Any) -> Window:
+    names = tuple(static.name for static in robot.statics)
+    motion = Dynamics(biased if names else step, 0.1, sigma=NOISE, statics=names)
+    terms: list[Term] = [motion, Measurement("gps", position, (1,), GPS)]
+    usual: dict[str, Any] = {"solver": GaussNewton(tolerance=1e-12)}
+    return Window(robot, length, terms, start=START, sigma=0.8, **usual | options)
+
+
+@pytest.mark.parametrize("length", [1, 3, 7])
+@pytest.mark.parametrize("static", [False, True])
+def test_a_window_says_what_the_whole_history_says(length: int, static: bool) -> None:
+    """From the first tick, while the window is not full yet, to long after the start has left it."""
+    drive, window = Drive(20), line_window(length, BIASED if static else LINE)
+    for k in range(21):
+        if k:
+            window.move(drive.controls[k - 1])
+        window.record("gps", drive.positions[k])
+        window.estimate(None)
+        state, covariance, bias = drive.batch(k, static)
+        np.testing.assert_allclose(window.present, state, atol=1e-9)
+        np.testing.assert_allclose(window.covariance, covariance, atol=1e-9)
+        if static:
+            np.testing.assert_allclose(window.history.statics["bias"][0], bias, atol=1e-9)
+    assert window.history.full and window.left.arrival is not None
+
+
+def test_a_window_of_one_step_is_the_kalman_filter() -> None:
+    drive, window = Drive(15, seed=1), line_window(1)
+    mean, P, Q = START.copy(), 0.64 * np.eye(2), np.diag(NOISE**2)
+    H, R = np.array([[1.0, 0.0]]), GPS**2
+    for k in range(16):
+        if k:
+            window.move(drive.controls[k - 1])
+            mean, P = T @ mean + B @ drive.controls[k - 1], T @ P @ T.T + Q
+        if drive.seen[k]:
+            gain = P @ H.T / (H @ P @ H.T + R)
+            mean, P = mean + gain @ (drive.positions[k] - H @ mean), (np.eye(2) - gain @ H) @ P
+        window.record("gps", drive.positions[k] if drive.seen[k] else None)
+        window.estimate(None)
+        np.testing.assert_allclose(window.present, mean, atol=1e-9)
+        np.testing.assert_allclose(window.state_covariance, P, atol=1e-9)
+
+
+class Pushed:
+    """Exact dynamics pushed by one noise per step, fewer than there are states: constraints of the past."""
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        noise = graph.families["noise"]
+        graph.minimize(fg.prior, noise, [0.0], sigma=0.4, name="noise")
+        graph.constrain(
+            lambda x, u, w, y: y - x @ T.T - (u + w) @ B.T, x[:-1], u, noise, x[1:], lower=0, upper=0, name="pushed"
+        )
+        graph.constrain(lambda w: w, noise, lower=-50.0, upper=50.0, name="weak")  # an inequality that never holds
+
+    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+        return {}
+
+
+@pytest.mark.parametrize(
+    "solver", [SQP(tolerance=1e-11, qp="graph"), InteriorPoint(tolerance=1e-11)], ids=["sqp", "ipm"]
+)
+def test_what_leaves_through_constraints_is_not_lost(solver: fg.Solver) -> None:
+    """The marginal of a node and its noise through a hard dynamics, against the batch with the same constraints."""
+    drive, robot = Drive(14, seed=2), replace(LINE, steps={"noise": fg.Rn(1)})
+    terms: list[Term] = [Pushed(), Measurement("gps", position, (1,), GPS)]
+    window: Window = Window(robot, 4, terms, start=START, sigma=0.8, solver=solver)
+    for k in range(15):
+        if k:
+            window.move(drive.controls[k - 1])
+        window.record("gps", drive.positions[k])
+        window.estimate(None)
+    graph = fg.Graph()
+    x, w = graph.variables("x", fg.Rn(2), 15), graph.variables("w", fg.Rn(1), 14)
+    graph.minimize(fg.prior, x[0], START, sigma=0.8)
+    graph.minimize(fg.prior, w, [0.0], sigma=0.4)
+    each = graph.data("u", drive.controls, each=True)
+    graph.constrain(lambda x, u, w, y: y - x @ T.T - (u + w) @ B.T, x[:-1], each, w, x[1:], lower=0, upper=0)
+    at = np.flatnonzero(drive.seen)
+    graph.minimize(position, x[at], graph.data("z", drive.positions[at], each=True), sigma=GPS)
+    whole = SQP(tolerance=1e-12).solve(graph, {x: np.zeros((15, 2)), w: np.zeros((14, 1))})
+    np.testing.assert_allclose(window.history.states, whole[x][-5:], atol=1e-9)
+    # Where constraints hold, a covariance softens them by 1e-5 in their own units.
+    np.testing.assert_allclose(window.state_covariance, whole.covariance(x[-1]), atol=1e-7)
+
+
+class Smooth:
+    """A cost over three nodes in a row, and a mark seen from them: what leaves ties two nodes and the mark."""
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        graph.minimize(lambda a, b, c: a - 2.0 * b + c, x[:-2], x[1:-1], x[2:], sigma=0.3, name="smooth")
+        seen = graph.data("marked", np.zeros(len(x), dtype=bool), each=True)
+        mark = graph.families["mark"]
+        graph.minimize(lambda x, m: m - x[:, :1], x, mark[0], sigma=0.2, active=seen, name="mark")
+
+    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+        return {"marked": np.round(now.past.times) % 3 == 0}
+
+
+def test_factors_over_several_nodes_leave_whole() -> None:
+    robot = replace(LINE, statics=(Static("mark", fg.Rn(1), [[0.0], [7.0]], [[2.0], [0.1]]),))
+    terms: list[Term] = [
+        Smooth(),
+        Measurement("gps", position, (1,), GPS),
+        Measurement("speed", lambda x, z: x[:, 1:] - z, (1,), 1.0),
+    ]
+    exact = GaussNewton(tolerance=1e-12)
+    window: Window = Window(robot, 3, terms, start=START, sigma=0.8, solver=exact)
+    drive, ticks = Drive(12, seed=3), 12
+    graph = fg.Graph()
+    x, m = graph.variables("x", fg.Rn(2), ticks + 1), graph.variables("m", fg.Rn(1), 2)
+    graph.minimize(fg.prior, x[0], START, sigma=0.8)
+    graph.minimize(fg.prior, m, [[0.0], [7.0]], sigma=[[2.0], [0.1]])
+    graph.minimize(lambda a, b, c: a - 2.0 * b + c, x[:-2], x[1:-1], x[2:], sigma=0.3)
+    graph.minimize(lambda x, m: m - x[:, :1], x[::3], m[0], sigma=0.2)
+    at = np.flatnonzero(drive.seen)
+    graph.minimize(position, x[at], graph.data("z", drive.positions[at], each=True), sigma=GPS)
+    graph.minimize(lambda x: x[:, 1:] - 0.3, x, sigma=1.0)
+    whole = exact.solve(graph, {x: np.zeros((ticks + 1, 2)), m: np.zeros((2, 1))})
+    for k in range(ticks + 1):
+        if k:
+            window.move([0.0])
+        window.record("gps", drive.positions[k])
+        window.record("speed", [0.3])
+        window.estimate(None)
+    np.testing.assert_allclose(window.history.states, whole[x][-4:], atol=1e-9)
+    np.testing.assert_allclose(window.history.statics["mark"], whole[m], atol=1e-9)
+
+
+def test_a_late_measurement_counts_as_one_in_time() -> None:
+    drive, early, late = Drive(10, seed=4), line_window(4), line_window(4)
+    drive.positions[8] = 0.7
+    for k in range(11):
+        for window in (early, late):
+            if k:
+                window.move(drive.controls[k - 1])
+            if window is early or k != 8:
+                window.record("gps", drive.positions[k])
+            if window is late and k == 10:
+                window.record("gps", drive.positions[8], node=-3)
+            window.estimate(None)
+    np.testing.assert_allclose(late.history.states, early.history.states, atol=1e-9)
+
+
+def test_what_cannot_be_recorded_is_refused() -> None:
+    window = line_window(3)
+    window.estimate(None)
+    with pytest.raises(fg.GraphError, match=r"nothing measures 'pgs'.*gps"):
+        window.record("pgs", [0.0])
+    with pytest.raises(fg.GraphError, match=r"shape \(2,\), expected \(1,\)"):
+        window.record("gps", [0.0, 0.0])
+    with pytest.raises(fg.GraphError, match=r"the window holds nodes 3..3"):
+        window.record("gps", [0.0], node=-2)  # nothing has entered there yet
+    with pytest.raises(fg.GraphError, match="must be"):
+        window.move([np.nan])
+    window.move([0.0], time=2.0)
+    with pytest.raises(fg.GraphError, match="not later"):
+        window.move([0.0], time=2.0)
+    with pytest.raises(fg.GraphError, match="at least one step"):
+        line_window(0)
+    with pytest.raises(fg.GraphError, match="not a point"):
+        Window(LINE, 3, [], start=[0.0], sigma=1.0)
+    with pytest.raises(fg.GraphError, match="positive"):
+        line_window(3, replace(LINE, statics=(Static("bias", fg.Rn(1), [0.0], 0.0),)))
+
+
+def test_an_estimate_that_is_none_leaves_the_prediction() -> None:
+    """A mark of which nothing is known and nothing is seen: the states are estimated, and leave, all the same."""
+    robot = replace(LINE, statics=(Static("mark", fg.Rn(1), [3.0], np.inf),))
+    terms: list[Term] = [
+        Dynamics(step, 0.1, sigma=NOISE),
+        Measurement("gap", lambda x, m, z: m - x[:, :1] - z, (1,), 0.1, ("mark",)),
+    ]
+    window: Window = Window(robot, 2, terms, start=START, sigma=0.1)
+    for k in range(8):
+        if k:
+            window.move([0.0])
+        window.record("gap", [1.0] if k == 6 else None)
+        window.estimate(None)
+        assert np.isfinite(window.present).all()
+        assert (window.history.statics["mark"][0, 0] == 3.0) == (k < 6)
+    assert window.history.statics["mark"][0, 0] == pytest.approx(0.5 + 0.6 + 1.0, abs=0.2)
+
+
+# ---------------------------------------------------------------- loops
+
+
+class Goal:
+    """Come to rest at what is given."""
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        goal = graph.data("goal", np.zeros(2))
+        graph.minimize(fg.prior, x[1:], goal, sigma=[0.2, 0.5], name="goal")
+        graph.bound(u, lower=-1.0, upper=1.0, name="limits")
+
+    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+        return {"goal": now.given}
+
+
+TARGET = np.array([1.5, 0.0])
+
+
+def line_loop(robot: Robot = LINE, steps: int = 20, solver: fg.Solver | None = None, **options: Any) -> Loop:
+    names = tuple(static.name for static in robot.statics)
+    motion = Dynamics(biased if names else step, 0.1, statics=names)
+    terms: list[Term] = [motion, Goal(), ControlCost(sigma=[1.0], change=[2.0])]
+    usual: dict[str, Any] = {"window": line_window(5, robot), "limits": (-np.ones(1), np.ones(1))}
+    return Loop(robot, steps, terms, solver=solver or InteriorPoint(), **usual | options)
+
+
+def drive(loop: Loop, ticks: int, seed: int = 0) -> tuple[list[Plan], Array]:
+    """Plans, and the true states before them, of a robot whose controls have a bias if it has one."""
+    rng, truth, plans, states = np.random.default_rng(seed), START.copy(), [], []
+    bias = BIAS if loop.robot.statics else 0.0
+    for k in range(ticks):
+        states.append(truth)
+        plans.append(loop.tick(TARGET, {"gps": truth[:1] + GPS * rng.normal(size=1)} if k % 3 else None))
+        truth = T @ truth + B @ (plans[-1].control + bias) + NOISE * 0.3 * rng.normal(size=2)
+    return plans, np.array(states)
+
+
+BACKENDS = {"ipm": InteriorPoint(), "sqp": SQP(), "alm": AugmentedLagrangian()}
+
+
+def test_backends_and_couplings_find_the_same_way() -> None:
+    ends = {}
+    for name, solver in BACKENDS.items():
+        for coupling in ("sequential", "joint"):
+            loop = line_loop(BIASED, solver=solver, coupling=coupling)
+            plans, states = drive(loop, 60)
+            assert loop.sources == {"solved": 60} and sum(loop.statuses.values()) == 60
+            assert len(loop.milliseconds) == 60 and all(plan.milliseconds > 0.0 for plan in plans)
+            assert states[-1] == pytest.approx(TARGET, abs=0.3)
+            assert loop.statics["bias"][0, 0] == pytest.approx(BIAS, abs=0.3)
+            assert np.array_equal(plans[-1].states[0], loop.estimate)
+            ends[coupling, name] = states[-1]
+    for coupling in ("sequential", "joint"):
+        for name in ("sqp", "alm"):
+            np.testing.assert_allclose(ends[coupling, name], ends[coupling, "ipm"], atol=1e-3)
+
+
+def test_what_the_couplings_hand_on() -> None:
+    """Statics: as at the start, as estimated, or estimated in the same solve."""
+    found = {}
+    for coupling in ("separate", "sequential", "joint"):
+        loop = line_loop(BIASED, coupling=coupling)
+        plans, _ = drive(loop, 25)
+        before, after = plans[-1].states[:2]
+        found[coupling] = ((after - T @ before - B @ plans[-1].control) / B[:, 0]).mean()
+        assert loop.window is not None
+        alone = loop.window.history.statics["bias"][0, 0]
+        assert loop.statics["bias"][0, 0] == pytest.approx(found["joint"] if coupling == "joint" else alone, abs=1e-5)
+        if coupling == "sequential":
+            assert found["sequential"] == pytest.approx(alone, abs=1e-6)
+    assert found["separate"] == pytest.approx(0.0, abs=1e-6)
+    assert found["sequential"] > 0.1 and found["joint"] != found["sequential"]
+
+
+@pytest.mark.parametrize(
+    ("weight", "pull", "least", "most"),
+    [(1e-8, np.inf, 0.0, 1e-4), (1.0, np.inf, 1e-2, np.inf), (1e4, 0.5, 0.49, 0.51), (1e4, [0.01, 0.02], 0.0, 0.11)],
+    ids=["no wishes", "free", "in sigmas", "in units"],
+)
+def test_how_far_the_future_pulls(weight: float, pull: Any, least: float, most: float) -> None:
+    loop = line_loop(BIASED, coupling="joint", control_weight=weight, pull=pull)
+    drive(loop, 12)
+    window = loop.window
+    assert window is not None
+    pulled = np.append(loop.estimate - window.present, loop.statics["bias"][0] - window.history.statics["bias"][0])
+    in_sigmas = np.abs(pulled) / np.sqrt(np.diag(window.covariance))
+    if np.ndim(pull):
+        assert np.abs(pulled[:2]) == pytest.approx(pull, abs=1e-4)
+    else:
+        assert least <= in_sigmas.max() <= most
+
+
+def test_a_pull_moves_by_the_covariance_times_the_gradient_of_the_plan() -> None:
+    """The joint estimate is that of the past moved by -Sigma grad V, V the optimal cost of the future."""
+    weight = 1e-4
+    loop = line_loop(coupling="joint", control_weight=weight, pull=np.inf, solver=InteriorPoint(tolerance=1e-10))
+    drive(loop, 10)
+    window, solution = loop.window, loop.solution
+    assert window is not None and solution is not None
+    gradient = []
+    for k in range(2):
+        costs = []
+        for side in (1.0, -1.0):
+            alone = line_loop(window=None, control_weight=weight, solver=InteriorPoint(tolerance=1e-10))
+            alone.applied = loop.window.history.controls[-1].copy()  # type: ignore[union-attr]
+            alone.plan(loop.estimate + side * 1e-4 * np.eye(2)[k], TARGET)
+            assert alone.solution is not None
+            costs.append(alone.solution.cost)
+        gradient.append((costs[0] - costs[1]) / 2e-4)
+    expected = -window.state_covariance @ np.array(gradient)
+    assert np.abs(expected).max() > 1e-6
+    np.testing.assert_allclose(loop.estimate - window.present, expected, rtol=1e-3, atol=1e-9)
+
+
+@pytest.mark.parametrize("coupling", ["sequential", "joint"])
+def test_nothing_is_compiled_after_a_loop_is_made(coupling: Any) -> None:
+    for solver in BACKENDS.values():
+        loop = line_loop(BIASED, solver=solver, coupling=coupling, judge=Sometimes(KeepThenBrake(BIASED, keep=2)))
+        with counting() as new:
+            drive(loop, 16)
+            loop.reset()
+            drive(loop, 2)
+        assert new.everything == 0, new
+        assert set(loop.sources) == {"solved", "kept", "braking"}
+
+
+@dataclass
+class Sometimes:
+    """A judge that refuses every plan of ticks 5 to 9."""
+
+    inner: KeepThenBrake
+    ticks: int = 0
+
+    def __call__(self, solution: Any, states: Array, controls: Array, now: Now[Any], kept: Any) -> Choice:
+        self.ticks += 1
+        if 5 <= self.ticks <= 9:
+            return self.inner.instead(now, kept)
+        return self.inner(solution, states, controls, now, kept)
+
+
+def test_a_plan_is_kept_shifted_and_then_braked() -> None:
+    brake = KeepThenBrake(LINE, keep=2, brake=lambda now: np.clip(-now.present[1:] / 0.1, -1.0, 1.0))
+    loop = line_loop(judge=Sometimes(brake), solver=InteriorPoint())
+    plans, _ = drive(loop, 12)
+    assert [plan.source for plan in plans] == ["solved"] * 4 + ["kept"] * 2 + ["braking"] * 3 + ["solved"] * 3
+    good = plans[3].controls
+    for age in (1, 2):
+        kept = plans[3 + age]
+        assert kept.emergency and np.array_equal(kept.controls[:-age], good[age:])
+        np.testing.assert_allclose(kept.states[1], T @ kept.states[0] + B @ kept.control, atol=1e-12)
+    assert plans[6].control == pytest.approx(np.clip(-plans[6].states[0, 1:] / 0.1, -1.0, 1.0))
+    assert loop.sources == {"solved": 7, "kept": 2, "braking": 3}
+    assert loop.kept.age == 0
+
+
+def test_a_solve_that_fails_is_neither_applied_nor_believed() -> None:
+    """Limits that cannot be kept: no exception, a status, the estimate of the past alone."""
+
+    class Wall(Goal):
+        def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+            super().state(graph, x, u)
+            graph.bound(x[1:], lower=[graph_least, -np.inf], name="wall")
+
+    graph_least = 50.0
+    motion = Dynamics(step, 0.1)
+    for coupling in ("sequential", "joint"):
+        loop: Loop = Loop(
+            LINE, 8, [motion, Wall()], solver=InteriorPoint(max_iterations=30), window=line_window(3), coupling=coupling
+        )
+        plans, _ = drive(loop, 4)
+        assert all(plan.source == "braking" and not plan.control.any() for plan in plans)
+        assert not loop.statuses[fg.Status.CONVERGED]
+        assert loop.window is not None and np.array_equal(loop.estimate, loop.window.present)
+
+
+def test_a_plan_that_comes_too_late_serves_the_next_tick() -> None:
+    now = [0.0]
+    delays = {3: 1.0}
+    loop = line_loop(deadline=0.1, clock=lambda: now[0])
+    limits: list[float] = []
+
+    class Slow:
+        def __init__(self, inner: fg.Prepared) -> None:
+            self.inner, self.solver = inner, inner.solver
+
+        def solve(self, guess: Any, **options: Any) -> fg.Solution:
+            limits.append(self.solver.time_limit)
+            now[0] += delays.get(len(limits), 0.02)
+            self.solver.time_limit = np.inf
+            return self.inner.solve(guess, **options)
+
+    loop.warm, loop.cold = Slow(loop.warm), Slow(loop.cold)  # type: ignore[assignment]
+    plans, _ = drive(loop, 5)
+    assert [plan.source for plan in plans] == ["solved", "solved", "late", "solved", "solved"]
+    assert plans[2].milliseconds == pytest.approx(1000.0) and loop.sources["late"] == 1
+    assert np.array_equal(plans[2].controls[:-1], plans[1].controls[1:])
+    assert limits == pytest.approx([0.1] * 5)
+    assert loop.guess is not None
+
+
+def test_the_solver_is_given_what_is_left_of_the_deadline() -> None:
+    """With no time at all the solve ends at once, and the robot does what it does without a plan."""
+    loop = line_loop(deadline=1e-9)
+    plans, _ = drive(loop, 3)
+    assert not any(plan.source == "solved" for plan in plans)
+    loop = line_loop(deadline=10.0)
+    plans, _ = drive(loop, 3)
+    assert loop.sources == {"solved": 3}
+
+
+def test_a_loop_that_ended_early_begins_anew() -> None:
+    loop = line_loop(BIASED, coupling="joint")
+    first, _ = drive(loop, 9)
+    loop.reset()
+    again, _ = drive(loop, 9)
+    for one, other in zip(first, again, strict=True):
+        assert np.array_equal(one.controls, other.controls)
+    loop.reset(start=[0.0, 0.0], sigma=[0.1, 0.1])
+    plan = loop.tick(np.zeros(2))
+    assert plan.states[0] == pytest.approx([0.0, 0.0], abs=0.05)
+
+
+def test_plans_that_end_behind_begin_anew() -> None:
+    @dataclass(frozen=True)
+    class Behind(KeepThenBrake):
+        def __call__(self, *arguments: Any) -> Choice:
+            return replace(super().__call__(*arguments), behind=True)
+
+    begun: list[float] = []
+
+    def cold(now: Now[Any]) -> tuple[Array, Array]:
+        begun.append(now.past.times[-1])
+        return np.tile(now.present, (21, 1)), np.zeros((20, 1))
+
+    loop = line_loop(judge=Behind(LINE), patience=3, starts=Starts(cold=cold))
+    drive(loop, 8)
+    assert begun == [0.0, 3.0, 6.0]
+
+
+def test_a_horizon_without_a_window() -> None:
+    loop, x = line_loop(window=None), START
+    for _ in range(40):
+        plan = loop.plan(x, TARGET)
+        x = T @ x + B @ plan.control
+    assert x == pytest.approx(TARGET, abs=0.05)
+    with pytest.raises(fg.GraphError, match="without one, give the present"):
+        loop.tick(TARGET)
+    with pytest.raises(fg.GraphError, match="needs a window"):
+        line_loop(window=None, coupling="joint")
+
+
+class Scalar:
+    """A cost that is no square."""
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        graph.minimize_scalar(lambda x: x[:, 0] ** 2, x, name="seen")
+
+    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+        return {}
+
+
+class Ahead(Scalar):
+    """A term of the past that takes the end of the trajectory for the present."""
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        graph.minimize(fg.prior, graph.families["x"][-1], [0.0, 0.0], name="latest")
+
+
+def test_what_a_loop_refuses() -> None:
+    with pytest.raises(fg.GraphError, match="choose separate, sequential, joint"):
+        line_loop(coupling="both")
+    for pull in (0.0, -1.0, np.nan):
+        with pytest.raises(fg.GraphError, match="sequential"):
+            line_loop(coupling="joint", pull=pull)
+    with pytest.raises(fg.GraphError, match="at least one step"):
+        line_loop(steps=0)
+    with pytest.raises(fg.GraphError, match="deadline"):
+        line_loop(deadline=0.0)
+    with pytest.raises(fg.GraphError, match="control_weight"):
+        line_loop(control_weight=0.0)
+    with pytest.raises(fg.GraphError, match="'seen' cannot be weighed"):
+        Loop(LINE, 5, [Dynamics(step, 0.1), Scalar()], solver=SQP(), control_weight=2.0)
+    with pytest.raises(fg.GraphError, match=r"'seen'.*cannot be marginalised"):
+        Window(LINE, 5, [Scalar()], start=START, sigma=1.0)
+    window: Window = Window(LINE, 5, [Dynamics(step, 0.1, sigma=NOISE), Ahead()], start=START, sigma=1.0)
+    with pytest.raises(fg.GraphError, match="'latest' of the past reaches into the future"):
+        Loop(LINE, 5, [Dynamics(step, 0.1), Goal()], solver=SQP(), window=window, coupling="joint")
+    with pytest.raises(fg.GraphError, match="another robot"):
+        line_loop(window=line_window(3, replace(LINE, predict=None)), coupling="joint")
+
+    class Wrong(Goal):
+        def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+            return {"gaol": now.given}
+
+    loop: Loop = Loop(LINE, 5, [Dynamics(step, 0.1), Wrong()], solver=SQP(), window=line_window(3))
+    with pytest.raises(fg.GraphError, match=r"Wrong gives data 'gaol'.*goal"):
+        loop.tick(TARGET)
+
+
+# ---------------------------------------------------------------- on groups, with functions nobody can trace
+
+
+class Lamp:
+    """Ranges to a lamp whose place nobody knows, as NumPy alone computes them."""
+
+    @property
+    def records(self) -> Mapping[str, tuple[int, ...]]:
+        return {"range": (1,)}
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        ranges = graph.data("ranges", np.ones((len(x), 1)), each=True)
+        seen = graph.data("in sight", np.zeros(len(x), dtype=bool), each=True)
+
+        def distance(pose: Array, lamp: Array, measured: Array) -> Array:
+            rows: Sequence[float] = [
+                float(np.hypot(*(p[:2] - q))) for p, q in zip(pose, np.broadcast_to(lamp, (len(pose), 2)), strict=True)
+            ]
+            return np.array(rows)[:, None] - measured
+
+        graph.minimize(distance, x, graph.families["lamp"], ranges, sigma=0.05, active=seen, name="ranges")
+
+    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+        ranges, seen = now.past.recorded("range")
+        return {"ranges": ranges, "in sight": seen}
+
+
+class Towards:
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        graph.minimize(unicycle.tracking, x[1:], [4.0, 1.0, 0.0], sigma=[1.0, 1.0, 2.0], name="towards")
+        graph.minimize(
+            lambda p, lamp: 0.3 / (0.1 + np.sum((p[:, :2] - lamp) ** 2, axis=1, keepdims=True)),
+            x[1:],
+            graph.families["lamp"],
+            name="shy",
+        )
+        graph.bound(u, lower=[0.0, -1.0], upper=[1.0, 1.0], name="limits")
+
+    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+        return {}
+
+
+@pytest.mark.parametrize("coupling", ["sequential", "joint"])
+def test_a_robot_on_se2_finds_a_lamp_while_it_drives(coupling: Any) -> None:
+    h, lamp = 0.2, np.array([2.0, -0.8])
+    noise = np.array([0.01, 0.005, 0.01])
+    robot = Robot(
+        fg.SE2, fg.Rn(2), (Static("lamp", fg.Rn(2), [1.5, -1.2], 0.5),),
+        predict=lambda x, u: unicycle.step(x[None], u[None], h)[0],
+    )  # fmt: skip
+    past: list[Term] = [Dynamics(unicycle.dynamics, h, sigma=noise), Lamp()]
+    window: Window = Window(robot, 8, past, start=np.zeros(3), sigma=[0.02, 0.02, 0.02])
+    effort = ControlCost([1.0, 1.0], [1.0, 1.0], wanted=[0.6, 0.0])
+    ahead: list[Term] = [Dynamics(unicycle.dynamics, h), Towards(), effort]
+    loop: Loop = Loop(robot, 12, ahead, solver=InteriorPoint(hessian="gauss-newton"), window=window, coupling=coupling)
+    rng, truth = np.random.default_rng(5), np.zeros(3)
+    for _ in range(30):
+        before = truth
+        plan = loop.tick(measured={"range": [np.hypot(*(truth[:2] - lamp)) + 0.05 * rng.normal()]})
+        truth = fg.SE2.retract(unicycle.step(truth[None], plan.control[None], h)[0], noise * rng.normal(size=3))
+    assert loop.statics["lamp"][0] == pytest.approx(lamp, abs=0.15)
+    assert np.hypot(*(truth[:2] - [4.0, 1.0])) < 0.4
+    error = fg.SE2.local(window.present, before)
+    assert error @ np.linalg.solve(window.state_covariance, error) < 16.3  # as large as its covariance says
+    assert loop.sources["solved"] == 30

@@ -1,0 +1,306 @@
+"""One prepared graph solved tick after tick: warm starts, a deadline, the plan that is kept, and when to begin anew."""
+
+from __future__ import annotations
+
+import time as clocks
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from unifg.answers.graph import Graph
+from unifg.answers.solution import Guess, Solution
+from unifg.answers.solver import Prepared, Solver
+from unifg.answers.status import Status
+from unifg.errors import GraphError
+from unifg.horizon.coupled import COUPLINGS, Coupling, Given, Joined, Tie, weigh
+from unifg.horizon.decision import Choice, Judge, KeepThenBrake, Kept, Plan
+from unifg.horizon.robot import Robot
+from unifg.horizon.statements import Now, Term, handles_of, values_of
+from unifg.horizon.window import Window
+from unifg.typing import Array, ArrayLike
+
+TIMES = 100_000  # ticks whose times are kept
+CLOSE = 1e-4  # a plan may bend constraints more, but noise of the past is as small as that
+LEAST_TIME = 1e-4  # [s] a solver is given however late it is
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Where solves begin that have no last answer to go on from.
+
+    Attributes:
+        cold: ``cold(now)`` gives states (N + 1, storage) and controls (N, m); None: stay, with the control zero.
+        after_failure: the same after a solve whose plan was refused; None for ``cold``.
+        carry: ``carry(guess, now)`` what of a shifted last answer still holds; None for all of it.
+    """
+
+    cold: Callable[[Now[Any]], tuple[Array, Array]] | None = None
+    after_failure: Callable[[Now[Any]], tuple[Array, Array]] | None = None
+    carry: Callable[[Guess, Now[Any]], Guess] | None = None
+
+
+class Loop:
+    """Estimates, plans and decides, tick after tick, with graphs that are stated and prepared once.
+
+    A plan that the robot may apply is kept; while later solves fail, what is left of it is there to fall back on.
+    Plans that end behind where they should for too long are caught in a dead end, where the warm start would keep
+    them: the next solve begins anew.
+
+    Attributes:
+        robot: who moves.
+        steps: N of the future.
+        coupling: of estimation and control.
+        window: of the past; None where the present is given to :meth:`plan`.
+        tie: what ties the horizon to the past.
+        x, u: nodes (N + 1) of the future, and the family of controls (N).
+        warm, cold: the prepared backend for solves with and without a warm start.
+        guess: where the next solve begins; None for anew.
+        failed: whether the last plan was refused.
+        kept: the last plan that was accepted.
+        lagging: ticks for which plans have ended behind.
+        applied: (m,) control of the last plan.
+        estimate: (storage,) present state as it is believed after the last tick.
+        statics: (count, storage) statics as they are believed after the last tick, by name.
+        solution: of the last tick; None before.
+        statuses: how often solves ended in what way.
+        sources: how often what was applied; "late" counts plans that came after the deadline.
+        milliseconds: wall-clock times of the last ticks [ms].
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        steps: int,
+        terms: Sequence[Term],
+        *,
+        solver: Solver,
+        cold: Solver | None = None,
+        window: Window | None = None,
+        coupling: Coupling = "sequential",
+        pull: float | Sequence[float] | Array = 0.5,
+        control_weight: float = 1.0,
+        limits: tuple[ArrayLike, ArrayLike] | None = None,
+        judge: Judge | None = None,
+        starts: Starts | None = None,
+        believable: Callable[[Solution, Choice], bool] | None = None,
+        deadline: float = np.inf,
+        patience: int = 10,
+        clock: Callable[[], float] = clocks.perf_counter,
+    ) -> None:
+        """State the graph and prepare the backends; ticks compile nothing.
+
+        Args:
+            robot: who moves.
+            steps: N of the future.
+            terms: what is said of the nodes and controls of the future.
+            solver: for a solve with a warm start.
+            cold: for one without, which may iterate longer; None for the same.
+            window: of the past.
+            coupling: "separate", "sequential" or "joint".
+            pull: see :class:`unifg.horizon.coupled.Joined`.
+            control_weight: factor on all costs of the future; matters where they meet those of the past.
+            limits: least and greatest controls (m,), to which plans are clipped; None for none.
+            judge: decides what is applied; by default :class:`unifg.horizon.KeepThenBrake`.
+            starts: where solves begin that have no last answer to go on from.
+            believable: whether what a joint solve says of the present is believed; by default when its plan is
+                applied and bends no constraint by more than ``CLOSE``.
+            deadline: for a tick [s]: the solver is given what is left of it; a plan that comes later is not applied.
+            patience: ticks of ending behind before a solve begins anew.
+            clock: seconds of the wall.
+
+        Raises:
+            GraphError: for an unknown coupling, a joint one without a window, sizes that do not fit, or a term that
+                cannot be stated.
+        """
+        if coupling not in COUPLINGS:
+            raise GraphError(f"unknown coupling '{coupling}': choose {', '.join(COUPLINGS)}")
+        if steps < 1:
+            raise GraphError(f"a horizon needs at least one step, found steps={steps}")
+        if not deadline > 0.0:
+            raise GraphError(f"the deadline must be positive, got {deadline} s")
+        if not (control_weight > 0.0 and np.isfinite(control_weight)):
+            raise GraphError(f"control_weight must be positive and finite, got {control_weight}")
+        self.robot, self.steps, self.coupling, self.window = robot, steps, coupling, window
+        self._terms, self._deadline, self._clock, self._patience = tuple(terms), deadline, clock, patience
+        graph = Graph()
+        self.tie: Tie = self._tied(graph, pull)
+        self.x, self.u = self.tie.ahead, graph.variables("u", robot.control, steps)
+        before = len(graph.terms)
+        for term in self._terms:
+            term.state(graph, self.x, self.u)
+        weigh(graph.terms[before:], control_weight)
+        self._handles = handles_of(graph)
+        timed = [replace(own, time_limit=min(own.time_limit, deadline)) for own in (solver, cold or solver)]
+        self._limits = [own.time_limit for own in timed]
+        self.warm, self.cold = (own.prepare(graph) for own in timed)
+        size = robot.control.storage
+        least, most = limits if limits is not None else (np.full(size, -np.inf), np.full(size, np.inf))
+        self.kept = Kept(steps, robot, (np.asarray(least, dtype=np.float64), np.asarray(most, dtype=np.float64)))
+        self.judge: Judge = judge or KeepThenBrake(robot)
+        self.starts: Starts = starts or Starts()
+        self._believable = believable or _close
+        self.statuses: Counter[Status] = Counter()
+        self.sources: Counter[str] = Counter()
+        self.milliseconds: deque[float] = deque(maxlen=TIMES)
+        self.guess: Guess | None = None
+        self.solution: Solution | None = None
+        self.lagging, self._begun = 0, False
+        self.reset()
+
+    def _tied(self, graph: Graph, pull: float | Sequence[float] | Array) -> Tie:
+        if self.coupling != "joint":
+            return Given(graph, self.robot, self.steps, self.coupling == "separate")
+        if self.window is None:
+            raise GraphError("the coupling 'joint' needs a window: there is no past to join")
+        if self.window.robot is not self.robot:
+            raise GraphError("the window is of another robot")
+        return Joined(graph, self.window, self.steps, pull)
+
+    # ---------------------------------------------------------------- a tick
+
+    def tick(
+        self,
+        given: Any = None,
+        measured: Mapping[str, ArrayLike | None] | None = None,
+        *,
+        applied: ArrayLike | None = None,
+        time: float | None = None,
+    ) -> Plan:
+        """Let the past move on by what was applied, take in what was measured, estimate and plan.
+
+        Args:
+            given: what terms ask for in ``now.given``.
+            measured: values at the present node, by name; what is missing or None was not measured.
+            applied: (m,) since the last tick; None for what the last plan said.
+            time: of the present [s]; None for one more than at the last tick.
+
+        Raises:
+            GraphError: without a window, or for data that do not fit; not for a hard problem.
+        """
+        if self.window is None:
+            raise GraphError("a tick needs a window; without one, give the present to plan()")
+        begin = self._clock()
+        if self._begun:
+            self.window.move(self.applied if applied is None else applied, time)
+        elif time is not None:
+            self.window.history.times[:] = time
+        self._begun = True
+        for name, value in (measured or {}).items():
+            self.window.record(name, value)
+        self.window.estimate(given)
+        last = self.applied if applied is None else np.asarray(applied, dtype=np.float64)
+        return self._plan(self.window.now(given, last), begin)
+
+    def plan(self, present: ArrayLike, given: Any = None, statics: Mapping[str, Array] | None = None) -> Plan:
+        """Plan from a present state (storage,) that somebody else has estimated.
+
+        Args:
+            present: state.
+            given: what terms ask for in ``now.given``.
+            statics: (count, storage) by name; those at the start by default.
+        """
+        known = {static.name: static.values for static in self.robot.statics} | dict(statics or {})
+        history = None if self.window is None else self.window.history
+        now = Now(given, np.array(present, dtype=np.float64), self.applied.copy(), known, history)
+        return self._plan(now, self._clock())
+
+    def _plan(self, now: Now[Any], begin: float) -> Plan:
+        """Solve, judge, and remember."""
+        data = self.tie.data(now) | values_of(self._terms, now, self._handles)
+        run, guess = self.begin(now)
+        limit = self._limits[0 if run is self.warm else 1]
+        run.solver.time_limit = max(LEAST_TIME, min(limit, self._deadline - (self._clock() - begin)))
+        solution = run.solve(self.tie.begin(guess, now), data=data)
+        self.solution = solution
+        self.statuses[solution.status] += 1
+        states, controls = solution[self.x], solution[self.u]
+        self.kept.age += 1
+        choice = self.judge(solution, states, controls, now, self.kept)
+        late = self._clock() - begin > self._deadline
+        if late and choice.source == "solved":
+            instead = KeepThenBrake(self.robot, brake=getattr(self.judge, "brake", None)).instead(now, self.kept)
+            self._accept(solution, states, controls, choice)
+            choice = replace(instead, source="late")
+        elif choice.source == "solved":
+            self._accept(solution, states, controls, choice)
+        else:
+            self.failed, self.guess = True, choice.guess
+        self._believe(solution, choice, now)
+        self.sources[choice.source] += 1
+        self.applied = choice.controls[0].copy()
+        elapsed = 1e3 * (self._clock() - begin)
+        self.milliseconds.append(elapsed)
+        return Plan(
+            choice.controls, choice.states, solution.status, solution.iterations, choice.source, self.kept.excess,
+            elapsed,
+        )  # fmt: skip
+
+    def begin(self, now: Now[Any]) -> tuple[Prepared, Guess]:
+        """Which backend solves next, and from where."""
+        if self.guess is not None:
+            carry = self.starts.carry
+            return self.warm, self.guess if carry is None else carry(self.guess, now)
+        if self.failed and self.starts.after_failure is not None:
+            return self.warm, self.guess_of(*self.starts.after_failure(now), now)
+        if self.starts.cold is not None:
+            return self.cold, self.guess_of(*self.starts.cold(now), now)
+        rest = np.zeros((self.steps, self.robot.control.storage))
+        return self.cold, self.guess_of(np.tile(now.present, (self.steps + 1, 1)), rest, now)
+
+    def guess_of(self, states: Array, controls: Array, now: Now[Any]) -> Guess:
+        """A guess for the graph, from states (N + 1, storage) and controls (N, m) of the future."""
+        x = self.x.family
+        nodes = np.tile(now.present, (len(x), 1))
+        nodes[len(x) - self.steps - 1 :] = states
+        return Guess({x: nodes, self.u: np.asarray(controls, dtype=np.float64)})
+
+    def _accept(self, solution: Solution, states: Array, controls: Array, choice: Choice) -> None:
+        """Keep a plan, and begin the next solve from it."""
+        self.kept.store(controls, states)
+        self.failed = False
+        self.guess = None if self.stays_behind(choice.behind) else solution.shifted(*self.tie.along, self.u)
+
+    def _believe(self, solution: Solution, choice: Choice, now: Now[Any]) -> None:
+        said = self.tie.believed(solution) if self._believable(solution, choice) else None
+        self.estimate, self.statics = said or (now.present, dict(now.statics))
+
+    def stays_behind(self, behind: bool) -> bool:
+        """Count a tick; whether plans have ended behind for too long, after which the count begins anew."""
+        self.lagging = self.lagging + 1 if behind else 0
+        if self.lagging < self._patience:
+            return False
+        self.lagging = 0
+        return True
+
+    # ---------------------------------------------------------------- beginning anew
+
+    def forget(self) -> None:
+        """Drop the warm start, as when a new reference makes it misleading."""
+        self.guess = None
+        self.failed = False
+
+    def reset(self, start: ArrayLike | None = None, sigma: ArrayLike | None = None) -> None:
+        """Forget the plan that is kept and the past, too; counts of statuses and times stay.
+
+        Args:
+            start: (storage,) believed state; None for that of the beginning.
+            sigma: (d,) its standard deviations, or its covariance; None for those of the beginning.
+        """
+        self.forget()
+        self.kept.clear()
+        self.lagging = 0
+        self.applied = np.zeros(self.robot.control.storage)
+        self.solution = None
+        self._begun = False
+        if self.window is not None:
+            self.window.reset(start, sigma)
+        self.estimate = self.robot.state.identity() if self.window is None else self.window.present
+        self.statics = {static.name: static.values for static in self.robot.statics}
+
+
+def _close(solution: Solution, choice: Choice) -> bool:
+    """A dynamics that gives by a millimetre says as little about the past as one that is not there."""
+    return choice.source == "solved" and solution.violation <= CLOSE

@@ -1,0 +1,200 @@
+"""How the future is tied to the past: two graphs that share nothing, two that share a belief, or one graph."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal, Protocol, TypeAlias, get_args
+
+import numpy as np
+
+from unifg.answers.graph import Graph
+from unifg.answers.solution import Guess, Solution
+from unifg.errors import GraphError
+from unifg.horizon.past import Past
+from unifg.horizon.robot import Robot
+from unifg.horizon.statements import Now
+from unifg.horizon.window import Window
+from unifg.language.factors import prior
+from unifg.language.terms import Cost, ScalarCost
+from unifg.language.terms import Term as Stated
+from unifg.language.variables import Data, Family, Selection
+from unifg.typing import Array, ArrayLike
+
+Coupling: TypeAlias = Literal["separate", "sequential", "joint"]
+"""Of estimation and control: "separate", the plan is given the present state, and statics as they were believed at the
+start; "sequential", it is given the present state and statics as they are estimated; "joint", one graph of past and
+future."""
+COUPLINGS: tuple[Coupling, ...] = get_args(Coupling)
+
+LEAST_SIGMA = 1e-6  # of what the past knows for certain
+
+
+class Tie(Protocol):
+    """What ties the horizon to what is known.
+
+    Attributes:
+        ahead: the nodes of the future, the present first.
+        along: families that run along time.
+    """
+
+    ahead: Selection
+    along: tuple[Family, ...]
+
+    def data(self, now: Now[Any]) -> dict[Data, ArrayLike]:
+        """Values of the data it declared."""
+        ...
+
+    def begin(self, guess: Guess, now: Now[Any]) -> Guess:
+        """The guess for a solve, from one for the horizon alone or the shifted last answer."""
+        ...
+
+    def believed(self, solution: Solution) -> tuple[Array, dict[str, Array]] | None:
+        """Present state (storage,) and statics (count, storage) of a solve; None where it was given them."""
+        ...
+
+
+class Given:
+    """The present state and the statics are given.
+
+    Attributes:
+        ahead: the nodes of the future.
+        along: the trajectory.
+    """
+
+    def __init__(self, graph: Graph, robot: Robot, steps: int, at_start: bool) -> None:
+        """Fix them.
+
+        Args:
+            graph: to state it in.
+            robot: who moves.
+            steps: N of the future.
+            at_start: whether statics stay as they were believed at the start.
+        """
+        x = graph.variables("x", robot.state, steps + 1)
+        self.ahead = x[:]
+        self.along: tuple[Family, ...] = (x,)
+        self._start = graph.data("present", robot.state.identity())
+        graph.fix(x[0], self._start, name="present")
+        self._statics: dict[str, Data] = {}
+        for static in robot.statics:
+            value = graph.data(f"{static.name}, given", static.values)
+            graph.fix(static.family(graph), value, name=f"{static.name}, given")
+            if not at_start:
+                self._statics[static.name] = value
+
+    def data(self, now: Now[Any]) -> dict[Data, ArrayLike]:
+        """What is given."""
+        found: dict[Data, ArrayLike] = {self._start: now.present}
+        return found | {data: now.statics[name] for name, data in self._statics.items()}
+
+    def begin(self, guess: Guess, now: Now[Any]) -> Guess:
+        """The guess as it is."""
+        return guess
+
+    def believed(self, solution: Solution) -> None:
+        """Nothing but what was given."""
+
+
+class Joined:
+    """The present state and the statics are estimated in the same solve as the plan.
+
+    Costs of the future pull on the estimate; how far, is bounded, around what the past alone says.
+
+    Attributes:
+        ahead: the nodes of the future, of one trajectory with those of the past.
+        along: families that run along time.
+        past: the terms of the window.
+    """
+
+    def __init__(self, graph: Graph, window: Window, steps: int, pull: float | Sequence[float] | Array) -> None:
+        """State the past's terms, and bound the pull.
+
+        Args:
+            graph: to state it in.
+            window: of the past.
+            steps: N of the future.
+            pull: how far the future may move the present state and the statics from where the past alone puts them:
+                a number, in standard deviations by the past alone, each coordinate by itself; or (d,) for the state,
+                in the units of its tangent space, and nothing for the statics. Infinite for no bound.
+
+        Raises:
+            GraphError: unless the pull is positive; without any, the coupling is the sequential one.
+        """
+        bound = np.asarray(pull, dtype=np.float64)
+        if not np.all(bound > 0.0):
+            raise GraphError(f"the pull must be positive, got {pull}: without any, the coupling is 'sequential'")
+        robot, length = window.robot, window.length
+        x = graph.variables("x", robot.state, length + steps + 1)
+        for static in robot.statics:
+            static.family(graph)
+        behind, self.ahead = x[: length + 1], x[length:]
+        self.past: Past = window.past_in(graph, behind)
+        self.along: tuple[Family, ...] = (x, *self.past.families)
+        self._window, self._present, self._length = window, self.ahead[0], length
+        self._limits: list[tuple[str | None, Data, Data, Data]] = []
+        self._pull = bound
+        if bound.ndim:
+            self._bound(graph, "state", self._present, None)
+        elif np.isfinite(bound):
+            self._bound(graph, "state", self._present, None)
+            for family in self.past.statics:
+                self._bound(graph, family.name, family[:], family.name)
+
+    def _bound(self, graph: Graph, name: str, variable: Selection, key: str | None) -> None:
+        manifold, count = variable.manifold, len(variable)
+        place = graph.data(f"{name}, by the past", np.tile(manifold.identity(), (count, 1)), each=True)
+        limits = np.ones((count, manifold.dim))
+        lower = graph.data(f"{name}, pulled at least", -limits, each=True)
+        upper = graph.data(f"{name}, pulled at most", limits, each=True)
+        graph.constrain(prior, variable, place, lower=lower, upper=upper, name=f"pull of {name}")
+        self._limits.append((key, place, lower, upper))
+
+    def data(self, now: Now[Any]) -> dict[Data, ArrayLike]:
+        """What the window knows, and where it puts what may be pulled."""
+        found = self.past.data(now)
+        window, at = self._window, 0
+        sigma = np.sqrt(np.maximum(np.diag(window.covariance), LEAST_SIGMA**2))
+        for key, place, lower, upper in self._limits:
+            value = now.present[None] if key is None else now.statics[key]
+            size = lower.value.size
+            bound = (self._pull if self._pull.ndim else self._pull * sigma[at : at + size]).reshape(lower.value.shape)
+            found |= {place: value, lower: -bound, upper: bound}
+            at += size
+        return found
+
+    def begin(self, guess: Guess, now: Now[Any]) -> Guess:
+        """The nodes up to the present, the steps and the statics as the past alone says; the rest from the guess.
+
+        A shifted plan begins where the last tick expected the robot; that gives way to what is known now.
+        """
+        x = self.ahead.family
+        given = np.asarray(guess.values[x])
+        nodes = np.concatenate([self.past.nodes(), given[self._length + 1 :]])
+        return replace(guess, values={**guess.values, **self.past.guess(), x: nodes})
+
+    def believed(self, solution: Solution) -> tuple[Array, dict[str, Array]]:
+        """What the solve says."""
+        return solution[self._present][0], {family.name: solution[family] for family in self.past.statics}
+
+
+def weigh(terms: Sequence[Stated], weight: float) -> None:
+    """Multiply costs, as they have been stated, by a common weight.
+
+    Raises:
+        GraphError: for a cost that is not a square, or whose standard deviations are data, when the weight is not one.
+    """
+    if weight == 1.0:
+        return
+    for term in terms:
+        if isinstance(term, ScalarCost) or (
+            isinstance(term, Cost) and (isinstance(term.sigma, Data) or isinstance(term.information, Data))
+        ):
+            raise GraphError(
+                f"term '{term.name}' cannot be weighed by control_weight: state its weight in the term", term=term.name
+            )
+        if isinstance(term, Cost) and term.information is not None:
+            term.information = np.asarray(term.information, dtype=np.float64) * weight
+        elif isinstance(term, Cost):
+            sigma = 1.0 if term.sigma is None else term.sigma
+            term.sigma = np.asarray(sigma, dtype=np.float64) / np.sqrt(weight)

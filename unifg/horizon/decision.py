@@ -1,0 +1,159 @@
+"""What a tick decides: a plan, where it comes from, and what is done when a solve gives none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from unifg.answers.solution import Guess, Solution
+from unifg.answers.status import Status
+from unifg.horizon.robot import Robot
+from unifg.horizon.statements import Now
+from unifg.typing import Array
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a tick decided.
+
+    Attributes:
+        controls: (N, m), the first to be applied now.
+        states: (N + 1, storage) predicted, the first being the present.
+        status: of the solve.
+        iterations: of the backend.
+        source: "solved", or what is done instead of the solver's answer.
+        excess: by how much the plan exceeded the limits of the controls before it was clipped.
+        milliseconds: wall-clock time of the whole decision.
+    """
+
+    controls: Array
+    states: Array
+    status: Status
+    iterations: int
+    source: str
+    excess: float
+    milliseconds: float
+
+    @property
+    def control(self) -> Array:
+        """(m,) to be applied now."""
+        first: Array = self.controls[0]
+        return first
+
+    @property
+    def emergency(self) -> bool:
+        """Whether the solve gave nothing that may be applied."""
+        return self.source != "solved"
+
+
+class Kept:
+    """The last plan that was accepted, which ages while later solves fail.
+
+    Attributes:
+        controls: (N, m), within their limits.
+        states: (N + 1, storage).
+        age: ticks since then; N when nothing is left of it.
+        least, most: limits (m,) of the controls.
+        excess: by how much the plan exceeded them.
+    """
+
+    def __init__(self, steps: int, robot: Robot, limits: tuple[Array, Array]) -> None:
+        """Begin with nothing."""
+        self.least, self.most = limits
+        self.controls = np.zeros((steps, robot.control.storage))
+        self.states = np.tile(robot.state.identity(), (steps + 1, 1))
+        self.clear()
+
+    def clear(self) -> None:
+        """Let nothing be left."""
+        self.controls[:] = 0.0
+        self.age, self.excess = len(self.controls), 0.0
+
+    def store(self, controls: Array, states: Array) -> None:
+        """Keep a new plan (N, m), (N + 1, storage)."""
+        self.excess = float(np.maximum(controls - self.most, self.least - controls).max(initial=0.0))
+        self.controls, self.states, self.age = controls.copy(), states.copy(), 0
+
+    def left(self) -> Array:
+        """(k, m) controls that are left of the plan."""
+        rest: Array = self.controls[self.age :]
+        return rest
+
+    def within(self, controls: Array) -> Array:
+        """Controls (k, m) clipped to their limits."""
+        clipped: Array = np.clip(controls, self.least, self.most)
+        return clipped
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What is applied at a tick.
+
+    Attributes:
+        controls: (N, m).
+        states: (N + 1, storage).
+        source: "solved" for the solver's answer, which is then kept; what else it is otherwise.
+        guess: where the next solve begins after another source; None for anew.
+        behind: whether a plan that was accepted ends far from where it should.
+    """
+
+    controls: Array
+    states: Array
+    source: str
+    guess: Guess | None = None
+    behind: bool = False
+
+
+class Judge(Protocol):
+    """Decides what is applied."""
+
+    def __call__(self, solution: Solution, states: Array, controls: Array, now: Now[Any], kept: Kept) -> Choice:
+        """Judge a solve.
+
+        Args:
+            solution: of the graph of this tick.
+            states: (N + 1, storage) its plan.
+            controls: (N, m) its controls.
+            now: what the terms were asked with.
+            kept: the last plan that was accepted; its age counts this tick already.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class KeepThenBrake:
+    """Apply a plan that keeps its constraints; else what is left of the last one, for a while; else brake.
+
+    Attributes:
+        robot: who moves.
+        feasible: greatest violation of a plan that may be applied.
+        keep: ticks for which an old plan may be applied.
+        brake: ``brake(now)`` gives controls (N, m), or (m,) for all steps, that bring the robot to rest; None: zero.
+    """
+
+    robot: Robot
+    feasible: float = 1e-3
+    keep: int = 8
+    brake: Callable[[Now[Any]], Array] | None = None
+
+    def __call__(self, solution: Solution, states: Array, controls: Array, now: Now[Any], kept: Kept) -> Choice:
+        """Judge a solve."""
+        if solution.violation <= self.feasible and np.isfinite(states).all() and np.isfinite(controls).all():
+            return Choice(kept.within(controls), states, "solved")
+        return self.instead(now, kept)
+
+    def instead(self, now: Now[Any], kept: Kept) -> Choice:
+        """What is done without a plan of this tick."""
+        count = len(kept.controls)
+        braking = kept.within(np.tile(np.zeros(kept.controls.shape[1]), (count, 1)))
+        if self.brake is not None:
+            braking = kept.within(np.broadcast_to(np.asarray(self.brake(now), dtype=np.float64), kept.controls.shape))
+        left = kept.within(kept.left())
+        if kept.age <= self.keep and len(left):
+            controls, source = np.concatenate([left, braking[: count - len(left)]]), "kept"
+        else:
+            controls, source = braking, "braking"
+        return Choice(controls, self.robot.rollout(now.present, controls), source)

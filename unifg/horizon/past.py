@@ -1,0 +1,256 @@
+"""The past in a graph: what the terms of a window say, and the prior that stands for all that has left it.
+
+What leaves takes its costs and equalities along: they are marginalised into a prior on the nodes and statics they
+reach, at the point where they were last linearised (:mod:`unifg.answers.marginal`); inequalities are dropped. While
+the window is not full, factors that touch an empty place do not count, and the empty places are held by a weak prior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from unifg.answers.graph import Graph
+from unifg.answers.solution import Solution
+from unifg.errors import GraphError
+from unifg.horizon.recorded import History
+from unifg.horizon.robot import Robot
+from unifg.horizon.statements import Now, Term, handles_of, values_of
+from unifg.kernels.residuals import Residual
+from unifg.language.factors import prior
+from unifg.language.joint_prior import joint_prior
+from unifg.language.terms import Constraint, ScalarCost
+from unifg.language.terms import Term as Stated
+from unifg.language.variables import Data, Family, Selection
+from unifg.lie import Manifold
+from unifg.typing import Array, ArrayLike, BoolArray, IntArray
+
+
+class Arrival(Protocol):
+    """Coordinates in which the prior of what has left is a quadratic."""
+
+    def residual(self, *manifolds: Manifold) -> Residual:
+        """``r(v_1, ..., v_k, reference)``: difference (n, D) of variables from a reference (S,)."""
+        ...
+
+    def express(self, here: Array, reference: Array, information: Array) -> tuple[Array, Array]:
+        """Reference (S,) and information (D, D) in these coordinates.
+
+        Args:
+            here: (S,) where the prior was linearised.
+            reference: (S,) its lowest point.
+            information: (D, D) over right perturbations.
+        """
+        ...
+
+
+class Tangent:
+    """The tangent spaces of the variables themselves: :func:`unifg.joint_prior`."""
+
+    def residual(self, *manifolds: Manifold) -> Residual:
+        """Local differences side by side."""
+        return joint_prior(*manifolds)
+
+    def express(self, here: Array, reference: Array, information: Array) -> tuple[Array, Array]:
+        """As they are."""
+        return reference, information
+
+
+class Left:
+    """What is known of what has left the window.
+
+    Attributes:
+        initial: reference (storage,) and information (d, d) about the node everything began at.
+        statics: reference (count, storage) and information (count, d, d) about every static at the start, by name.
+        arrival: reference (S,) and information (D, D) about the oldest nodes and the statics; None before any has left.
+        departure: what ``arrival`` becomes with the next node that leaves.
+    """
+
+    def __init__(self, robot: Robot, start: Array, covariance: Array) -> None:
+        """Begin with what is believed at the start."""
+        self._robot = robot
+        self.begin(start, covariance)
+
+    def begin(self, start: Array, covariance: Array) -> None:
+        """Forget what has left; a state (storage,) is believed with a covariance (d, d)."""
+        robot = self._robot
+        self.initial = start.copy(), np.linalg.inv(covariance)
+        self.statics = {static.name: (static.values, static.information) for static in robot.statics}
+        self.arrival: tuple[Array, Array] | None = None
+        self.departure: tuple[Array, Array] | None = None
+
+
+class Past:
+    """The terms of a window in one graph, alone or joined to a future.
+
+    Attributes:
+        x: (L + 1) nodes, the present last.
+        names: of the costs and equalities that are marginalised.
+        reach: how many nodes a factor of the past spans at most, less one.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        x: Selection,
+        robot: Robot,
+        history: History,
+        left: Left,
+        terms: Sequence[Term],
+        arrival: Arrival,
+    ) -> None:
+        """Add everything the past says to a graph that holds the robot's statics.
+
+        Raises:
+            GraphError: for a scalar cost, which cannot be marginalised, and a factor that reaches into the future.
+        """
+        self.x, self._robot, self._history, self._left, self._terms = x, robot, history, left, terms
+        self._arrival = arrival
+        length = history.length
+        self._steps = {name: graph.variables(name, kind, length) for name, kind in robot.steps.items()}
+        self._statics = {static.name: graph.families[static.name] for static in robot.statics}
+        self._applied = graph.data("applied controls", np.zeros((length, robot.control.storage)), each=True)
+        before = len(graph.terms)
+        for term in terms:
+            term.state(graph, x, self._applied)
+        stated = graph.terms[before:]
+        self._handles = handles_of(graph)
+        self._entered, self._own_activity = self._switch(graph, stated)
+        self.names = ["initial", "arrival", *(term.name for term in stated if _leaves(term))]
+        self._state_priors(graph)
+
+    def _switch(self, graph: Graph, stated: list[Stated]) -> tuple[list[tuple[Data, IntArray]], dict[Data, Any]]:
+        """Make every factor wait until all its nodes have entered; also find how many nodes factors span."""
+        oldest, self.reach = int(self.x.indices[0]), 1
+        switches: list[tuple[Data, IntArray]] = []
+        own: dict[Data, Any] = {}
+        for term in stated:
+            if isinstance(term, ScalarCost):
+                raise GraphError(
+                    f"term '{term.name}': a scalar cost of the past cannot be marginalised; state it as a square",
+                    term=term.name,
+                )
+            nodes = [
+                np.broadcast_to(s.indices - (oldest if s.family is self.x.family else 0), term.count)
+                for s in term.selections
+                if s.family is self.x.family or s.family in self._steps.values()
+            ]
+            if not nodes:
+                continue
+            first, last = np.min(nodes, axis=0), np.max(nodes, axis=0)
+            if first.min() < 0 or last.max() > self._history.length:
+                raise GraphError(f"term '{term.name}' of the past reaches into the future", term=term.name)
+            self.reach = max(self.reach, int((last - first).max()))
+            switch = graph.data(f"{term.name}: entered", np.ones(term.count, dtype=bool), each=True)
+            own[switch], term.active = term.active, switch
+            switches.append((switch, first.astype(np.intp)))
+        return switches, own
+
+    def _state_priors(self, graph: Graph) -> None:
+        """What was believed at the start, what has left, and what holds empty places."""
+        x, history, left = self.x, self._history, self._left
+        count = len(x)
+        self._initial = graph.data("initial", np.zeros(count, dtype=bool), each=True)
+        self._start = graph.data("start", left.initial[0]), graph.data("information at the start", left.initial[1])
+        start, information = self._start
+        graph.minimize(prior, x, start, information=information, active=self._initial, name="initial")
+        self._resting = graph.data("empty places", left.initial[0])
+        self._empty = graph.data("empty", np.zeros(history.length, dtype=bool), each=True)
+        graph.minimize(prior, x[:-1], self._resting, active=self._empty, name="empty places")
+        for name, family in self._steps.items():
+            graph.minimize(prior, family, family.manifold.identity(), active=self._empty, name=f"empty {name}")
+        self._believed: dict[str, tuple[Data, Data]] = {}
+        for name, family in self._statics.items():
+            values, weights = left.statics[name]
+            reference = graph.data(f"{name} at the start", values, each=True)
+            weight = graph.data(f"information about {name} at the start", weights, each=True)
+            graph.minimize(prior, family, reference, information=weight, name=f"prior of {name}")
+            self._believed[name] = reference, weight
+        members = [family[k] for family in self._statics.values() for k in range(len(family))]
+        about = [*(x[k] for k in range(self.reach)), *members]
+        size = sum(variable.manifold.dim for variable in about)
+        identity = np.concatenate([variable.manifold.identity() for variable in about])
+        self._reference = graph.data("arrival", identity)
+        self._information = graph.data("arrival information", np.eye(size))
+        self._arrived = graph.data("arrived", np.zeros(1, dtype=bool), each=True)
+        graph.minimize(
+            self._arrival.residual(*(variable.manifold for variable in about)), *about, self._reference,
+            information=self._information, active=self._arrived, name="arrival",
+        )  # fmt: skip
+
+    @property
+    def families(self) -> tuple[Family, ...]:
+        """Families of the steps, which run along the window."""
+        return tuple(self._steps.values())
+
+    @property
+    def statics(self) -> tuple[Family, ...]:
+        """Families of the statics."""
+        return tuple(self._statics.values())
+
+    def data(self, now: Now[Any]) -> dict[Data, ArrayLike]:
+        """What the window knows."""
+        history, left = self._history, self._left
+        found = values_of(self._terms, now, self._handles)
+        for switch, first in self._entered:
+            own = self._own_activity[switch]
+            if isinstance(own, Data):
+                own = found.get(own, own.value)
+            entered: BoolArray = first >= history.empty
+            found[switch] = entered if own is None else entered & np.asarray(own, dtype=bool)
+        found |= {
+            self._applied: history.controls,
+            self._initial: history.initial,
+            self._start[0]: left.initial[0],
+            self._start[1]: left.initial[1],
+            self._resting: history.present,
+            self._empty: np.arange(history.length) < history.empty,
+            self._arrived: np.array([left.arrival is not None]),
+        }
+        for name, (reference, weight) in self._believed.items():
+            found[reference], found[weight] = left.statics[name]
+        if left.arrival is not None:
+            found[self._reference], found[self._information] = left.arrival
+        return found
+
+    def guess(self) -> dict[Family, Array]:
+        """What is believed about everything but the nodes."""
+        history = self._history
+        steps = {family: history.steps[name] for name, family in self._steps.items()}
+        return steps | {family: history.statics[name] for name, family in self._statics.items()}
+
+    def nodes(self) -> Array:
+        """(L + 1, storage) what is believed about the nodes; empty places are guessed at the present."""
+        states = self._history.states.copy()
+        states[: self._history.empty] = self._history.present
+        return states
+
+    def take(self, solution: Solution) -> None:
+        """Believe what a solution says of the past."""
+        history = self._history
+        history.states[history.empty :] = solution[self.x][history.empty :]
+        for name, family in self._steps.items():
+            history.steps[name][:] = solution[family]
+        for name, family in self._statics.items():
+            history.statics[name][:] = solution[family]
+
+    def depart(self, solution: Solution) -> None:
+        """Marginalise the oldest node, if the next step drops it, where a solution was linearised."""
+        if not self._history.full:
+            return
+        x, reach = self.x, self.reach
+        kept: list[Family | Selection] = [x[1 : reach + 1], *self.statics]
+        reference, information = solution.marginal_prior(self.names, [x[0], *(f[0] for f in self.families)], kept)
+        here = np.concatenate([solution[variable].ravel() for variable in kept])
+        self._left.departure = self._arrival.express(here, reference[0], information)
+
+
+def _leaves(term: Stated) -> bool:
+    """Whether a term is marginalised: costs and equalities, no inequalities."""
+    if not isinstance(term, Constraint):
+        return True
+    if isinstance(term.lower, Data) or isinstance(term.upper, Data):
+        return term.lower is term.upper
+    return bool(np.all(np.asarray(term.lower) == np.asarray(term.upper)))

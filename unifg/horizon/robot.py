@@ -1,0 +1,107 @@
+"""Who moves: where its state and its controls live, and what else is unknown that past and future share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.language.statement import Statement
+from unifg.language.variables import Family
+from unifg.lie import Manifold
+from unifg.typing import Array, ArrayLike
+
+
+@dataclass(frozen=True)
+class Static:
+    """Unknowns that do not change with time: parameters, landmarks, biases. One family in every graph of the robot.
+
+    Attributes:
+        name: of the family; terms find it as ``graph.families[name]``.
+        manifold: of every member.
+        start: (count, storage) believed at the start, or (storage,) for one member.
+        sigma: standard deviations of that belief in the tangent space, of any shape that fits (count, dim); infinite
+            where nothing is believed, which leaves it to the measurements alone.
+
+    Raises:
+        GraphError: when the start does not lie on the manifold, or a standard deviation is not positive.
+    """
+
+    name: str
+    manifold: Manifold
+    start: ArrayLike
+    sigma: ArrayLike
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be believed."""
+        start = np.atleast_2d(np.asarray(self.start, dtype=np.float64))
+        if start.ndim != 2 or start.shape[1] != self.manifold.storage or not np.all(self.manifold.is_valid(start)):
+            raise GraphError(
+                f"static '{self.name}': its start has shape {start.shape}, expected (count, {self.manifold.storage}), "
+                f"or is not on {self.manifold.name}",
+                family=self.name,
+            )
+        try:
+            sigma = np.broadcast_to(np.asarray(self.sigma, dtype=np.float64), (len(start), self.manifold.dim))
+        except ValueError as error:
+            raise GraphError(
+                f"static '{self.name}': sigma does not fit ({len(start)}, {self.manifold.dim})", family=self.name
+            ) from error
+        if not np.all(sigma > 0.0):
+            raise GraphError(f"static '{self.name}': standard deviations must be positive", family=self.name)
+
+    @property
+    def values(self) -> Array:
+        """(count, storage) at the start."""
+        return np.atleast_2d(np.array(self.start, dtype=np.float64))
+
+    @property
+    def information(self) -> Array:
+        """(count, dim, dim) about the start."""
+        count, dim = len(self.values), self.manifold.dim
+        return information_of(np.broadcast_to(np.asarray(self.sigma, dtype=np.float64), (count, dim)))
+
+    def family(self, graph: Statement) -> Family:
+        """Add the family to a graph."""
+        return graph.variables(self.name, self.manifold, len(self.values))
+
+
+@dataclass(frozen=True)
+class Robot:
+    """One trajectory family, the controls that drive it, and what else is unknown.
+
+    Attributes:
+        state: manifold of every node of the trajectory.
+        control: manifold R^m of the controls.
+        statics: unknowns that past and future share.
+        steps: manifolds by name of unknowns that belong to each step of the past, as process noise; terms of the past
+            find the families, one member per step, as ``graph.families[name]``.
+        predict: ``predict(x, u)`` where a state (storage,) is after one step with a control (m,); a first guess of the
+            next node, and what kept plans and braking lead to. None: it stays where it is.
+    """
+
+    state: Manifold
+    control: Manifold
+    statics: tuple[Static, ...] = ()
+    steps: Mapping[str, Manifold] = field(default_factory=dict)
+    predict: Callable[[Array, Array], Array] | None = None
+
+    def predicted(self, state: Array, control: Array) -> Array:
+        """(storage,) where one step leads."""
+        if self.predict is None:
+            return state.copy()
+        return np.asarray(self.predict(state, control), dtype=np.float64).reshape(self.state.storage)
+
+    def rollout(self, state: Array, controls: Array) -> Array:
+        """(k + 1, storage) states that controls (k, m) lead to from a state (storage,)."""
+        states = [np.asarray(state, dtype=np.float64)]
+        for control in controls:
+            states.append(self.predicted(states[-1], control))
+        return np.array(states)
+
+
+def information_of(sigma: Array) -> Array:
+    """(..., d, d) diagonal information of standard deviations (..., d); none where they are infinite."""
+    return np.eye(sigma.shape[-1]) / np.square(sigma)[..., None]
