@@ -26,14 +26,13 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from unifg.answers.history import Iteration
-from unifg.answers.solution import NotConverged, Solution
-from unifg.answers.solver import AnyGuess, Backend, Callback, Prepared, Solver
+from unifg.answers.solution import AnyGuess, NotConverged, Solution
+from unifg.answers.solver import Backend, Callback, Prepared, Solver
 from unifg.answers.status import Status
 from unifg.answers.verdict import Verdict
 from unifg.errors import BackendError
@@ -457,9 +456,7 @@ def _rival(loss: Loss) -> Loss:
 
 def _staged(graph: Statement) -> tuple[Statement, list[_Stage]]:
     """The same graph with a `_Stage` in place of every loss that has surrogates."""
-    staged, stages = copy(graph), []
-    staged.terms = list(graph.terms)
-    staged.compiled = None
+    staged, stages = graph.snapshot(), []
     for k, term in enumerate(staged.terms):
         if isinstance(term, Cost) and isinstance(term.robust, Graduated):
             stages.append(_Stage(term.robust))

@@ -40,22 +40,22 @@ REFUSALS: list[tuple[str, Breaks, str]] = [
     ("data nan", lambda g, x: g.data("z", [np.nan]), "NaN"),
     (
         "residual shape",
-        lambda g, x: (g.minimize(lambda p: p[:, 0], x), g.compile()),
+        lambda g, x: g.minimize(lambda p: p[:, 0], x),
         r"returned shape \(4,\)",
     ),
     (
         "sigma shape",
-        lambda g, x: (g.minimize(fg.prior, x, [0, 0], sigma=np.ones(3)), g.compile()),
+        lambda g, x: g.minimize(fg.prior, x, [0, 0], sigma=np.ones(3)),
         "sigma has shape",
     ),
     (
         "negative sigma",
-        lambda g, x: (g.minimize(fg.prior, x, [0, 0], sigma=-1.0), g.compile()),
+        lambda g, x: g.minimize(fg.prior, x, [0, 0], sigma=-1.0),
         "must be positive",
     ),
     (
         "indefinite information",
-        lambda g, x: (g.minimize(fg.prior, x, [0, 0], information=np.diag([1.0, -1.0])), g.compile()),
+        lambda g, x: g.minimize(fg.prior, x, [0, 0], information=np.diag([1.0, -1.0])),
         "negative eigenvalue",
     ),
     (

@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from unifg.answers.check import Report, check_graph
+from unifg.answers.solution import AnyGuess, values_of
 from unifg.elimination.tree import EliminationTree
 from unifg.language.statement import Statement
-from unifg.language.variables import Data, Family
+from unifg.language.variables import Data
 from unifg.program.program import Program, compile_graph
 from unifg.typing import ArrayLike
 
@@ -20,7 +21,7 @@ class Graph(Statement):
 
     The objective is ``sum 1/2 |r|^2`` over the costs plus the scalar costs; constraints read
     ``lower <= g(x) <= upper``. A graph holds no values: a solve takes a guess and returns a solution,
-    and changes neither the graph nor the guess.
+    and changes neither the graph nor the guess. ``print(graph)`` lists what it holds.
 
     Attributes:
         families: variable families by name.
@@ -28,9 +29,13 @@ class Graph(Statement):
         fixes: fixed variables.
     """
 
-    def check(self, guess: Mapping[Family, ArrayLike], data: Mapping[Data, ArrayLike] | None = None) -> Report:
-        """Look for mistakes at ``guess``: see :mod:`unifg.answers.check`."""
-        return check_graph(self, guess, data)
+    def check(self, guess: AnyGuess, data: Mapping[Data, ArrayLike] | None = None) -> Report:
+        """Look for mistakes at ``guess``, or at a solution: see :mod:`unifg.answers.check`."""
+        return check_graph(self, values_of(guess), data)
+
+    def routes(self) -> dict[str, str]:
+        """For each term by name, how it is evaluated and differentiated; nothing before the graph is compiled."""
+        return {term.name: term.route for term in self.compiled.terms} if isinstance(self.compiled, Program) else {}
 
     def compile(self) -> Program:
         """Offsets, ordering and sparsity; computed once and kept until the graph changes.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from unifg.errors import GraphError, UnifgError
 from unifg.language.variables import Family, Selection, Variable, as_selection
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
-from unifg.typing import Array, BoolArray
+from unifg.typing import Array, ArrayLike, BoolArray
 
 
 @dataclass(frozen=True)
@@ -286,3 +286,21 @@ class NotConverged(UnifgError, RuntimeError):
     def __reduce__(self) -> tuple[type[NotConverged], tuple[Solution]]:
         """Made from the solution, not from its report."""
         return type(self), (self.solution,)
+
+
+AnyGuess: TypeAlias = Mapping[Family, ArrayLike] | Guess | Solution
+
+
+def values_of(guess: AnyGuess) -> Mapping[Family, ArrayLike]:
+    """The values of a guess, of whatever form.
+
+    Raises:
+        GraphError: when it is none.
+    """
+    if isinstance(guess, Mapping):
+        return guess
+    if isinstance(guess, Guess | Solution):
+        return guess.values
+    raise GraphError(
+        f"a guess is {{family: array, ...}}, a Guess or a Solution, found {type(guess).__name__}: {guess!r}"[:200]
+    )

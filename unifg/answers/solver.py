@@ -16,11 +16,11 @@ from unifg.answers.optimality import infeasible_stationary, optimality, within_b
 from unifg.answers.rehearsal import rehearse
 from unifg.answers.relative_offset import Factored
 from unifg.answers.requirements import Constraints, require
-from unifg.answers.solution import Guess, NotConverged, Solution
+from unifg.answers.solution import AnyGuess, NotConverged, Solution, values_of
 from unifg.answers.status import Status
 from unifg.errors import BackendError, GraphError
 from unifg.language.statement import Statement
-from unifg.language.variables import Data, Family
+from unifg.language.variables import Data
 from unifg.program.by_term import ByTerm
 from unifg.program.columns import Values
 from unifg.program.linearization import Linearization, all_finite
@@ -29,7 +29,6 @@ from unifg.typing import Array, ArrayLike
 
 logger = logging.getLogger("unifg")
 
-AnyGuess: TypeAlias = Mapping[Family, ArrayLike] | Guess | Solution
 Callback: TypeAlias = Callable[[Iteration], bool | None]
 
 UNBOUNDED_COST = -1e20
@@ -145,7 +144,7 @@ class Solver(Backend):
         self.require(program)
         if not program.least_squares:  # there, curvature is asked for in rare cases only
             program.table.require_second()
-        return Prepared(self, program)
+        return Prepared(self, program, graph)
 
     def require(self, program: Program) -> None:
         """Raise BackendError when the backend cannot take this class of problem."""
@@ -406,15 +405,20 @@ class SolveState:
 class Prepared:
     """A backend bound to one compiled graph; solves repeatedly without rebuilding structure.
 
+    It solves the graph as it was when it was prepared: terms that are added, removed or replaced later need another
+    :meth:`Solver.prepare`. The first solve after such a change says so, in a warning of the logger ``unifg``.
+
     Attributes:
         solver: the backend and its options.
         program: the compiled graph.
     """
 
-    def __init__(self, solver: Solver, program: Program) -> None:
-        """Made by :meth:`Solver.prepare`."""
+    def __init__(self, solver: Solver, program: Program, graph: Statement | None = None) -> None:
+        """Made by :meth:`Solver.prepare`, for the graph that the program was made of."""
         self.solver = solver
         self.program = program
+        self._graph = graph or program.graph
+        self._edition = self._graph.edition
         self._workspace: Any = None
         self._constraints = {
             t.name: (t, rows) for t, rows in zip(program.constraint_terms, program.slices, strict=True)
@@ -432,7 +436,8 @@ class Prepared:
         """Solve from ``guess``; arguments and errors as for :meth:`Solver.solve`."""
         program = self.program
         program.bind(data or {})
-        values = program.values_from(guess if isinstance(guess, Mapping) else guess.values)
+        self._say_if_stale()
+        values = program.values_from(values_of(guess))
         carried = {} if isinstance(guess, Mapping) else guess.multipliers
         multipliers = self._stacked("multipliers", {**carried, **duals} if duals else carried)
         run = SolveState(self.solver, program, values, multipliers, callback)
@@ -455,6 +460,20 @@ class Prepared:
         if check and not solution.converged:
             raise NotConverged(solution)
         return solution
+
+    @property
+    def stale(self) -> bool:
+        """Whether the graph has been changed since."""
+        return self._graph.edition != self.program.graph.edition
+
+    def _say_if_stale(self) -> None:
+        """Say once of every change that it does not reach this solver."""
+        if self._graph.edition != self._edition:
+            self._edition = self._graph.edition
+            logger.warning(
+                "a prepared %s solves the graph as it was when it was prepared, and the graph has changed since: "
+                "prepare it again", self.solver.name,
+            )  # fmt: skip
 
     def allocate(self) -> None:
         """Make the backend's workspace, unless there is one."""

@@ -94,7 +94,7 @@ class Batched:
         except Exception as error:
             name_term(error, self.name)
             raise
-        array = result if isinstance(result, np.ndarray) else np.asarray(result)
+        array = result if isinstance(result, np.ndarray) else self._as_array(result)
         if array.dtype != FLOAT64:
             raise GraphError(
                 f"term '{self.name}': its function returned {array.dtype}, expected float64: differences of anything "
@@ -102,6 +102,22 @@ class Batched:
                 term=self.name,
             )
         return array
+
+    def _as_array(self, result: Any) -> Array:
+        """What was returned, if it is no array yet.
+
+        Raises:
+            GraphError: it cannot become one.
+        """
+        if result is None:
+            raise GraphError(f"term '{self.name}': its function returned None: is there no return?", term=self.name)
+        try:
+            return np.asarray(result)
+        except ValueError as error:
+            raise GraphError(
+                f"term '{self.name}': its function returned a {type(result).__name__} that is no array: {error}",
+                term=self.name,
+            ) from error
 
     def __call__(self, near: Near, steps: Steps, moves: Moves) -> Array:
         """(K, n, ...) what the function returns after each of K moves, until it is called again."""

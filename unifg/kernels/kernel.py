@@ -132,6 +132,8 @@ class Kernel:
             lengths.add(count)
         if len(lengths) > 1:
             raise GraphError(f"{self.name}: its arguments speak of {sorted(lengths)} factors")
+        if count == 1 and lengths:
+            raise GraphError(f"{self.name}: its parameters speak of {max(lengths)} factors, its variables of one")
         return variables, parameters, lengths.pop() if lengths else 1
 
     def __call__(self, *arguments: Any) -> Array:

@@ -58,11 +58,19 @@ def reciprocals(name: str, sigma: Array, count: int, size: int) -> Array:
         GraphError: naming the term, when sigma has another shape or is not positive.
     """
     if sigma.shape not in ((), (size,), (count, size)):
+        each = "; repeat one number for each factor: sigma[:, None] * np.ones(m)" if sigma.shape[:1] == (count,) else ""
         raise GraphError(
-            f"term '{name}': sigma has shape {sigma.shape}, expected (), ({size},) or {(count, size)}", term=name
+            f"term '{name}': sigma has shape {sigma.shape}, expected (), ({size},) or {(count, size)}{each}", term=name
         )
     if not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
-        raise GraphError(f"term '{name}': sigma must be positive and finite", term=name)
+        place = tuple(int(k) for k in np.argwhere(~(np.isfinite(sigma) & (sigma > 0.0)))[0])
+        at = f" at {place}" if place else ""
+        raise GraphError(
+            f"term '{name}': sigma must be positive and finite, found {sigma[place]:g}{at}; "
+            "leave factors out with active=, hold rows exactly with constrain",
+            term=name,
+            index=place[0] if len(place) == 2 else None,
+        )
     return np.array(np.broadcast_to(1.0 / sigma, (len(sigma) if sigma.ndim == 2 else 1, size)))
 
 
@@ -81,7 +89,15 @@ def square_roots(name: str, information: Array, count: int, size: int) -> Array:
     stack = information.reshape(-1, m, m)
     transposed = np.swapaxes(stack, -1, -2)
     if not np.isfinite(stack).all() or not np.allclose(stack, transposed, rtol=1e-9, atol=0.0):
-        raise GraphError(f"term '{name}': information must be finite and symmetric", term=name)
+        unequal = ~np.isfinite(stack) | ~np.isclose(stack, transposed, rtol=1e-9, atol=0.0)
+        index, row, column = (int(k) for k in np.argwhere(unequal)[0])
+        raise GraphError(
+            f"term '{name}': information must be finite and symmetric, found {stack[index, row, column]:g} at "
+            f"{(row, column)} and {stack[index, column, row]:g} at {(column, row)}"
+            f"{f' of factor {index}' if len(stack) > 1 else ''}",
+            term=name,
+            index=index,
+        )
     try:
         lower = np.linalg.cholesky(stack)
     except np.linalg.LinAlgError:  # singular, or wrong
@@ -90,7 +106,10 @@ def square_roots(name: str, information: Array, count: int, size: int) -> Array:
         if (lowest < -1e-9).any():
             index = int(np.argmin(lowest))
             raise GraphError(
-                f"term '{name}': information of factor {index} has a negative eigenvalue", term=name, index=index
+                f"term '{name}': information of factor {index} has a negative eigenvalue, "
+                f"{eigenvalues[index].min():g}: it must be positive semi-definite",
+                term=name,
+                index=index,
             ) from None
         roots = np.sqrt(np.maximum(eigenvalues, 0.0))[..., :, None] * np.swapaxes(vectors, -1, -2)
         return np.asarray(np.linalg.qr(roots, mode="r"))

@@ -1,21 +1,46 @@
-"""The graph: what is unknown, what is minimised, what must hold."""
+"""The graph: what is unknown, what is minimised, what must hold.
+
+A statement is looked at before it is kept: the function is called once, weights and limits are compared with what it
+returns. One that is refused leaves the graph as it was.
+"""
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from collections.abc import Sequence
+from copy import copy
+from difflib import get_close_matches
+from html import escape
+from operator import index
+from typing import Any, Final, TypeAlias, TypeVar
 
 import numpy as np
 
 from unifg.errors import GraphError
 from unifg.kernels.residuals import Function, Residual, as_residual, residual
 from unifg.kernels.robust import Loss
+from unifg.language.doubles import doubles
 from unifg.language.factors import ManifoldResidual
+from unifg.language.inventory import inventory
 from unifg.language.terms import Constraint, Cost, Fix, Parameter, ScalarCost, Term, prepare_arguments
-from unifg.language.variables import Data, Family, Selection, Variable, as_selection, is_variable
+from unifg.language.trial import rows_of
+from unifg.language.variables import (
+    RESERVED,
+    Data,
+    Family,
+    Selection,
+    Variable,
+    as_selection,
+    is_variable,
+)
+from unifg.language.weights import check_limits, check_weights, placed
 from unifg.lie import Manifold, Rn
-from unifg.typing import Array, ArrayLike
+from unifg.lie.product import Product
+from unifg.typing import Array, ArrayLike, IntArray
 
 AnyResidual: TypeAlias = Function | Residual | ManifoldResidual
+S = TypeVar("S", bound="Statement")
+SAME: Final[Any] = object()
+"""In the place of what :meth:`Statement.replace` leaves as it is."""
 
 
 class Statement:
@@ -23,13 +48,14 @@ class Statement:
 
     The objective is ``sum 1/2 |r|^2`` over the costs plus the scalar costs; constraints read
     ``lower <= g(x) <= upper``. A graph holds no values: a solve takes a guess and returns a solution,
-    and changes neither the graph nor the guess.
+    and changes neither the graph nor the guess. ``print(graph)`` lists what it holds.
 
     Attributes:
         families: variable families by name.
         terms: costs and constraints in the order they were stated.
         fixes: fixed variables.
         compiled: what rooms above have made of this statement, dropped with every change; None before.
+        edition: how often it has been changed.
     """
 
     def __init__(self) -> None:
@@ -40,20 +66,37 @@ class Statement:
         self._data: dict[str, Data] = {}
         self._names: set[str] = set()
         self.compiled: object | None = None
+        self.edition = 0
 
     def variables(self, name: str, manifold: Manifold, count: int) -> Family:
         """Add a family of ``count`` unknowns.
 
         Raises:
-            GraphError: when the name is taken or ``count`` is not positive.
+            GraphError: when the name is taken, ``count`` is no positive integer, or ``manifold`` is no manifold.
         """
+        _require_name("family", name)
         if name in self.families:
             raise GraphError(f"family '{name}' exists already: choose another name", family=name)
+        if isinstance(manifold, type) or not hasattr(manifold, "name"):
+            raise GraphError(
+                f"family '{name}' needs a manifold such as fg.SE2 or fg.Rn(3), found {manifold!r}", family=name
+            )
+        hidden = [part for part in getattr(manifold, "components", ()) if part in RESERVED]
+        if isinstance(manifold, Product) and hidden:
+            raise GraphError(
+                f"family '{name}': the component '{hidden[0]}' of {manifold.name} could not be selected, because "
+                f"{name}.{hidden[0]} means something else: give it another name",
+                family=name,
+            )
+        try:
+            count = index(count)
+        except TypeError:
+            raise GraphError(f"family '{name}' needs a whole number of members, found count={count!r}") from None
         if count < 1:
             raise GraphError(f"family '{name}' needs at least one member, found count={count}", family=name)
-        family = Family(name, manifold, int(count))
+        family = Family(name, manifold, count)
         self.families[name] = family
-        self.compiled = None
+        self._changed()
         return family
 
     def data(self, name: str, value: ArrayLike, *, each: bool = False) -> Data:
@@ -64,7 +107,11 @@ class Statement:
             value: default; its shape (and whether it is boolean) is kept.
             each: whether the first axis runs over the factors of the terms that use it; otherwise all
                 factors share it.
+
+        Raises:
+            GraphError: when the name is taken, or the value is not made of real numbers or booleans.
         """
+        _require_name("data", name)
         if name in self._data:
             raise GraphError(f"data '{name}' exists already: choose another name")
         handle = Data(name, value, each)
@@ -96,14 +143,9 @@ class Statement:
             The term's name.
 
         Raises:
-            GraphError: on contradictory or malformed arguments.
+            GraphError: on contradictory or malformed arguments; the graph is as it was.
         """
-        if sigma is not None and information is not None:
-            raise GraphError(f"term '{name or function}': give sigma or information, not both", term=name)
-        wrapped = complete(function, arguments, name)
-        unique = self._unique(name, wrapped.name)
-        normal, active, count = self._arguments(unique, arguments, active)
-        return self._add(Cost(unique, wrapped, normal, active, count, sigma, information, robust))
+        return self._add(self._cost(name, function, arguments, sigma, information, robust, active))
 
     def minimize_scalar(
         self, function: AnyResidual, *arguments: Any, active: Any = None, name: str | None = None
@@ -113,10 +155,7 @@ class Statement:
         Gradient and Hessian are exact where the function can be traced, and come from differences elsewhere.
         Least-squares backends refuse it.
         """
-        wrapped = complete(function, arguments, name)
-        unique = self._unique(name, wrapped.name)
-        normal, active, count = self._arguments(unique, arguments, active)
-        return self._add(ScalarCost(unique, wrapped, normal, active, count))
+        return self._add(self._scalar_cost(name, function, arguments, active))
 
     def constrain(
         self,
@@ -132,13 +171,9 @@ class Statement:
         Multipliers are positive at an active upper limit and negative at an active lower one.
 
         Raises:
-            GraphError: when a lower limit exceeds its upper limit.
+            GraphError: when a lower limit exceeds its upper limit, or anything is malformed; the graph is as it was.
         """
-        wrapped = complete(function, arguments, name)
-        unique = self._unique(name, wrapped.name)
-        normal, active, count = self._arguments(unique, arguments, active)
-        check_limits(unique, lower, upper)
-        return self._add(Constraint(unique, wrapped, normal, active, count, lower, upper))
+        return self._add(self._constraint(name, function, arguments, lower, upper, active))
 
     def bound(
         self,
@@ -151,19 +186,9 @@ class Statement:
         """Limit Rn variables, or Rn components of a product, entry by entry.
 
         Raises:
-            GraphError: when the variable does not live in Rn.
+            GraphError: when the variable does not live in Rn, or the limits do not fit; the graph is as it was.
         """
-        selection = as_selection(variable)
-        if not isinstance(selection.manifold, Rn):
-            raise GraphError(
-                f"bound on family '{selection.family.name}': {selection.manifold.name} is not Rn; bound a component, "
-                "or use constrain with a function",
-                family=selection.family.name,
-            )
-        unique = self._unique(name, f"{selection.family.name} bounds")
-        normal, active, count = self._arguments(unique, (selection,), None)
-        check_limits(unique, lower, upper)
-        return self._add(Constraint(unique, residual(itself), normal, active, count, lower, upper, is_bound=True))
+        return self._add(self._bound(name, (variable,), lower, upper))
 
     def fix(self, variable: Variable, value: ArrayLike | Data, *, name: str | None = None) -> str:
         """Give variables a value; they leave the unknowns and ``dual(name)`` is their reaction.
@@ -174,26 +199,104 @@ class Statement:
             name: defaults to the family's name.
 
         Raises:
-            GraphError: when a variable is fixed twice or the value is not on its manifold.
+            GraphError: when a variable is fixed twice or the value is not on its manifold; the graph is as it was.
         """
-        selection = as_selection(variable)
-        unique = self._unique(name, f"{selection.family.name} fixed")
-        held: Array | Data = value if isinstance(value, Data) else np.atleast_1d(np.asarray(value, dtype=np.float64))
-        check_fix(unique, selection, held.value if isinstance(held, Data) else held)
-        for other in self.fixes:
-            if other.selection.family is selection.family and _overlap(other.selection, selection):
-                twice = np.intersect1d(other.selection.indices, selection.indices)
-                if len(twice):
-                    raise GraphError(
-                        f"{selection.family.name}[{twice[0]}] is fixed by '{other.name}' already",
-                        family=selection.family.name,
-                        index=int(twice[0]),
-                    )
-        self._own(selection, unique)
-        self._names.add(unique)
-        self.fixes.append(Fix(unique, selection, held))
-        self.compiled = None
-        return unique
+        made = self._fix(name, (variable, value))
+        self._names.add(made.name)
+        self.fixes.append(made)
+        self._changed()
+        return made.name
+
+    def term(self, name: str) -> Term | Fix:
+        """The term or fix of that name.
+
+        Raises:
+            GraphError: when there is none.
+        """
+        for stated in self._stated:
+            if stated.name == name:
+                return stated
+        known = [stated.name for stated in self._stated]
+        near = get_close_matches(str(name), known, 1, 0.0)
+        listed = ", ".join(f"'{other}'" for other in known) if len(known) <= 12 else f"{len(known)}, as '{near[0]}'"
+        raise GraphError(f"no term is called {name!r} (there are: {listed or 'none'})", term=str(name))
+
+    def remove(self, *names: str) -> None:
+        """Take terms and fixes out of the graph, and with them the data that nothing else uses.
+
+        Solutions and prepared solvers stay as they are: they speak of the graph as it was.
+
+        Raises:
+            GraphError: when one of the names is unknown; nothing is removed then.
+        """
+        gone = [self.term(name) for name in names]
+        self._drop(gone)
+        self._names.difference_update(names)
+        self.terms[:] = [term for term in self.terms if term not in gone]
+        self.fixes[:] = [fix for fix in self.fixes if fix not in gone]
+        self._changed()
+
+    def replace(
+        self,
+        name: str,
+        *stated: Any,
+        sigma: Parameter | None = SAME,
+        information: Parameter | None = SAME,
+        robust: Loss | None = SAME,
+        active: Any = SAME,
+        lower: Parameter = SAME,
+        upper: Parameter = SAME,
+    ) -> None:
+        """State a term anew in its place, under its name and of its kind; what is not given stays as it was.
+
+        ``graph.replace("goal", sigma=0.05)`` changes a weight, ``graph.replace("goal", fg.prior, x[-1], pose)`` what
+        is weighed. Data that nothing uses any more leave the graph.
+
+        Args:
+            name: of the term, bound or fix.
+            *stated: what its statement began with: function and arguments of a cost or constraint, the variable of a
+                bound, variable and value of a fix; nothing to keep them.
+            sigma: as in :meth:`minimize`; takes the place of an information matrix.
+            information: takes the place of sigma.
+            robust: None for no loss.
+            active: None for all.
+            lower: as in :meth:`constrain`.
+            upper: the same.
+
+        Raises:
+            GraphError: when there is no such term, it has no such part, or the new one is refused; the graph is as it
+                was.
+        """
+        old = self.term(name)
+        given = {
+            "sigma": sigma, "information": information, "robust": robust, "active": active, "lower": lower,
+            "upper": upper,
+        }  # fmt: skip
+        parts = {key: value for key, value in given.items() if value is not SAME}
+        wrong = [key for key in parts if key not in _PARTS[old.kind]]
+        if wrong:
+            has = ", ".join(_PARTS[old.kind]) or "a variable and a value"
+            raise GraphError(f"term '{name}' is a {old.kind}, which has no {wrong[0]}=; it has {has}", term=name)
+        if isinstance(old, Fix):
+            made: Term | Fix = self._fix(name, stated or (old.selection, old.value), old)
+        else:
+            made = self._restated(old, stated, parts)
+        place: list[Any] = self.fixes if isinstance(old, Fix) else self.terms
+        place[place.index(old)] = made
+        self._drop([old])
+        self._changed()
+
+    def snapshot(self: S) -> S:
+        """A statement of its own of the same terms, which changes of this one do not reach."""
+        kept = copy(self)
+        kept.families, kept.terms, kept.fixes = dict(self.families), list(self.terms), list(self.fixes)
+        kept._data, kept._names = dict(self._data), set(self._names)
+        kept.compiled = None
+        return kept
+
+    def routes(self) -> dict[str, str]:
+        """For each term by name, how it is evaluated and differentiated, as far as that has been found out."""
+        return {}
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle the statement of the problem, not its compiled form."""
@@ -203,17 +306,161 @@ class Statement:
         """Counts of families and terms."""
         return f"<Graph: {len(self.families)} families, {len(self.terms)} terms, {len(self.fixes)} fixes>"
 
+    def __str__(self) -> str:
+        """A table of families, terms, fixes and data; see :mod:`unifg.language.inventory`."""
+        return inventory(self.families.values(), self.terms, self.fixes, self._data.values(), self.routes())
+
+    def _repr_html_(self) -> str:
+        """The table, for notebooks."""
+        return f"<pre>{escape(str(self))}</pre>"
+
+    # ---------------------------------------------------------------- statements, looked at before they are kept
+
+    def _cost(
+        self,
+        name: str | None,
+        function: AnyResidual,
+        arguments: tuple[Any, ...],
+        sigma: Parameter | None,
+        information: Parameter | None,
+        robust: Loss | None,
+        active: Any,
+        replaced: bool = False,
+    ) -> Cost:
+        with placed(name, function, arguments):
+            if sigma is not None and information is not None:
+                raise GraphError(f"term '{name or title(function)}': give sigma or information, not both", term=name)
+            wrapped = complete(function, arguments, name)
+            unique = self._unique(name, wrapped.name, replaced)
+            normal, active, count = self._arguments(unique, arguments, active)
+            if robust is not None and (isinstance(robust, type) or not hasattr(robust, "weight")):
+                raise GraphError(
+                    f"term '{unique}': robust= must be a loss such as fg.Huber(1.345), found {robust!r}", term=unique
+                )
+            size = rows_of(unique, wrapped, normal, count)
+            sigma, information = check_weights(unique, sigma, information, count, size)
+            self._own_data(unique, sigma, information)
+            return Cost(unique, wrapped, normal, active, count, size, sigma, information, robust)
+
+    def _scalar_cost(
+        self,
+        name: str | None,
+        function: AnyResidual,
+        arguments: tuple[Any, ...],
+        active: Any,
+        replaced: bool = False,
+    ) -> ScalarCost:
+        with placed(name, function, arguments):
+            wrapped = complete(function, arguments, name)
+            unique = self._unique(name, wrapped.name, replaced)
+            normal, active, count = self._arguments(unique, arguments, active)
+            size = rows_of(unique, wrapped, normal, count, scalar=True)
+            return ScalarCost(unique, wrapped, normal, active, count, size)
+
+    def _constraint(
+        self,
+        name: str | None,
+        function: AnyResidual,
+        arguments: tuple[Any, ...],
+        lower: Parameter,
+        upper: Parameter,
+        active: Any,
+        replaced: bool = False,
+    ) -> Constraint:
+        with placed(name, function, arguments):
+            wrapped = complete(function, arguments, name)
+            unique = self._unique(name, wrapped.name, replaced)
+            normal, active, count = self._arguments(unique, arguments, active)
+            size = rows_of(unique, wrapped, normal, count)
+            lower, upper = check_limits(unique, lower, upper, count, size)
+            self._own_data(unique, lower, upper)
+            return Constraint(unique, wrapped, normal, active, count, size, lower, upper)
+
+    def _bound(
+        self,
+        name: str | None,
+        stated: tuple[Any, ...],
+        lower: Parameter,
+        upper: Parameter,
+        replaced: bool = False,
+    ) -> Constraint:
+        selection = _one_variable("a bound", stated)
+        with placed(name, itself, (selection,)):
+            if not isinstance(selection.manifold, Rn):
+                raise GraphError(
+                    f"bound on family '{selection.family.name}': {selection.manifold.name} is not Rn; bound a "
+                    "component, or use constrain with a function",
+                    family=selection.family.name,
+                )
+            unique = self._unique(name, f"{selection.family.name} bounds", replaced)
+            normal, active, count = self._arguments(unique, (selection,), None)
+            size = selection.manifold.dim
+            lower, upper = check_limits(unique, lower, upper, count, size)
+            self._own_data(unique, lower, upper)
+            return Constraint(unique, residual(itself), normal, active, count, size, lower, upper, is_bound=True)
+
+    def _fix(self, name: str | None, stated: tuple[Any, ...], replaced: Fix | None = None) -> Fix:
+        if len(stated) != 2:
+            raise GraphError(f"a fix is stated by a variable and its value, found {len(stated)} arguments", term=name)
+        selection, value = _one_variable("a fix", stated[:1]), stated[1]
+        unique = self._unique(name, f"{selection.family.name} fixed", replaced is not None)
+        held = (
+            value if isinstance(value, Data) else np.atleast_1d(doubles(f"fix '{unique}': value", value, term=unique))
+        )
+        self._own(selection, unique)
+        self._own_data(unique, held)
+        check_fix(unique, selection, held.value if isinstance(held, Data) else held)
+        for other in self.fixes:
+            if other is not replaced and other.selection.family is selection.family:
+                if _overlap(other.selection, selection):
+                    _require_once(selection, other.selection.indices, f"by '{other.name}' already")
+        members, times = np.unique(selection.indices, return_counts=True)
+        _require_once(selection, members[times > 1], "twice")
+        return Fix(unique, selection, held)
+
+    def _restated(self, old: Term, stated: tuple[Any, ...], parts: dict[str, Any]) -> Term:
+        """A term of the same kind and name with other parts."""
+        function, arguments = (stated[0], stated[1:]) if stated else (old.residual, old.arguments)
+        arguments = arguments or old.arguments
+        if isinstance(old, Cost):
+            if (parts.get("sigma") is None) != (parts.get("information") is None):  # one takes the other's place
+                parts = {"sigma": None, "information": None, **parts}
+            kept = {key: parts.get(key, getattr(old, key)) for key in ("sigma", "information", "robust", "active")}
+            return self._cost(old.name, function, arguments, **kept, replaced=True)
+        if isinstance(old, Constraint):
+            kept = {key: parts.get(key, getattr(old, key)) for key in ("lower", "upper")}
+            if old.is_bound:
+                return self._bound(old.name, stated or old.arguments, **kept, replaced=True)
+            active = parts.get("active", old.active)
+            return self._constraint(old.name, function, arguments, **kept, active=active, replaced=True)
+        return self._scalar_cost(old.name, function, arguments, parts.get("active", old.active), replaced=True)
+
     def _add(self, term: Term) -> str:
         self._names.add(term.name)
         self.terms.append(term)
-        self.compiled = None
+        self._changed()
         return term.name
+
+    def _changed(self) -> None:
+        self.compiled = None
+        self.edition += 1
+
+    @property
+    def _stated(self) -> list[Term | Fix]:
+        return [*self.terms, *self.fixes]
+
+    def _drop(self, gone: Sequence[Term | Fix]) -> None:
+        """Let data go that only ``gone`` uses."""
+        used = {handle for stated in self._stated if stated not in gone for handle in stated.data}
+        for handle in {handle for stated in gone for handle in stated.data} - used:
+            self._data.pop(handle.name, None)
 
     def _arguments(self, name: str, arguments: tuple[Any, ...], active: Any) -> tuple[tuple[Any, ...], Any, int]:
         normal, active, count = prepare_arguments(name, arguments, active)
         for argument in normal:
             if isinstance(argument, Selection):
                 self._own(argument, name)
+        self._own_data(name, *normal, active)
         return normal, active, count
 
     def _own(self, selection: Selection, term: str) -> None:
@@ -224,15 +471,39 @@ class Statement:
                 family=selection.family.name,
             )
 
-    def _unique(self, name: str | None, default: str) -> str:
+    def _own_data(self, term: str, *given: Any) -> None:
+        for handle in given:
+            if isinstance(handle, Data) and self._data.get(handle.name) is not handle:
+                raise GraphError(
+                    f"term '{term}': data '{handle.name}' is not of this graph: it is another's, or left with the last "
+                    "term that used it; declare it with graph.data",
+                    term=term,
+                )
+
+    def _unique(self, name: str | None, default: str, replaced: bool = False) -> str:
         if name is not None:
-            if name in self._names:
-                raise GraphError(f"the name '{name}' is taken: names identify terms in duals and tables", term=name)
+            _require_name("term", name)
+            if name in self._names and not replaced:
+                raise GraphError(
+                    f"the name '{name}' is taken: names identify terms in duals and tables; choose another, or change "
+                    "the term with graph.replace",
+                    term=name,
+                )
             return name
         candidate, number = default, 2
         while candidate in self._names:
             candidate, number = f"{default} {number}", number + 1
         return candidate
+
+
+_PARTS = {
+    "cost": ("sigma", "information", "robust", "active"),
+    "scalar cost": ("active",),
+    "equality": ("lower", "upper", "active"),
+    "inequality": ("lower", "upper", "active"),
+    "bound": ("lower", "upper"),
+    "fix": (),
+}
 
 
 def complete(function: AnyResidual, arguments: tuple[Any, ...], name: str | None = None) -> Residual:
@@ -265,23 +536,29 @@ def _overlap(first: Selection, second: Selection) -> bool:
     return first.component is None or second.component is None or first.component == second.component
 
 
-def check_limits(name: str, lower: Parameter, upper: Parameter) -> None:
-    """Raise when limits are NaN, do not fit each other, or cross."""
-    low, high = (np.asarray(p.value if isinstance(p, Data) else p, dtype=np.float64) for p in (lower, upper))
-    if np.isnan(low).any() or np.isnan(high).any():
-        raise GraphError(f"term '{name}': a limit is NaN", term=name)
-    try:
-        crossed = np.argwhere(np.atleast_1d(low > high))
-    except ValueError as error:
-        raise GraphError(f"term '{name}': lower {low.shape} and upper {high.shape} do not fit", term=name) from error
-    if len(crossed):
-        place = tuple(int(i) for i in crossed[0])
+def title(function: Any) -> str:
+    """What a residual is called."""
+    return getattr(function, "name", None) or getattr(function, "__name__", None) or "residual"
+
+
+def _require_name(what: str, name: Any) -> None:
+    if not isinstance(name, str) or not name:
+        raise GraphError(f"the name of a {what} must be a text that is not empty, found {name!r}")
+
+
+def _one_variable(what: str, stated: tuple[Any, ...]) -> Selection:
+    if len(stated) != 1 or not is_variable(stated[0]):
+        found = ", ".join(f"{argument!r}"[:60] for argument in stated)
+        raise GraphError(f"{what} takes one family or selection, found {found or 'nothing'}")
+    return as_selection(stated[0])
+
+
+def _require_once(selection: Selection, others: IntArray, how: str) -> None:
+    """Refuse to fix what is fixed."""
+    twice = np.intersect1d(others, selection.indices)
+    if len(twice):
         raise GraphError(
-            f"term '{name}': lower exceeds upper at {place}: "
-            f"{np.broadcast_to(low, np.broadcast_shapes(low.shape, high.shape, (1,)))[place]:g} > "
-            f"{np.broadcast_to(high, np.broadcast_shapes(low.shape, high.shape, (1,)))[place]:g}",
-            term=name,
-            index=place[0],
+            f"{selection.family.name}[{twice[0]}] is fixed {how}", family=selection.family.name, index=int(twice[0])
         )
 
 

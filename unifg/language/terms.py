@@ -10,13 +10,14 @@ import numpy as np
 from unifg.errors import GraphError
 from unifg.kernels.residuals import Residual
 from unifg.kernels.robust import Loss
+from unifg.language.doubles import doubles
 from unifg.language.variables import Data, Family, Selection
 from unifg.typing import Array, ArrayLike, BoolArray
 
 Parameter: TypeAlias = ArrayLike | Data
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Term:
     """A batch of factors that share one residual function.
 
@@ -26,6 +27,7 @@ class Term:
         arguments: selections, data and constants in the order the function takes them.
         active: (n,) boolean, constant or data; None means all.
         count: number of factors n.
+        size: rows m of each of them.
     """
 
     name: str
@@ -33,14 +35,42 @@ class Term:
     arguments: tuple[Any, ...]
     active: BoolArray | Data | None
     count: int
+    size: int
+
+    @property
+    def kind(self) -> str:
+        """What it is, in a word."""
+        return "cost"
 
     @property
     def selections(self) -> list[Selection]:
         """The variable arguments, in order."""
         return [argument for argument in self.arguments if isinstance(argument, Selection)]
 
+    @property
+    def families(self) -> list[Family]:
+        """Of its variables, each once, in order."""
+        return list(dict.fromkeys(selection.family for selection in self.selections))
 
-@dataclass(eq=False)
+    @property
+    def shaping(self) -> list[Data]:
+        """Data that are no arguments of its function: weights, limits, and which factors are active."""
+        given = [getattr(self, name, None) for name in ("active", "sigma", "information", "lower", "upper")]
+        return list(dict.fromkeys(value for value in given if isinstance(value, Data)))
+
+    @property
+    def data(self) -> list[Data]:
+        """All data that it reads, each once."""
+        return list(dict.fromkeys([*(a for a in self.arguments if isinstance(a, Data)), *self.shaping]))
+
+    def __repr__(self) -> str:
+        """Kind, name and size."""
+        rows = f"{self.size} row{'s' if self.size != 1 else ''}"
+        of = ", ".join(family.name for family in self.families)
+        return f"<{self.kind} '{self.name}': {self.count} x {rows}, of {of}>"
+
+
+@dataclass(eq=False, repr=False)
 class Cost(Term):
     """1/2 rho(|W r|^2) with W'W the information matrix.
 
@@ -55,12 +85,17 @@ class Cost(Term):
     robust: Loss | None = None
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class ScalarCost(Term):
     """A cost that is not a square: (n,) values added to the objective as they are."""
 
+    @property
+    def kind(self) -> str:
+        """What it is, in a word."""
+        return "scalar cost"
 
-@dataclass(eq=False)
+
+@dataclass(eq=False, repr=False)
 class Constraint(Term):
     """lower <= g(x) <= upper.
 
@@ -74,8 +109,17 @@ class Constraint(Term):
     upper: Parameter = np.inf
     is_bound: bool = False
 
+    @property
+    def kind(self) -> str:
+        """What it is, in a word: an equality where no data can set the limits apart."""
+        if self.is_bound:
+            return "bound"
+        if isinstance(self.lower, Data) or isinstance(self.upper, Data):
+            return "equality" if self.lower is self.upper else "inequality"
+        return "equality" if np.all(np.equal(self.lower, self.upper)) else "inequality"
 
-@dataclass(eq=False)
+
+@dataclass(eq=False, repr=False)
 class Fix:
     """Variables that take a given value and leave the unknowns.
 
@@ -88,6 +132,20 @@ class Fix:
     name: str
     selection: Selection
     value: Array | Data
+
+    @property
+    def kind(self) -> str:
+        """What it is, in a word."""
+        return "fix"
+
+    @property
+    def data(self) -> list[Data]:
+        """What it reads."""
+        return [self.value] if isinstance(self.value, Data) else []
+
+    def __repr__(self) -> str:
+        """What is fixed."""
+        return f"<fix '{self.name}': {self.selection!r}>"
 
 
 def prepare_arguments(name: str, arguments: tuple[Any, ...], active: Any) -> tuple[tuple[Any, ...], Any, int]:
@@ -114,14 +172,17 @@ def prepare_arguments(name: str, arguments: tuple[Any, ...], active: Any) -> tup
             lengths.append((f"data '{argument.name}'", len(argument.value)))
     if not any(isinstance(argument, Selection) for argument in normal):
         raise GraphError(f"term '{name}' has no variable among its arguments: pass a family or a selection", term=name)
-    if active is not None and not isinstance(active, Data):
-        active = np.asarray(active, dtype=bool)
-        if active.ndim != 1:
-            raise GraphError(f"term '{name}': active= must be (n,) booleans, found shape {active.shape}", term=name)
     if active is not None:
+        if not isinstance(active, Data):
+            active = doubles(f"term '{name}': active=", active, term=name, flags=True)
         value = active.value if isinstance(active, Data) else active
         if value.dtype != bool:
-            raise GraphError(f"term '{name}': active= data must be boolean, found {value.dtype}", term=name)
+            raise GraphError(
+                f"term '{name}': active= must be (n,) booleans, found numbers: compare them, as in values != 0",
+                term=name,
+            )
+        if value.ndim != 1:
+            raise GraphError(f"term '{name}': active= must be (n,) booleans, found shape {value.shape}", term=name)
         lengths.append(("active=", len(value)))
     if len({length for _, length in lengths}) > 1:
         found = ", ".join(f"{what} has {length}" for what, length in lengths)

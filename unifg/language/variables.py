@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from unifg.errors import GraphError
+from unifg.language.doubles import doubles
 from unifg.lie import Manifold, Product
 from unifg.typing import Array, ArrayLike, IntArray
 
@@ -45,14 +46,14 @@ class Selection:
 
     def __getitem__(self, index: Index) -> Selection:
         """Select again within this selection; an int keeps length 1."""
-        return Selection(self.family, pick(self.indices, index, self.family.name), self.component)
+        return Selection(self.family, pick(self.indices, index, self.family), self.component)
 
     def __getattr__(self, name: str) -> Selection:
         """Select a component of a product manifold by its name."""
         if name.startswith("_") or "component" not in self.__dict__:
             raise AttributeError(name)
         if self.component is not None or not has_component(self.family.manifold, name):
-            raise AttributeError(no_component(self.family, name))
+            raise AttributeError(no_component(self.family, name, self.component))
         return Selection(self.family, self.indices, name)
 
     def __repr__(self) -> str:
@@ -82,7 +83,7 @@ class Family:
 
     def __getitem__(self, index: Index) -> Selection:
         """Select members as NumPy would; an int gives a selection of length 1."""
-        return Selection(self, pick(np.arange(self.count), index, self.name))
+        return Selection(self, pick(np.arange(self.count), index, self))
 
     def __getattr__(self, name: str) -> Selection:
         """Select one component of every member of a product family."""
@@ -108,10 +109,9 @@ class Data:
 
     def __init__(self, name: str, value: ArrayLike, each: bool) -> None:
         """Hold a default value; made by :meth:`unifg.Graph.data`."""
-        array = np.asarray(value)
         self.name = name
         self.each = each
-        self.value: Array = array if array.dtype == bool else array.astype(np.float64)
+        self.value: Array = np.array(doubles(f"data '{name}'", value, flags=True))
         if each and self.value.ndim == 0:
             raise GraphError(f"data '{name}' is declared each=True but is a scalar: give it one row per factor")
         self.check(self.value)
@@ -142,6 +142,8 @@ class Data:
 
 
 Variable: TypeAlias = Family | Selection
+RESERVED = frozenset({"name", "manifold", "count", "family", "indices", "component", "storage", "tangent"})
+"""What families and selections have by themselves: a component of such a name could not be selected."""
 
 
 def as_selection(variable: Variable) -> Selection:
@@ -154,13 +156,35 @@ def is_variable(argument: Any) -> bool:
     return isinstance(argument, Family | Selection)
 
 
-def pick(indices: IntArray, index: Index, family: str) -> IntArray:
-    """Apply a NumPy index to ``indices``, always returning one axis."""
+def pick(indices: IntArray, index: Index, family: Family) -> IntArray:
+    """Apply a NumPy index to ``indices``, always returning one axis.
+
+    Raises:
+        GraphError: it is none, reaches beyond the members, or asks for numbers inside of them.
+    """
     try:
-        chosen = indices[index]
-    except IndexError as error:
-        raise GraphError(f"family '{family}' has {len(indices)} members here: {error}", family=family) from error
-    return np.atleast_1d(np.asarray(chosen, dtype=np.intp))
+        chosen = np.atleast_1d(np.asarray(indices[index], dtype=np.intp))
+    except (IndexError, TypeError, ValueError) as error:
+        raise GraphError(_no_member(indices, index, family, error), family=family.name) from error
+    if chosen.ndim > 1:
+        raise GraphError(
+            f"family '{family.name}': a selection has one axis, and {index!r} makes {chosen.ndim}: give integers, a "
+            "slice or a mask",
+            family=family.name,
+        )
+    return chosen
+
+
+def _no_member(indices: IntArray, index: Any, family: Family, error: Exception) -> str:
+    """What to say of an index that selects no members."""
+    if isinstance(index, tuple):
+        return (
+            f"family '{family.name}' is indexed by its members alone, found {index!r}: {_components(family)}; single "
+            "numbers of a member are taken in the residual, as in lambda p: p[:, :2]"
+        )
+    if isinstance(index, str):
+        return f"family '{family.name}' is indexed by its members, found {index!r}: {_components(family)}"
+    return f"family '{family.name}' has {len(indices)} members here: {error}"
 
 
 def has_component(manifold: Manifold, name: str) -> bool:
@@ -168,8 +192,20 @@ def has_component(manifold: Manifold, name: str) -> bool:
     return isinstance(manifold, Product) and name in manifold.components
 
 
-def no_component(family: Family, name: str) -> str:
-    """Explain which components exist."""
-    manifold = family.manifold
-    names = ", ".join(manifold.components) if isinstance(manifold, Product) else "none: it is not a product"
-    return f"family '{family.name}' has no component '{name}' (components: {names})"
+def no_component(family: Family, name: str, within: str | None = None) -> str:
+    """Explain which components exist, and how they are selected."""
+    if within is not None:
+        return (
+            f"'{family.name}.{within}' has no attribute '{name}': it is a component already, and components of "
+            "components are not selected; take their numbers in the residual"
+        )
+    return f"family '{family.name}' has no component '{name}': {_components(family)}"
+
+
+def _components(family: Family) -> str:
+    """Which components the members of a family have, spelled as they are selected."""
+    if not isinstance(family.manifold, Product):
+        return f"its members are elements of {family.manifold.name}, which is no product and has no components"
+    names = list(family.manifold.components)
+    spelled = ", ".join(f"{family.name}.{name}" for name in names)
+    return f"its components are {spelled} (of one member, {family.name}[0].{names[0]})"

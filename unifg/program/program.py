@@ -55,7 +55,7 @@ class Program:
     """The compiled form of a graph.
 
     Attributes:
-        graph: what was compiled.
+        graph: what was compiled, as it was then.
         columns: numbering of the tangent coordinates.
         size: number of unknown ones.
         costs, constraints: patterns of the stacked Jacobians.
@@ -81,7 +81,8 @@ class Program:
         """Compile; see :func:`compile_graph`."""
         if not graph.families:
             raise GraphError("the graph has no variables: add a family with graph.variables(...)")
-        self.graph = graph
+        declared = graph._data
+        self.graph = graph = graph.snapshot()
         self.families = list(graph.families.values())
         self.columns = Columns(self.families, graph.fixes)
         self.size = self.columns.size
@@ -119,7 +120,7 @@ class Program:
         self.python_seconds = 0.0
         read = {value for term in self.terms for value in term.data}
         read |= {fix.value for fix in graph.fixes if isinstance(fix.value, Data)}
-        self._binding, self._vetted = Binding(graph._data, filter(read.__contains__, graph._data.values())), False
+        self._binding, self._vetted = Binding(declared, filter(read.__contains__, declared.values())), False
         self._bind_first()
 
     @property
@@ -519,5 +520,6 @@ def compile_graph(graph: Statement) -> Program:
         GraphError: when the graph has no variable, or a variable no term touches.
     """
     if not isinstance(graph.compiled, Program):
-        graph.compiled = Program(graph)
+        program = Program(graph)
+        program.graph.compiled = graph.compiled = program
     return graph.compiled

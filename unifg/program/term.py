@@ -32,6 +32,7 @@ from unifg.kernels.per_factor import per_factor
 from unifg.kernels.residuals import Residual
 from unifg.kernels.whitening import DIAGONAL, FULL, reciprocals, square_roots
 from unifg.language.terms import Constraint, Cost, Parameter, ScalarCost, Term
+from unifg.language.trial import size_of, told, tried
 from unifg.language.variables import Data, Selection
 from unifg.lie import Manifold
 from unifg.program.columns import Columns, Values
@@ -127,29 +128,16 @@ class CompiledTerm:
         self.is_bound = isinstance(term, Constraint) and term.is_bound
         self.kernel, self.search_kernel = (None, None) if isinstance(term, ScalarCost) else _kernels(term.residual)
         self.place: IntArray = np.zeros(0, dtype=np.int64)
-        shaping = [getattr(term, name, None) for name in ("active", "sigma", "information", "lower", "upper")]
-        self._shaping = frozenset(value for value in shaping if isinstance(value, Data))
-        self.data = self._shaping | {argument for argument in term.arguments if isinstance(argument, Data)}
+        self._shaping, self.data = frozenset(term.shaping), frozenset(term.data)
         self._blocks: dict[int, tuple[int, int]] = {}
         self._taken = tuple(range(len(term.arguments)))
         self.trace: Trace | None = None
         self._changes = 0
         self.bind({})
         self.route = "" if not term.residual.rows or isinstance(term, ScalarCost) else self._choose_single()
-        if self.kernel is not None:
-            self._require_manifolds(self.kernel)
-        with np.errstate(all="ignore"):
-            trial = self._batched.at([np.tile(m.identity(), (self.count, 1)) for m in self.manifolds])
-        scalar = isinstance(term, ScalarCost)
-        expected = "(n,)" if scalar else "(n, m)"
-        if trial.ndim != (1 if scalar else 2) or len(trial) != self.count:
-            raise GraphError(
-                f"term '{self.name}': its function returned shape {trial.shape}, expected {expected} with "
-                f"n = {self.count}; arguments were {self._shapes()}",
-                term=self.name,
-            )
-        self.size = 1 if scalar else trial.shape[1]
-        self.shape = trial.shape
+        self._require_stated_size()
+        self.size = term.size
+        self.shape = (self.count,) if isinstance(term, ScalarCost) else (self.count, self.size)
         self.route = self.route or self._choose_route()
         self.differenced = (
             self._jacobian is None and not self.is_bound if self.kernel is None else self.kernel.differenced
@@ -157,6 +145,24 @@ class CompiledTerm:
         self._bind_parameters({})
         if isinstance(self.term, Cost) and isinstance(self.term.information, np.ndarray):
             _notice_no_information(self.name, self.whitener)
+
+    def _require_stated_size(self) -> None:
+        """Call a function again: what it reads beyond its arguments may have changed since it was stated.
+
+        Raises:
+            GraphError: it returns another shape.
+        """
+        if self.kernel is not None or self.is_bound:
+            return
+        term, identities = self.term, [np.tile(m.identity(), (self.count, 1)) for m in self.manifolds]
+        found = tried(self._batched, identities, lambda: told(term.arguments, self.count))
+        size = size_of(found, self.name, term.arguments, self.count, isinstance(term, ScalarCost))
+        if size != term.size:
+            raise GraphError(
+                f"term '{self.name}': its function returns {size} rows now and returned {term.size} when it was "
+                "stated: something that it reads has changed; state the term when that is known, or pass it as data",
+                term=self.name,
+            )
 
     def _choose_route(self) -> str:
         """Trace a plain function if that is possible; how the term is evaluated.
@@ -578,24 +584,6 @@ class CompiledTerm:
         own = self.term.residual
         return per_factor(own.function, own.jacobian, own.rows, arguments, shapes, self.name)
 
-    def _require_manifolds(self, kernel: Kernel) -> None:
-        if len(kernel.arguments) != len(self.term.arguments):
-            raise GraphError(
-                f"term '{self.name}': {kernel.name} takes {len(kernel.arguments)} arguments, found "
-                f"{len(self.term.arguments)}: {self._shapes()}",
-                term=self.name,
-            )
-        for place, selection in zip(self._places, [gather.selection for gather in self.gathers], strict=True):
-            expected = kernel.arguments[place]
-            if expected != selection.manifold:
-                wanted = "a parameter, not a variable" if isinstance(expected, int | tuple) else expected.name
-                raise GraphError(
-                    f"term '{self.name}': argument {place} of {kernel.name} is {wanted}; found {selection!r} on "
-                    f"{selection.manifold.name}",
-                    term=self.name,
-                    family=selection.family.name,
-                )
-
     def _limit(self, limit: Array, which: str, none: float) -> Array:
         try:
             full = np.array(np.broadcast_to(limit, (self.count, self.size)))
@@ -632,18 +620,6 @@ class CompiledTerm:
             return array
         shape = (-1,) + (1,) * (array.ndim - 1)
         return np.where(self.active.reshape(shape), array, 0.0)
-
-    def _shapes(self) -> str:
-        """Shapes of all arguments, for messages."""
-        shapes = []
-        for argument in self.term.arguments:
-            if isinstance(argument, Selection):
-                shapes.append(f"{argument!r} as ({self.count}, {argument.manifold.storage})")
-            elif isinstance(argument, Data):
-                shapes.append(repr(argument))
-            else:
-                shapes.append(f"constant {np.shape(argument)}" if np.shape(argument) else f"{argument!r}")
-        return ", ".join(shapes)
 
 
 def _kernels(residual: Residual) -> tuple[Kernel | None, Kernel | None]:

@@ -22,6 +22,7 @@ from unifg.kernels.whitening import DIAGONAL, FULL, quick_roots, reciprocals, sq
 from unifg.language.factors import prior
 from unifg.language.statement import AnyResidual, complete
 from unifg.language.terms import Cost, Parameter, prepare_arguments
+from unifg.language.trial import rows_of
 from unifg.language.variables import Data, Family, Selection
 from unifg.lie import Manifold
 from unifg.lie.moving import ADDITION, move_of
@@ -130,7 +131,8 @@ class Types:
         key = self._key(wrapped, normal, count)
         known = self._kernels.get(key) if form is not None else None
         if known is None or (known[2] is not None and known[2].outdated):
-            term = _compiled(Cost(name, wrapped, _by_itself(normal), None, count, sigma, information, robust))
+            size = rows_of(name, wrapped, normal, count)
+            term = _compiled(Cost(name, wrapped, _by_itself(normal), None, count, size, sigma, information, robust))
             if term.kernel is None or form is None or len(term.kernel.manifolds) > len(selections):
                 rest = np.zeros((count, 0))
                 kind = self._kind(None, (0, 0, 0, term.size), selections, (), *PLAIN)
@@ -145,11 +147,9 @@ class Types:
         if trace is not None:
             filled = trace.arguments(filled)
         try:
-            _, parameters, rows = kernel.split(filled, count)
+            _, parameters, _ = kernel.split(filled, count)
         except GraphError as error:
             raise GraphError(f"term '{name}': {error}", term=name) from None
-        if rows > 1 and count == 1:
-            raise GraphError(f"term '{name}': its parameters speak of {rows} factors, its variables of one", term=name)
         shapes = tuple([parameter.shape[1:] for parameter in parameters])
         size = kernel.size(shapes)
         whitening, whitener = 0, np.zeros((1, 0))

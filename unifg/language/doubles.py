@@ -1,0 +1,44 @@
+"""Numbers as a user gives them, as doubles: what would lose something on the way, or is no number, is refused."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.typing import Array
+
+_KINDS = {"b": "booleans", "c": "complex numbers", "U": "text", "S": "bytes", "M": "dates", "m": "durations"}
+
+
+def doubles(what: str, given: Any, *, term: str | None = None, flags: bool = False) -> Array:
+    """An array of float64; arrays of whole or coarser numbers are converted, an array of float64 is not copied.
+
+    Args:
+        what: what the numbers are, the subject of the message.
+        given: a number, an array, or anything NumPy makes one of.
+        term: for the error.
+        flags: whether an array of booleans is returned as it is.
+
+    Raises:
+        GraphError: it is ragged, or holds text, booleans, complex numbers or objects.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # of NumPy, about sequences of different lengths
+            array = np.asarray(given)
+    except Exception as error:
+        raise GraphError(f"{what} cannot be read as an array of numbers: {error}", term=term) from error
+    if array.dtype.kind in "fiu":
+        return np.asarray(array, dtype=np.float64)
+    if flags and array.dtype == bool:
+        return array
+    if array.dtype.kind == "O" and array.ndim == 0:
+        found = f"{given!r}"[:80]
+    else:
+        found = _KINDS.get(array.dtype.kind, f"an array of {array.dtype} objects")
+        if array.ndim == 0:
+            found = f"{given!r}"[:80]
+    raise GraphError(f"{what} must be real numbers, found {found}: convert to float64 first", term=term)

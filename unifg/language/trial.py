@@ -1,0 +1,135 @@
+"""A residual tried on the variables it is stated for: does it take them, and how many rows has each factor?
+
+A function is called once, at identity elements. A kernel says what it expects, and need not be called.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.kernels.batched import Batched
+from unifg.kernels.kernel import Kernel
+from unifg.kernels.residuals import Residual
+from unifg.language.doubles import doubles
+from unifg.language.variables import Data, Selection
+from unifg.typing import Array
+
+
+def rows_of(name: str, residual: Residual, arguments: Sequence[Any], count: int, scalar: bool = False) -> int:
+    """The number of rows m of one factor.
+
+    Args:
+        name: of the term.
+        residual: of the term.
+        arguments: of the term, families as selections.
+        count: factors n.
+        scalar: whether the function is to return (n,) values instead of (n, m).
+
+    Raises:
+        GraphError: naming the term, when the residual does not take these arguments or returns something else. Errors
+            of the function itself say which term it was tried for.
+    """
+    if not callable(residual.function):
+        raise GraphError(
+            f"term '{name}': its residual must be a function of batches, found {residual.function!r}", term=name
+        )
+    if residual.kernel is not None and not scalar:
+        return _rows_of_kernel(name, residual.kernel, arguments, count)
+    if residual.rows and not scalar:
+        return residual.rows
+    batched = Batched(name, residual.function)
+    places = [k for k, argument in enumerate(arguments) if isinstance(argument, Selection)]
+    given = [argument.value if isinstance(argument, Data) else argument for argument in arguments]
+    batched.bind(given, places, [])
+    points = [np.tile(a.manifold.identity(), (count, 1)) for a in arguments if isinstance(a, Selection)]
+    return size_of(tried(batched, points, lambda: told(arguments, count)), name, arguments, count, scalar)
+
+
+def tried(batched: Batched, points: Sequence[Array], arguments: Callable[[], str]) -> Array:
+    """What a function returns; an error of its own is given a note about what it was called with."""
+    try:
+        with np.errstate(all="ignore"):
+            return batched.at(points)
+    except GraphError:
+        raise
+    except Exception as error:
+        error.add_note(f"it was called with {arguments()}")
+        raise
+
+
+def size_of(found: Array, name: str, arguments: Sequence[Any], count: int, scalar: bool) -> int:
+    """The number of rows m in what a function returned.
+
+    Raises:
+        GraphError: it has another shape than (n, m), or (n,) of a scalar cost.
+    """
+    if found.ndim != (1 if scalar else 2) or len(found) != count:
+        expected = "(n,)" if scalar else "(n, m)"
+        raise GraphError(
+            f"term '{name}': its function returned shape {found.shape}, expected {expected} with n = {count}; "
+            f"arguments were {told(arguments, count)}",
+            term=name,
+        )
+    return 1 if scalar else found.shape[1]
+
+
+def _rows_of_kernel(name: str, kernel: Kernel, arguments: Sequence[Any], count: int) -> int:
+    if len(kernel.arguments) != len(arguments):
+        raise GraphError(
+            f"term '{name}': {kernel.name} takes {len(kernel.arguments)} arguments, found {len(arguments)}: "
+            f"{told(arguments, count)}",
+            term=name,
+        )
+    filled: list[Any] = []
+    for place, (argument, expected) in enumerate(zip(arguments, kernel.arguments, strict=True)):
+        if isinstance(argument, Selection):
+            _require_manifold(name, kernel, place, argument)
+            filled.append(np.empty((1, argument.manifold.storage)))
+        elif isinstance(argument, Data):
+            filled.append(argument.value)
+        else:
+            what = "a parameter" if isinstance(expected, int | tuple) else f"an element of {expected.name}"
+            filled.append(doubles(f"term '{name}': argument {place} of {kernel.name}, {what},", argument, term=name))
+    try:
+        _, parameters, _ = kernel.split(filled, count)
+    except GraphError as error:
+        raise GraphError(f"term '{name}': {error}", term=name) from None
+    return kernel.size([parameter.shape[1:] for parameter in parameters])
+
+
+def _require_manifold(name: str, kernel: Kernel, place: int, selection: Selection) -> None:
+    expected = kernel.arguments[place]
+    if expected != selection.manifold:
+        wanted = "a parameter, not a variable" if isinstance(expected, int | tuple) else expected.name
+        raise GraphError(
+            f"term '{name}': argument {place} of {kernel.name} is {wanted}; found {selection!r} on "
+            f"{selection.manifold.name}",
+            term=name,
+            family=selection.family.name,
+        )
+
+
+def told(arguments: Sequence[Any], count: int) -> str:
+    """Shapes of all arguments, for messages."""
+    shapes = []
+    for argument in arguments:
+        if isinstance(argument, Selection):
+            shapes.append(f"{argument!r} as ({count}, {argument.manifold.storage})")
+        elif isinstance(argument, Data):
+            shapes.append(repr(argument))
+        elif isinstance(argument, np.ndarray | list | tuple):
+            shapes.append(f"constant {_shape(argument)}")
+        else:
+            shapes.append(f"{argument!r}"[:60])
+    return ", ".join(shapes)
+
+
+def _shape(argument: Any) -> str:
+    try:
+        return str(np.shape(argument))
+    except ValueError:
+        return f"{type(argument).__name__} of {len(argument)}, ragged"
