@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import numpy as np
@@ -25,10 +24,10 @@ def doubles(what: str, given: Any, *, term: str | None = None, flags: bool = Fal
     Raises:
         GraphError: it is ragged, or holds text, booleans, complex numbers or objects.
     """
+    if type(given) is np.ndarray and given.dtype == np.float64:
+        return given
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")  # of NumPy, about sequences of different lengths
-            array = np.asarray(given)
+        array = np.asarray(given)
     except Exception as error:
         raise GraphError(f"{what} cannot be read as an array of numbers: {error}", term=term) from error
     if array.dtype.kind in "fiu":

@@ -64,9 +64,10 @@ def check_limits(name: str, lower: Parameter, upper: Parameter, count: int, size
         made = limit if isinstance(limit, Data) else doubles(f"term '{name}': {which}", limit, term=name)
         _check_limit(name, which, _present(made), count, size)
         both.append(made)
-    low, high = (np.broadcast_to(_present(limit), (count, size)) for limit in both)
-    crossed = np.argwhere(low > high)
-    if len(crossed):
+    least, most = (_present(limit) for limit in both)
+    if (least > most).any():
+        low, high = (np.broadcast_to(limit, (count, size)) for limit in (least, most))
+        crossed = np.argwhere(low > high)
         factor, row = (int(i) for i in crossed[0])
         raise GraphError(
             f"term '{name}': lower exceeds upper in factor {factor}, row {row}: {low[factor, row]:g} > "
