@@ -50,7 +50,7 @@ def test_page_has_no_placeholder_left_and_says_what_it_shows(page: str, log: Epi
     assert any("lidar hits" in key["text"] for key in data["legend"])
     failed = data_of(drive_scene(replace(log, collisions=2, reached=[False])).html())
     assert failed["outcome"] == "0 of 1 goals reached, 2 collisions" and failed["good"] is False
-    assert 'DATA.good ? "good" : "bad"' in around
+    assert 'good ? "good" : "bad"' in around
 
 
 def test_readouts_are_those_of_the_log(page: str, log: EpisodeLog) -> None:

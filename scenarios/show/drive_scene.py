@@ -11,7 +11,8 @@ from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors
 from unifg.scenarios.log.metrics import collision_words
 from unifg.typing import Array, IntArray
 from unifg.view import shapes
-from unifg.view.stage import Key, Label, Page, Readout, Stage, View
+from unifg.view.page import Key, Label, Page, Readout, View
+from unifg.view.stage import Stage
 
 __all__ = ["drive_scene", "scan_points"]
 

@@ -17,7 +17,8 @@ from unifg.scenarios.worlds.air import VEHICLE_RADIUS
 from unifg.scenarios.worlds.bearing_range import SensorModel
 from unifg.typing import Array, IntArray
 from unifg.view import drone, shapes
-from unifg.view.stage import Key, Label, Page, Readout, Stage, View
+from unifg.view.page import Key, Label, Page, Readout, View
+from unifg.view.stage import Stage
 
 __all__ = ["first_sights", "flight_scene", "sensor_reach"]
 

@@ -8,8 +8,9 @@ from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.scenarios.pose_graph import SolvedGraph
 from unifg.scenarios.show.graph_plot import segments
 from unifg.typing import Array
+from unifg.view.page import Key, Page, Readout, View
 from unifg.view.shapes import strips
-from unifg.view.stage import Key, Page, Readout, Stage, View
+from unifg.view.stage import Stage
 
 __all__ = ["graph_scene", "shown_steps"]
 

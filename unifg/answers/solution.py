@@ -137,6 +137,18 @@ class Solution:
         self._require(selection)
         return self._lin.values[selection.family][selection.indices][:, selection.storage].copy()
 
+    def selections(self, term: str) -> list[Selection]:
+        """What the factors of a term touch: its variable arguments, in order; one of length 1 is shared by all factors.
+
+        Raises:
+            GraphError: when no term has that name.
+        """
+        for compiled in self._program.terms:
+            if compiled.name == term:
+                return compiled.term.selections
+        known = ", ".join(compiled.name for compiled in self._program.terms) or "none"
+        raise GraphError(f"no term is called '{term}' (there are: {known})", term=term)
+
     def dual(self, name: str) -> Array:
         """Multipliers of a constraint or bound (n, m), or reaction of fixed variables (n, d).
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-__all__ = ["COLOURS", "GREY", "INK", "css"]
+import re
+
+from unifg.errors import ViewError
+
+__all__ = ["COLOURS", "GREY", "INK", "css", "rgb"]
 
 COLOURS = {
     "floor": 0xF6F4EF,
     "metres": 0xE2DFD6,
+    "grid": 0xBCC3CC,
     "wall": 0x9AA3AE,
     "ink": 0x1D2430,
     "dark": 0x2B3340,
@@ -31,9 +36,25 @@ COLOURS = {
 """Name to 0xRRGGBB."""
 
 
-def css(name: str) -> str:
+_HEX = re.compile(r"#[0-9a-fA-F]{6}")
+
+
+def rgb(colour: str) -> int:
+    """A colour of the palette by its name, or ``#rrggbb``, as 0xRRGGBB.
+
+    Raises:
+        ViewError: it is neither.
+    """
+    if colour in COLOURS:
+        return COLOURS[colour]
+    if not _HEX.fullmatch(colour):
+        raise ViewError(f"there is no colour {colour!r}: take '#rrggbb' or one of {', '.join(COLOURS)}")
+    return int(colour[1:], 16)
+
+
+def css(colour: str) -> str:
     """The colour as ``#rrggbb``."""
-    return f"#{COLOURS[name]:06x}"
+    return f"#{rgb(colour):06x}"
 
 
 INK, GREY = css("ink"), "#6b7280"

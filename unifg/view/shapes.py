@@ -16,6 +16,8 @@ from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 __all__ = [
     "Mesh",
     "box",
+    "column",
+    "copies",
     "cover",
     "ellipse_axes",
     "extrude",
@@ -26,6 +28,7 @@ __all__ = [
     "quads",
     "ribbon",
     "ring",
+    "sphere",
     "strips",
     "thin",
     "tube",
@@ -223,6 +226,50 @@ def box(centre: ArrayLike, size: ArrayLike) -> Mesh:
             side[:, [(axis + 1) % 3, (axis + 2) % 3]] = signs if sign > 0.0 else signs[::-1]
             sides.append(side)
     return quads(np.asarray(centre) + 0.5 * np.asarray(size) * np.stack(sides))
+
+
+def copies(mesh: Mesh, places: Array, turns: Array) -> Mesh:
+    """A mesh again and again, as one.
+
+    Args:
+        mesh: around the origin, v vertices.
+        places: (n, 3) [m].
+        turns: (n, 3, 3), what its axes become there; they may stretch it.
+
+    Returns:
+        n v vertices.
+    """
+    vertices, faces = mesh
+    every = np.einsum("nij,vj->nvi", turns, vertices) + places[:, None]
+    step = len(vertices) * np.arange(len(places), dtype=np.intp)[:, None, None]
+    return every.reshape(-1, 3), (faces + step).reshape(-1, 3)
+
+
+def sphere(bands: int = 6, corners: int = 10) -> Mesh:
+    """A sphere of radius 1 of few faces."""
+    polar, around = np.linspace(0.0, np.pi, bands + 1), np.linspace(0.0, 2.0 * np.pi, corners + 1)[:-1]
+    level = np.repeat(np.cos(polar), corners)
+    reach = np.repeat(np.sin(polar), corners)
+    turn = np.tile(around, bands + 1)
+    vertices = np.column_stack([reach * np.cos(turn), reach * np.sin(turn), level])
+    low = (corners * np.arange(bands)[:, None] + np.arange(corners)).ravel()
+    after = (corners * np.arange(bands)[:, None] + (np.arange(corners) + 1) % corners).ravel()
+    faces = np.concatenate(
+        [np.stack([low, low + corners, after], axis=1), np.stack([after, low + corners, after + corners], axis=1)]
+    )
+    return vertices, faces
+
+
+def column(corners: int = 24) -> Mesh:
+    """An upright cylinder of radius 1 from z = 0 to z = 1, its top apart from its side."""
+    angles = np.linspace(0.0, 2.0 * np.pi, corners + 1)
+    rim = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(corners + 1)])
+    up = np.array([0.0, 0.0, 1.0])
+    sides = quads(np.stack([rim[:-1], rim[1:], rim[1:] + up, rim[:-1] + up], axis=1))
+    top = np.concatenate([up[None], rim[:-1] + up])
+    step = np.arange(corners)
+    fan = np.column_stack([np.zeros(corners, dtype=np.intp), step + 1, (step + 1) % corners + 1])
+    return merge([sides, (top, fan)])
 
 
 def on_ground(rows: Array) -> Array:

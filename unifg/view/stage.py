@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,13 @@ from typing import Any
 import numpy as np
 
 from unifg.errors import ViewError
-from unifg.style.colours import COLOURS, css
+from unifg.style.colours import css, rgb
 from unifg.typing import Array, ArrayLike, IntArray
+from unifg.view.page import Page
 from unifg.view.recorder import Recorder, load_meshcat, viewer_script
 from unifg.view.shapes import Mesh
 
-__all__ = ["Key", "Label", "Page", "Readout", "Stage", "View", "frame_ticks"]
+__all__ = ["Stage", "frame_ticks", "page_text"]
 
 MAX_FRAMES = 500
 """Longer runs show every second tick, every third, ..."""
@@ -32,95 +34,6 @@ MAX_FRAMES = 500
 _PIECES = 200  # of a way that appears bit by bit
 _WATCHED = 40.0  # [s]; a scene starts at the lowest speed that shows it within this time
 _KINDS = {"position": "vector3", "scale": "vector3", "quaternion": "quaternion", "visible": "boolean"}
-
-
-@dataclass
-class Key:
-    """One line of the legend: a swatch (disc, ghost, ring, line, thin, dots, block, flag) in a colour of the palette.
-
-    Objects named as parts can be switched off there.
-    """
-
-    colour: str
-    shape: str
-    text: str
-    parts: list[str] = field(default_factory=list)
-
-
-@dataclass
-class Label:
-    """A word at a place (x, y, z) [m] or with a moving object; a minor one yields to those before it."""
-
-    text: str
-    at: list[float] | None = None
-    follows: str | None = None
-    above: bool = False
-    minor: bool = False
-
-
-@dataclass
-class Readout:
-    """A number that changes: one text per frame, those of alarms in red."""
-
-    name: str
-    texts: list[str]
-    alarms: list[bool] = field(default_factory=list)
-
-
-@dataclass
-class View:
-    """Where the camera stands, with a button: it looks from ``direction`` at everything, or at something that moves.
-
-    Attributes:
-        name: in the address of a picture, ``#t=12.5&view=NAME``.
-        text: of the button.
-        direction: from what is looked at to the camera, in the world.
-        fov: vertical angle of view [deg].
-        follows: the object to go along with; None to see everything.
-        distance: from that object [m].
-        ahead: of that object, the place in the middle of the picture [m].
-    """
-
-    name: str
-    text: str
-    direction: Sequence[float]
-    fov: float
-    follows: str | None = None
-    distance: float = 0.0
-    ahead: Sequence[float] = (0.0, 0.0, 0.0)
-
-
-@dataclass
-class Page:
-    """The words and numbers around the picture, and what the camera must see.
-
-    Attributes:
-        title: what this is.
-        outcome: how it ended.
-        good: whether that is what was asked for.
-        facts: names and values; empty values are left out.
-        corners: (n, 3) [m] that a view of everything must hold.
-        legend: what is drawn, from top to bottom.
-        labels: words in the picture.
-        readouts: numbers of the moment.
-        views: of the camera, the first one at the start.
-        speeds: to choose from; none leaves out the choice.
-        counts: what the slider counts; "time" in seconds, anything else by ``numbers``.
-        numbers: what is counted, one per frame.
-    """
-
-    title: str
-    outcome: str
-    good: bool
-    facts: dict[str, str]
-    corners: Array
-    legend: list[Key]
-    labels: list[Label]
-    readouts: list[Readout]
-    views: list[View]
-    speeds: tuple[float, ...] = ()
-    counts: str = "time"
-    numbers: list[int] = field(default_factory=list)
 
 
 def frame_ticks(count: int) -> IntArray:
@@ -137,10 +50,12 @@ class Stage:
         last: the last of them.
         dt: seconds per tick.
         recorder: everything sent.
+        origin: (3,) of the world, where the stage has its own [m]; a browser reckons in single precision.
+        stroke: half the width of a line that is to be seen well [m].
         page: around it; set by :meth:`finish`.
     """
 
-    def __init__(self, ticks: int, dt: float) -> None:
+    def __init__(self, ticks: int, dt: float, *, origin: ArrayLike = (0.0, 0.0, 0.0), stroke: float = 0.05) -> None:
         """Set an empty stage of so many ticks.
 
         Raises:
@@ -154,6 +69,8 @@ class Stage:
 
         self.recorder = Recorder()
         self.ticks, self.last, self.dt = frame_ticks(ticks), ticks - 1, dt
+        self.origin, self.stroke = np.asarray(origin, dtype=np.float64), stroke
+        self._here = self.origin
         self._viewer, self._animation = Visualizer(window=self.recorder), Animation(default_framerate=1.0 / dt)
         for path in ("/Grid", "/Axes"):
             self._viewer[path].set_property("visible", False)
@@ -173,7 +90,8 @@ class Stage:
         from meshcat.geometry import MeshBasicMaterial, MeshLambertMaterial, TriangularMeshGeometry
 
         material = MeshLambertMaterial if lit else MeshBasicMaterial
-        self._send(path, TriangularMeshGeometry(*mesh), material, colour, opacity)
+        vertices, faces = mesh
+        self._send(path, TriangularMeshGeometry(vertices - self._here, faces), material, colour, opacity)
 
     def cylinder(
         self,
@@ -195,6 +113,7 @@ class Stage:
         # The cylinder's axis is y there: turned by a quarter about x, it is z.
         upright = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, z + height / 2.0], [0, 0, 0, 1]], dtype=np.float64)
         upright[:2, 3] = place
+        upright[:3, 3] -= self._here
         self._viewer[path].set_transform(upright)
 
     def ball(self, path: str, radius: float, colour: str, place: Array) -> None:
@@ -203,28 +122,43 @@ class Stage:
 
         self._send(path, Sphere(radius), MeshLambertMaterial, colour)
         transform = np.eye(4)
-        transform[:3, 3] = place
+        transform[:3, 3] = place - self._here
         self._viewer[path].set_transform(transform)
 
     def points(self, path: str, points: Array, colour: str, pixels: float) -> None:
         """Send points (n, 3) [m] of a size on the screen."""
         from meshcat.geometry import GenericMaterial, Points, PointsGeometry
 
-        material = GenericMaterial(color=COLOURS[colour], size=pixels, sizeAttenuation=False)
+        material = GenericMaterial(color=rgb(colour), size=pixels, sizeAttenuation=False)
         material._type = "PointsMaterial"  # meshcat's own insists on a colour per point
-        self._viewer[path].set_object(Points(PointsGeometry(points.T.astype(np.float32)), material))
+        self._viewer[path].set_object(Points(PointsGeometry((points - self._here).T.astype(np.float32)), material))
 
     def lines(self, path: str, lines: Array, colour: str) -> None:
         """Send straight lines (n, 2, 3) [m], hair-thin."""
         from meshcat.geometry import LineBasicMaterial, LineSegments, PointsGeometry
 
-        points = lines.reshape(-1, 3).T.astype(np.float32)
-        material = LineBasicMaterial(color=COLOURS[colour], transparent=True, opacity=0.55)
+        points = (lines.reshape(-1, 3) - self._here).T.astype(np.float32)
+        material = LineBasicMaterial(color=rgb(colour), transparent=True, opacity=0.55)
         self._viewer[path].set_object(LineSegments(PointsGeometry(points), material))
+
+    @contextmanager
+    def around(self) -> Iterator[None]:
+        """What is sent meanwhile has its places around the origin of something that moves."""
+        self._here = np.zeros(3)
+        yield
+        self._here = self.origin
+
+    def place(self, path: str, matrix: Array) -> None:
+        """Put an object somewhere, for good (4, 4) [m]."""
+        self._viewer[path].set_transform(matrix)
+
+    def delete(self, path: str) -> None:
+        """Take an object, and what lies below it, away."""
+        self._viewer[path].delete()
 
     def _send(self, path: str, shape: Any, material: Any, colour: str, opacity: float = 1.0) -> None:
         extra = {"depthWrite": False} if opacity < 1.0 else {}  # what lies behind shows through
-        self._viewer[path].set_object(shape, material(color=COLOURS[colour], opacity=opacity, **extra))
+        self._viewer[path].set_object(shape, material(color=rgb(colour), opacity=opacity, **extra))
 
     # ------------------------------------------------------------------- time
 
@@ -232,6 +166,8 @@ class Stage:
         """Animate an object: at a tick its position [m], its quaternion (w, x, y, z), its scale, or whether visible."""
         target = self._animation.at_frame(self._viewer[path], tick)
         for name, value in properties.items():
+            if name == "position":
+                value = np.asarray(value) - self._here
             plain: Any = value if isinstance(value, bool) else np.asarray(value).tolist()
             if name == "quaternion":
                 plain = [*plain[1:], plain[0]]  # three.js puts w last
@@ -293,6 +229,7 @@ class Stage:
             "facts": [[name, text] for name, text in page.facts.items() if text],
             "corners": page.corners.round(4).tolist(),
             "legend": [asdict(key) | {"colour": css(key.colour)} for key in page.legend],
+            "plots": [asdict(plot) | {"colour": css(plot.colour)} for plot in page.plots],
             "dt": self.dt,
             "duration": duration,
             "ticks": self.ticks.tolist(),
@@ -300,13 +237,27 @@ class Stage:
             "step": 0.01 if page.counts == "time" else self.dt,
             "play": page.counts == "time",
         }
-        parts = {
-            # Names from outside cannot end the script: no "<" is left in it.
-            "DATA": json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
-            "COMMANDS": json.dumps(self.recorder.packed_base64(), indent=0),
-            "VIEWER": viewer_script(),
-        }
-        text = resources.files("unifg.view").joinpath("page.html").read_text(encoding="utf-8")
-        for name, part in parts.items():  # the viewer last: it is code in which no placeholder may be looked for
-            text = text.replace(f"@@{name}@@", part)
-        return text
+        return page_text(data, self.recorder.packed_base64())
+
+
+def page_text(data: dict[str, Any], commands: list[str], *, connect: str = "", live: str = "") -> str:
+    """The page around what is known and sent.
+
+    Args:
+        data: what its script knows.
+        commands: to the viewer, as text.
+        connect: a directive of its policy, for a page that is to be told more.
+        live: the script that listens.
+    """
+    parts = {
+        "CONNECT": connect,
+        "LIVE": live,
+        # Names from outside cannot end the script: no "<" is left in it.
+        "DATA": json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
+        "COMMANDS": json.dumps(commands, indent=0),
+        "VIEWER": viewer_script(),
+    }
+    text = resources.files("unifg.view").joinpath("page.html").read_text(encoding="utf-8")
+    for name, part in parts.items():  # the viewer last: it is code in which no placeholder may be looked for
+        text = text.replace(f"@@{name}@@", part)
+    return text

@@ -1,0 +1,426 @@
+"""Looking at solutions: what is in the file of a scene, and what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from scenes import check_offline, commands_of, data_of, tracks_of, without_viewer
+from unifg.errors import GraphError, ViewError
+from unifg.files.ros_map import OccupancyMap
+from unifg.models.distance_map import DistanceMap
+from unifg.solvers import GaussNewton
+from unifg.typing import Array
+from unifg.view import Part, Scene
+from unifg.view.bodies import BODIES
+from unifg.view.shapes import box, column, copies, sphere
+
+pytest.importorskip("meshcat")
+POINT = fg.Rn(2)
+STATE = fg.Product(pose=fg.SE2, speed=fg.Rn(1))
+
+
+def offset_error(pose: Array, tree: Array, far: Array) -> Array:
+    return tree - pose[:, : tree.shape[1]] - far
+
+
+def chain(count: int = 5, group: Any = fg.SE2, offset: float = 0.0) -> tuple[fg.Solution, fg.Family, fg.Family]:
+    """A way of poses a metre apart, and two trees seen from the first of them."""
+    graph = fg.Graph()
+    x, trees = graph.variables("x", group, count), graph.variables("trees", fg.Rn(group.point_dim), 2)
+    start = np.array(group.identity())
+    start[0] += offset
+    step = np.zeros(group.dim)
+    step[0] = 1.0
+    graph.minimize(fg.prior, x[0], start, sigma=0.1, name="origin")
+    if count > 1:
+        graph.minimize(fg.between, x[:-1], x[1:], group.exp(step), sigma=0.1, name="odometry")
+    places = np.zeros((2, group.point_dim))
+    places[:, :2] = [[offset + 1.0, 2.0], [offset + 3.0, -1.0]]
+    far = places - start[: group.point_dim]
+    graph.minimize(offset_error, x[0], trees, far, sigma=0.2, name="seen")
+    guess = {x: np.tile(start, (count, 1)), trees: places}
+    return GaussNewton(keep_values=True).solve(graph, guess), x, trees
+
+
+@pytest.fixture(scope="module")
+def solved() -> tuple[fg.Solution, fg.Family, fg.Family]:
+    return chain()
+
+
+def objects(page: str) -> dict[str, Any]:
+    """Path below /meshcat/ to what was sent."""
+    return {c["path"].removeprefix("/meshcat/"): c["object"] for c in commands_of(page) if c["type"] == "set_object"}
+
+
+def vertices(sent: Any) -> Array:
+    """(n, 3) of what was sent."""
+    packed = sent["geometries"][0]["data"]["attributes"]["position"]["array"].data
+    return np.frombuffer(packed, dtype=np.float32).reshape(-1, 3).astype(np.float64)
+
+
+def legend(page: str) -> list[str]:
+    return [key["text"] for key in data_of(page)["legend"]]
+
+
+def test_a_solution_in_one_line(solved: tuple[fg.Solution, fg.Family, fg.Family], tmp_path: Path) -> None:
+    solution, x, trees = solved
+    path = Scene.of(solution, x, trees, sigmas=3, terms=["odometry", "seen"]).save(tmp_path / "scene.html")
+    page = path.read_text(encoding="utf-8")
+    check_offline(page)
+    data, drawn = data_of(page), objects(page)
+    assert legend(page) == ["x", "x: poses", "x: 3\u03c3", "trees", "trees: 3\u03c3", "odometry", "seen"]
+    assert data["outcome"] == fg.Status.CONVERGED.value and data["good"] is True
+    assert data["ticks"] == [0] and data["plots"] == []  # one picture: nothing to play
+    middle = vertices(drawn["x"]).reshape(-1, 2, 3).mean(axis=1)
+    np.testing.assert_allclose(middle[:, :2], solution[x][:, :2], atol=1e-6)
+    np.testing.assert_allclose(vertices(drawn["trees"])[:, :2], solution[trees], atol=1e-6)
+    lines = vertices(drawn["seen"]).reshape(-1, 2, 3)
+    np.testing.assert_allclose(lines[:, 0, :2], np.tile(solution[x][0, :2], (2, 1)), atol=1e-6)
+    np.testing.assert_allclose(lines[:, 1, :2], solution[trees], atol=1e-6)
+
+
+def test_poses_are_shown_where_no_family_is_named(
+    solved: tuple[fg.Solution, fg.Family, fg.Family],
+) -> None:
+    assert legend(Scene.of(solved[0]).html()) == ["x", "x: poses"]  # trees might be controls
+
+
+@pytest.mark.parametrize("group", [fg.SE2, fg.SE3])
+def test_ellipses_are_the_marginals_in_the_world(group: Any) -> None:
+    """The farthest vertex from the middle is the longer half axis; the covariance is that of p + R d."""
+    solution, x, _ = chain(3, group)
+    page = Scene.of(solution, x[-1], sigmas=2.0).html()
+    drawn = objects(page)
+    outline = next(vertices(sent) for path, sent in drawn.items() if path.startswith("x: 2"))
+    size = group.point_dim
+    turn = group.matrix(solution[x[-1]])[0, :size, :size]
+    covariance = turn @ solution.marginals(x[-1])[0, :size, :size] @ turn.T
+    reach = np.linalg.norm(outline[:, :size] - solution[x[-1]][0, :size], axis=1).max()
+    assert reach == pytest.approx(2.0 * math.sqrt(np.linalg.eigvalsh(covariance)[-1]), rel=0.02)
+
+
+def test_covariances_of_places_that_a_function_gives_are_carried_through_it() -> None:
+    graph = fg.Graph()
+    arm = graph.variables("arm", fg.SO2, 1)
+    graph.minimize(fg.prior, arm, [0.5], sigma=0.1)
+    solution = GaussNewton().solve(graph, {arm: [[0.4]]})
+    scene = Scene.of(
+        solution, arm, sigmas=1.0, position=lambda angle: 2.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    )
+    outline = next(vertices(sent) for path, sent in objects(scene.html()).items() if path.endswith("edge"))
+    along = np.array([-math.sin(0.5), math.cos(0.5)])
+    offset = outline[:, :2] - 2.0 * np.array([math.cos(0.5), math.sin(0.5)])
+    assert np.abs(offset @ along).max() == pytest.approx(0.2, rel=5e-3)  # 2 m times 0.1 rad
+    assert np.abs(offset @ [math.cos(0.5), math.sin(0.5)]).max() < 1e-6
+
+
+def test_iterates_are_on_the_slider_with_their_numbers(solved: tuple[fg.Solution, fg.Family, fg.Family]) -> None:
+    solution, x, _ = solved
+    page = Scene.of(solution, x, over="iterates").html()
+    data, tracks = data_of(page), tracks_of(commands_of(page))
+    rows = [row for row in solution.history if row.values is not None]
+    assert data["counts"] == "iteration" and data["numbers"] == [row.number for row in rows]
+    (cost, _) = data["plots"]
+    assert cost["name"] == "cost" and cost["values"] == [row.cost for row in rows]
+    assert data["play"] is False
+    assert dict(tracks["x/1"][".visible"])[0] is False
+    with pytest.raises(ViewError, match="keep_values=True"):
+        graph = fg.Graph()
+        y = graph.variables("y", POINT, 1)
+        graph.minimize(fg.prior, y, [0.0, 0.0], sigma=1.0)
+        Scene.of(GaussNewton().solve(graph, {y: [[1.0, 1.0]]}), y, over="iterates")
+
+
+@pytest.mark.parametrize("kind", sorted(BODIES))
+def test_a_body_goes_along_the_members(kind: str) -> None:
+    solution, x, _ = chain(4)
+    page = Scene.of(solution, x, over="members", dt=0.25, body=kind, size=0.3).html()
+    data, tracks = data_of(page), tracks_of(commands_of(page))
+    places = np.array([value for _, value in tracks[f"x: {kind}"][".position"]])
+    np.testing.assert_allclose(places[:, :2], solution[x][:, :2])
+    assert data["counts"] == "time" and data["duration"] == 0.75
+    assert f"Follow x: {kind}" in [view["text"] for view in data["views"]]
+
+
+def test_solutions_one_after_the_other(solved: tuple[fg.Solution, fg.Family, fg.Family]) -> None:
+    solution, x, trees = solved
+    scene = Scene.of([solution, solution], x, trees, dt=0.1)
+    scene.add(solution)
+    page = scene.html()
+    data = data_of(page)
+    assert data["ticks"] == [0, 1, 2] and data["outcome"] == ""
+    assert [row["name"] for row in data["readouts"]] == ["solver", "status", "iterations", "cost"]
+    assert data["plots"][0]["values"] == [1e3 * solution.seconds] * 3
+    assert "x" in objects(page)  # the same in all frames: sent once, and never hidden
+
+
+def test_what_changes_is_shown_in_its_turn_and_what_stays_is_sent_once() -> None:
+    scene = Scene("turns", dt=1.0)
+    for k in range(4):
+        with scene.frame() as frame:
+            frame.way("plan", [[0.0, 0.0], [1.0, float(k >= 2)]])
+            if k == 1:
+                frame.points("hit", [[0.5, 0.5]])
+            frame.trail("driven", [float(k), 0.0])
+    page = scene.html()
+    tracks = tracks_of(commands_of(page))
+
+    def shown(path: str, tick: int) -> bool:
+        keys = dict(tracks[path][".visible"])
+        assert min(keys) == 0 and max(keys) == 3
+        return bool(keys[max(time for time in keys if time <= tick)])
+
+    assert [path for path in objects(page) if path.startswith("plan")] == ["plan/0", "plan/2"]
+    assert [shown("plan/0", k) for k in range(4)] == [True, True, False, False]
+    assert [shown("plan/2", k) for k in range(4)] == [False, False, True, True]
+    assert [shown("hit/1", k) for k in range(4)] == [False, True, False, False]
+    assert [shown("driven/1", k) for k in range(4)] == [False, False, True, True]
+
+
+def test_a_body_is_seen_where_it_is_placed() -> None:
+    scene = Scene(dt=1.0)
+    scene.body("drone", "quadrotor", size=0.25)
+    for k in range(4):
+        frame = scene.frame()
+        if k in (1, 2):
+            frame.place("drone", [float(k), 0.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    tracks = tracks_of(commands_of(scene.html()))
+    keys = dict(tracks["drone/parts"][".visible"])
+    assert keys == {0: False, 1: True, 3: False}
+    assert [value for _, value in tracks["drone"][".position"]] == [[1.0, 0.0, 1.0], [2.0, 0.0, 1.0]]
+    with pytest.raises(ViewError, match="there is no body 'plane'"):
+        scene.frame().place("plane", [0.0, 0.0, 0.0])
+
+
+def test_same_bytes_for_the_same_input(tmp_path: Path) -> None:
+    code = (
+        "import hashlib; from test_view import everything;"
+        "print(hashlib.sha256(everything().html().encode()).hexdigest())"
+    )
+    here = Path(__file__).parent
+    environment = {"PYTHONPATH": f"{here}:{here.parent}", "PYTHONHASHSEED": "7"}
+    printed = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
+    ).stdout.strip()
+    assert printed == hashlib.sha256(everything().html().encode()).hexdigest()
+    assert everything().save(tmp_path / "a.html").read_text(encoding="utf-8") == everything().html()
+
+
+def everything() -> Scene:
+    """One of each."""
+    scene = Scene("everything", dt=0.5)
+    occupied = np.zeros((8, 12), dtype=bool)
+    occupied[0], occupied[:, 0] = True, True
+    scene.map("map", OccupancyMap(occupied, ~occupied, 0.5, (0.0, 0.0, 0.1)))
+    scene.way("line", [[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
+    scene.points("dots", [[1.0, 1.0, 1.0]])
+    scene.lines("thin", [[[0.0, 0.0], [1.0, 1.0]]])
+    scene.poses("axes", [[0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0]])
+    scene.poses("arrows", [[0.0, 0.0, 1.0]])
+    scene.discs("discs", [[1.0, 1.0, 0.2], [2.0, 1.0, 0.3]], height=1.0)
+    scene.boxes("boxes", [[3.0, 1.0, 0.5]], [1.0, 0.5, 1.0])
+    scene.covariances("sure", [[1.0, 1.0, 1.0]], [np.diag([0.01, 0.02, 0.0])])
+    scene.mesh("own", box([0.0, 0.0, 0.0], [1.0, 1.0, 1.0]), lit=True)
+    for kind in BODIES:
+        scene.body(kind, kind, size=0.3)
+    scene.body("mine", [Part("cube", box([0.0, 0.0, 0.0], [1.0, 1.0, 1.0]), "#ff8800")])
+    for k in range(3):
+        with scene.frame() as frame:
+            for kind in [*BODIES, "mine"]:
+                frame.place(kind, [float(k), 1.0, 0.5], scale=(1.0, 1.0, 1.0 + k))
+            frame.readout("speed", f"{k} m/s", alarm=k == 2)
+            frame.value("error", float(k))
+    return scene
+
+
+def test_bad_numbers_are_refused_by_name() -> None:
+    scene = Scene()
+    bad = [[0.0, 1.0], [math.nan, 2.0]]
+    for draw in (scene.way, scene.points):
+        with pytest.raises(ViewError, match=r"'walk': place 1 is \[nan, 2.0\]") as caught:
+            draw("walk", bad)
+        assert caught.value.index == 1
+    with pytest.raises(ViewError, match="'p': pose 0"):
+        scene.poses("p", [[0.0, math.inf, 0.0]])
+    with pytest.raises(ViewError, match="'d': disc 0"):
+        scene.discs("d", [[0.0, math.nan, 0.0]])
+    with pytest.raises(ViewError, match="'c': covariance 0"):
+        scene.covariances("c", [[0.0, 0.0]], [[[math.nan, 0.0], [0.0, 1.0]]])
+    scene.body("robot", "disc")
+    with pytest.raises(ViewError, match="'robot': pose 0"):
+        scene.frame().place("robot", [0.0, 0.0, math.nan])
+
+
+@pytest.mark.parametrize(
+    ("shape", "draw"),
+    [
+        ("places are", lambda scene: scene.way("a", np.zeros((2, 4)))),
+        ("poses are", lambda scene: scene.poses("a", np.zeros((2, 4)))),
+        ("lines are", lambda scene: scene.lines("a", np.zeros((2, 3, 2)))),
+        ("discs are", lambda scene: scene.discs("a", np.zeros((2, 4)))),
+        ("sizes are", lambda scene: scene.boxes("a", np.zeros((2, 3)), [1.0, 1.0])),
+        ("need covariances", lambda scene: scene.covariances("a", np.zeros((2, 2)), np.zeros((2, 3, 3)))),
+        ("no map but int", lambda scene: scene.map("a", 3)),
+        ("no colour 'mauve'", lambda scene: scene.way("a", np.zeros((2, 2)), colour="mauve")),
+        ("a name is empty", lambda scene: scene.way("", np.zeros((2, 2)))),
+        ("no body 'boat'", lambda scene: scene.body("a", "boat")),
+        ("must be positive", lambda scene: scene.body("a", "car", size=0.0)),
+        ("either a place or a body", lambda scene: scene.label("a")),
+        ("is no body", lambda scene: scene.label("a", follows="b")),
+        ("is no body", lambda scene: scene.view("a", "b", (0.0, 0.0, 1.0), follows="b")),
+        ("Scene.of", lambda scene: scene.add(None)),
+        ("nothing is drawn", lambda scene: scene.html()),
+        ("must be positive", lambda scene: Scene(dt=0.0)),
+        ("at least one frame", lambda scene: Scene(keep=0)),
+    ],
+)  # fmt: skip
+def test_refusals_say_what_was_found(shape: str, draw: Any) -> None:
+    with pytest.raises(ViewError, match=shape):
+        draw(Scene())
+
+
+def test_what_has_no_place_is_refused_with_what_to_do() -> None:
+    graph = fg.Graph()
+    q, s = graph.variables("q", fg.Rn(7), 2), graph.variables("s", STATE, 3)
+    graph.minimize(fg.prior, q, np.zeros(7), sigma=1.0)
+    graph.minimize(fg.prior, s, np.zeros(4), sigma=1.0)
+    solution = GaussNewton().solve(graph, {q: np.zeros((2, 7)), s: np.zeros((3, 4))})
+    with pytest.raises(ViewError, match=r"'q' of Rn\(7\) cannot be drawn.*give position=lambda"):
+        Scene.of(solution, q)
+    with pytest.raises(ViewError, match=r"'s' of .*name a component \(s\.pose\), or give position="):
+        Scene.of(solution, s)
+    with pytest.raises(ViewError, match=r"no family of this solution has a place \('q' of Rn\(7\), 's' of"):
+        Scene.of(solution)
+    assert legend(Scene.of(solution, s.pose).html()) == ["s.pose", "s.pose: poses"]
+    assert legend(Scene.of(solution, q, position=lambda v: v[:, :3]).html()) == ["q"]
+    with pytest.raises(ViewError, match="'q': place 0 is"):
+        Scene.of(solution, q, position=lambda v: np.full((len(v), 2), math.nan))
+    with pytest.raises(ViewError, match=r"returned \(2, 5\)"):
+        Scene.of(solution, q, position=lambda v: v[:, :5])
+    with pytest.raises(GraphError, match="no term is called 'nothing'"):
+        Scene.of(solution, s.pose, terms=["nothing"])
+    with pytest.raises(ViewError, match="found ndarray"):
+        Scene.of(solution, np.zeros(3))  # type: ignore[arg-type]
+    with pytest.raises(ViewError, match="one of solutions, iterates, members"):
+        Scene.of(solution, s.pose, over="time")
+    with pytest.raises(ViewError, match="no solution to look at"):
+        Scene.of([], s.pose)
+
+
+def test_empty_and_single_members_are_drawn() -> None:
+    solution, x, trees = chain(1)
+    page = Scene.of(solution, x, trees, sigmas=1.0).html()
+    assert legend(page) == ["x", "x: 1\u03c3", "trees", "trees: 1\u03c3"]
+    scene = Scene()
+    scene.points("none", np.zeros((0, 2)))
+    scene.discs("no discs", [])
+    scene.covariances("unsure", np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    with pytest.raises(ViewError, match="nothing is drawn"):
+        scene.html()
+    scene.points("one", [[4.0, 5.0]])
+    page = scene.html()
+    assert "none" not in objects(page) and np.ptp(np.array(data_of(page)["corners"]), axis=0)[0] == pytest.approx(1.0)
+
+
+def test_far_from_the_origin_nothing_jitters() -> None:
+    """Metres of UTM are large: in single precision 5e6 m is known to half a metre."""
+    solution, x, _ = chain(5, offset=5.4e6)
+    page = Scene.of(solution, x).html()
+    middle = vertices(objects(page)["x"]).reshape(-1, 2, 3).mean(axis=1)
+    np.testing.assert_allclose(np.diff(middle[:, 0]), 1.0, atol=1e-6)
+    data = data_of(page)
+    facts = dict(data["facts"])
+    assert facts["shown around"] == "(5400002, 0, 0) m"
+    assert np.abs(np.array(data["corners"])).max() < 10.0
+    assert "shown around" not in dict(data_of(Scene.of(chain(5)[0]).html())["facts"])
+
+
+def test_bodies_and_labels_move_with_the_scene() -> None:
+    scene = Scene(dt=1.0)
+    scene.body("car", "car", size=2.0)
+    scene.label("depot", [1e6, 1e6])
+    for k in range(3):
+        scene.frame().place("car", [1e6 + k, 1e6, 0.0])
+    page = scene.html()
+    places = np.array([value for _, value in tracks_of(commands_of(page))["car"][".position"]])
+    assert np.abs(places).max() < 10.0 and np.abs(data_of(page)["labels"][0]["at"]).max() < 10.0
+    body = vertices(objects(page)["car/parts/body"])
+    assert np.abs(body).max() < 10.0
+
+
+def test_names_cannot_become_paths_or_markup() -> None:
+    scene = Scene("</script><script>alert(1)</script>")
+    for name in ("a/b", "a", "</script>", "%2f", "<object>"):
+        scene.points(name, [[0.0, 1.0]])
+    scene.label("<img src=x onerror=alert(1)>", [0.0, 0.0])
+    page = scene.html()
+    assert set(objects(page)) >= {"a%2fb", "a", "%3c%2fscript%3e", "%252f", "%3cobject%3e"}
+    around = without_viewer(page)
+    assert around.count("</script>") == 3 and "<img" not in around
+    assert data_of(page)["title"].startswith("</script>") and legend(page)[0] == "a/b"
+
+
+def test_long_ways_over_many_ticks_stay_small() -> None:
+    """2000 poses in each of 300 frames are 600 000; the page says how many of them it shows."""
+    scene = Scene("long", dt=0.1)
+    along = np.linspace(0.0, 50.0, 2000)
+    for k in range(300):
+        with scene.frame() as frame:
+            frame.way("x", np.column_stack([along, np.sin(along + 0.01 * k)]))
+            frame.poses("x: poses", np.column_stack([along, np.sin(along + 0.01 * k), np.cos(along)]))
+    page = scene.html()
+    assert len(page) < 12e6
+    facts = dict(data_of(page)["facts"])
+    assert facts["x, thinned"] == "333 of 2000" and facts["x: poses, thinned"] == "26 of 2000"
+
+
+def test_only_so_many_frames_are_kept() -> None:
+    scene = Scene(dt=0.1, keep=3)
+    for k in range(10):
+        scene.frame().points("p", [[float(k), 0.0]])
+    assert data_of(scene.html())["ticks"] == [0, 1, 2]
+
+
+def test_scenes_in_threads_do_not_meet() -> None:
+    wanted, found = everything().html(), dict[int, str]()
+
+    def make(k: int) -> None:
+        found[k] = everything().html()
+
+    threads = [threading.Thread(target=make, args=(k,)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert set(found.values()) == {wanted} and len(found) == 4
+
+
+def test_a_distance_map_has_walls_where_the_distance_is_not_positive() -> None:
+    occupied = np.zeros((10, 10), dtype=bool)
+    occupied[:2] = True
+    scene = Scene()
+    scene.map("map", DistanceMap.from_occupancy(occupied, 0.5, (0.0, 0.0, 0.0)), height=2.0)
+    walls = vertices(objects(scene.html())["map/walls"])
+    assert walls[:, 1].max() == pytest.approx(1.0) and walls[:, 2].max() == pytest.approx(2.0)
+
+
+def test_shapes_look_outwards() -> None:
+    for mesh, middle in ((sphere(), np.zeros(3)), (column(), np.array([0.0, 0.0, 0.5]))):
+        corners = mesh[0][mesh[1]]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        large = np.linalg.norm(normals, axis=1) > 1e-12
+        assert (np.sum(normals * (corners.mean(axis=1) - middle), axis=1)[large] > 0.0).all()
+    twice, faces = copies(
+        sphere(), np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]]), np.stack([np.eye(3), 2.0 * np.eye(3)])
+    )
+    assert twice[:, 0].max() == pytest.approx(7.0) and faces.max() == len(twice) - 1

@@ -1,0 +1,331 @@
+"""How one draws: on a scene, where it stays, or on one frame of it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from unifg.errors import ViewError
+from unifg.files.ros_map import OccupancyMap
+from unifg.models.distance_map import DistanceMap
+from unifg.typing import Array, ArrayLike
+from unifg.view import shapes, things
+from unifg.view.content import Content, Placement, Shot
+from unifg.view.members import finite
+from unifg.view.page import Plot
+from unifg.view.shapes import Mesh
+from unifg.view.things import Thing
+
+__all__ = ["Canvas", "Frame"]
+
+# How many of each may stand in a file, over all its frames: some ten megabytes.
+_WAYS, _TUBES, _DOTS, _LINES, _MARKS, _OUTLINES = 100_000, 40_000, 200_000, 60_000, 8_000, 4_000
+
+
+class Canvas:
+    """What is drawn alike on a scene, where it stays, and on a frame of it.
+
+    Each method takes the name first: a line of the legend, which switches it off and on, and what tells later frames
+    that it is the same thing. ``colour`` is a name of `unifg.style.colours.COLOURS` or ``#rrggbb``, by default the next
+    of a palette; ``legend`` other words than the name, and no line where it is empty. Places with two columns lie in
+    the plane, places with three in space. What is drawn twice under one name on one canvas replaces itself.
+    """
+
+    def __init__(self, content: Content, drawn: dict[str, Thing]) -> None:
+        """Draw into a part of a scene."""
+        self._content, self._drawn = content, drawn
+
+    def way(
+        self, name: str, points: ArrayLike, *, width: float | None = None, colour: str | None = None,
+        legend: str | None = None,
+    ) -> None:  # fmt: skip
+        """A line through (n, 2) or (n, 3) places [m], of a width [m].
+
+        Raises:
+            ViewError: the shape is another, or a number is not finite.
+        """
+        places, flat = self._places(name, points)
+        layer = self._content.layer(name, "line", colour, legend)
+        given = {"points": places, "flat": flat, "colour": layer.colour, "width": width, "level": layer.level}
+        self._drawn[name] = Thing(things.draw_way, given, places, len(places), _WAYS if flat else _TUBES)
+
+    def points(
+        self, name: str, points: ArrayLike, *, pixels: float = 7.0, colour: str | None = None,
+        legend: str | None = None,
+    ) -> None:  # fmt: skip
+        """Dots at (n, 2) or (n, 3) places [m], as large on the screen from near and far.
+
+        Raises:
+            ViewError: the shape is another, or a number is not finite.
+        """
+        places, flat = self._places(name, points)
+        layer = self._content.layer(name, "dots", colour, legend)
+        given = {"points": places, "flat": flat, "colour": layer.colour, "pixels": pixels, "level": layer.level}
+        self._drawn[name] = Thing(things.draw_points, given, places, len(places), _DOTS)
+
+    def lines(
+        self, name: str, lines: ArrayLike, *, width: float | None = None, colour: str | None = None,
+        legend: str | None = None,
+    ) -> None:  # fmt: skip
+        """Straight lines (n, 2, 2) or (n, 2, 3) [m], hair-thin unless they are given a width [m].
+
+        Raises:
+            ViewError: the shape is another, or a number is not finite.
+        """
+        ends = np.asarray(lines, dtype=np.float64)
+        if ends.ndim != 3 or ends.shape[1] != 2 or ends.shape[2] not in (2, 3):
+            raise ViewError(f"'{name}': lines are (n, 2, 2) or (n, 2, 3) [m], found {ends.shape}")
+        finite(name, ends, "line")
+        flat = ends.shape[2] == 2
+        full = np.concatenate([ends, np.zeros((len(ends), 2, 1))], axis=2) if flat else ends.copy()
+        layer = self._content.layer(name, "thin" if width is None else "line", colour, legend)
+        given = {"lines": full, "flat": flat, "colour": layer.colour, "width": width, "level": layer.level}
+        self._drawn[name] = Thing(things.draw_segments, given, full.reshape(-1, 3), len(full), _LINES)
+
+    def poses(
+        self, name: str, poses: ArrayLike, *, length: float | None = None, colour: str | None = None,
+        legend: str | None = None,
+    ) -> None:  # fmt: skip
+        """Arrows at (n, 3) poses in the plane, or axes at (n, 7) poses in space, of a length [m].
+
+        Args:
+            name: of the layer.
+            poses: (x, y, theta) [m, m, rad], or position [m] and unit quaternion (w, x, y, z).
+            length: of each mark; None suits it to the size of the scene.
+            colour: of arrows; axes are red, green and blue.
+            legend: words of the legend.
+
+        Raises:
+            ViewError: the shape is another, or a number is not finite.
+        """
+        rows = np.atleast_2d(np.array(poses, dtype=np.float64))
+        if rows.ndim != 2 or rows.shape[1] not in (3, 7):
+            raise ViewError(
+                f"'{name}': poses are (n, 3) x, y, theta or (n, 7) position and quaternion, found {rows.shape}"
+            )
+        finite(name, rows, "pose")
+        layer = self._content.layer(name, "arrow" if rows.shape[1] == 3 else "axes", colour, legend)
+        if rows.shape[1] == 3:
+            given = {"poses": rows, "length": length, "colour": layer.colour, "level": layer.level}
+            self._drawn[name] = Thing(things.draw_arrows, given, shapes.on_ground(rows), len(rows), _MARKS)
+        else:
+            given = {"poses": rows, "length": length, "level": layer.level}
+            self._drawn[name] = Thing(things.draw_triads, given, rows[:, :3], len(rows), _MARKS // 4)
+
+    def covariances(
+        self, name: str, centres: ArrayLike, covariances: ArrayLike, *, sigmas: float = 3.0, colour: str | None = None,
+        legend: str | None = None,
+    ) -> None:  # fmt: skip
+        """Ellipses in the plane or ellipsoids in space: places that are so many standard deviations off.
+
+        Args:
+            name: of the layer.
+            centres: (n, p) [m], p = 2 or 3.
+            covariances: (n, p, p) [m^2], symmetric; directions without variance are drawn flat.
+            sigmas: half axes in standard deviations.
+            colour: of the outlines.
+            legend: words of the legend.
+
+        Raises:
+            ViewError: shapes do not fit, or a number is not finite.
+        """
+        places, flat = self._places(name, centres)
+        size = 2 if flat else 3
+        given_covariances = np.asarray(covariances, dtype=np.float64)
+        if given_covariances.shape != (len(places), size, size):
+            raise ViewError(
+                f"'{name}': {len(places)} centres in {size} dimensions need covariances ({len(places)}, {size}, "
+                f"{size}) [m^2], found {given_covariances.shape}"
+            )
+        finite(name, given_covariances, "covariance")
+        variances, vectors = np.linalg.eigh(0.5 * (given_covariances + given_covariances.transpose(0, 2, 1)))
+        half = sigmas * np.sqrt(np.maximum(variances, 0.0))
+        axes = np.einsum("nij,nj,nkj->nik", vectors, half, vectors)  # symmetric: it turns as little as can be
+        layer = self._content.layer(name, "ghost", colour, legend)
+        given = {"centres": places, "axes": axes, "colour": layer.colour, "level": layer.level}
+        largest = half.max(axis=1, initial=0.0)[:, None]
+        corners = np.concatenate([places - largest, places + largest])
+        if flat:
+            corners[:, 2] = 0.0
+        draw = things.draw_ellipses if flat else things.draw_ellipsoids
+        slack = 0.01 * float(largest.max(initial=0.0))
+        self._drawn[name] = Thing(draw, given, corners, len(places), _OUTLINES if flat else _OUTLINES // 4, slack)
+
+    def discs(
+        self, name: str, rows: ArrayLike, *, height: float = 0.0, base: float = 0.0, opacity: float = 1.0,
+        colour: str | None = None, legend: str | None = None,
+    ) -> None:  # fmt: skip
+        """Discs (n, 3) x, y, radius [m] on the ground; with a height [m], upright cylinders from ``base`` up.
+
+        Raises:
+            ViewError: the shape is another, or a number is not finite.
+        """
+        discs = (
+            np.array(rows, dtype=np.float64).reshape(-1, 3)
+            if np.size(rows) == 0
+            else np.atleast_2d(np.array(rows, dtype=np.float64))
+        )
+        if discs.ndim != 2 or discs.shape[1] != 3:
+            raise ViewError(f"'{name}': discs are (n, 3) x, y, radius [m], found {discs.shape}")
+        finite(name, discs, "disc")
+        layer = self._content.layer(name, "disc" if opacity == 1.0 else "ghost", colour, legend)
+        given = {
+            "rows": discs, "height": height, "base": base, "colour": layer.colour, "opacity": opacity,
+            "level": layer.level,
+        }  # fmt: skip
+        low, high = discs - discs[:, 2:], discs + discs[:, 2:]
+        low[:, 2], high[:, 2] = base, base + height
+        self._drawn[name] = Thing(things.draw_discs, given, np.concatenate([low, high]), len(discs), 4 * _MARKS)
+
+    def boxes(
+        self, name: str, poses: ArrayLike, sizes: ArrayLike, *, opacity: float = 1.0, colour: str | None = None,
+        legend: str | None = None,
+    ) -> None:  # fmt: skip
+        """Boxes around their middles.
+
+        Args:
+            name: of the layer.
+            poses: (n, 3) places [m], the boxes along the axes; or (n, 7) positions and quaternions (w, x, y, z).
+            sizes: (3,) or (n, 3) lengths of their edges [m].
+            opacity: 1 hides what is behind.
+            colour: of all of them.
+            legend: words of the legend.
+
+        Raises:
+            ViewError: a shape is another, or a number is not finite.
+        """
+        rows = np.atleast_2d(np.array(poses, dtype=np.float64))
+        if rows.ndim != 2 or rows.shape[1] not in (3, 7):
+            raise ViewError(f"'{name}': boxes stand at (n, 3) places or (n, 7) poses, found {rows.shape}")
+        finite(name, rows, "box")
+        edges = np.asarray(sizes, dtype=np.float64)
+        if edges.shape not in ((3,), (len(rows), 3)):
+            raise ViewError(f"'{name}': sizes are (3,) or ({len(rows)}, 3) [m], found {edges.shape}")
+        edges = np.broadcast_to(edges, (len(rows), 3)).copy()
+        finite(name, edges, "size")
+        if rows.shape[1] == 3:
+            rows = np.column_stack([rows, np.tile([1.0, 0.0, 0.0, 0.0], (len(rows), 1))])
+        layer = self._content.layer(name, "block", colour, legend)
+        given = {"poses": rows, "sizes": edges, "colour": layer.colour, "opacity": opacity, "level": layer.level}
+        half = 0.5 * np.linalg.norm(edges, axis=1)[:, None]
+        corners = np.concatenate([rows[:, :3] - half, rows[:, :3] + half])
+        self._drawn[name] = Thing(things.draw_boxes, given, corners, len(rows), _MARKS)
+
+    def map(self, name: str, occupancy: OccupancyMap | DistanceMap, *, height: float = 0.6,
+            legend: str | None = None) -> None:  # fmt: skip
+        """A map as floor and walls of a height [m]; of a distance map, walls where the distance is not positive.
+
+        Raises:
+            ViewError: it is neither an occupancy map nor a distance map.
+        """
+        if isinstance(occupancy, DistanceMap):
+            inside = occupancy.values <= 0.0
+            occupancy = OccupancyMap(inside, ~inside, occupancy.resolution, occupancy.origin)
+        if not isinstance(occupancy, OccupancyMap):
+            raise ViewError(
+                f"'{name}' is no map but {type(occupancy).__name__}: give what unifg.files.ros_map.load_map returns, "
+                "or a unifg.models.distance_map.DistanceMap"
+            )
+        corners = shapes.known_corners(occupancy)
+        box = np.concatenate([np.column_stack([corners, np.full(4, z)]) for z in (0.0, height)])
+        layer = self._content.layer(name, "block", "wall", legend)
+        given = {"occupancy": occupancy, "height": height, "level": layer.level}
+        self._drawn[name] = Thing(things.draw_walls, given, box)
+
+    def mesh(
+        self, name: str, mesh: Mesh, *, lit: bool = False, opacity: float = 1.0, swatch: str = "block",
+        colour: str | None = None, legend: str | None = None,
+    ) -> None:  # fmt: skip
+        """Triangles, as made by `unifg.view.shapes`: vertices (n, 3) [m] and faces (m, 3).
+
+        Raises:
+            ViewError: a vertex is not finite.
+        """
+        vertices = np.asarray(mesh[0], dtype=np.float64)
+        finite(name, vertices, "vertex")
+        layer = self._content.layer(name, swatch, colour, legend)
+        given = {"mesh": mesh, "colour": layer.colour, "lit": lit, "opacity": opacity, "level": layer.level}
+        self._drawn[name] = Thing(things.draw_mesh, given, np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
+
+    def colour(self, name: str) -> str:
+        """What a layer is drawn in."""
+        return self._content.layers[name].colour
+
+    def _places(self, name: str, points: ArrayLike) -> tuple[Array, bool]:
+        """(n, 3) places, and whether they lie in the plane."""
+        rows = np.asarray(points, dtype=np.float64)
+        rows = rows.reshape(-1, rows.shape[-1] if rows.ndim > 1 else 2) if rows.size == 0 else np.atleast_2d(rows)
+        if rows.ndim != 2 or rows.shape[1] not in (2, 3):
+            raise ViewError(f"'{name}': places are (n, 2) or (n, 3) [m], found {rows.shape}")
+        finite(name, rows, "place")
+        flat = rows.shape[1] == 2
+        return (np.column_stack([rows, np.zeros(len(rows))]) if flat else rows.copy()), flat
+
+
+class Frame(Shot, Canvas):
+    """What is seen while its turn lasts; made by :meth:`Scene.frame`.
+
+    As a context it is shown, live, when the block ends.
+    """
+
+    def __init__(self, content: Content, number: int) -> None:
+        """Hold nothing."""
+        Shot.__init__(self, number)
+        Canvas.__init__(self, content, self.things)
+
+    def place(self, name: str, pose: ArrayLike, *, scale: ArrayLike = (1.0, 1.0, 1.0)) -> None:
+        """Put a body of the scene somewhere; a frame that does not place it does not show it.
+
+        Args:
+            name: given to :meth:`Scene.body`.
+            pose: (3,) x, y, theta on the ground, or (7,) position and quaternion (w, x, y, z).
+            scale: (3,) by which it is stretched along its own axes.
+
+        Raises:
+            ViewError: there is no such body, or the pose has another shape or is not finite.
+        """
+        if name not in self._content.bodies:
+            known = ", ".join(f"'{body}'" for body in self._content.bodies) or "none"
+            raise ViewError(f"there is no body '{name}' (there are: {known}): make it by scene.body('{name}', ...)")
+        row = np.array(pose, dtype=np.float64)
+        if row.shape not in ((3,), (7,)):
+            raise ViewError(f"'{name}': a body is placed at (3,) x, y, theta or (7,) poses, found {row.shape}")
+        finite(name, row[None], "pose")
+        stretch = np.broadcast_to(np.asarray(scale, dtype=np.float64), (3,))
+        if len(row) == 3:
+            half = 0.5 * row[2]
+            row = np.array([row[0], row[1], 0.0, math.cos(half), 0.0, 0.0, math.sin(half)])
+        self.placed[name] = Placement(row[:3], row[3:], stretch)
+
+    def trail(self, name: str, place: ArrayLike, *, colour: str | None = None, legend: str | None = None) -> None:
+        """A place (2,) or (3,) [m] of a way that grows from frame to frame and stays.
+
+        Raises:
+            ViewError: the shape is another, or a number is not finite.
+        """
+        places, _ = self._places(name, np.asarray(place, dtype=np.float64)[None])
+        self._content.layer(name, "line", colour, legend)
+        self._content.flat_trails.setdefault(name, np.size(place) == 2)
+        self.trails[name] = places[0]
+
+    def readout(self, name: str, text: str, *, alarm: bool = False) -> None:
+        """A line of the panel; red where it is an alarm."""
+        self._content.readouts.setdefault(name)
+        self.texts[name] = text, alarm
+
+    def value(self, name: str, value: float) -> None:
+        """A number that the strip below the picture plots over the frames; NaN leaves a gap."""
+        if name not in self._content.plots:
+            self._content.plots[name] = Plot(name)
+        self.values[name] = float(value)
+
+    def __enter__(self) -> Frame:
+        """Itself."""
+        return self
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        """Show it, where somebody watches; a frame that was given up is not shown."""
+        if kind is None:
+            for watcher in list(self._content.watchers):
+                watcher(self)

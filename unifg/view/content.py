@@ -1,0 +1,146 @@
+"""What a scene consists of, before anybody shows it."""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from unifg.errors import ViewError
+from unifg.style.colours import rgb
+from unifg.typing import Array
+from unifg.view.bodies import Part
+from unifg.view.page import Key, Label, Plot, View
+from unifg.view.things import Thing
+
+__all__ = ["Body", "Content", "Layer", "Placement", "Shot"]
+
+_PALETTE = ("robot", "landmark", "horizon", "estimate", "moving", "trail", "odometry", "plan")
+_RESERVED = re.compile(r"[%/<>\x00-\x1f]")
+
+
+@dataclass
+class Layer:
+    """Everything of one name.
+
+    Attributes:
+        path: of its objects.
+        level: rank from the ground up.
+        key: its line of the legend, None for none.
+        colour: of what is drawn without saying which.
+    """
+
+    path: str
+    level: int
+    key: Key | None
+    colour: str
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a body is: position (3,) [m], attitude (w, x, y, z), and how it is stretched along its axes."""
+
+    position: Array
+    attitude: Array
+    scale: Array
+
+
+@dataclass
+class Body:
+    """Something rigid that frames place.
+
+    Attributes:
+        parts: its meshes.
+        reach: radius of a ball around its origin that holds it [m].
+    """
+
+    parts: Sequence[Part]
+    reach: float
+
+
+class Shot:
+    """One frame.
+
+    Attributes:
+        number: in the order of making.
+        things: seen in this frame, by layer.
+        placed: bodies, by name.
+        trails: a place (3,) [m] of each way that grows.
+        texts: of readouts, each with whether it is an alarm.
+        values: that are plotted.
+    """
+
+    def __init__(self, number: int) -> None:
+        """Hold nothing."""
+        self.number = number
+        self.things: dict[str, Thing] = {}
+        self.placed: dict[str, Placement] = {}
+        self.trails: dict[str, Array] = {}
+        self.texts: dict[str, tuple[str, bool]] = {}
+        self.values: dict[str, float] = {}
+
+
+class Content:
+    """A whole scene.
+
+    Attributes:
+        title: of the page.
+        dt: time between two frames [s]; None where they are merely counted.
+        counts: what is counted then, such as "iteration".
+        outcome: a word below the title, green where ``good``.
+        facts: names and values, below that; empty values are left out.
+        shots: the frames.
+        views: of the camera, the first one at the start; by default some that suit what is there.
+        labels: words in the picture.
+        numbers: what is counted, one per frame; None for 0, 1, ...
+        speeds: to choose from where time passes.
+        whole: whether the view of everything holds every frame, or only the last one and what stays.
+        ground: whether lines on the ground give the scale.
+        things: what stays, by layer.
+        layers: everything drawn, by name.
+        bodies: what frames may place.
+        readouts: names of the lines of the panel, in order.
+        plots: how numbers are plotted.
+        flat_trails: which ways that grow lie in the plane.
+        watchers: to be told of each frame that is done.
+    """
+
+    def __init__(self, title: str, dt: float | None, counts: str) -> None:
+        """Begin with nothing."""
+        self.title, self.dt, self.counts = title, dt, counts
+        self.outcome, self.good = "", True
+        self.facts: dict[str, str] = {}
+        self.shots: list[Shot] = []
+        self.views: list[View] = []
+        self.labels: list[Label] = []
+        self.numbers: list[int] | None = None
+        self.speeds: tuple[float, ...] = (0.25, 0.5, 1, 2, 4, 8)
+        self.whole = self.ground = True
+        self.things: dict[str, Thing] = {}
+        self.layers: dict[str, Layer] = {}
+        self.bodies: dict[str, Body] = {}
+        self.readouts: dict[str, None] = {}
+        self.plots: dict[str, Plot] = {}
+        self.flat_trails: dict[str, bool] = {}
+        self.watchers: list[Callable[[Shot], None]] = []
+        self.lock = threading.RLock()
+
+    def layer(self, name: str, swatch: str, colour: str | None, legend: str | None) -> Layer:
+        """The layer of a name; a new one gets a line of the legend.
+
+        Raises:
+            ViewError: the name is empty, or there is no such colour.
+        """
+        if not name:
+            raise ViewError("a name is empty: it is the line of the legend")
+        with self.lock:
+            layer = self.layers.get(name)
+            if layer is None:
+                chosen = colour or _PALETTE[len(self.layers) % len(_PALETTE)]
+                rgb(chosen)
+                path = _RESERVED.sub(lambda found: f"%{ord(found[0]):02x}", name)
+                text = name if legend is None else legend
+                key = Key(chosen, swatch, text, [path]) if text else None
+                layer = self.layers[name] = Layer(path, len(self.layers) + 1, key, chosen)
+        return layer

@@ -1,0 +1,135 @@
+"""What can be drawn of the members of a family: where they are, how they are turned, how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from unifg.errors import ViewError
+from unifg.language.variables import Selection
+from unifg.lie import SE2, SE3, Manifold, Product, Rn
+from unifg.typing import Array
+
+__all__ = ["Position", "Reading", "finite", "reading_of"]
+
+Position: TypeAlias = Callable[[Array], Array]
+"""Takes stored values (n, storage), returns (n, 2) or (n, 3) places [m] or (n, 7) poses, quaternion w first."""
+
+_STEP = 1e-5  # of differences, in the tangent space
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How the members of a family are read.
+
+    Attributes:
+        name: of the family, with its component.
+        kind: "plane" for poses (x, y, theta), "space" for poses (position, quaternion w first), "points" for places.
+        manifold: of the members.
+        position: for members that are none of the three.
+    """
+
+    name: str
+    kind: str
+    manifold: Manifold
+    position: Position | None = None
+
+    def read(self, values: Array) -> tuple[Array, Array | None]:
+        """Places (n, 2) or (n, 3) [m], and poses (n, 3) or (n, 7) of what has an attitude, of values (n, storage).
+
+        Raises:
+            ViewError: something is not finite, or the function for positions returns something else.
+        """
+        finite(self.name, values)
+        if self.position is None:
+            size = {"plane": 2, "space": 3}.get(self.kind, values.shape[1])
+            return values[:, :size], None if self.kind == "points" else values
+        given = np.asarray(self.position(values), dtype=np.float64)
+        if given.ndim != 2 or len(given) != len(values) or given.shape[1] not in (2, 3, 7):
+            raise ViewError(
+                f"'{self.name}': position= was given {values.shape} and returned {given.shape}; return "
+                f"({len(values)}, 2) or ({len(values)}, 3) places, or ({len(values)}, 7) positions and quaternions"
+            )
+        finite(self.name, given, "place")
+        return (given[:, :3], given) if given.shape[1] == 7 else (given, None)
+
+    def covariances(self, values: Array, marginals: Array) -> Array:
+        """Covariances of the places in the world, (n, p, p) [m^2].
+
+        Args:
+            values: (n, storage).
+            marginals: (n, d, d), in the tangent space.
+        """
+        if self.position is None and self.kind == "points":
+            return marginals
+        if self.position is None:
+            size = 2 if self.kind == "plane" else 3
+            group = SE2 if self.kind == "plane" else SE3
+            slopes = group.matrix(values)[:, :size, :size]  # p Exp(d) = p + R d_p + ...
+            marginals = marginals[:, :size, :size]
+        else:
+            slopes = self._slopes(values, marginals.shape[-1])
+        result: Array = slopes @ marginals @ slopes.transpose(0, 2, 1)
+        return result
+
+    def _slopes(self, values: Array, dim: int) -> Array:
+        """(n, p, d) derivatives of the places, by central differences."""
+        columns = []
+        for k in range(dim):
+            step = np.zeros((len(values), dim))
+            step[:, k] = _STEP
+            ahead, behind = (self.read(self.manifold.retract(values, way * step))[0] for way in (1.0, -1.0))
+            columns.append((ahead - behind) / (2.0 * _STEP))
+        return np.stack(columns, axis=2)
+
+
+def reading_of(selection: Selection, position: Position | None) -> Reading:
+    """How a family or a part of it is read.
+
+    Args:
+        selection: the family, some of its members, or a component.
+        position: where a member is, for what is neither a pose nor a point.
+
+    Raises:
+        ViewError: there is no telling where its members are.
+    """
+    name = selection.family.name + (f".{selection.component}" if selection.component else "")
+    manifold = selection.manifold
+    if position is not None:
+        return Reading(name, "points", manifold, position)
+    kind = _kind(manifold)
+    if kind is not None:
+        return Reading(name, kind, manifold)
+    if isinstance(manifold, Product) and selection.component is None:
+        parts = [part for part, component in manifold.components.items() if _kind(component.manifold)]
+        way = f"name a component ({' or '.join(f'{name}.{part}' for part in parts)}), or give" if parts else "give"
+    else:
+        way = "give"
+    raise ViewError(
+        f"'{name}' of {manifold.name} cannot be drawn: its members have no place. SE2, SE3, Rn(2) and Rn(3) have one; "
+        f"{way} position=lambda values: (n, 2) or (n, 3) places",
+        family=selection.family.name,
+    )
+
+
+def finite(name: str, values: Array, what: str = "member") -> None:
+    """Refuse what is not finite.
+
+    Raises:
+        ViewError: a number is NaN or infinite; the message says whose.
+    """
+    good = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+    if not good.all():
+        k = int(np.argmin(good))
+        raise ViewError(f"'{name}': {what} {k} is {values[k].tolist()}, which has no place in a picture", index=k)
+
+
+def _kind(manifold: Manifold) -> str | None:
+    if manifold == SE2:
+        return "plane"
+    if manifold == SE3:
+        return "space"
+    return "points" if isinstance(manifold, Rn) and manifold.storage in (2, 3) else None

@@ -1,0 +1,266 @@
+"""A whole scene on a stage: every frame in turn, bodies moved through all of them, ways that grow bit by bit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from unifg.errors import ViewError
+from unifg.typing import Array
+from unifg.view import shapes, things
+from unifg.view.content import Body, Content, Layer, Shot
+from unifg.view.page import Key, Label, Page, Plot, Readout, View
+from unifg.view.stage import Stage
+from unifg.view.things import Thing
+
+__all__ = ["Ground", "default_views", "ground_of", "labels_of", "lay_ground", "legend_of", "recorded", "set_body"]
+
+FAR = 100.0  # a scene farther from the origin than this many times its size is moved there
+STROKE = 0.0022  # half width of lines, over the size of the scene
+COUNTED = 0.5  # seconds a frame is shown where frames are merely counted; sums of it are exact, as seeking needs
+_HALF = np.array([0.5, 0.5, 0.0])  # around a single place [m]
+_AROUND = 0.3  # of the size of what is looked at: how much more a view of everything shows of earlier frames
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Where a scene lies and how large it is.
+
+    Attributes:
+        low, high: (3,) corners of everything [m].
+        origin: (3,) of the stage [m].
+        size: longest edge between the corners [m].
+        flat: whether everything lies in the plane.
+    """
+
+    low: Array
+    high: Array
+    origin: Array
+    size: float
+    flat: bool
+
+    @property
+    def stroke(self) -> float:
+        """Half width of lines [m]."""
+        return STROKE * self.size
+
+    @property
+    def corners(self) -> Array:
+        """(8, 3) corners on the stage [m]."""
+        box = np.stack([self.low, self.high]) - self.origin
+        return np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)
+
+
+def recorded(content: Content) -> Stage:
+    """Put a scene on a stage.
+
+    Raises:
+        ViewError: nothing is drawn, or meshcat is not installed.
+    """
+    shots = content.shots or [Shot(0)]
+    ground = ground_of(content, shots)
+    dt = COUNTED if content.dt is None else content.dt
+    stage = Stage(len(shots), dt, origin=ground.origin, stroke=ground.stroke)
+    thinned: dict[str, str] = {}
+    for name, thing in content.things.items():
+        _draw(stage, content.layers[name], [(0, None, thing)], thinned)
+    step = lay_ground(stage, content, ground)
+    for name, layer in content.layers.items():
+        _draw(stage, layer, _turns(stage, shots, name), thinned)
+    for name, body in content.bodies.items():
+        _move(stage, content.layers[name], body, shots, name)
+    for name, flat in content.flat_trails.items():
+        _grow(stage, content.layers[name], shots, name, flat)
+    facts = dict(content.facts)
+    if step:
+        facts["grid"] = f"{step:g} m"
+    if ground.origin.any():
+        facts["shown around"] = "(" + ", ".join(f"{value:.0f}" for value in ground.origin) + ") m"
+    facts |= thinned
+    ticks = stage.ticks.tolist()
+    chosen = [shots[tick] for tick in ticks]
+    numbers = list(range(len(shots))) if content.numbers is None else content.numbers
+    page = Page(
+        title=content.title,
+        outcome=content.outcome,
+        good=content.good,
+        facts=facts,
+        corners=ground.corners,
+        legend=legend_of(content, shots),
+        labels=labels_of(content, ground),
+        readouts=[_readout(name, chosen) for name in content.readouts],
+        views=content.views or default_views(content, ground),
+        speeds=() if content.dt is None else content.speeds,
+        counts="time" if content.dt is not None else content.counts,
+        numbers=[] if content.dt is not None else [numbers[tick] for tick in ticks],
+        plots=[replace(plot, values=_values(plot, chosen)) for plot in content.plots.values() if len(shots) > 1],
+    )
+    return stage.finish(page)
+
+
+def ground_of(content: Content, shots: list[Shot]) -> Ground:
+    """Where the things of a scene lie.
+
+    Raises:
+        ViewError: there are none.
+    """
+    last, earlier = _box(content, shots[-1:]), _box(content, shots)
+    if earlier is None:
+        raise ViewError("nothing is drawn: give families to Scene.of, or draw on the scene or on a frame of it")
+    low, high = earlier
+    if last is not None and not content.whole:
+        reach = _AROUND * float((last[1] - last[0]).max())
+        low, high = np.maximum(low, last[0] - reach), np.minimum(high, last[1] + reach)
+    size = float((high - low).max())
+    flat = float(np.abs([low[2], high[2]]).max()) == 0.0
+    if size == 0.0:
+        size, low, high = 1.0, low - _HALF, high + _HALF
+    far = float(np.abs([low, high]).max()) > FAR * size
+    origin = np.round(0.5 * (low + high)) if far else np.zeros(3)
+    if flat:
+        origin[2] = 0.0
+    return Ground(low, high, origin, size, flat)
+
+
+def lay_ground(stage: Stage, content: Content, ground: Ground) -> float:
+    """Draw lines on the ground, unless there is a map; returns their distance [m], 0 for none."""
+    if not content.ground or any(thing.draw is things.draw_walls for thing in content.things.values()):
+        return 0.0
+    decade = 10.0 ** math.floor(math.log10(ground.size / 8.0))
+    step = next(decade * k for k in (1.0, 2.0, 5.0, 10.0) if decade * k >= ground.size / 12.0)
+    margin = 0.08 * ground.size
+    left, low = np.floor((ground.low[:2] - margin) / step) * step
+    right, high = np.ceil((ground.high[:2] + margin) / step) * step
+    z = min(0.0, float(ground.low[2])) - 0.5 * stage.stroke
+    xs, ys = (np.arange(round((b - a) / step) + 1) * step + a for a, b in ((left, right), (low, high)))
+    across = [[[x, low, z], [x, high, z]] for x in xs.tolist()]
+    along = [[[left, y, z], [right, y, z]] for y in ys.tolist()]
+    stage.lines("%grid", np.array(across + along), "grid")
+    return float(step)
+
+
+def set_body(stage: Stage, layer: Layer, body: Body) -> None:
+    """Put the meshes of a body on a stage, around its own origin."""
+    with stage.around():
+        for part in body.parts:
+            path = f"{layer.path}/parts/{part.name}"
+            stage.mesh(path, part.mesh, part.colour, lit=part.lit, opacity=part.opacity)
+
+
+def legend_of(content: Content, shots: list[Shot]) -> list[Key]:
+    """The lines of the legend whose things are there."""
+    there = set(content.things)
+    for shot in shots:
+        there |= shot.things.keys() | shot.placed.keys() | shot.trails.keys()
+    return [layer.key for name, layer in content.layers.items() if layer.key is not None and name in there]
+
+
+def labels_of(content: Content, ground: Ground) -> list[Label]:
+    """Labels at places of the stage, and with paths in place of names."""
+    return [
+        replace(
+            label,
+            at=None if label.at is None else (np.array(label.at) - ground.origin).tolist(),
+            follows=None if label.follows is None else content.layers[label.follows].path,
+        )
+        for label in content.labels
+    ]
+
+
+def default_views(content: Content, ground: Ground) -> list[View]:
+    """From above for what lies in the plane, from the side as well for what does not, and along with each body."""
+    above = View("above", "From above", (0.0, -1e-4, 1.0), 20.0)
+    slant = (0.0, -math.cos(1.1), math.sin(1.1)) if ground.flat else (0.55, -0.67, 0.5)
+    views = [above] if ground.flat else [View("overview", "Overview", slant, 20.0), above]
+    for name, body in content.bodies.items():
+        distance = max(25.0 * body.reach, 0.5 * ground.size)
+        views.append(View(f"follow {name}", f"Follow {name}", slant, 20.0, name, distance))
+    return views
+
+
+def _box(content: Content, shots: list[Shot]) -> tuple[Array, Array] | None:
+    """Corners of everything that some frames hold, and of what stays; None of nothing."""
+    parts = [thing.corners for thing in content.things.values()]
+    for shot in shots:
+        parts += [thing.corners for thing in shot.things.values()]
+        parts += [place[None] for place in shot.trails.values()]
+        for name, placed in shot.placed.items():
+            reach = content.bodies[name].reach * float(np.abs(placed.scale).max())
+            lift = 0.0 if placed.position[2] == 0.0 else reach
+            arm = np.array([reach, reach, lift])
+            parts.append(np.stack([placed.position - arm, placed.position + arm]))
+    parts = [part for part in parts if len(part)]
+    if not parts:
+        return None
+    return np.min([part.min(axis=0) for part in parts], axis=0), np.max([part.max(axis=0) for part in parts], axis=0)
+
+
+def _turns(stage: Stage, shots: list[Shot], name: str) -> list[tuple[int, int | None, Thing]]:
+    """What a layer shows, each from a tick to another; what stays the same is one thing."""
+    runs: list[tuple[int, int | None, Thing]] = []
+    for tick, following in stage.turns():
+        thing = shots[tick].things.get(name)
+        if thing is None:
+            continue
+        if runs and runs[-1][1] == tick and thing.same(runs[-1][2]):
+            runs[-1] = (runs[-1][0], following, runs[-1][2])
+        else:
+            runs.append((tick, following, thing))
+    return runs
+
+
+def _draw(stage: Stage, layer: Layer, runs: list[tuple[int, int | None, Thing]], thinned: dict[str, str]) -> None:
+    members = [thing.members for _, _, thing in runs]
+    if not members:
+        return
+    budget = runs[0][2].budget
+    most = max(members) if sum(members) <= budget else max(2, budget // len(members))
+    if most < max(members):
+        thinned[f"{layer.path}, thinned"] = f"{most} of {max(members)}"
+    for begin, end, thing in runs:
+        always = begin == 0 and end is None
+        path = layer.path if always else f"{layer.path}/{begin}"
+        thing.draw(stage, path, most, **thing.given)
+        if not always:
+            stage.appear(path, begin, end)
+
+
+def _move(stage: Stage, layer: Layer, body: Body, shots: list[Shot], name: str) -> None:
+    """Animate a body; where it is not placed it is not seen."""
+    if not any(name in shots[tick].placed for tick in stage.ticks):
+        return
+    set_body(stage, layer, body)
+    stretched = any(bool((shot.placed[name].scale != 1.0).any()) for shot in shots if name in shot.placed)
+    seen = [name in shots[tick].placed for tick in stage.ticks]
+    for k, tick in enumerate(stage.ticks.tolist()):
+        placed = shots[tick].placed.get(name)
+        if not all(seen) and (k == 0 or seen[k] != seen[k - 1] or tick == stage.last):
+            stage.key(f"{layer.path}/parts", tick, visible=seen[k])
+        if placed is not None:
+            stage.key(layer.path, tick, position=placed.position, quaternion=placed.attitude)
+            if stretched:
+                stage.key(f"{layer.path}/parts", tick, scale=np.maximum(placed.scale, 1e-9))
+
+
+def _grow(stage: Stage, layer: Layer, shots: list[Shot], name: str, flat: bool) -> None:
+    for begin, end in stage.pieces():
+        places = [shot.trails[name] for shot in shots[begin : end + 1] if name in shot.trails]
+        points = shapes.thin(np.array(places), 3) if len(places) > 1 else np.zeros((0, 3))
+        if len(points) > 1:
+            path = f"{layer.path}/{begin}"
+            things.draw_way(
+                stage, path, len(points), points=points, flat=flat, colour=layer.colour, width=None, level=layer.level
+            )
+            stage.appear(path, end)
+
+
+def _readout(name: str, shots: list[Shot]) -> Readout:
+    rows = [shot.texts.get(name, ("\u2013", False)) for shot in shots]
+    return Readout(name, [text for text, _ in rows], [alarm for _, alarm in rows])
+
+
+def _values(plot: Plot, shots: list[Shot]) -> list[float | None]:
+    values = [shot.values.get(plot.name, math.nan) for shot in shots]
+    return [value if math.isfinite(value) else None for value in values]

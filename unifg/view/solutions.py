@@ -1,0 +1,190 @@
+"""What is drawn of a solution: its families, how sure they are, and its factors as lines between what they touch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from unifg.answers.solution import Solution
+from unifg.errors import ViewError
+from unifg.language.variables import Family, Selection, Variable, as_selection
+from unifg.typing import Array, IntArray
+from unifg.view.canvas import Canvas, Frame
+from unifg.view.members import Position, Reading, reading_of
+
+__all__ = ["Recipe", "recipe_of"]
+
+_ALONG = 20  # ellipses along a way
+
+Values = Mapping[Family, Array]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A family, or a part of it, with how it is read."""
+
+    selection: Selection
+    reading: Reading
+
+    @property
+    def name(self) -> str:
+        """Of its layer."""
+        return self.reading.name
+
+    @property
+    def joined(self) -> bool:
+        """Whether its members are a way: those of a family of bare points are not."""
+        return self.reading.kind != "points" or self.reading.position is not None or bool(self.selection.component)
+
+    def of(self, values: Values) -> Array:
+        """(n, storage) values of the members shown."""
+        return values[self.selection.family][self.selection.indices][:, self.selection.storage]
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What to draw of every solution of a graph.
+
+    Attributes:
+        shown: families, in order.
+        sigmas: half axes of ellipses in standard deviations; None draws none.
+        terms: whose factors are lines.
+        position: where members are that are neither poses nor points.
+    """
+
+    shown: Sequence[Shown]
+    sigmas: float | None
+    terms: Sequence[str]
+    position: Position | None
+
+    def draw(self, canvas: Canvas, values: Values, solution: Solution | None, terms_of: Solution) -> None:
+        """Draw some values.
+
+        Args:
+            canvas: to draw on.
+            values: of all families.
+            solution: whose covariances are those of the values, if any is.
+            terms_of: a solution of the graph.
+
+        Raises:
+            ViewError: a value is not finite.
+            GraphError: covariances are asked for and do not exist.
+        """
+        for entry in self.shown:
+            places, poses = entry.reading.read(entry.of(values))
+            if entry.joined and len(places) != 1:
+                canvas.way(entry.name, places)
+            if poses is not None:
+                if len(places) == 1:
+                    canvas.poses(entry.name, poses)
+                else:
+                    canvas.poses(f"{entry.name}: poses", poses, colour=canvas.colour(entry.name))
+            elif not entry.joined or len(places) == 1:
+                canvas.points(entry.name, places)
+            if self.sigmas is not None and solution is not None and len(places):
+                some = _few(len(places)) if entry.joined else np.arange(len(places))
+                marginals = solution.marginals(entry.selection[some])
+                spread = entry.reading.covariances(entry.of(values)[some], marginals)
+                name = f"{entry.name}: {self.sigmas:g}\u03c3"
+                canvas.covariances(name, places[some], spread, sigmas=self.sigmas, colour="estimate")
+        for term in self.terms:
+            canvas.lines(term, self._lines(term, values, terms_of))
+
+    def tell(self, frame: Frame, solution: Solution) -> None:
+        """Say how a solve went."""
+        frame.readout("solver", solution.solver)
+        frame.readout("status", solution.status.name.lower().replace("_", " "), alarm=not solution.converged)
+        frame.readout("iterations", str(solution.iterations))
+        frame.readout("cost", f"{solution.cost:.6g}")
+        frame.value("solve time", 1e3 * solution.seconds)
+
+    def _lines(self, term: str, values: Values, solution: Solution) -> Array:
+        """(n, 2, 2 or 3) between the first variable of each factor that has a place and each other one."""
+        ends = []
+        for selection in solution.selections(term):
+            try:
+                reading = reading_of(selection, None)
+            except ViewError:
+                if self.position is None:
+                    continue  # controls, biases, ...: they are nowhere
+                reading = reading_of(selection, self.position)
+            ends.append(reading.read(Shown(selection, reading).of(values))[0])
+        if len(ends) < 2:
+            raise ViewError(
+                f"the factors of '{term}' touch {len(ends)} variable{'s' * (len(ends) != 1)} with a place: "
+                "a line needs two",
+                term=term,
+            )
+        size, count = max(end.shape[1] for end in ends), max(len(end) for end in ends)
+        full = [np.pad(end, ((0, 0), (0, size - end.shape[1]))) for end in ends]
+        full = [np.broadcast_to(end, (count, size)) for end in full]
+        return np.concatenate([np.stack([full[0], end], axis=1) for end in full[1:]])
+
+
+def _few(count: int) -> IntArray:
+    """Members of a way whose ellipses can still be told apart, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, _ALONG).round().astype(np.intp))
+
+
+def recipe_of(
+    solution: Solution,
+    shown: Sequence[Variable],
+    sigmas: float | None,
+    terms: Sequence[str],
+    position: Position | None,
+) -> Recipe:
+    """What to draw of a solution.
+
+    Args:
+        solution: of the graph.
+        shown: families or parts of them; none for all poses or, where there are none, all points.
+        sigmas: half axes of ellipses in standard deviations.
+        terms: names.
+        position: for what is neither a pose nor a point.
+
+    Raises:
+        ViewError: a family cannot be drawn, or none can.
+        GraphError: the graph has no such term or family.
+    """
+    if sigmas is not None and not (np.isfinite(sigmas) and sigmas > 0.0):
+        raise ViewError(f"sigmas={sigmas!r}: half axes are a positive number of standard deviations")
+    entries: list[Shown] = []
+    if shown:
+        for variable in shown:
+            if not isinstance(variable, Family | Selection):
+                raise ViewError(
+                    f"Scene.of shows families and parts of them, found {type(variable).__name__}: draw arrays by "
+                    "scene.way, scene.points or scene.poses"
+                )
+            selection = as_selection(variable)
+            solution[selection]
+            entries.append(Shown(selection, _reading(selection, position)))
+    else:
+        tried: list[str] = []
+        for family in solution.values:
+            try:
+                entries.append(Shown(family[:], _reading(family[:], position)))
+            except ViewError:
+                tried.append(f"'{family.name}' of {family.manifold.name}")
+        poses = [entry for entry in entries if entry.reading.kind != "points"]
+        entries = poses or entries  # beside poses, a family of R^2 may as well be controls
+        if not entries:
+            raise ViewError(
+                f"no family of this solution has a place ({', '.join(tried)}): name a component, as in "
+                "Scene.of(solution, x.pose), or give position="
+            )
+    for term in terms:
+        solution.selections(term)
+    return Recipe(entries, sigmas, tuple(terms), position)
+
+
+def _reading(selection: Selection, position: Position | None) -> Reading:
+    """Poses and points are read as what they are, all else by the function, if there is one."""
+    try:
+        return reading_of(selection, None)
+    except ViewError:
+        if position is None:
+            raise
+        return reading_of(selection, position)
