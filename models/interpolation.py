@@ -22,7 +22,7 @@ from typing import TypeAlias
 import numpy as np
 
 from unifg.errors import ModelError
-from unifg.lie import SO3, LieGroup, Manifold, Product, Rn
+from unifg.lie import SE23, SO3, LieGroup, Manifold, Product, Rn
 from unifg.typing import Array
 
 Interpolation: TypeAlias = Callable[[Array, Array, Array, Array], Array]
@@ -39,15 +39,17 @@ def geodesic(manifold: Manifold) -> Interpolation:
 
 
 def cubic(manifold: Manifold) -> Interpolation:
-    """Cubics that know the velocities, for products of two kinds; other components move on geodesics.
+    """Cubics that know the velocities; other components of a product move on geodesics.
 
     Args:
-        manifold: with components ``pose``, a group, and ``velocity``, its velocity in the body's axes; or with
-            ``p``, ``R`` and ``v``, the last a velocity in the world's axes.
+        manifold: a product with components ``pose``, a group, and ``velocity``, its velocity in the body's axes; or
+            with ``p``, ``R`` and ``v``, the last a velocity in the world's axes; or SE23.
 
     Raises:
         ModelError: for another manifold.
     """
+    if manifold == SE23:
+        return _along_velocities(manifold, slice(0, 3), slice(3, 6))
     parts = {name: part.manifold for name, part in manifold.components.items()} if isinstance(manifold, Product) else {}
     pose, velocity = parts.get("pose"), parts.get("velocity")
     if isinstance(manifold, Product) and isinstance(pose, LieGroup) and velocity == Rn(pose.dim):
@@ -56,7 +58,7 @@ def cubic(manifold: Manifold) -> Interpolation:
         return _along_velocities(manifold, manifold.component("p").storage, manifold.component("v").storage)
     raise ModelError(
         f"cubic needs velocities, which {manifold.name} has not: make it a product with components pose (a group) and "
-        "velocity (Rn of the same dimension), or p, R, v (Rn(3), SO3, Rn(3)); or use geodesic"
+        "velocity (Rn of the same dimension), or p, R, v (Rn(3), SO3, Rn(3)), or SE23; or use geodesic"
     )
 
 

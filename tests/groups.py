@@ -9,7 +9,7 @@ import numpy as np
 from numpy.random import Generator
 from scipy.linalg import expm
 
-from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Product, Rn
+from unifg.lie import SE2, SE3, SE23, SO2, SO3, LieGroup, Product, Rn
 from unifg.typing import Array
 
 Batch: TypeAlias = tuple[int, ...]
@@ -34,6 +34,7 @@ CASES = {
     "SE2": Case(SE2, (slice(2, 3),), [2]),
     "SO3": Case(SO3, (slice(0, 3),), []),
     "SE3": Case(SE3, (slice(3, 6),), []),
+    "SE23": Case(SE23, (slice(6, 9),), []),
     "product": Case(Product(p=Rn(2), R=SO2, T=SE2), (slice(2, 3), slice(5, 6)), [2, 5]),
     "nested": Case(
         Product(robot=Product(T=SE2, v=Rn(2)), R=SO2, tool=Product(T=SE2)),

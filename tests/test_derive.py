@@ -11,7 +11,7 @@ import pytest
 import unifg as fg
 from unifg.kernels.derive.expression import Expression, traced
 from unifg.kernels.kernel import Argument, evaluate_rows
-from unifg.lie import SE2, SE3, SO2, SO3, Rn
+from unifg.lie import SE2, SE3, SE23, SO2, SO3, Rn
 from unifg.typing import Array
 
 Function = Callable[..., Any]
@@ -129,6 +129,11 @@ GROUPS: dict[str, tuple[Function, tuple[Argument, ...]]] = {
     "between on SE3": (lambda x, y, z: SE3.local(z, SE3.between(x, y)), (SE3, SE3, (7,))),
     "act on SE3": (lambda x, p: SE3.act(SE3.inverse(x), p), (SE3, Rn(3))),
     "exp on SE3": (lambda x, d: SE3.local(x, SE3.exp(d)), (SE3, Rn(6))),
+    "between on SE23": (lambda x, y, z: SE23.local(z, SE23.between(x, y)), (SE23, SE23, (10,))),
+    "act on SE23": (lambda x, p: SE23.act(SE23.inverse(x), p), (SE23, Rn(3))),
+    "exp on SE23": (lambda x, d: SE23.local(x, SE23.exp(d)), (SE23, Rn(9))),
+    "matrix of SE23": (lambda x: SE23.matrix(x).reshape(len(x), 25), (SE23,)),
+    "Jacobian on SE23": (lambda d: SE23.right_jacobian_inverse(d).reshape(len(d), 81), (Rn(9),)),
     "product": (lambda x, y: POSE.local(x, y), (POSE, POSE)),
     "bearing": (lambda x, p: SE3.act(SE3.inverse(x), p)[:, :2] / 3.0, (SE3, Rn(3))),
 }
@@ -137,7 +142,7 @@ GROUPS: dict[str, tuple[Function, tuple[Argument, ...]]] = {
 def points(arguments: Sequence[Argument], count: int, seed: int = 0) -> list[Array]:
     """One batch per argument; parameters on manifolds of the same size are points of them."""
     rng = np.random.default_rng(seed)
-    like: dict[Any, Any] = {(3,): SE2, (7,): SE3}
+    like: dict[Any, Any] = {(3,): SE2, (7,): SE3, (10,): SE23}
     drawn = []
     for argument in arguments:
         manifold: Any = like.get(argument, argument) if isinstance(argument, tuple) else argument

@@ -208,6 +208,41 @@ def spatial_chart(x: Array, y: Array, z: Array) -> Any:
     return np.concatenate([error[:, :3], error[:, 4:] * np.where(error[:, 3:4] < 0.0, -1.0, 1.0)], axis=1)
 
 
+def crossed(a: Array, b: Array) -> Any:
+    pairs = ((1, 2), (2, 0), (0, 1))
+    return np.stack([a[:, i] * b[:, j] - a[:, j] * b[:, i] for i, j in pairs], axis=1)
+
+
+def swung(w: Array, p: Array) -> Any:
+    """The integral of Exp(s w) p over s in [0, 1]."""
+    angle = np.linalg.norm(w, axis=1)[:, None]
+    once = crossed(w, p)
+    return p + (1.0 - np.cos(angle)) / angle**2 * once + (angle - np.sin(angle)) / angle**3 * crossed(w, once)
+
+
+def inertial_motion(at: tuple[slice, slice, slice]) -> Function:
+    """Of states whose position, velocity and orientation stand there."""
+    p, v, q = at
+
+    def motion(x: Array, y: Array, b: Array, seen: Array, by_bias: Array, reference: Array, h: Array) -> Any:
+        h, back = h[:, None], SO3.inverse(x[:, q])
+        fall = np.stack([0.0 * h[:, 0], 0.0 * h[:, 0], -9.81 * h[:, 0]], axis=1)
+        moved = SO3.act(back, y[:, p] - x[:, p] - h * x[:, v] - 0.5 * h * fall)
+        sped, turned = SO3.act(back, y[:, v] - x[:, v] - fall), SO3.compose(back, y[:, q])
+        back = SO3.inverse(seen[:, 6:])
+        moved, sped = SO3.act(back, moved - seen[:, :3]), SO3.act(back, sped - seen[:, 3:6])
+        shift = -np.einsum("nij,nj->ni", by_bias, b - reference)
+        w, turned = shift[:, 6:], SO3.compose(back, turned)
+        moved = swung(w, shift[:, :3]) + SO3.act(SO3.exp(w), moved)
+        sped = swung(w, shift[:, 3:6]) + SO3.act(SO3.exp(w), sped)
+        left = SO3.log(SO3.compose(SO3.exp(w), turned))
+        straight = SO3.right_jacobian_inverse(-left)
+        rows = [np.einsum("nij,nj->ni", straight, part) for part in (moved, sped)]
+        return np.concatenate([*rows, left], axis=1)
+
+    return motion
+
+
 def step(group: Any, F: Function, tableau: Tableau) -> Function:
     """The defect of a step, as the tableau says."""
     weights, matrix, ends, flat = tableau.weights, tableau.matrix, tableau.ends, tableau.flat
@@ -253,6 +288,8 @@ DEFINED: dict[str, Function] = {
     "obstacles.shortfall": shortfall(wall_distance), "potential.potential": repulsion(discs),
     "potential.potential, walls": repulsion(wall_distance), "potential.potential, vortex": repulsion(discs),
     "vehicle.dynamics": vehicle, "quadrotor.dynamics": undisturbed, "quadrotor.disturbed_dynamics": disturbed,
+    "inertial.motion": inertial_motion((slice(0, 3), slice(3, 6), slice(6, 10))),
+    "inertial.motion, in parts": inertial_motion((slice(0, 3), slice(7, 10), slice(3, 7))),
     "landmarks.bearing_range": bearing_range, "landmarks.height": height, "landmarks.tilt": tilt,
     "avoidance.cylinder_clearance": discs, "avoidance.landmark_clearance": landmark_clearance,
     "avoidance.segment_clearance": segments, "avoidance.sphere_clearance": spheres,
@@ -431,6 +468,18 @@ class Rigid(Rotation):
         return x[:3] + Rotation.act(self, x[3:], p)
 
 
+class Extended(Rigid):
+    """Of SE_2(3), what moves its points."""
+
+    def exp(self, d: Any, of: Function = closed) -> Any:
+        first, second = (Rigid.exp(self, C.array([*part, *d[6:]]), of) for part in (d[:3], d[3:6]))
+        return C.array([*first[:3], *second])
+
+    def compose(self, x: Any, y: Any) -> Any:
+        first, second = (Rigid.compose(self, *(C.array([*z[k : k + 3], *z[6:]]) for z in (x, y))) for k in (0, 3))
+        return C.array([*first[:3], *second])
+
+
 class SideBySide:
     def __init__(self, product: Any) -> None:
         self.parts = [(part, theirs(part.manifold)) for part in product.components.values()]
@@ -461,7 +510,7 @@ def theirs(manifold: Any) -> Any:
         return SideBySide(manifold)
     if isinstance(manifold, Rn):
         return Vector()
-    return {"SO2": Angle, "SE2": Planar, "SO3": Rotation, "SE3": Rigid}[manifold.name]()
+    return {"SO2": Angle, "SE2": Planar, "SO3": Rotation, "SE3": Rigid, "SE23": Extended}[manifold.name]()
 
 
 class Batch:

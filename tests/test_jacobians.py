@@ -20,10 +20,12 @@ from unifg.models import (
     avoidance,
     bicycle,
     cart_pole,
+    inertial,
     landmarks,
     lidar,
     manipulator,
     obstacles,
+    preintegration,
     quadrotor,
     rkmk,
     unicycle,
@@ -195,6 +197,14 @@ CASES["landmarks.bearing_range"] = (
 )  # fmt: skip
 CASES["landmarks.height"] = (landmarks.height, [vectors(3)], [fg.Rn(3)], [RNG.normal(size=COUNT)])
 CASES["landmarks.tilt"] = (landmarks.tilt, [FLIGHT[0][:, 3:7]], [fg.SO3], [vectors(3)])
+INCREMENTS: list[object] = [
+    fg.SE23.random(RNG, (COUNT,)), 0.1 * RNG.normal(size=(COUNT, 9, 6)), vectors(6), np.linspace(0.1, 0.5, COUNT),
+]  # fmt: skip
+for inertial_case, states in (("inertial.motion", fg.SE23), ("inertial.motion, in parts", quadrotor.STATE)):
+    CASES[inertial_case] = (
+        inertial.motion(states), [states.random(RNG, (COUNT,)), states.random(RNG, (COUNT,)), vectors(6)],
+        [states, states, preintegration.BIAS], INCREMENTS,
+    )  # fmt: skip
 PLACES, WALL = vectors(3), RNG.normal(size=(5, 2, 2))
 CASES["avoidance.cylinder_clearance"] = (avoidance.cylinder_clearance, [PLACES], [fg.Rn(3)], DISCS)
 CASES["avoidance.landmark_clearance"] = (

@@ -30,6 +30,7 @@ WAYS: dict[str, tuple[fg.Manifold, Interpolation]] = {
     "cubic on SE2": (TWIST2, cubic(TWIST2)),
     "cubic on SE3": (TWIST3, cubic(TWIST3)),
     "cubic in space": (INERTIAL, cubic(INERTIAL)),
+    "cubic on SE23": (fg.SE23, cubic(fg.SE23)),
 }
 
 
@@ -111,6 +112,8 @@ def test_constant_acceleration_is_exact_for_cubics_and_off_by_an_eighth_for_geod
     x, y, middle = states
     half, step = np.array([0.5]), np.array([h])
     assert np.abs(INERTIAL.local(middle, cubic(INERTIAL)(x, y, half, step))).max() < 1e-14
+    first, last, between = (fg.SE23.from_parts(*(INERTIAL.unpack(z)[k] for k in "pvR")) for z in (x, y, middle))
+    np.testing.assert_allclose(cubic(fg.SE23)(first, last, half, step), between, atol=1e-14)
     straight = INERTIAL.unpack(geodesic(INERTIAL)(x, y, half, step))["p"] - INERTIAL.unpack(middle)["p"]
     np.testing.assert_allclose(straight[0], a * h**2 / 8.0, atol=1e-14)
 

@@ -41,6 +41,7 @@ from unifg.language.variables import Data, Family, Selection
 from unifg.lie import (
     SE2,
     SE3,
+    SE23,
     SO2,
     SO3,
     Axioms,
@@ -70,6 +71,7 @@ __all__ = [
     "DCS",
     "SE2",
     "SE3",
+    "SE23",
     "SO2",
     "SO3",
     "Axioms",

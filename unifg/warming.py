@@ -26,7 +26,7 @@ from unifg.kernels.kernel import Kernel, evaluate_rows
 from unifg.kernels.residuals import Residual
 from unifg.kernels.robust import DCS, Cauchy, GemanMcClure, Huber, TruncatedLeastSquares, Tukey
 from unifg.language.factors import between, difference, prior
-from unifg.lie import SE2, SE3, SO2, SO3, Product, Rn
+from unifg.lie import SE2, SE3, SE23, SO2, SO3, Product, Rn
 from unifg.lie.elementwise import LAYOUTS, STORAGE
 from unifg.lie.manifold import LieGroup
 from unifg.machine.jit import folder_of, processor
@@ -35,6 +35,7 @@ from unifg.machine.tally import Tally, counting
 from unifg.models import obstacles, unicycle
 from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.models.lidar import endpoint, endpoint_loss
+from unifg.models.preintegration import ImuNoise, preintegrate
 from unifg.pose_graphs import Simulated, manhattan, sphere
 from unifg.smoothing import FixedLag, Incremental
 from unifg.solvers import SQP, AugmentedLagrangian, GraduatedNonConvexity, InteriorPoint
@@ -43,7 +44,7 @@ from unifg.solvers.names import TABLE, backend
 Job: TypeAlias = tuple[str, Callable[[], object]]
 Progress: TypeAlias = Callable[[float, str], object]
 
-GROUPS: tuple[LieGroup, ...] = (SE2, SE3, SO2, SO3, Rn(1), Rn(2), Rn(3), Product(pose=SE2, velocity=Rn(2)))
+GROUPS: tuple[LieGroup, ...] = (SE2, SE3, SE23, SO2, SO3, Rn(1), Rn(2), Rn(3), Product(pose=SE2, velocity=Rn(2)))
 LOSSES = (Huber(1.0), Cauchy(1.0), GemanMcClure(1.0), Tukey(1.0), TruncatedLeastSquares(1.0), DCS(1.0))
 
 
@@ -106,6 +107,7 @@ def jobs() -> Iterator[Job]:
         yield f"group {group.name}", partial(_use, group)
     yield "models", _models
     yield "driving", _drive
+    yield "inertial", _integrate
     for simulated, name in ((manhattan(60, outliers=0.1), "plane"), (sphere(4, 8, outliers=0.1), "space")):
         yield f"pose graph in {name}", partial(_pose_graph, simulated)
         yield f"smoothing in {name}", partial(_smooth, simulated)
@@ -179,6 +181,11 @@ def _drive() -> None:
         graph.bound(u, lower=-1.0, upper=1.0, name="limits")
         start = unicycle.rollout(np.zeros(3), np.full((steps, 2), 0.5), dt)
         solver.solve(graph, {x: start, u: np.full((steps, 2), 0.5)})
+
+
+def _integrate() -> None:
+    """Samples of an IMU."""
+    preintegrate([0.0], [[0.0, 0.0, 0.1]], [[0.0, 0.0, 9.8]], [0.0, 0.1], ImuNoise(), np.zeros(6))
 
 
 def _pose_graph(simulated: Simulated) -> None:

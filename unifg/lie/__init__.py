@@ -1,9 +1,9 @@
 """Manifolds and Lie groups: batched, in float64, right perturbation, translation before rotation.
 
-``SO2``, ``SE2``, ``SO3`` and ``SE3`` are ready-made objects, ``Rn(n)`` and ``Product(name=manifold, ...)`` make
-equal objects from equal arguments. Each group is one file: its formulas as compiled functions of one element, and the
-class that states them (:func:`elementwise`). A manifold of one's own derives from :class:`ManifoldBase`, a group from
-:class:`LieGroup`. Conventions are collected in ``docs/conventions.md``.
+``SO2``, ``SE2``, ``SO3``, ``SE3`` and ``SE23`` are ready-made objects, ``Rn(n)`` and ``Product(name=manifold, ...)``
+make equal objects from equal arguments. Each group is one file: its formulas as compiled functions of one element, and
+the class that states them (:func:`elementwise`). A manifold of one's own derives from :class:`ManifoldBase`, a group
+from :class:`LieGroup`. Conventions are collected in ``docs/conventions.md``.
 """
 
 from unifg.lie.axioms import Axioms, Breach, check_manifold
@@ -13,12 +13,14 @@ from unifg.lie.product import Component, Product, ProductGroup
 from unifg.lie.rn import Rn
 from unifg.lie.se2 import SE2
 from unifg.lie.se3 import SE3
+from unifg.lie.se23 import SE23
 from unifg.lie.so2 import SO2, wrap_angle
 from unifg.lie.so3 import SO3
 
 __all__ = [
     "SE2",
     "SE3",
+    "SE23",
     "SO2",
     "SO3",
     "Axioms",

@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 
 from unifg.kernels.derive.symbols import UFUNCS, choose
-from unifg.lie import SE2, SE3, SO2, SO3, Manifold, Rn
+from unifg.lie import SE2, SE3, SE23, SO2, SO3, Manifold, Rn
 
 Numbers = Sequence[Any]
 TWO_PI = 2.0 * math.pi
@@ -51,7 +51,23 @@ def moved_closed(manifold: Manifold, point: Numbers, step: Numbers) -> list[Any]
         bent = [a + 0.5 * b for a, b in zip(v, _cross(w, v), strict=True)]
         along = _rotate(point[3:], bent)
         return [*(p + a for p, a in zip(point[:3], along, strict=True)), *_turned(point[3:], w)]
+    if manifold == SE23:
+        position, velocity = (
+            moved_closed(SE3, point_, step_) for point_, step_ in zip(_two(point), _two(step), strict=True)
+        )
+        assert position is not None and velocity is not None
+        return _one(position, velocity)
     return None
+
+
+def _two(x: Numbers) -> tuple[list[Any], list[Any]]:
+    """An element of SE_2(3), or a tangent, as two of SE(3)."""
+    return [*x[:3], *x[6:]], [*x[3:6], *x[6:]]
+
+
+def _one(position: Numbers, velocity: Numbers) -> list[Any]:
+    """And back."""
+    return [*position[:3], *velocity[:3], *position[3:]]
 
 
 def _turned(q: Numbers, w: Numbers) -> list[Any]:
@@ -267,6 +283,21 @@ def _se3_act(x: Numbers, p: Numbers) -> list[Any]:
     return [a + b for a, b in zip(x[:3], _rotate(x[3:], p), strict=True)]
 
 
+def _twice(form: Callable[..., list[Any]]) -> Callable[..., list[Any]]:
+    """What SE_2(3) does, of what SE(3) does."""
+    return lambda *arguments: _one(*(form(*parts) for parts in zip(*map(_two, arguments), strict=True)))
+
+
+def _join_blocks(position: list[list[Any]], velocity: list[list[Any]]) -> list[list[Any]]:
+    """The square matrix of two of SE(3)."""
+    none = [0.0, 0.0, 0.0]
+    return [
+        *([*row[:3], *none, *row[3:]] for row in position[:3]),
+        *([*none, *row] for row in velocity[:3]),
+        *([*none, *none, *row[3:]] for row in position[3:]),
+    ]
+
+
 FORMS: dict[Hashable, dict[str, Callable[..., list[Any]]]] = {
     SO2: {
         "exp": lambda d: [wrap(d[0])],
@@ -307,6 +338,10 @@ FORMS: dict[Hashable, dict[str, Callable[..., list[Any]]]] = {
         "right_jacobian_inverse": _se3_inverse_jacobian,
     },
 }
+FORMS[SE23] = {name: _twice(FORMS[SE3][name]) for name in ("exp", "log", "compose", "inverse", "between")} | {
+    "act": lambda x, p: _se3_act(_two(x)[0], p),
+    "right_jacobian_inverse": lambda d: _join_blocks(*(_se3_inverse_jacobian(part) for part in _two(d))),
+}
 """Group, operation -> what it computes of single elements."""
 _VECTORS: dict[str, Callable[..., list[Any]]] = {
     "exp": list,
@@ -324,9 +359,14 @@ MATRICES: dict[Hashable, Callable[[Numbers], list[list[Any]]]] = {
         *([*row, p] for row, p in zip(_so3_matrix(x[3:]), x[:3], strict=True)),
         [0.0, 0.0, 0.0, 1.0],
     ],
+    SE23: lambda x: [
+        *([*row, v, p] for row, v, p in zip(_so3_matrix(x[6:]), x[3:6], x[:3], strict=True)),
+        [0.0, 0.0, 0.0, 1.0, 0.0],
+        [0.0, 0.0, 0.0, 0.0, 1.0],
+    ],
 }
 
-GROUPS = (SO2, SE2, SO3, SE3)
+GROUPS = (SO2, SE2, SO3, SE3, SE23)
 KINDS = {type(group) for group in GROUPS}
 
 

@@ -1,0 +1,233 @@
+"""Gyro and accelerometer as factors between states that have a position, a velocity and an orientation.
+
+With x = (p, v, R) and y the states of two nodes, Y what was preintegrated between them at the biases b0
+(:mod:`unifg.models.preintegration`), and B its derivative by them, the residual is what is left of the motion, in the
+tangent of SE_2(3):
+
+    Log((Y Exp(B (b - b0)))^-1 M),    M = (R'(p_y - p - h v - h^2 g / 2), R'(v_y - v - h g), R' R_y)
+
+(Forster et al. 2017, section VI-D, with one logarithm for all nine rows as in Brossard et al. 2021). Units of the rows
+are m, m/s and rad. Biases are held over an interval; from one to the next they walk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import NamedTuple, cast
+
+import numpy as np
+
+from unifg.errors import ModelError
+from unifg.kernels.derive.stated import StatedKernel
+from unifg.kernels.residuals import Residual, residual
+from unifg.language.factors import difference
+from unifg.language.statement import Statement
+from unifg.language.variables import Data, Variable, as_selection
+from unifg.lie import SE23, SO3, Manifold, Product, Rn
+from unifg.models.preintegration import BIAS, GRAVITY, ImuNoise, Preintegrated, preintegrate
+from unifg.typing import Array, ArrayLike
+
+
+def motion(state: Manifold = SE23, gravity: tuple[float, float, float] = GRAVITY) -> Residual:
+    """``motion()(x, y, bias, increment, by_bias, reference, duration)``: (n, 9) [m, m/s, rad].
+
+    ``graph.minimize(motion(), x[:-1], x[1:], bias[:-1], *measured[:4], information=measured.information)`` with
+    ``measured`` from :func:`~unifg.models.preintegration.preintegrate`.
+
+    Args:
+        state: of x and y: SE23, or a product with components p and v in Rn(3) and R in SO3, as a quadrotor's.
+        gravity: in the world [m/s^2].
+
+    Raises:
+        ModelError: for another manifold.
+    """
+    down = np.asarray(gravity, dtype=np.float64)
+    if down.shape != (3,) or not np.isfinite(down).all():
+        raise ModelError(f"gravity must be three finite numbers, found {gravity}")
+    return residual(_kernel(cast(Hashable, state), tuple(down.tolist())))
+
+
+@cache
+def _kernel(manifold: Hashable, gravity: tuple[float, ...]) -> StatedKernel:
+    state = cast(Manifold, manifold)
+    p, v, R = _parts(state)
+
+    def inertial(
+        x: Array, y: Array, bias: Array, increment: Array, by_bias: Array, reference: Array, duration: Array
+    ) -> Array:
+        h, back = np.reshape(duration, (-1, 1)), SO3.inverse(x[:, R])
+        fallen = h * np.array([gravity])
+        moved = (y[:, p] - x[:, p]) - h * (x[:, v] + 0.5 * fallen)  # places differ before anything small is taken off
+        sped = (y[:, v] - x[:, v]) - fallen
+        seen = [SO3.act(back, moved), SO3.act(back, sped), SO3.compose(back, y[:, R])]
+        shift = np.einsum("nij,nj->ni", by_bias, bias - reference)
+        left = SE23.between(increment, np.concatenate(seen, axis=1))
+        return SE23.log(SE23.compose(SE23.exp(-shift), left))
+
+    shapes = (state, state, BIAS, (10,), (9, 6), (6,), ())
+    return StatedKernel(inertial, shapes, 9, name="inertial motion")
+
+
+def _parts(state: Manifold) -> tuple[slice, slice, slice]:
+    """Where position, velocity and orientation are stored."""
+    if state == SE23:
+        return slice(0, 3), slice(3, 6), slice(6, 10)
+    parts = state.components if isinstance(state, Product) else {}
+    if all(name in parts and parts[name].manifold == kind for name, kind in (("p", Rn(3)), ("v", Rn(3)), ("R", SO3))):
+        return parts["p"].storage, parts["v"].storage, parts["R"].storage
+    raise ModelError(
+        f"inertial motion needs a position, a velocity and an orientation, which {state.name} has not: use SE23, or a "
+        "product with components p=Rn(3), v=Rn(3) and R=SO3"
+    )
+
+
+class _Given(NamedTuple):
+    """Data of the terms, one row for each interval."""
+
+    increment: Data
+    by_bias: Data
+    reference: Data
+    duration: Data
+    information: Data
+    walk: Data
+    known: Data
+
+
+@dataclass(frozen=True)
+class SampleCounts:
+    """What became of the samples.
+
+    Attributes:
+        kept: of the last :meth:`InertialMeasurements.data`.
+        invalid: left out, because a number was not finite.
+        repeated: left out, because there was a sample with that stamp.
+        unknown: intervals of the last data without information: they begin before the first sample, or have a gap.
+    """
+
+    kept: int = 0
+    invalid: int = 0
+    repeated: int = 0
+    unknown: int = 0
+
+
+class InertialMeasurements:
+    """Samples of one gyro and accelerometer, as factors between all neighbours of a trajectory.
+
+    ``state`` adds the factors once, ``add`` takes samples as they arrive, and ``data`` integrates what lies between
+    nodes at given times, at given biases: a window of some thousand samples in some milliseconds. Nothing is compiled
+    or laid out again in between. The body is the sensor: its place and axes are those of the states.
+
+    Attributes:
+        noise: of the sensor.
+        gap: for how long a sample may be held [s]; an interval with a longer gap is inactive, and only its biases walk.
+        counts: what has become of the samples.
+    """
+
+    def __init__(
+        self,
+        noise: ImuNoise,
+        *,
+        gap: float = 0.1,
+        gravity: tuple[float, float, float] = GRAVITY,
+        name: str = "imu",
+    ) -> None:
+        """Describe the sensor.
+
+        Raises:
+            ModelError: when the gap is not positive.
+        """
+        if not gap > 0.0:
+            raise ModelError(f"'{name}': gap {gap} must be positive")
+        self.noise, self.gap, self.name, self.counts = noise, gap, name, SampleCounts()
+        self._gravity = gravity
+        self._given: _Given | None = None
+        self._samples: Array = np.empty((0, 7))  # stamp, rates, forces
+
+    def state(self, graph: Statement, x: Variable, bias: Variable) -> None:
+        """Add factors between all neighbours of ``x``, and of ``bias``, on ``preintegration.BIAS``, one for each node.
+
+        Raises:
+            ModelError: when it has been stated before, or the numbers of nodes do not fit.
+        """
+        nodes, biases = as_selection(x), as_selection(bias)
+        if self._given is not None:
+            raise ModelError(f"'{self.name}' has been stated already: each graph takes measurements of its own")
+        if len(nodes) < 2 or len(biases) != len(nodes) or biases.manifold != BIAS:
+            raise ModelError(
+                f"'{self.name}' needs two nodes or more and a bias on {BIAS.name} for each; found {len(nodes)} and "
+                f"{len(biases)} on {biases.manifold.name}"
+            )
+        n = len(nodes) - 1
+
+        def given(what: str, value: Array) -> Data:
+            return graph.data(f"{self.name}: {what}", np.broadcast_to(value, (n, *value.shape)).copy(), each=True)
+
+        self._given = _Given(
+            given("increment", SE23.identity()),
+            given("by bias", np.zeros((9, 6))),
+            given("reference", np.zeros(6)),
+            given("duration", np.ones(())),
+            given("information", np.eye(9)),
+            given("walk", np.ones(6)),
+            given("known", np.zeros((), dtype=bool)),
+        )
+        factor, before, after = motion(nodes.manifold, self._gravity), np.arange(n), np.arange(1, n + 1)
+        graph.minimize(
+            factor, nodes[before], nodes[after], biases[before], *self._given[:4],
+            information=self._given.information, active=self._given.known, name=self.name,
+        )  # fmt: skip
+        graph.minimize(difference, biases[before], biases[after], sigma=self._given.walk, name=f"{self.name}: biases")
+
+    def add(self, stamp: ArrayLike, gyro: ArrayLike, accelerometer: ArrayLike) -> None:
+        """Take samples in any order: one stamp [s] with (3,) rates [rad/s] and forces [m/s^2], or (k,) with (k, 3).
+
+        Raises:
+            ModelError: on another shape.
+        """
+        t, w, a = (np.asarray(part, dtype=np.float64) for part in (stamp, gyro, accelerometer))
+        if t.ndim > 1 or w.shape != (*t.shape, 3) or a.shape != w.shape:
+            raise ModelError(
+                f"'{self.name}': stamps {t.shape} need rates and forces {(*t.shape, 3)}, found {w.shape}, {a.shape}"
+            )
+        rows = np.concatenate([t.reshape(-1, 1), w.reshape(-1, 3), a.reshape(-1, 3)], axis=1)
+        good = np.isfinite(rows).all(axis=1)
+        rows = np.concatenate([self._samples, rows[good]])
+        rows = rows[np.argsort(rows[:, 0], kind="stable")]
+        first = np.diff(rows[:, 0], prepend=-np.inf) > 0.0
+        self._samples = rows[first]
+        self.counts = replace(
+            self.counts,
+            invalid=self.counts.invalid + int((~good).sum()),
+            repeated=self.counts.repeated + int((~first).sum()),
+        )
+
+    def data(self, times: ArrayLike, bias: ArrayLike) -> dict[Data, Array]:
+        """What a solve needs, for nodes that stand at these times; samples before the oldest node are forgotten.
+
+        Args:
+            times: (n,) of the nodes, increasing [s].
+            bias: (6,) or (n - 1, 6), as they are believed to be.
+
+        Raises:
+            ModelError: when nothing has been stated, or times or biases are not what they should be.
+        """
+        if self._given is None:
+            raise ModelError(f"'{self.name}' has not been stated: call state(graph, x, bias) first")
+        at = np.asarray(times, dtype=np.float64)
+        if at.shape != (len(self._given.duration.value) + 1,):
+            raise ModelError(f"'{self.name}': {len(self._given.duration.value) + 1} times are needed, found {at.shape}")
+        old = int(np.searchsorted(self._samples[:, 0], at[0], side="right")) - 1
+        self._samples = self._samples[max(old, 0) :]  # the one before the oldest node is held into its interval
+        found = preintegrate(self._samples[:, 0], self._samples[:, 1:4], self._samples[:, 4:], at, self.noise, bias)
+        known = found.held <= self.gap
+        information = np.where(known[:, None, None], found.information, np.eye(9))
+        self.counts = replace(self.counts, kept=len(self._samples), unknown=int((~known).sum()))
+        walk = self.noise.walk(found.duration)
+        return dict(zip(self._given, (*found[:4], information, walk, known), strict=True))
+
+    def integrated(self, times: ArrayLike, bias: ArrayLike) -> Preintegrated:
+        """The samples integrated between any times, as for a guess by :func:`unifg.models.preintegration.predict`."""
+        s = self._samples
+        return preintegrate(s[:, 0], s[:, 1:4], s[:, 4:], times, self.noise, bias)

@@ -1,0 +1,272 @@
+"""Position, velocity and orientation as one group, SE_2(3) (Barrau and Bonnabel 2017, section V, *extended poses*).
+
+Storage ``(px, py, pz, vx, vy, vz, qw, qx, qy, qz)``, tangent ``(rho, nu, omega)``: of the position, of the velocity and
+of the rotation, each of length 3.
+
+Position and velocity are turned by one rotation and know nothing of each other, so every formula is that of SE(3)
+twice: of (position, rotation) and of (velocity, rotation). Square results have the blocks of the two,
+
+    A, 0, P
+    0, A, N
+    0, 0, A
+
+with A, P the blocks of the first and A, N those of the second.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from unifg.errors import UnifgError
+from unifg.lie import se3
+from unifg.lie.elementwise import elementwise
+from unifg.lie.manifold import LieGroup
+from unifg.lie.so3 import SO3, write_matrix
+from unifg.machine.calls import local_matrix, local_vector
+from unifg.machine.jit import compiled
+from unifg.typing import Array, ArrayLike, BoolArray
+
+
+@compiled
+def take(x: Array, first: int, out: Array) -> None:
+    """Write the three numbers at ``first`` and what follows the sixth: an element of SE(3), or a tangent of it."""
+    for k in range(3):
+        out[k] = x[first + k]
+    for k in range(3, len(out)):
+        out[k] = x[3 + k]
+
+
+@compiled
+def join(p: Array, v: Array, out: Array) -> None:
+    """The reverse: the vectors of two elements of SE(3), or of two tangents, and the rotation of the first."""
+    for k in range(3):
+        out[k] = p[k]
+        out[3 + k] = v[k]
+    for k in range(3, len(p)):
+        out[3 + k] = p[k]
+
+
+@compiled
+def join_blocks(p: Array, v: Array, out: Array) -> None:
+    """Write the (9, 9) matrix of two (6, 6) ones of SE(3)."""
+    for i in range(3):
+        for k in range(3):
+            same = p[i, k]
+            out[i, k] = same
+            out[3 + i, 3 + k] = same
+            out[6 + i, 6 + k] = p[3 + i, 3 + k]
+            out[i, 6 + k] = p[i, 3 + k]
+            out[3 + i, 6 + k] = v[i, 3 + k]
+            out[i, 3 + k] = out[3 + i, k] = out[6 + i, k] = out[6 + i, 3 + k] = 0.0
+
+
+@compiled
+def exp(d: Array, out: Array) -> None:
+    """Exponential ``(Jl(omega) rho, Jl(omega) nu, Exp(omega))``."""
+    part, p, v = local_vector(6), local_vector(7), local_vector(7)
+    take(d, 0, part)
+    se3.exp(part, p)
+    take(d, 3, part)
+    se3.exp(part, v)
+    join(p, v, out)
+
+
+@compiled
+def log(x: Array, out: Array) -> None:
+    """Logarithm with a rotation of at most pi."""
+    part, p, v = local_vector(7), local_vector(6), local_vector(6)
+    take(x, 0, part)
+    se3.log(part, p)
+    take(x, 3, part)
+    se3.log(part, v)
+    join(p, v, out)
+
+
+@compiled
+def compose(x: Array, y: Array, out: Array) -> None:
+    """``x y``: ``(p + R p', v + R v', R R')``."""
+    a, b, p, v = local_vector(7), local_vector(7), local_vector(7), local_vector(7)
+    take(x, 0, a)
+    take(y, 0, b)
+    se3.compose(a, b, p)
+    take(x, 3, a)
+    take(y, 3, b)
+    se3.compose(a, b, v)
+    join(p, v, out)
+
+
+@compiled
+def inverse(x: Array, out: Array) -> None:
+    """``x^-1``: ``(-R' p, -R' v, R')``."""
+    part, p, v = local_vector(7), local_vector(7), local_vector(7)
+    take(x, 0, part)
+    se3.inverse(part, p)
+    take(x, 3, part)
+    se3.inverse(part, v)
+    join(p, v, out)
+
+
+@compiled
+def between(x: Array, y: Array, out: Array) -> None:
+    """``x^-1 y``; positions differ before they are turned."""
+    a, b, p, v = local_vector(7), local_vector(7), local_vector(7), local_vector(7)
+    take(x, 0, a)
+    take(y, 0, b)
+    se3.between(a, b, p)
+    take(x, 3, a)
+    take(y, 3, b)
+    se3.between(a, b, v)
+    join(p, v, out)
+
+
+@compiled
+def act(x: Array, p: Array, out: Array) -> None:
+    """Bring a (3,) point from the body frame to the world."""
+    part = local_vector(7)
+    take(x, 0, part)
+    se3.act(part, p, out)
+
+
+@compiled
+def matrix(x: Array, out: Array) -> None:
+    """Write ``[R, v, p; 0, 1, 0; 0, 0, 1]``, (5, 5)."""
+    write_matrix(x[6], x[7], x[8], x[9], out, 0)
+    for i in range(3):
+        out[i, 3], out[i, 4] = x[3 + i], x[i]
+        out[3, i] = out[4, i] = 0.0
+    out[3, 3] = out[4, 4] = 1.0
+    out[3, 4] = out[4, 3] = 0.0
+
+
+@compiled
+def adjoint(x: Array, out: Array) -> None:
+    """Write ``[R, 0, [p]x R; 0, R, [v]x R; 0, 0, R]``, (9, 9)."""
+    part, p, v = local_vector(7), local_matrix(6, 6), local_matrix(6, 6)
+    take(x, 0, part)
+    se3.adjoint(part, p)
+    take(x, 3, part)
+    se3.adjoint(part, v)
+    join_blocks(p, v, out)
+
+
+@compiled
+def right_jacobian(d: Array, out: Array) -> None:
+    """Write Jr, (9, 9)."""
+    part, p, v = local_vector(6), local_matrix(6, 6), local_matrix(6, 6)
+    take(d, 0, part)
+    se3.right_jacobian(part, p)
+    take(d, 3, part)
+    se3.right_jacobian(part, v)
+    join_blocks(p, v, out)
+
+
+@compiled
+def right_jacobian_inverse(d: Array, out: Array) -> None:
+    """Write Jr^-1, (9, 9); singular at a rotation of 2 pi."""
+    part, p, v = local_vector(6), local_matrix(6, 6), local_matrix(6, 6)
+    take(d, 0, part)
+    se3.right_jacobian_inverse(part, p)
+    take(d, 3, part)
+    se3.right_jacobian_inverse(part, v)
+    join_blocks(p, v, out)
+
+
+@compiled
+def bend(d: Array, v: Array, out: Array) -> None:
+    """Write the (9, 9) derivative of ``Jr^-1(d) v`` along d."""
+    part, along, first, second = local_vector(6), local_vector(6), local_matrix(6, 6), local_matrix(6, 6)
+    take(d, 0, part)
+    take(v, 0, along)
+    se3.bend(part, along, first)
+    take(d, 3, part)
+    take(v, 3, along)
+    se3.bend(part, along, second)
+    join_blocks(first, second, out)
+
+
+class ExtendedPoses(LieGroup):
+    """Position, velocity and orientation that turn as one; use the ready-made object ``SE23``.
+
+    Storage is ``(px, py, pz, vx, vy, vz, qw, qx, qy, qz)``: position [m] and velocity [m/s] in the world, then a
+    rotation as ``SO3`` stores it. Tangent is ``(rho, nu, omega)`` [m, m/s, rad], in the axes of the body.
+    """
+
+    name = "SE23"
+    storage = 10
+    dim = 9
+    point_dim = 3
+    matrix_dim = 5
+
+    exp = elementwise(exp)
+    log = elementwise(log)
+    compose = elementwise(compose)
+    inverse = elementwise(inverse)
+    between = elementwise(between)
+    act = elementwise(act)
+    matrix = elementwise(matrix)
+    adjoint = elementwise(adjoint)
+    right_jacobian = elementwise(right_jacobian)
+    right_jacobian_inverse = elementwise(right_jacobian_inverse)
+    bend = elementwise(bend)
+
+    # Constructors, and back.
+
+    def from_parts(self, position: ArrayLike, velocity: ArrayLike, rotation: ArrayLike, /) -> Array:
+        """Join (..., 3) positions [m], (..., 3) velocities [m/s] and (..., 4) elements of ``SO3``.
+
+        Raises:
+            UnifgError: when a last axis has another length.
+        """
+        parts = [np.asarray(part, dtype=np.float64) for part in (position, velocity, rotation)]
+        if [part.shape[-1:] for part in parts] != [(3,), (3,), (4,)]:
+            shapes = ", ".join(str(part.shape) for part in parts)
+            raise UnifgError(f"SE23.from_parts joins (..., 3), (..., 3) and (..., 4) arrays; got shapes {shapes}")
+        batch = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        return np.concatenate([np.broadcast_to(part, (*batch, part.shape[-1])) for part in parts], axis=-1)
+
+    def position(self, x: ArrayLike, /) -> Array:
+        """Return the (..., 3) positions [m], as a view of an array."""
+        return np.asarray(x, dtype=np.float64)[..., :3]
+
+    def velocity(self, x: ArrayLike, /) -> Array:
+        """Return the (..., 3) velocities [m/s], as a view of an array."""
+        return np.asarray(x, dtype=np.float64)[..., 3:6]
+
+    def rotation(self, x: ArrayLike, /) -> Array:
+        """Return the (..., 4) rotations, elements of ``SO3``, as a view of an array."""
+        return np.asarray(x, dtype=np.float64)[..., 6:]
+
+    # The group.
+
+    def identity(self) -> Array:
+        """Return (0, 0, 0, 0, 0, 0, 1, 0, 0, 0)."""
+        return np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+
+    def hat(self, d: ArrayLike, /) -> Array:
+        """Return (..., 5, 5) Lie algebra matrices ``[[omega]x, nu, rho; 0, 0, 0; 0, 0, 0]``."""
+        d = np.asarray(d, dtype=np.float64)
+        result = np.zeros((*d.shape[:-1], 5, 5))
+        result[..., :3, :3] = SO3.hat(d[..., 6:])
+        result[..., :3, 3], result[..., :3, 4] = d[..., 3:6], d[..., :3]
+        return result
+
+    def ad(self, d: ArrayLike, /) -> Array:
+        """Return (..., 9, 9) small adjoints ``[[omega]x, 0, [rho]x; 0, [omega]x, [nu]x; 0, 0, [omega]x]``."""
+        d = np.asarray(d, dtype=np.float64)
+        result = np.zeros((*d.shape[:-1], 9, 9))
+        result[..., :3, :3] = result[..., 3:6, 3:6] = result[..., 6:, 6:] = SO3.hat(d[..., 6:])
+        result[..., :3, 6:], result[..., 3:6, 6:] = SO3.hat(d[..., :3]), SO3.hat(d[..., 3:6])
+        return result
+
+    def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
+        """Draw (*shape, 10) elements: standard normal positions and velocities, uniform rotations."""
+        position, velocity = rng.standard_normal((2, *shape, 3))
+        return self.from_parts(position, velocity, SO3.random(rng, shape))
+
+    def is_valid(self, x: ArrayLike, /) -> BoolArray:
+        """Tell for each of (..., 10) vectors whether it is finite and its quaternion of unit norm to within 1e-9."""
+        x = np.asarray(x, dtype=np.float64)
+        return np.asarray(np.isfinite(x[..., :6]).all(axis=-1) & SO3.is_valid(x[..., 6:]))
+
+
+SE23 = ExtendedPoses()
