@@ -8,7 +8,7 @@
 #   make stale    name the pages of docs/ whose tables were measured on other sources
 #   make release-check    the same, and fail if there are any, or if the kernels that come with unifg are out of date
 #   make kernels  compile everything anew into unifg/machine/kernels.zip, which spares a first use most of it (minutes)
-#   make mutants  change decisions one at a time and see whether a test notices (hours; FILES='scenarios/driving/drive_joint.py')
+#   make mutants  change decisions one at a time and see whether a test notices (hours; FILES='scenarios/driving/drive_past.py')
 #   make offsets  solve the same problems with their worlds moved by up to 5000 km (minutes)
 #   make fences   run the shell commands shown in README.md and docs/
 #   make clean    remove everything made here

@@ -1,7 +1,7 @@
 """Do the tests notice when a decision is changed? Mutants of the decisions' files, each run against its tests.
 
     python -m benchmarks.mutants                            every file of TARGETS (hours)
-    python -m benchmarks.mutants scenarios/driving/drive_joint.py   one file
+    python -m benchmarks.mutants scenarios/driving/drive_past.py   one file
     python -m benchmarks.mutants --share 0.3 --seed 1 ...   a drawn share of the mutants of each file
 
 Everything happens in a scratch copy of the checkout. The tests of a file run once with every line they touch recorded;
@@ -88,13 +88,21 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "scenarios/driving/drive_control.py": ("control_decisions", "navigation", "joint"),
     "scenarios/driving/drive_parts.py": ("control_decisions", "navigation", "joint"),
     "scenarios/driving/drive_settings.py": ("control_decisions", "navigation", "joint"),
-    "scenarios/driving/drive_joint.py": ("control_decisions", "joint"),
+    "scenarios/driving/drive_past.py": ("control_decisions", "joint"),
     "scenarios/driving/localiser.py": ("navigation",),
     "scenarios/navigation.py": ("navigation",),
     "scenarios/seeing/disc_tracker.py": ("perception", "control_decisions"),
     "scenarios/driving/drive_pilot.py": ("navigation", "joint"),
     "scenarios/ways/grid.py": ("planner", "route"),
     "scenarios/driving/route.py": ("route", "navigation"),
+    "unifg/horizon/control_loop.py": ("horizon", "examples", "control_decisions"),
+    "unifg/horizon/coupled.py": ("horizon", "joint"),
+    "unifg/horizon/decision.py": ("horizon", "control_decisions"),
+    "unifg/horizon/past.py": ("horizon", "joint"),
+    "unifg/horizon/recorded.py": ("horizon",),
+    "unifg/horizon/robot.py": ("horizon",),
+    "unifg/horizon/statements.py": ("horizon", "examples"),
+    "unifg/horizon/window.py": ("horizon", "joint"),
     "scenarios/horizon/loop.py": ("control_decisions", "quadrotor_decisions", "navigation"),
     "scenarios/horizon/past.py": ("joint", "control_decisions", "quadrotor_estimator"),
     "scenarios/log/columns.py": ("metrics",),
@@ -102,7 +110,6 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "scenarios/show/drive_scene.py": ("scene",),
     "unifg/view/stage.py": ("scene", "quadrotor_scene"),
     "scenarios/worlds/placement.py": ("unforeseen",),
-    "scenarios/driving/drive_window.py": ("joint", "control_decisions"),
     "scenarios/flying/arrival.py": ("quadrotor_mpc", "quadrotor_flights"),
     "scenarios/seeing/association.py": ("quadrotor_estimator", "quadrotor_world"),
     "scenarios/flying/braking.py": ("quadrotor_controller",),

@@ -14,6 +14,7 @@ import numpy as np
 
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import load_map
+from unifg.horizon import Plan
 from unifg.lie import wrap_angle
 from unifg.machine.tally import counting
 from unifg.models.distance_map import DistanceMap
@@ -22,7 +23,6 @@ from unifg.scenarios.driving.drive_pilot import make_pilot
 from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.driving.route import Route
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
-from unifg.scenarios.horizon.loop import Plan
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.options import existing, option, pose

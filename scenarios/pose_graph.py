@@ -21,8 +21,8 @@ from unifg.kernels.robust import DCS, Cauchy, Huber, Loss, TruncatedLeastSquares
 from unifg.pose_graphs.initialise import chordal, lago, odometric
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
 from unifg.scenarios.episode import Progress, silent
-from unifg.scenarios.horizon.stopwatch import Stopwatch
 from unifg.scenarios.options import existing, option
+from unifg.scenarios.stopwatch import Stopwatch
 from unifg.solvers import GraduatedNonConvexity, names
 from unifg.typing import Array, BoolArray
 

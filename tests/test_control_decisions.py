@@ -10,14 +10,13 @@ import pytest
 
 import unifg as fg
 from episodes import room
+from unifg.horizon import Plan
 from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.scenarios.driving.drive_control import BRAKING, LEFT_BEHIND, PATIENCE, Controller, is_behind
-from unifg.scenarios.driving.drive_joint import SharedPast, Smoother
 from unifg.scenarios.driving.drive_parts import disc_limits, predicted, wall_limits
+from unifg.scenarios.driving.drive_past import Smoother
 from unifg.scenarios.driving.drive_settings import ControllerSettings
-from unifg.scenarios.driving.drive_window import PAST_TERMS, PoseWindow
-from unifg.scenarios.horizon.loop import Plan
 from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.seeing.tracks import Tracks
 from unifg.scenarios.worlds.plane import World
@@ -85,7 +84,7 @@ def test_the_robot_rests_for_a_mover_that_closes_in(controller: Controller, othe
     assert not plan.emergency and plan.excess < 1e-3
     assert (not plan.control.any()) == rests
     if rests:  # the next tick goes on from rest, as the first change of control is counted from there
-        assert not controller._applied.any()
+        assert not controller.loop.applied.any()
 
 
 # ---------------------------------------------------------------- how near it may come
@@ -157,22 +156,15 @@ class Bent:
         return Answer()
 
 
-def joint(field: DistanceMap, settings: ControllerSettings, window: PoseWindow) -> tuple[Controller, Smoother]:
-    """A controller that shares its first pose with the past, and what registers that beforehand."""
-    smoother = Smoother(field, window)
-    return Controller(field, "sqp", settings, SharedPast(smoother, settings.pull)), smoother
-
-
 def believing(field: DistanceMap) -> tuple[Controller, Smoother]:
     """A joint controller whose window is full, at a tick that has been registered and not planned."""
     world = World(room(), OPEN, rng=np.random.default_rng(3))
-    window = PoseWindow(2, OPEN + np.array([0.03, -0.02, 0.01]), np.diag([0.01, 0.01, 0.0025]), world.lidar.beams)
-    controller, smoother = joint(field, replace(SETTINGS, pull=(0.5, 0.5, 0.5), control_weight=30.0), window)
+    off, sigma = np.array([0.03, -0.02, 0.01]), [0.1, 0.1, 0.05]
+    smoother = Smoother(field, OPEN + off, sigma, world.lidar.beams, SETTINGS.dt, length=2)
+    settings = replace(SETTINGS, pull=(0.5, 0.5, 0.5), control_weight=30.0)
+    controller = Controller(field, "sqp", settings, smoother.window)
     for tick in range(4):
-        if tick:
-            window.move(np.array(world.odometry()), SETTINGS.dt)
-        window.look(world.scan())
-        smoother.register()
+        smoother.update(world.scan(), np.array(world.odometry()) if tick else None, SETTINGS.dt)
         if tick < 3:
             plan = controller.plan(smoother.pose, ahead(OPEN), tracks())
             world.step(float(plan.control[0]), float(plan.control[1]), SETTINGS.dt)
@@ -191,35 +183,35 @@ def believing(field: DistanceMap) -> tuple[Controller, Smoother]:
     ],
     ids=["converged", "its own stop test", "limit", "stalled", "infeasible", "stopped while violating"],
 )
-def test_only_a_solve_that_ended_moves_the_past(field: DistanceMap, claims: dict[str, Any], believed: bool) -> None:
-    """A solve that fell short says nothing about where the robot is: the past alone is believed, and marginalised."""
+def test_only_a_solve_that_ended_moves_the_pose(field: DistanceMap, claims: dict[str, Any], believed: bool) -> None:
+    """A solve that fell short says nothing about where the robot is; what is marginalised is the past alone, always."""
     controller, smoother = believing(field)
-    window, past = smoother.window, smoother.terms.past
-    registered = smoother.pose
-    alone = smoother.solution.marginal_prior(PAST_TERMS, past[0], past[1])
+    window, registered = smoother.window, smoother.pose
+    states, departure = window.history.states.copy(), window.left.departure
+    assert window.history.full and departure is not None
     for name in ("warm", "cold"):
         setattr(controller.loop, name, Bent(getattr(controller.loop, name), **claims))
     plan = controller.plan(registered, ahead(OPEN), tracks())
     assert plan.emergency == (claims.get("violation", 0.0) > 0.0)
-    moved = window.present - registered
-    oldest = window.poses[0]
+    moved = controller.loop.estimate - registered
     if believed:
         assert moved[0] == pytest.approx(1.0, abs=0.1)
     else:
         assert not moved.any()
-        assert np.abs(oldest - smoother.solution[past][0]).max() == 0.0
-        assert np.array_equal(window.departure[0], alone[0][0]) and np.array_equal(window.departure[1], alone[1])
+    assert np.array_equal(window.history.states, states)
+    assert window.left.departure is departure
 
 
 @pytest.mark.parametrize("off", [(0.35, -0.3, 0.1), (0.0, 0.45, 0.0)], ids=str)
 def test_registering_goes_on_until_the_beams_are_found(field: DistanceMap, off: tuple[float, float, float]) -> None:
     """From half a metre away the beams that count change from round to round; at rest one round is enough."""
     world = World(room(), OPEN, rng=np.random.default_rng(3))
-    window = PoseWindow(2, OPEN + np.array(off), np.diag([0.3, 0.3, 0.1]), world.lidar.beams)
-    smoother = Smoother(field, window)
-    window.look(world.scan())
+    spread = np.diag([0.3, 0.3, 0.1])
+    smoother = Smoother(field, OPEN + np.array(off), spread, world.lidar.beams, SETTINGS.dt, length=2)
+    window = smoother.window
+    smoother.look(world.scan())
     solves: list[int] = []
-    inner = smoother.run
+    inner = window.run
 
     class Counted:
         def solve(self, guess: Any, **options: Any) -> fg.Solution:
@@ -227,13 +219,13 @@ def test_registering_goes_on_until_the_beams_are_found(field: DistanceMap, off: 
             solves.append(solution.iterations)
             return solution
 
-    smoother.run = Counted()  # type: ignore[assignment]
-    smoother.register()
+    window.run = Counted()  # type: ignore[assignment]
+    window.estimate()
     assert smoother.iterations == sum(solves)
     assert 1 < len(solves) < 8
     assert np.hypot(*(window.present - OPEN)[:2]) < 0.03
     rounds = len(solves)
-    smoother.register()
+    window.estimate()
     assert smoother.iterations == sum(solves[rounds:])
     assert len(solves) == rounds + 1
 
@@ -249,11 +241,11 @@ def test_a_guess_of_the_joint_solve_begins_at_the_estimate(field: DistanceMap) -
             self.inner = inner
 
         def solve(self, guess: fg.Guess, **options: Any) -> fg.Solution:
-            begun.append(np.array(guess.values[loop.x]))
+            begun.append(np.array(guess.values[loop.x.family])[loop.x.indices])
             return self.inner.solve(guess, **options)
 
     assert loop.guess is not None
-    shifted = np.array(loop.guess.values[loop.x])
+    shifted = np.array(loop.guess.values[loop.x.family])[loop.x.indices]
     loop.warm = Seen(loop.warm)  # type: ignore[assignment]
     controller.plan(pose, ahead(OPEN), tracks())
     assert np.array_equal(begun[0][0], pose) and not np.array_equal(shifted[0], pose)
@@ -270,7 +262,7 @@ def failing(controller: Controller) -> None:
 def test_braking_keeps_the_shape_of_the_last_plan_and_rests_in_time(controller: Controller) -> None:
     good = controller.plan(OPEN, ahead(), tracks())
     assert good.control[0] > 0.3
-    stored = controller.loop.stored.copy()
+    stored = controller.loop.kept.controls.copy()
     failing(controller)
     plans: list[Plan] = [controller.plan(OPEN, ahead(), tracks()) for _ in range(BRAKING + 2)]
     assert all(plan.emergency for plan in plans)
@@ -284,18 +276,19 @@ def test_braking_keeps_the_shape_of_the_last_plan_and_rests_in_time(controller: 
 
 
 def test_after_a_failure_the_guess_is_rest_until_it_is_forgotten(controller: Controller) -> None:
-    loop, now = controller.loop, controller.now(OPEN, ahead(), tracks())
+    loop = controller.loop
+    now = loop.now(OPEN, controller.given(ahead(), tracks()))
     controller.plan(OPEN, ahead(), tracks())
-    assert controller.begin(now) == (loop.warm, loop.guess)
+    assert loop.begin(now) == (loop.warm, loop.guess)
     good = (loop.warm, loop.cold)
     failing(controller)
     controller.plan(OPEN, ahead(), tracks())
     loop.warm, loop.cold = good
-    run, guess = controller.begin(now)
+    run, guess = loop.begin(now)
     assert run is loop.warm
-    assert not guess.values[loop.u].any() and (guess.values[loop.x] == OPEN).all()
+    assert not guess.values[loop.u].any() and (guess.values[loop.x.family] == OPEN).all()
     controller.forget()
-    run, guess = controller.begin(now)
+    run, guess = loop.begin(now)
     assert run is loop.cold and guess.values[loop.u].any()
 
 
@@ -352,12 +345,10 @@ def test_a_robot_too_near_a_wall_may_stay_and_not_come_nearer(field: DistanceMap
 
 
 def test_a_scan_without_returns_changes_nothing(field: DistanceMap) -> None:
-    window = PoseWindow(2, OPEN, np.diag([0.01, 0.01, 0.01]), 72)
-    smoother = Smoother(field, window)
+    smoother = Smoother(field, OPEN, [0.1, 0.1, 0.1], 72, SETTINGS.dt, length=2)
     angles = np.linspace(-np.pi, np.pi, 72, endpoint=False)
-    window.look(Scan(angles, np.full(72, np.nan)))
-    smoother.register()
-    assert np.abs(window.present - OPEN).max() < 1e-9
+    smoother.update(Scan(angles, np.full(72, np.nan)), None, SETTINGS.dt)
+    assert np.abs(smoother.pose - OPEN).max() < 1e-9
 
 
 def test_backends_take_the_settings_tolerances() -> None:

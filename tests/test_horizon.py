@@ -249,7 +249,7 @@ def test_what_cannot_be_recorded_is_refused() -> None:
     with pytest.raises(fg.GraphError, match="not a point"):
         Window(LINE, 3, [], start=[0.0], sigma=1.0)
     with pytest.raises(fg.GraphError, match="positive"):
-        line_window(3, replace(LINE, statics=(Static("bias", fg.Rn(1), [0.0], 0.0),)))
+        line_window(3, replace(LINE, statics=(Static("bias", fg.Rn(1), [0.0], -1.0),)))
 
 
 def test_an_estimate_that_is_none_leaves_the_prediction() -> None:

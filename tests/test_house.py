@@ -39,7 +39,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 # Inside scenarios/, where "" are the files that lie in no room: one per scenario.
 STOREYS: tuple[tuple[str, ...], ...] = (
-    ("horizon", "options", "ways"),
+    ("horizon", "options", "stopwatch", "ways"),
     ("seeing",),
     ("worlds",),
     ("driving", "flying"),
@@ -235,7 +235,7 @@ def test_side_folders_use_absolute_imports() -> None:
         ("from .. import solvers", "unifg.lie.so2", True),
         ("import importlib\nimportlib.import_module('unifg.solvers.sqp')", "unifg.models.lidar", True),
         ("import unifg as fg", "unifg.models.lidar", True),
-        ("import unifg as fg", "unifg.scenarios.driving.drive_window", False),
+        ("import unifg as fg", "unifg.scenarios.driving.drive_past", False),
         ("from unifg.models import unicycle\nfrom unifg.solvers import SQP", "unifg.scenarios.driving.route", False),
         ("from unifg.answers.solver import Solver\nimport unifg.modelset", "unifg.models.lidar", False),
     ],

@@ -9,9 +9,8 @@ import pytest
 
 import unifg as fg
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.driving.drive_joint import Smoother
+from unifg.scenarios.driving.drive_past import WINDOW, Registration, Smoother
 from unifg.scenarios.driving.drive_settings import ControllerSettings
-from unifg.scenarios.driving.drive_window import NOW_TERMS, PAST_TERMS, PoseWindow
 from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigation
 from unifg.scenarios.worlds.building import building_map
@@ -64,11 +63,6 @@ def test_marginal_prior_refuses_what_it_cannot_do(rng: np.random.Generator) -> N
         solution.marginal_prior(["steps"], x[0], x[1])
 
 
-def test_a_window_needs_two_poses() -> None:
-    with pytest.raises(fg.ScenarioError, match="at least two"):
-        PoseWindow(1, np.zeros(3), np.eye(3), 360)
-
-
 def settled(field: DistanceMap, weight: float, ticks: int = 12) -> tuple[Episode, Smoother]:
     """A joint episode after some ticks, and its past."""
     settings = NavigationSettings(
@@ -98,9 +92,7 @@ def settled(field: DistanceMap, weight: float, ticks: int = 12) -> tuple[Episode
 def test_the_past_ignores_a_weightless_future(field: DistanceMap) -> None:
     """With a tiny control weight the joint estimate is that of the window alone."""
     episode, smoother = settled(field, 1e-6)
-    joint = smoother.pose
-    smoother.register()
-    alone = smoother.pose
+    joint, alone = episode.pilot.pose, smoother.pose
     assert np.hypot(*(joint - alone)[:2]) < 1e-3
     assert np.hypot(*(joint - episode.world.pose)[:2]) < 0.15  # one step of motion after the last tick
 
@@ -120,8 +112,7 @@ def test_a_heavy_future_pulls_the_estimate() -> None:
 def test_the_pull_is_bounded(field: DistanceMap) -> None:
     """However heavy the future, the estimate stays within the bound around what the past alone says."""
     episode, smoother = settled(field, 1000.0)
-    alone = smoother.solution[smoother.terms.present]
-    moved = fg.SE2.log(fg.SE2.between(alone, smoother.pose[None]))[0]
+    moved = fg.SE2.log(fg.SE2.between(smoother.pose, episode.pilot.pose))
     bound = np.array(episode.settings.controller.pull)
     assert (np.abs(moved) <= bound + 5e-4).all()
     assert (np.abs(moved) > 0.9 * bound).any()
@@ -130,15 +121,16 @@ def test_the_pull_is_bounded(field: DistanceMap) -> None:
 def test_beams_keep_their_weights_during_a_solve(field: DistanceMap) -> None:
     """Weights are chosen at the belief before the solve: a beam off the map counts nothing, however the poses move."""
     _, smoother = settled(field, 1.0)
-    terms, window = smoother.terms, smoother.window
+    window = smoother.window
+    registration = window.terms[1]
+    assert isinstance(registration, Registration)
 
     def told(name: str) -> Array:
-        return next(
-            np.asarray(value) for data, value in terms.data(window).items() if data.name == f"lidar now: {name}"
-        )
+        """Of the beams of the present scan."""
+        return np.asarray(registration.data(window.now(None))[f"lidar: {name}"])[-registration.beams :]
 
     right = told("which count").sum()
-    window.poses[-1] += np.array([2.0, 0.0, 0.0])
+    window.history.states[-1] += np.array([2.0, 0.0, 0.0])
     wrong = told("which count").sum()
     assert wrong < 0.8 * right
     information = told("information")
@@ -148,23 +140,25 @@ def test_beams_keep_their_weights_during_a_solve(field: DistanceMap) -> None:
 def test_window_keeps_its_length_and_its_prior_is_of_the_past_alone(field: DistanceMap) -> None:
     _, smoother = settled(field, 1.0)
     window = smoother.window
-    assert window.full and window.entered == window.length
-    reference, information = window.departure
+    assert window.history.full and window.history.entered == window.length == WINDOW
+    assert window.left.departure is not None
+    reference, information = window.left.departure
     assert np.linalg.eigvalsh(information).min() > 0.0
-    oldest = window.poses[1]  # the prior is about the pose that is oldest after the next move
+    oldest = window.history.states[1]  # the prior is about the pose that is oldest after the next move
     assert np.hypot(*(reference - oldest)[:2]) < 0.05
 
 
 def test_covariance_counts_the_past_alone(field: DistanceMap) -> None:
     """Raising the control weight does not make the robot more certain of where it is."""
     _, smoother = settled(field, 1.0)
-    terms, window = smoother.terms, smoother.window
-    guess = {terms.past: window.guess(), terms.present.family: smoother.pose[None]}
-    solution = smoother.run.solve(guess, data=terms.data(window))
-    mine = terms.covariance(solution)
-    np.testing.assert_allclose(mine, solution.covariance(terms.present), rtol=1e-5)
-    everything = solution.information((*PAST_TERMS, *NOW_TERMS), terms.past, terms.present)
+    window = smoother.window
+    solution = window.solution
+    assert solution is not None
+    x = next(iter(solution.values))
+    np.testing.assert_allclose(window.state_covariance, solution.covariance(x[-1]), rtol=1e-5)
+    everything = solution.information(("initial", "arrival", "odometry", "lidar"), x)
     assert everything.shape == (3 * window.length + 3,) * 2
+    np.testing.assert_allclose(window.state_covariance, np.linalg.inv(everything)[-3:, -3:], rtol=1e-5)
 
 
 @pytest.mark.parametrize("solver", ["ipm", "sqp", "alm"])

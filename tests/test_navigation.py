@@ -223,8 +223,8 @@ class Ended:
     def __init__(self, solution: fg.Solution, violation: float) -> None:
         self._solution, self.violation, self.status = solution, violation, fg.Status.ITERATION_LIMIT
 
-    def __getitem__(self, variable: fg.Family) -> Array:
-        return self._solution[variable] + (0.25 if variable.name == "control" else 0.0)
+    def __getitem__(self, variable: fg.Family | fg.Selection) -> Array:
+        return self._solution[variable] + (0.25 if isinstance(variable, fg.Family) else 0.0)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._solution, name)
@@ -239,12 +239,13 @@ def test_a_plan_is_driven_where_it_stopped_if_it_keeps_the_constraints(share: fl
     controller = episode.pilot.controller
     pose = np.array(episode.settings.start)
     reference = np.tile(pose, (controller.settings.horizon + 1, 1))
-    now = controller.now(pose, reference, NOBODY)
-    solution = controller.loop.warm.solve(controller.staying(pose), data=controller.data(now))
+    loop = controller.loop
+    now = loop.now(pose, controller.given(reference, NOBODY))
+    solution = loop.warm.solve(loop.guess_of(*controller.staying(now), now), data=loop.data(now))
     ended: Any = Ended(solution, share * controller.settings.feasible)
-    controls, _, source = controller.judge(ended, now)
-    assert (source == "solved") == driven
-    np.testing.assert_allclose(controls[0], 0.25 + solution[controller.loop.u][0] if driven else 0.0)
+    choice = controller.judge(ended, ended[loop.x], ended[loop.u], now, loop.kept)
+    assert (choice.source == "solved") == driven
+    np.testing.assert_allclose(choice.controls[0], 0.25 + solution[loop.u][0] if driven else 0.0)
 
 
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])

@@ -126,8 +126,7 @@ def test_a_guess_without_a_warm_start_can_be_driven(heading: float) -> None:
     route, start = through_the_hall()
     pose = np.array([start[0], start[1], heading])
     reference = route.reference(pose, 0.1, 31)
-    values = controller.along(controller.now(pose, reference, Tracks.none())).values
-    states, controls = np.asarray(values[controller.loop.x]), np.asarray(values[controller.loop.u])
+    states, controls = controller.along(controller.loop.now(pose, controller.given(reference, Tracks.none())))
     assert np.abs(controls).max() <= 1.0
     np.testing.assert_allclose(states, unicycle.rollout(pose, controls, 0.1), atol=1e-9)
     if heading > 1.5:

@@ -6,19 +6,16 @@ discs. Constraints: unicycle dynamics, velocity limits, hard clearance from wall
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 
 import unifg as fg
+from unifg.horizon import Choice, ControlCost, Dynamics, Kept, Loop, Now, Plan, Starts, Term, Window
 from unifg.lie import wrap_angle
 from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap, SmoothField
-from unifg.scenarios.driving.drive_parts import DriveNow, clearance, following, motion
+from unifg.scenarios.driving.drive_parts import Clearance, Drive, Following, Limits
+from unifg.scenarios.driving.drive_past import robot
 from unifg.scenarios.driving.drive_settings import ControllerSettings, backend
-from unifg.scenarios.horizon.loop import Loop, Plan
-from unifg.scenarios.horizon.part import Part, effort, stated
-from unifg.scenarios.horizon.past import GivenPast, Past
 from unifg.scenarios.seeing.tracks import Tracks
 from unifg.typing import Array
 
@@ -29,6 +26,7 @@ BRAKING = 6  # ticks to come to rest when no new plan is found
 PURSUIT = 0.3  # [m] ahead of the robot, where a guess aims at the reference
 PURSUIT_TIME = 0.2  # [s] in which it would turn there
 ARRIVED = 0.05  # [m] to the end of the reference, where it only turns
+SETTLED = (fg.Status.CONVERGED, fg.Status.STOP_RULE)
 PATIENCE = 5  # ticks of being left behind before the plan starts over from the reference
 
 
@@ -37,30 +35,27 @@ class Controller:
 
     Attributes:
         settings: weights and limits.
-        past: what ties the horizon to what is known; without one the pose is given.
-        data: what gives the data of the whole graph at a tick.
         loop: the prepared graph.
     """
 
     def __init__(
-        self, distance_map: DistanceMap, solver: str, settings: ControllerSettings, past: Past[DriveNow] | None = None
+        self, distance_map: DistanceMap, solver: str, settings: ControllerSettings, window: Window | None = None
     ) -> None:
-        """State the graph and prepare the backend."""
+        """State the graph and prepare the backend; with a window, past and future are one graph."""
         self.settings = s = settings
-        self.past: Past[DriveNow] = past or GivenPast()
-        parts: list[Part[DriveNow]] = [
-            self.past.state,
-            following(s),
-            effort(s.weighted(s.control_sigma), s.weighted(s.rate_sigma)),
-            motion(s),
-            clearance(s, SmoothField(distance_map)),
+        terms: list[Term] = [
+            Following(s),
+            ControlCost(s.weighted(s.control_sigma), s.weighted(s.rate_sigma), wanted=lambda now: now.given.wanted),
+            Dynamics(unicycle.dynamics, s.dt),
+            Limits(s),
+            Clearance(s, SmoothField(distance_map)),
         ]
-        graph = fg.Graph()
-        x = graph.variables("pose", fg.SE2, s.horizon + 1)
-        u = graph.variables("control", fg.Rn(2), s.horizon)
-        self.data = stated(parts, graph, x, u)
-        self.loop = Loop(graph, x, u, backend(solver, s), backend(solver, s, COLD_PATIENCE), s.box, PATIENCE)
-        self._applied = np.zeros(2)
+        self.loop = Loop(
+            robot(s.dt) if window is None else window.robot, s.horizon, terms, solver=backend(solver, s),
+            cold=backend(solver, s, COLD_PATIENCE), window=window, coupling="sequential" if window is None else "joint",
+            pull=s.pull, limits=s.box, judge=self.judge, starts=Starts(self.along, self.staying), believable=settled,
+            patience=PATIENCE,
+        )  # fmt: skip
 
     def plan(self, pose: Array, reference: Array, tracks: Tracks) -> Plan:
         """Decide the next control.
@@ -70,71 +65,56 @@ class Controller:
             reference: (N + 1, 3) poses along the path, the first beside the robot.
             tracks: discs the robot has seen.
         """
-        begin = time.perf_counter()
-        now = self.now(pose, reference, tracks)
-        run, guess = self.begin(now)
-        solution = run.solve(self.past.begin(guess, now), data=self.data(now))
-        controls, states, source = self.judge(solution, now)
-        self.past.take(solution, now, source)
-        elapsed = 1e3 * (time.perf_counter() - begin)
-        return Plan(controls, states, solution.status, solution.iterations, source, self.loop.excess, elapsed)
+        return self.loop.plan(pose, self.given(reference, tracks))
 
-    def now(self, pose: Array, reference: Array, tracks: Tracks) -> DriveNow:
-        """What the graph's parts ask for."""
+    def given(self, reference: Array, tracks: Tracks) -> Drive:
+        """What the terms are given."""
         cruise = np.zeros((self.settings.horizon, 2))
         cruise[:, 0] = np.hypot(*np.diff(reference[:, :2], axis=0).T) / self.settings.dt
-        return DriveNow(pose, cruise, self._applied, reference, tracks)
-
-    def begin(self, now: DriveNow) -> tuple[fg.Prepared, fg.Guess]:
-        """The shifted solution; without one, rest after a failure, and the reference otherwise."""
-        return self.loop.begin(lambda: self.along(now), lambda: self.staying(now.present))
+        return Drive(cruise, reference, tracks)
 
     def forget(self) -> None:
         """Drop the warm start, as when a new route makes it misleading."""
         self.loop.forget()
 
-    def judge(self, solution: fg.Solution, now: DriveNow) -> tuple[Array, Array, str]:
+    def judge(self, solution: fg.Solution, states: Array, controls: Array, now: Now[Drive], kept: Kept) -> Choice:
         """Drive a plan that keeps the constraints; brake along the last one otherwise; rest where a mover nears.
 
         Of a solve that ended early this is where it stopped. The cheapest iterate it has passed that keeps the
         constraints was tried: such plans brush past obstacles and creep up to those that stand in the way.
         """
-        s, loop = self.settings, self.loop
+        s, source, behind = self.settings, "solved", False
         if solution.violation <= s.feasible:
-            states = solution[loop.x]
-            loop.accept(solution, behind=is_behind(states, now.reference))
-            controls, source = loop.within(loop.stored), "solved"
+            behind, driven = is_behind(states, now.given.reference), kept.within(controls)
         else:
-            loop.refuse()
-            controls, source = self._braking(), "braking"
-            states = unicycle.rollout(now.present, controls, s.dt)
-        if self._yields(now.present, now.tracks):
-            controls = np.zeros_like(controls)
-        self._applied = controls[0]
-        return controls, states, source
+            source, driven = "braking", self._braking(kept, now.last)
+            states = unicycle.rollout(now.present, driven, s.dt)
+        if self._yields(now.present, now.given.tracks):
+            driven = np.zeros_like(driven)
+        return Choice(driven, states, source, behind=behind)
 
-    def _braking(self) -> Array:
+    def _braking(self, kept: Kept, last: Array) -> Array:
         """(N, 2) stored plan slowed to rest; the path keeps its shape, and the robot rests well before its end."""
-        left, controls = self.loop.left(), np.zeros((self.settings.horizon, 2))
-        fade = np.maximum(1.0 - (self.loop.age + np.arange(len(left))) / BRAKING, 0.0)
+        left, controls = kept.left(), np.zeros((self.settings.horizon, 2))
+        fade = np.maximum(1.0 - (kept.age + np.arange(len(left))) / BRAKING, 0.0)
         stored = left * fade[:, None]
         fastest = np.abs(stored[:, 0]).max(initial=0.0)
-        slower = min(1.0, abs(float(self._applied[0])) / fastest) if fastest > 0.0 else 1.0
+        slower = min(1.0, abs(float(last[0])) / fastest) if fastest > 0.0 else 1.0
         controls[: len(left)] = slower * stored
         return controls
 
-    def staying(self, pose: Array) -> fg.Guess:
+    def staying(self, now: Now[Drive]) -> tuple[Array, Array]:
         """Guess rest, which is feasible: from there a solver that failed finds the near side of what stopped it."""
         n = self.settings.horizon
-        return fg.Guess({self.loop.x: np.tile(pose, (n + 1, 1)), self.loop.u: np.zeros((n, 2))})
+        return np.tile(now.present, (n + 1, 1)), np.zeros((n, 2))
 
-    def along(self, now: DriveNow) -> fg.Guess:
+    def along(self, now: Now[Drive]) -> tuple[Array, Array]:
         """Guess how a simple pursuit would follow the reference, which leads around whatever the route leads around.
 
         It keeps limits and dynamics: it turns first where the reference begins behind the robot's back.
         """
-        s, reference = self.settings, now.reference
-        speeds, controls = now.wanted[:, 0], np.zeros((s.horizon, 2))
+        s, reference = self.settings, now.given.reference
+        speeds, controls = now.given.wanted[:, 0], np.zeros((s.horizon, 2))
         states = np.tile(now.present, (s.horizon + 1, 1))
         aim = 0
         for k in range(s.horizon):
@@ -148,7 +128,7 @@ class Controller:
             speed = min(speeds[k], distance / s.dt) * max(np.cos(turn), 0.0) ** 2 if distance > ARRIVED else 0.0
             controls[k] = np.clip([speed, turn / PURSUIT_TIME], *s.box)
             states[k + 1] = unicycle.step(here[None], controls[k : k + 1], s.dt)[0]
-        return fg.Guess({self.loop.x: states, self.loop.u: controls})
+        return states, controls
 
     def _yields(self, pose: Array, tracks: Tracks) -> bool:
         """Whether a mover is so near and closing in that resting, which it respects, is the only safe answer."""
@@ -163,3 +143,8 @@ class Controller:
 def is_behind(states: Array, reference: Array) -> bool:
     """Whether a plan (N + 1, 3) ends far from its reference: it may be caught in a dead end."""
     return bool(np.hypot(*(states[-1] - reference[-1])[:2]) > LEFT_BEHIND)
+
+
+def settled(solution: fg.Solution, choice: Choice) -> bool:
+    """Whether a joint solve says where the robot is: it ended, and its plan is driven."""
+    return choice.source == "solved" and solution.status in SETTLED

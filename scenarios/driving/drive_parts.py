@@ -1,69 +1,89 @@
-"""What the driving robot's horizon says, part by part (Bazzana et al. 2022, section V)."""
+"""What the driving robot's horizon says, term by term (Bazzana et al. 2022, section V)."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 import unifg as fg
+from unifg.horizon import Now
 from unifg.models import obstacles, unicycle
 from unifg.models.distance_map import SmoothField
 from unifg.scenarios.driving.drive_settings import ControllerSettings
-from unifg.scenarios.horizon.part import Given, Gives, Now, Part
 from unifg.scenarios.seeing.tracks import Tracks, nearest
-from unifg.typing import Array, BoolArray
+from unifg.typing import Array, ArrayLike, BoolArray
 
 FAR_AWAY = 1e3  # [m]; where an unused disc waits
 
 
 @dataclass(frozen=True)
-class DriveNow(Now):
-    """What the parts may ask for at a tick.
+class Drive:
+    """What the terms are given at a tick.
 
     Attributes:
+        wanted: (N, 2) controls that would follow the reference [m/s, rad/s].
         reference: (N + 1, 3) poses along the path, the first beside the robot.
         tracks: discs the robot has seen.
     """
 
+    wanted: Array
     reference: Array
     tracks: Tracks
 
 
-def following(s: ControllerSettings) -> Part[DriveNow]:
+@dataclass(frozen=True)
+class Following:
     """Costs of leaving the reference (eq. 8), the one at its end apart."""
 
-    def state(graph: fg.Graph, x: fg.Family, u: fg.Family) -> Gives[DriveNow]:
+    settings: ControllerSettings
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the costs."""
+        s = self.settings
         path = graph.data("reference", np.zeros((s.horizon - 1, 3)), each=True)
         end = graph.data("end of reference", np.zeros(3))
         graph.minimize(unicycle.tracking, x[1:-1], path, sigma=s.weighted(s.pose_sigma), name="path")
         graph.minimize(unicycle.tracking, x[-1], end, sigma=s.weighted(s.terminal_sigma), name="end of path")
-        return lambda now: {path: now.reference[1:-1], end: now.reference[-1]}
 
-    return state
-
-
-def motion(s: ControllerSettings) -> Part[Now]:
-    """Dynamics and limits of the unicycle."""
-
-    def state(graph: fg.Graph, x: fg.Family, u: fg.Family) -> Gives[Now]:
-        graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], s.dt, lower=0.0, upper=0.0, name="dynamics")
-        graph.bound(u, lower=[-limit for limit in s.limits], upper=s.limits, name="limits")
-        return lambda now: {}
-
-    return state
+    def data(self, now: Now[Drive]) -> Mapping[str, ArrayLike]:
+        """The reference."""
+        return {"reference": now.given.reference[1:-1], "end of reference": now.given.reference[-1]}
 
 
-def clearance(s: ControllerSettings, field: SmoothField) -> Part[DriveNow]:
+@dataclass(frozen=True)
+class Limits:
+    """Of the unicycle's velocities."""
+
+    settings: ControllerSettings
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Bound the controls."""
+        limits = self.settings.limits
+        graph.bound(u, lower=[-limit for limit in limits], upper=limits, name="limits")
+
+    def data(self, now: Now[Drive]) -> Mapping[str, ArrayLike]:
+        """None."""
+        return {}
+
+
+@dataclass(frozen=True)
+class Clearance:
     """Clearance from walls and tracked discs: soft margins, and hard limits as far as a robot at rest keeps them."""
-    n, m = s.horizon, s.discs
 
-    def state(graph: fg.Graph, x: fg.Family, u: fg.Family) -> Gives[DriveNow]:
+    settings: ControllerSettings
+    field: SmoothField
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add margins and limits."""
+        s, n, m = self.settings, self.settings.horizon, self.settings.discs
         wall_limit = graph.data("wall clearance", np.zeros((n, 1)), each=True)
         disc_limit = graph.data("disc clearance", np.zeros((n, m)), each=True)
         centre = graph.data("disc centres", np.full((n, m, 2), FAR_AWAY), each=True)
         radius, shy_radius = graph.data("disc radii", np.zeros(m)), graph.data("disc radii for the margin", np.zeros(m))
-        walls, discs = obstacles.wall_distance(field), obstacles.disc_clearance
+        walls, discs = obstacles.wall_distance(self.field), obstacles.disc_clearance
         margin, sigma = s.robot_radius + s.margin, s.weighted((s.margin_sigma,))[0]
         graph.minimize(obstacles.shortfall(walls, margin), x[1:], sigma=sigma, name="wall margin")
         shy = obstacles.shortfall(discs, margin)
@@ -71,22 +91,20 @@ def clearance(s: ControllerSettings, field: SmoothField) -> Part[DriveNow]:
         graph.constrain(walls, x[1:], lower=wall_limit, name="walls")
         graph.constrain(discs, x[1:], centre, radius, lower=disc_limit, name="discs")
 
-        def data(now: DriveNow) -> Given:
-            pose, chosen = now.present, nearest(now.tracks, now.present, m)
-            k = len(chosen)
-            centres, radii, movers = np.full((n, m, 2), FAR_AWAY), np.zeros(m), np.zeros(m, dtype=bool)
-            centres[:, :k], radii[:k], movers[:k] = predicted(s, pose, chosen), chosen.radius, chosen.mover
-            return {
-                wall_limit: wall_limits(s, field, pose),
-                disc_limit: disc_limits(s, pose, centres, radii, movers),
-                centre: centres,
-                radius: radii,
-                shy_radius: radii + np.where(movers, s.mover_margin, 0.0),
-            }
-
-        return data
-
-    return state
+    def data(self, now: Now[Drive]) -> Mapping[str, ArrayLike]:
+        """Where the discs will be, and what a robot at rest keeps."""
+        s, n, m = self.settings, self.settings.horizon, self.settings.discs
+        pose, chosen = now.present, nearest(now.given.tracks, now.present, m)
+        k = len(chosen)
+        centres, radii, movers = np.full((n, m, 2), FAR_AWAY), np.zeros(m), np.zeros(m, dtype=bool)
+        centres[:, :k], radii[:k], movers[:k] = predicted(s, pose, chosen), chosen.radius, chosen.mover
+        return {
+            "wall clearance": wall_limits(s, self.field, pose),
+            "disc clearance": disc_limits(s, pose, centres, radii, movers),
+            "disc centres": centres,
+            "disc radii": radii,
+            "disc radii for the margin": radii + np.where(movers, s.mover_margin, 0.0),
+        }
 
 
 def wall_limits(s: ControllerSettings, field: SmoothField, pose: Array) -> Array:

@@ -4,35 +4,30 @@ from __future__ import annotations
 
 from typing import Protocol
 
-import numpy as np
-
 from unifg.errors import ScenarioError
+from unifg.horizon import Plan
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.driving.drive_control import Controller
-from unifg.scenarios.driving.drive_joint import SharedPast, Smoother
+from unifg.scenarios.driving.drive_past import Smoother
 from unifg.scenarios.driving.drive_settings import ControllerSettings
-from unifg.scenarios.driving.drive_window import PoseWindow
 from unifg.scenarios.driving.localiser import Localiser
 from unifg.scenarios.driving.route import Route
-from unifg.scenarios.horizon.loop import Plan
-from unifg.scenarios.horizon.stopwatch import Stopwatch
 from unifg.scenarios.seeing.disc_tracker import DiscTracker
 from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.seeing.tracks import Tracks
+from unifg.scenarios.stopwatch import Stopwatch
 from unifg.typing import Array
 
 COUPLINGS = ("sequential", "joint")
-WINDOW = 4  # past poses in the joint graph
 
 
 class Estimator(Protocol):
-    """What says where the robot is.
+    """What says where the robot is."""
 
-    Attributes:
-        iterations: of the last update.
-    """
-
-    iterations: int
+    @property
+    def iterations(self) -> int:
+        """Of the last update."""
+        ...
 
     @property
     def pose(self) -> Array:
@@ -48,10 +43,11 @@ class Pilot:
     """Estimates, looks for discs that no map shows, repairs the route, and plans along it.
 
     Attributes:
-        estimator: of the pose; a joint graph moves its estimate when it plans.
+        estimator: of the pose, by the past alone.
         controller: of the drive.
         tracker: of discs.
         tracks: after the last tick.
+        pose: (3,) present estimate [m, m, rad]; that of the joint solve, if there is one.
         iterations: of the estimator at the last tick.
         clock: how long the stages of the last tick took: localise, perceive, route, plan.
     """
@@ -61,11 +57,7 @@ class Pilot:
         self.estimator, self.controller, self.tracker = estimator, controller, tracker
         self.tracks = Tracks.none()
         self.clock = Stopwatch()
-
-    @property
-    def pose(self) -> Array:
-        """(3,) present estimate [m, m, rad]."""
-        return self.estimator.pose
+        self.pose = estimator.pose
 
     @property
     def iterations(self) -> int:
@@ -84,7 +76,7 @@ class Pilot:
         self.clock.start()
         self.estimator.update(scan, odometry, s.dt)
         self.clock.split("localise")
-        pose = self.pose
+        pose = self.estimator.pose
         self.tracks = self.tracker.update(scan, pose, s.dt)
         self.clock.split("perceive")
         if route.repair(pose, self.tracks):
@@ -92,6 +84,7 @@ class Pilot:
         self.clock.split("route")
         plan = self.controller.plan(pose, route.reference(pose, s.speed * s.dt, s.horizon + 1), self.tracks)
         self.clock.split("plan")
+        self.pose = self.controller.loop.estimate
         return plan
 
     def forget(self) -> None:
@@ -127,9 +120,8 @@ def make_pilot(
         estimator = Localiser(distance_map, pose, sigma, beams)
         controller = Controller(distance_map, solver, settings)
     elif coupling == "joint":
-        window = PoseWindow(WINDOW, pose, np.diag(np.asarray(sigma) ** 2), beams)
-        estimator = smoother = Smoother(distance_map, window)
-        controller = Controller(distance_map, solver, settings, SharedPast(smoother, settings.pull))
+        estimator = smoother = Smoother(distance_map, pose, sigma, beams, settings.dt)
+        controller = Controller(distance_map, solver, settings, smoother.window)
     else:
         raise ScenarioError(f"unknown coupling '{coupling}': choose {' or '.join(COUPLINGS)}")
     return Pilot(estimator, controller, DiscTracker(distance_map))

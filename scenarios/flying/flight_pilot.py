@@ -11,10 +11,10 @@ from unifg.scenarios.flying.flight_control import Controller
 from unifg.scenarios.flying.flight_joint import BELIEVABLE, JointSettings, SharedFlight
 from unifg.scenarios.flying.flight_settings import ControllerSettings
 from unifg.scenarios.horizon.loop import Plan
-from unifg.scenarios.horizon.stopwatch import Stopwatch
 from unifg.scenarios.seeing.belief import Belief
 from unifg.scenarios.seeing.line_tracker import LineTracker
 from unifg.scenarios.seeing.readings import Reading
+from unifg.scenarios.stopwatch import Stopwatch
 from unifg.scenarios.worlds.layouts import Layout
 from unifg.typing import Array
 

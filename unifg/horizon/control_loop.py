@@ -20,6 +20,7 @@ from unifg.horizon.decision import Choice, Judge, KeepThenBrake, Kept, Plan
 from unifg.horizon.robot import Robot
 from unifg.horizon.statements import Now, Term, handles_of, values_of
 from unifg.horizon.window import Window
+from unifg.language.variables import Data
 from unifg.typing import Array, ArrayLike
 
 TIMES = 100_000  # ticks whose times are kept
@@ -202,17 +203,26 @@ class Loop:
             given: what terms ask for in ``now.given``.
             statics: (count, storage) by name; those at the start by default.
         """
+        begin = self._clock()
+        return self._plan(self.now(present, given, statics), begin)
+
+    def now(self, present: ArrayLike, given: Any = None, statics: Mapping[str, Array] | None = None) -> Now[Any]:
+        """What terms are asked with; arguments as of :meth:`plan`."""
         known = {static.name: static.values for static in self.robot.statics} | dict(statics or {})
         history = None if self.window is None else self.window.history
-        now = Now(given, np.array(present, dtype=np.float64), self.applied.copy(), known, history)
-        return self._plan(now, self._clock())
+        return Now(given, np.array(present, dtype=np.float64), self.applied.copy(), known, history)
+
+    def data(self, now: Now[Any]) -> dict[Data, ArrayLike]:
+        """Data of the whole graph."""
+        return self.tie.data(now) | values_of(self._terms, now, self._handles)
 
     def _plan(self, now: Now[Any], begin: float) -> Plan:
         """Solve, judge, and remember."""
-        data = self.tie.data(now) | values_of(self._terms, now, self._handles)
+        data = self.data(now)
         run, guess = self.begin(now)
-        limit = self._limits[0 if run is self.warm else 1]
-        run.solver.time_limit = max(LEAST_TIME, min(limit, self._deadline - (self._clock() - begin)))
+        if np.isfinite(self._deadline):
+            limit = self._limits[0 if run is self.warm else 1]
+            run.solver.time_limit = max(LEAST_TIME, min(limit, self._deadline - (self._clock() - begin)))
         solution = run.solve(self.tie.begin(guess, now), data=data)
         self.solution = solution
         self.statuses[solution.status] += 1
@@ -227,7 +237,8 @@ class Loop:
         elif choice.source == "solved":
             self._accept(solution, states, controls, choice)
         else:
-            self.failed, self.guess = True, choice.guess
+            self.failed = True
+            self.guess = None if choice.after is None else self.guess_of(*choice.after, now)
         self._believe(solution, choice, now)
         self.sources[choice.source] += 1
         self.applied = choice.controls[0].copy()

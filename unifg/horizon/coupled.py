@@ -78,10 +78,12 @@ class Given:
         graph.fix(x[0], self._start, name="present")
         self._statics: dict[str, Data] = {}
         for static in robot.statics:
-            value = graph.data(f"{static.name}, given", static.values)
-            graph.fix(static.family(graph), value, name=f"{static.name}, given")
-            if not at_start:
-                self._statics[static.name] = value
+            family = static.family(graph)
+            if not (static.known or at_start):
+                self._statics[static.name] = graph.data(f"{static.name}, given", static.values)
+                graph.fix(family, self._statics[static.name], name=f"{static.name}, given")
+            elif not static.known:
+                graph.fix(family, static.values, name=f"{static.name}, given")
 
     def data(self, now: Now[Any]) -> dict[Data, ArrayLike]:
         """What is given."""
@@ -138,8 +140,9 @@ class Joined:
             self._bound(graph, "state", self._present, None)
         elif np.isfinite(bound):
             self._bound(graph, "state", self._present, None)
-            for family in self.past.statics:
-                self._bound(graph, family.name, family[:], family.name)
+            for static in robot.statics:
+                if not static.known:
+                    self._bound(graph, static.name, graph.families[static.name][:], static.name)
 
     def _bound(self, graph: Graph, name: str, variable: Selection, key: str | None) -> None:
         manifold, count = variable.manifold, len(variable)
@@ -153,14 +156,15 @@ class Joined:
     def data(self, now: Now[Any]) -> dict[Data, ArrayLike]:
         """What the window knows, and where it puts what may be pulled."""
         found = self.past.data(now)
-        window, at = self._window, 0
-        sigma = np.sqrt(np.maximum(np.diag(window.covariance), LEAST_SIGMA**2))
         for key, place, lower, upper in self._limits:
-            value = now.present[None] if key is None else now.statics[key]
-            size = lower.value.size
-            bound = (self._pull if self._pull.ndim else self._pull * sigma[at : at + size]).reshape(lower.value.shape)
-            found |= {place: value, lower: -bound, upper: bound}
-            at += size
+            shape = lower.value.shape
+            if self._pull.ndim:
+                bound = np.broadcast_to(self._pull, shape)
+            else:
+                first = 0 if key is None else self._window.place(key).start
+                variance = np.diag(self._window.covariance)[first : first + lower.value.size]
+                bound = self._pull * np.sqrt(np.maximum(variance, LEAST_SIGMA**2)).reshape(shape)
+            found |= {place: now.present[None] if key is None else now.statics[key], lower: -bound, upper: bound}
         return found
 
     def begin(self, guess: Guess, now: Now[Any]) -> Guess:

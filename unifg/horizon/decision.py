@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from unifg.answers.solution import Guess, Solution
+from unifg.answers.solution import Solution
 from unifg.answers.status import Status
 from unifg.horizon.robot import Robot
 from unifg.horizon.statements import Now
@@ -96,14 +96,15 @@ class Choice:
         controls: (N, m).
         states: (N + 1, storage).
         source: "solved" for the solver's answer, which is then kept; what else it is otherwise.
-        guess: where the next solve begins after another source; None for anew.
+        after: states (N + 1, storage) and controls (N, m) where the next solve begins after another source than
+            "solved"; None for anew.
         behind: whether a plan that was accepted ends far from where it should.
     """
 
     controls: Array
     states: Array
     source: str
-    guess: Guess | None = None
+    after: tuple[Array, Array] | None = None
     behind: bool = False
 
 

@@ -27,6 +27,8 @@ from unifg.language.variables import Data, Family, Selection
 from unifg.lie import Manifold
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
+NOTHING = 1e-12  # information in directions that what has left says nothing about; a matrix without zeros has a root
+
 
 class Arrival(Protocol):
     """Coordinates in which the prior of what has left is a quadratic."""
@@ -63,7 +65,7 @@ class Left:
 
     Attributes:
         initial: reference (storage,) and information (d, d) about the node everything began at.
-        statics: reference (count, storage) and information (count, d, d) about every static at the start, by name.
+        statics: reference (count, storage) and information (count, d, d) about unknown statics at the start, by name.
         arrival: reference (S,) and information (D, D) about the oldest nodes and the statics; None before any has left.
         departure: what ``arrival`` becomes with the next node that leaves.
     """
@@ -77,9 +79,39 @@ class Left:
         """Forget what has left; a state (storage,) is believed with a covariance (d, d)."""
         robot = self._robot
         self.initial = start.copy(), np.linalg.inv(covariance)
-        self.statics = {static.name: (static.values, static.information) for static in robot.statics}
+        unknown = [static for static in robot.statics if not static.known]
+        self.statics = {static.name: (static.values, static.information) for static in unknown}
         self.arrival: tuple[Array, Array] | None = None
         self.departure: tuple[Array, Array] | None = None
+
+    def admit(self, name: str, member: int, value: Array, information: Array, place: tuple[slice, slice]) -> None:
+        """Begin a static anew: what has left says nothing about it.
+
+        Args:
+            name: of the static.
+            member: which of its members.
+            value: (storage,) where it is believed to be.
+            information: (d, d) of that belief.
+            place: of the member in the arrival's reference and in its information.
+        """
+        self.forget(place[1])
+        values, weights = (array.copy() for array in self.statics[name])
+        values[member], weights[member] = value, information
+        self.statics[name] = values, weights
+        if self.arrival is not None:
+            reference = self.arrival[0].copy()
+            reference[place[0]] = value
+            self.arrival = reference, self.arrival[1]
+
+    def forget(self, columns: slice) -> None:
+        """Marginalise some columns out of the arrival."""
+        self.departure = None
+        if self.arrival is not None:
+            reference, information = self.arrival
+            own = np.arange(columns.start, columns.stop)
+            kept = without(information, own)
+            kept[own, own] = NOTHING
+            self.arrival = reference, kept
 
 
 class Past:
@@ -111,6 +143,7 @@ class Past:
         length = history.length
         self._steps = {name: graph.variables(name, kind, length) for name, kind in robot.steps.items()}
         self._statics = {static.name: graph.families[static.name] for static in robot.statics}
+        self._known = {static.name for static in robot.statics if static.known}
         self._applied = graph.data("applied controls", np.zeros((length, robot.control.storage)), each=True)
         before = len(graph.terms)
         for term in terms:
@@ -163,6 +196,8 @@ class Past:
             graph.minimize(prior, family, family.manifold.identity(), active=self._empty, name=f"empty {name}")
         self._believed: dict[str, tuple[Data, Data]] = {}
         for name, family in self._statics.items():
+            if name in self._known:
+                continue
             values, weights = left.statics[name]
             reference = graph.data(f"{name} at the start", values, each=True)
             weight = graph.data(f"information about {name} at the start", weights, each=True)
@@ -244,7 +279,22 @@ class Past:
         kept: list[Family | Selection] = [x[1 : reach + 1], *self.statics]
         reference, information = solution.marginal_prior(self.names, [x[0], *(f[0] for f in self.families)], kept)
         here = np.concatenate([solution[variable].ravel() for variable in kept])
+        nothing = np.flatnonzero(np.diag(information) == 0.0)
+        information[nothing, nothing] = NOTHING
         self._left.departure = self._arrival.express(here, reference[0], information)
+
+
+def without(information: Array, columns: IntArray) -> Array:
+    """Information (D, D) once some columns are marginalised: theirs are zero."""
+    kept = information.copy()
+    kept[columns], kept[:, columns] = 0.0, 0.0
+    known = columns[information[columns, columns] > 0.0]
+    if len(known):
+        across = information[:, known]
+        across[columns] = 0.0
+        lost = across @ np.linalg.solve(information[np.ix_(known, known)], across.T)
+        kept -= 0.5 * (lost + lost.T)
+    return kept
 
 
 def _leaves(term: Stated) -> bool:

@@ -84,13 +84,14 @@ class History:
         state: Array = self.states[-1]
         return state
 
-    def move(self, control: ArrayLike, state: ArrayLike, time: float) -> None:
+    def move(self, control: ArrayLike, state: ArrayLike, time: float, steps: Mapping[str, ArrayLike]) -> None:
         """Let the present become the past.
 
         Args:
             control: (m,) applied since the last node.
             state: (storage,) where it should have led.
             time: of the new node [s].
+            steps: (storage,) guesses of the new step's unknowns, by name; what is missing is guessed at the identity.
 
         Raises:
             GraphError: when time runs backwards.
@@ -103,7 +104,7 @@ class History:
             array[:-1] = array[1:]
         self.states[-1], self.controls[-1], self.times[-1], self.initial[-1] = state, control, time, False
         for name, array in self.steps.items():
-            array[-1] = self._resting[name]
+            array[-1] = steps.get(name, self._resting[name])
         for name, values in self._values.items():
             values[-1], self._measured[name][-1] = 0.0, False
 

@@ -23,7 +23,8 @@ class Static:
         manifold: of every member.
         start: (count, storage) believed at the start, or (storage,) for one member.
         sigma: standard deviations of that belief in the tangent space, of any shape that fits (count, dim); infinite
-            where nothing is believed, which leaves it to the measurements alone.
+            where nothing is believed, which leaves it to the measurements alone; zero throughout for what is known,
+            which is fixed to its start.
 
     Raises:
         GraphError: when the start does not lie on the manifold, or a standard deviation is not positive.
@@ -49,7 +50,7 @@ class Static:
             raise GraphError(
                 f"static '{self.name}': sigma does not fit ({len(start)}, {self.manifold.dim})", family=self.name
             ) from error
-        if not np.all(sigma > 0.0):
+        if not np.all(sigma > 0.0) and np.any(sigma):
             raise GraphError(f"static '{self.name}': standard deviations must be positive", family=self.name)
 
     @property
@@ -63,9 +64,17 @@ class Static:
         count, dim = len(self.values), self.manifold.dim
         return information_of(np.broadcast_to(np.asarray(self.sigma, dtype=np.float64), (count, dim)))
 
+    @property
+    def known(self) -> bool:
+        """Whether it is no unknown at all."""
+        return not np.any(self.sigma)
+
     def family(self, graph: Statement) -> Family:
-        """Add the family to a graph."""
-        return graph.variables(self.name, self.manifold, len(self.values))
+        """Add the family to a graph; what is known is fixed."""
+        family = graph.variables(self.name, self.manifold, len(self.values))
+        if self.known:
+            graph.fix(family, self.values, name=f"{self.name}, known")
+        return family
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ stand in several graphs, the one of the past alone and the one of past and futur
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
@@ -166,17 +166,18 @@ class ControlCost:
     Attributes:
         sigma: (m,) standard deviations of the first.
         change: (m,) of the second; None for no such cost.
-        wanted: (m,) or (N, m).
+        wanted: (m,) or (N, m), for good or as ``wanted(now)`` says at a tick.
     """
 
     sigma: ArrayLike
     change: ArrayLike | None = None
-    wanted: ArrayLike = 0.0
+    wanted: ArrayLike | Callable[[Now[Any]], ArrayLike] = 0.0
 
     def state(self, graph: Graph, x: Selection, u: Any) -> None:
         """Add the costs."""
         shape = len(u), u.manifold.storage
-        wanted = graph.data("wanted controls", np.broadcast_to(np.asarray(self.wanted), shape), each=True)
+        constant = 0.0 if callable(self.wanted) else self.wanted
+        wanted = graph.data("wanted controls", np.broadcast_to(np.asarray(constant), shape), each=True)
         graph.minimize(prior, u, wanted, sigma=self.sigma, name="effort")
         if self.change is not None:
             last = graph.data("last control", np.zeros(shape[1]))
@@ -185,8 +186,11 @@ class ControlCost:
                 graph.minimize(difference, u[:-1], u[1:], sigma=self.change, name="change")
 
     def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
-        """The control applied last."""
-        return {} if self.change is None else {"last control": now.last}
+        """The control applied last, and those wanted now."""
+        found: dict[str, ArrayLike] = {} if self.change is None else {"last control": now.last}
+        if callable(self.wanted):
+            found["wanted controls"] = self.wanted(now)
+        return found
 
 
 def values_of(terms: Sequence[Term], now: Now[Any], handles: Mapping[str, Data]) -> dict[Data, ArrayLike]:
@@ -203,7 +207,8 @@ def values_of(terms: Sequence[Term], now: Now[Any], handles: Mapping[str, Data])
                 raise GraphError(f"{type(term).__name__} gives data '{name}', which its graph does not read ({known})")
             if handles[name] in found:
                 raise GraphError(f"{type(term).__name__} gives data '{name}', which another term has given")
-            found[handles[name]] = value
+            handle, size = handles[name], handles[name].value.shape
+            found[handle] = np.broadcast_to(np.asarray(value), size) if np.ndim(value) < len(size) else value
     return found
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +17,7 @@ from unifg.answers.status import Status
 from unifg.errors import GraphError
 from unifg.horizon.past import Arrival, Left, Past, Tangent
 from unifg.horizon.recorded import History
-from unifg.horizon.robot import Robot
+from unifg.horizon.robot import Robot, information_of
 from unifg.horizon.spread import JointCovariance
 from unifg.horizon.statements import Now, Recording, Term
 from unifg.language.terms import Constraint
@@ -24,6 +25,8 @@ from unifg.language.variables import Selection
 from unifg.solvers.interior_point.method import InteriorPoint
 from unifg.solvers.least_squares import LevenbergMarquardt
 from unifg.typing import Array, ArrayLike
+
+logger = logging.getLogger("unifg")
 
 USELESS = (Status.NOT_FINITE, Status.SINGULAR, Status.UNBOUNDED)
 
@@ -39,8 +42,9 @@ class Window:
         terms: what the past says.
         history: numbers of the nodes.
         left: what is known of what has left.
-        covariance: (D, D) of the present state and the statics, from the past's terms alone.
         solution: of the last estimate; None before.
+        iterations: of the last estimate.
+        run: the prepared solver.
         statuses: how often estimates ended in what way.
     """
 
@@ -54,6 +58,8 @@ class Window:
         sigma: ArrayLike,
         solver: Solver | None = None,
         arrival: Arrival | None = None,
+        rounds: int = 1,
+        steady: float = 0.0,
     ) -> None:
         """State the graph and prepare its solver.
 
@@ -66,6 +72,9 @@ class Window:
             solver: of the window's graph; by default Levenberg-Marquardt, where terms of the past constrain the
                 interior point.
             arrival: coordinates of the prior of what has left; by default the variables' own tangent spaces.
+            rounds: how often at most, in one estimate, terms are asked for their data at what is believed and the
+                window is solved: more than once where data depend on beliefs, as associations do.
+            steady: a round that moves the present state by less, in every coordinate of its tangent space, is the last.
 
         Raises:
             GraphError: when sizes do not fit, or a term cannot stand in a window.
@@ -88,12 +97,13 @@ class Window:
         if solver is None:
             constrained = any(isinstance(term, Constraint) for term in graph.terms)
             solver = InteriorPoint() if constrained else LevenbergMarquardt()
-        self._run = solver.prepare(graph)
+        self.run = solver.prepare(graph)
         self._look = replace(solver, max_iterations=0).prepare(graph)
-        self._spread = JointCovariance(self._run.program, x[-1], *self._past.statics)
+        self._spread = JointCovariance(self.run.program, x[-1], *self._past.statics)
         self.solution: Solution | None = None
         self.statuses: Counter[Status] = Counter()
-        self.covariance = self._prior_covariance()
+        self.iterations, self._rounds, self._steady = 0, rounds, steady
+        self._covariance, self._due = self._prior_covariance(), False
 
     def past_in(self, graph: Graph, x: Selection) -> Past:
         """State the past on the nodes x (L + 1) of a graph that holds the robot's statics."""
@@ -105,17 +115,90 @@ class Window:
         return self.history.present.copy()
 
     @property
+    def covariance(self) -> Array:
+        """(D, D) of the present state and the statics side by side, from the past's terms alone.
+
+        That of the last estimate for which there is one: statics that nothing has been measured of have none.
+        """
+        if self._due and self.solution is not None:
+            self._due = False
+            found = self._spread(self.solution.values)
+            if found is None:
+                logger.warning("the window's information is singular: the covariance stays as it was")
+            else:
+                self._covariance = found
+        return self._covariance
+
+    def place(self, name: str, member: int = 0) -> slice:
+        """Columns of a static's member in :attr:`covariance`.
+
+        Raises:
+            GraphError: when the robot has no such static.
+        """
+        return self._member(name, member, self.robot.state.dim, "dim")
+
+    def _member(self, name: str, member: int, at: int, size: str) -> slice:
+        for static in self.robot.statics:
+            own = getattr(static.manifold, size)
+            if static.name == name and 0 <= member < len(static.values):
+                return slice(at + member * own, at + (member + 1) * own)
+            at += own * len(static.values)
+        raise GraphError(f"the robot has no static '{name}' with a member {member}", family=name)
+
+    def _arriving(self, name: str, member: int) -> tuple[slice, slice]:
+        """Places of a static's member in the arrival's reference and in its information."""
+        state, reach = self.robot.state, self._past.reach
+        sizes = (reach * state.storage, "storage"), (reach * state.dim, "dim")
+        reference, information = (self._member(name, member, at, size) for at, size in sizes)
+        return reference, information
+
+    def admit(self, name: str, member: int, value: ArrayLike, sigma: ArrayLike) -> None:
+        """Let a member of a static stand for something new, of which nothing was known.
+
+        Args:
+            name: of the static.
+            member: which of its members.
+            value: (storage,) where it is believed to be.
+            sigma: standard deviations of that belief, of any shape that fits (d,).
+
+        Raises:
+            GraphError: when the robot has no such static, or it is known.
+        """
+        manifold = {static.name: static for static in self.robot.statics if not static.known}
+        place = self._arriving(name, member)
+        if name not in manifold:
+            raise GraphError(f"static '{name}' is known: nothing new can take its place", family=name)
+        kind, array = manifold[name].manifold, np.asarray(value, dtype=np.float64)
+        if array.shape != (kind.storage,) or not np.all(kind.is_valid(array)):
+            raise GraphError(f"static '{name}': {array} is not on {kind.name}", family=name)
+        weight = information_of(np.broadcast_to(np.asarray(sigma, dtype=np.float64), (kind.dim,)))
+        self.left.admit(name, member, array, weight, place)
+        self.history.statics[name][member] = array
+
+    def forget(self, name: str, member: int) -> None:
+        """Marginalise a member of a static out of what has left; its measurements in the window are the caller's."""
+        self.left.forget(self._arriving(name, member)[1])
+
+    @property
     def state_covariance(self) -> Array:
         """(d, d) of the present state."""
         dim = self.robot.state.dim
         return self.covariance[:dim, :dim].copy()
 
-    def move(self, control: ArrayLike, time: float | None = None) -> None:
-        """Let the next node enter, where the robot's model expects it; the oldest one leaves when the window is full.
+    def move(
+        self,
+        control: ArrayLike,
+        time: float | None = None,
+        state: ArrayLike | None = None,
+        steps: Mapping[str, ArrayLike] | None = None,
+    ) -> None:
+        """Let the next node enter; the oldest one leaves when the window is full.
 
         Args:
             control: (m,) applied since the last node.
             time: of the new node [s]; None for one more than that of the last.
+            state: (storage,) a guess of the new node; None for where the robot's model expects it.
+            steps: (storage,) guesses of the new step's unknowns, by name.
 
         Raises:
             GraphError: when the control is not finite or time runs backwards.
@@ -128,8 +211,8 @@ class Window:
             if self.left.departure is None:
                 self.estimate_nothing()
             self.left.arrival, self.left.departure = self.left.departure, None
-        expected = self.robot.predicted(history.present, applied)
-        history.move(applied, expected, history.times[-1] + 1.0 if time is None else time)
+        expected = self.robot.predicted(history.present, applied) if state is None else state
+        history.move(applied, expected, history.times[-1] + 1.0 if time is None else time, steps or {})
 
     def record(self, name: str, value: ArrayLike | None, node: int = -1) -> None:
         """Attach what was measured to a node, by default the present one; None where nothing was.
@@ -149,14 +232,18 @@ class Window:
 
     def estimate(self, given: Any = None) -> Solution:
         """Solve the window and believe it, unless the answer is none; then the prediction is kept."""
-        now, past = self.now(given), self._past
-        data = past.data(now)
-        solution = self._run.solve({past.x.family: past.nodes(), **past.guess()}, data=data)
-        self.statuses[solution.status] += 1
-        if solution.status in USELESS:
-            solution = self._look.solve({past.x.family: past.nodes(), **past.guess()}, data=data)
-        else:
+        past, self.iterations = self._past, 0
+        for _ in range(self._rounds):
+            before, data = self.present, past.data(self.now(given))
+            solution = self.run.solve({past.x.family: past.nodes(), **past.guess()}, data=data)
+            self.statuses[solution.status] += 1
+            self.iterations += solution.iterations
+            if solution.status in USELESS:
+                solution = self._look.solve({past.x.family: past.nodes(), **past.guess()}, data=data)
+                break
             past.take(solution)
+            if np.abs(self.robot.state.local(before, self.history.present)).max() < self._steady:
+                break
         self._conclude(solution)
         return solution
 
@@ -166,10 +253,7 @@ class Window:
         self._conclude(self._look.solve({past.x.family: past.nodes(), **past.guess()}, data=past.data(self.now(given))))
 
     def _conclude(self, solution: Solution) -> None:
-        self.solution = solution
-        covariance = self._spread(solution.values)
-        if covariance is not None:
-            self.covariance = covariance
+        self.solution, self._due = solution, True
         self._past.depart(solution)
 
     def reset(self, start: ArrayLike | None = None, sigma: ArrayLike | None = None) -> None:
@@ -183,14 +267,15 @@ class Window:
         spread = self._sigma if sigma is None else _covariance(sigma, self.robot.state.dim)
         self.history.begin(begin)
         self.left.begin(begin, spread)
-        self.solution, self.covariance = None, self._prior_covariance()
+        self.solution, self._covariance, self._due = None, self._prior_covariance(), False
 
     def _prior_covariance(self) -> Array:
         blocks = [np.linalg.inv(self.left.initial[1])]
         for static in self.robot.statics:
-            for information in static.information:
-                with np.errstate(divide="ignore"):
-                    blocks.append(np.diag(1.0 / np.diag(information)))
+            sigma = np.broadcast_to(
+                np.asarray(static.sigma, dtype=np.float64), (len(static.values), static.manifold.dim)
+            )
+            blocks += [np.diag(row**2) for row in sigma]
         size = sum(len(block) for block in blocks)
         covariance, at = np.zeros((size, size)), 0
         for block in blocks:
