@@ -1,9 +1,10 @@
-"""Anything that was solved, looked at: scenes in three dimensions, as pages that need nothing else."""
+"""Anything that was solved, looked at: scenes in three dimensions, as pages that need nothing else, or live."""
 
 from unifg.view.bodies import Part
 from unifg.view.canvas import Frame
 
 # from unifg.view.live import Live
+from unifg.view.live import Live
 from unifg.view.scene import Scene
 
-__all__ = ["Frame", "Part", "Scene"]
+__all__ = ["Frame", "Live", "Part", "Scene"]

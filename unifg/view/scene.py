@@ -1,4 +1,4 @@
-"""A scene: what stays, what each frame holds, the words beside it; saved as a page of its own.
+"""A scene: what stays, what each frame holds, the words beside it; saved as a page of its own, or shown live.
 
 ``Scene.of(solution, x).save("scene.html")`` looks at a solution. A scene of one's own is made by the same methods: what
 is drawn on the `Scene` stays, what is drawn on a `Frame` is seen while its turn lasts, and a body is placed anew in
@@ -23,6 +23,7 @@ from unifg.view.canvas import Canvas, Frame
 from unifg.view.content import Body, Content
 
 # from unifg.view.live import Live
+from unifg.view.live import Live
 from unifg.view.members import Position
 from unifg.view.page import Label, Plot, View
 from unifg.view.recording import recorded
@@ -107,7 +108,7 @@ class Scene(Content, Canvas):
             keep: at most so many frames, the latest ones.
 
         Returns:
-            A scene, to be drawn on, saved; more solutions may be added.
+            A scene, to be drawn on, saved, or shown live and added to.
 
         Raises:
             ViewError: there is no solution; a family has no place; a value is not finite; iterates were not kept.
@@ -151,7 +152,7 @@ class Scene(Content, Canvas):
         return made
 
     def add(self, solution: Solution) -> Frame:
-        """A further frame that shows a solution as the one this scene was made of.
+        """A further frame that shows a solution as the one this scene was made of, live where somebody watches.
 
         Raises:
             ViewError: the scene was not made by `Scene.of` with ``over="solutions"``.
@@ -257,6 +258,22 @@ class Scene(Content, Canvas):
         path = Path(path)
         path.write_text(self.html(), encoding="utf-8", newline="\n")
         return path
+
+    def live(self, port: int = 7000) -> Live:
+        """Serve the scene on this machine; from now on every frame is shown when it ends, and only there.
+
+        Does not wait: not for a browser, which may come, go and come back, nor for the picture.
+
+        Args:
+            port: tried first; if it is taken, another one is.
+
+        Returns:
+            Something to close, also as a context; its ``url`` is what to open.
+
+        Raises:
+            ViewError: meshcat is not installed, or no port is free.
+        """
+        return Live(self, port)
 
     # ------------------------------------------------------------------- inside
 
