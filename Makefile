@@ -9,6 +9,7 @@
 #   make release-check    the same, and fail if there are any, or if the kernels that come with unifg are out of date
 #   make kernels  compile everything anew into unifg/machine/kernels.zip, which spares a first use most of it (minutes)
 #   make mutants  change decisions one at a time and see whether a test notices (hours; FILES='scenarios/driving/drive_past.py')
+#   make examples run all scripts of examples/ and draw the pictures of docs/examples.md again
 #   make offsets  solve the same problems with their worlds moved by up to 5000 km (minutes)
 #   make fences   run the shell commands shown in README.md and docs/
 #   make clean    remove everything made here
@@ -27,7 +28,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Matrices here are small: more threads per process only make the processes wait for each other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: kernels help demo test lint types bench results stale release-check mutants fences clean offsets
+.PHONY: kernels help demo test lint types bench results stale release-check mutants fences clean offsets examples
 .DELETE_ON_ERROR:
 
 help:
@@ -70,6 +71,9 @@ mutants: $(VENV)/ready
 
 offsets: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/python -m benchmarks.offsets
+
+examples: $(VENV)/ready
+	$(BIN)/python docs/images/draw_examples.py
 
 fences: $(VENV)/ready
 	$(BIN)/python docs/check_shell_fences.py

@@ -1,55 +1,57 @@
-"""A car parks by noisy positions: past and future in one graph.
+"""Past and future in one graph: a car parks by noisy positions, with estimation and control coupled by one word.
 
-What it has measured over the last two seconds and what it will do in the next five share the present state.
+What it has measured over the last 2 s and what it will do in the next 5 s share the present state. The loop keeps the
+window, its prior and the warm start. One position in four is missing. "sequential" is two graphs, "joint" is one.
+
+    python examples/joint_past_future.py [FOLDER]
 """
 
+import sys
+from pathlib import Path
+
+import matplotlib.pyplot as plt
 import numpy as np
 
 import unifg as fg
-from unifg.horizon import ControlCost, Dynamics, Loop, Measurement, Robot, Window
+from unifg.horizon import COUPLINGS, ControlCost, Dynamics, Loop, Measurement, Now, Robot, Window
 from unifg.models import bicycle, rkmk
 from unifg.solvers import InteriorPoint
+from unifg.typing import Array
 
-CAR, H, PAST, AHEAD = bicycle.Bicycle(), 0.2, 10, 25  # [s] of a step; steps
-GOAL, LIMITS = np.array([6.0, 3.0, 0.0, 0.0]), np.array([1.0, 0.5])  # pose and speed; [m/s^2, rad]
-NOISE, GPS = np.array([0.01, 0.01, 0.005, 0.02]), 0.1  # of a step; [m] of a position
-motion = bicycle.dynamics(CAR)
-
-
-def position(x, measured):
-    return x[:, :2] - measured
+STATE, h, goal = bicycle.STATE, 0.2, np.array([6.0, 3.0, 0.0, 0.0])  # a step [s]; pose and speed
+noise, gps = np.array([0.01, 0.01, 0.005, 0.02]), 0.1  # of a step; of a position [m]
+field, motion = bicycle.field(bicycle.Bicycle()), bicycle.dynamics(bicycle.Bicycle())
 
 
 class Parking:  # what the future is to be, besides the dynamics
-    def state(self, graph, x, u):
-        goal = graph.data("goal", GOAL)
-        graph.minimize(fg.prior, x[1:], goal, sigma=[3.0, 1.0, 1.0, 2.0], name="approach")
-        graph.minimize(fg.prior, x[-1], goal, sigma=[0.1, 0.1, 0.05, 0.1], name="park")
-        graph.bound(u, lower=-LIMITS, upper=LIMITS, name="limits")
+    def state(self, graph: fg.Graph, x: fg.Selection, u: fg.Family) -> None:
+        graph.minimize(fg.prior, x[1:], goal, sigma=[1.0, 1.0, 1.0, 2.0], name="approach")
+        graph.bound(u, lower=[-1.0, -0.5], upper=[1.0, 0.5], name="limits")
         graph.bound(x.speed[1:], lower=-1.5, upper=1.5, name="speed")
 
-    def data(self, now):
-        return {"goal": now.given}
+    def data(self, now: Now[None]) -> dict[str, Array]:
+        return {}
 
 
-def main(coupling="joint", solver=None, seed=0):
-    rng = np.random.default_rng(seed)
-    move = lambda x, u: rkmk.rollout(bicycle.STATE, bicycle.field(CAR), x, u[None], h=H)[-1]  # noqa: E731
-    robot = Robot(bicycle.STATE, bicycle.CONTROL, predict=move)
-    past = [Dynamics(motion, H, sigma=NOISE), Measurement("gps", position, (2,), GPS)]
-    window = Window(robot, PAST, past, start=np.zeros(4), sigma=[0.3, 0.3, 0.1, 0.1])
-    future = [Dynamics(motion, H), Parking(), ControlCost(sigma=[1.0, 0.5], change=[0.5, 0.2])]
-    loop = Loop(robot, AHEAD, future, solver=solver or InteriorPoint(), window=window, coupling=coupling)
-    truth, errors = np.array([0.2, -0.2, 0.05, 0.0]), []
+results, (figure, axes) = {}, plt.subplots(1, 2, figsize=(8.0, 2.6), sharey=True, layout="constrained")
+for coupling, ax in zip(COUPLINGS[1:], axes, strict=True):
+    rng = np.random.default_rng(1)
+    robot = Robot(STATE, fg.Rn(2), predict=lambda x, u: rkmk.rollout(STATE, field, x, u[None], h=h)[-1])
+    past = Dynamics(motion, h, sigma=noise), Measurement("gps", lambda x, z: x[:, :2] - z, (2,), gps)
+    window = Window(robot, 10, past, start=np.zeros(4), sigma=[0.3, 0.3, 0.1, 0.1])
+    future = Dynamics(motion, h), Parking(), ControlCost(sigma=[1.0, 0.5], change=[0.5, 0.2])
+    loop = Loop(robot, 25, future, solver=InteriorPoint(), window=window, coupling=coupling)
+    truth, believed = np.array([[0.2, -0.2, 0.05, 0.0]]), np.zeros((0, 4))
     for tick in range(60):
-        seen = {"gps": truth[:2] + GPS * rng.normal(size=2)} if tick % 4 != 3 else {}  # one in four is missing
-        plan = loop.tick(GOAL, seen)
-        errors.append(np.linalg.norm((loop.estimate - truth)[:2]))
-        truth = bicycle.STATE.retract(move(truth, plan.control), NOISE * rng.normal(size=4))
-    return np.linalg.norm((truth - GOAL)[:2]), np.mean(errors), loop.statuses
-
-
-if __name__ == "__main__":
-    away, error, statuses = main()
-    print(f"parked {away:.2f} m from the goal; estimate off by {error:.2f} m on average")
-    print({status.name: count for status, count in statuses.items()})
+        plan = loop.tick(measured={"gps": truth[-1, :2] + gps * rng.normal(size=2)} if tick % 4 else {})
+        next_state = STATE.retract(robot.predicted(truth[-1], plan.control), noise * rng.normal(size=4))
+        believed, truth = np.vstack([believed, loop.estimate]), np.vstack([truth, next_state])
+    away = np.median(np.linalg.norm((truth[-20:] - goal)[:, :2], axis=1))
+    off = np.median(np.linalg.norm((truth[:-1] - believed)[:, :2], axis=1))
+    results[coupling] = away, off, loop.statuses[fg.Status.CONVERGED]
+    print(f"{coupling:10} stands {away:.2f} m from the goal, its estimate {off:.3f} m off")
+    ax.plot(*truth[:, :2].T, *believed[:, :2].T, ".")
+    ax.set_title(coupling)
+folder = Path(*sys.argv[1:] or ["out"])
+folder.mkdir(parents=True, exist_ok=True)
+figure.savefig(folder / "joint_past_future.png", dpi=80)

@@ -64,7 +64,7 @@ def sources(folder: Path) -> list[Path]:
 
 LIBRARY = [(package, path) for package, folder in FOLDERS.items() for path in sources(folder)]
 EVERYTHING = [path for _, path in LIBRARY] + [
-    path for name in ("tests", "docs", "benchmarks") for path in sources(CHECKOUT / name)
+    path for name in ("tests", "docs", "benchmarks", "examples") for path in sources(CHECKOUT / name)
 ]
 BENCHMARKS = CHECKOUT / "benchmarks"
 HOUSE = [*LIBRARY, *(("benchmarks", path) for path in sources(BENCHMARKS))]

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tarfile
 import tomllib
 import venv
 import zipfile
@@ -147,6 +148,13 @@ def test_wheel_holds_the_packages_and_nothing_else(source: Path, wheel: Path) ->
     if (source / "unifg" / "machine" / "kernels.zip").exists():  # what may be missing is compiled on the first use
         expected.add("unifg/machine/kernels.zip")
     assert {name for name in names if ".dist-info/" not in name} == expected
+
+
+def test_sdist_holds_the_examples(source: Path, wheel: Path) -> None:
+    del wheel  # building it leaves the sdist beside it
+    (sdist,) = (source / "dist").glob("*.tar.gz")
+    names = {Path(name).name for name in tarfile.open(sdist).getnames() if Path(name).parent.name == "examples"}
+    assert names >= {path.name for path in (CHECKOUT / "examples").glob("*.py")}
 
 
 def test_wheel_is_the_same_without_links(source: Path, wheel: Path, tmp_path: Path) -> None:
