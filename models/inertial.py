@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -24,9 +24,10 @@ from unifg.kernels.derive.stated import StatedKernel
 from unifg.kernels.residuals import Residual, residual
 from unifg.language.factors import difference
 from unifg.language.statement import Statement
-from unifg.language.variables import Data, Variable, as_selection
+from unifg.language.variables import Data, Selection, Variable, as_selection
 from unifg.lie import SE23, SO3, Manifold, Product, Rn
 from unifg.models.preintegration import BIAS, GRAVITY, ImuNoise, Preintegrated, preintegrate
+from unifg.models.stamped import Present, by_handle
 from unifg.typing import Array, ArrayLike
 
 
@@ -83,18 +84,6 @@ def _parts(state: Manifold) -> tuple[slice, slice, slice]:
     )
 
 
-class _Given(NamedTuple):
-    """Data of the terms, one row for each interval."""
-
-    increment: Data
-    by_bias: Data
-    reference: Data
-    duration: Data
-    information: Data
-    walk: Data
-    known: Data
-
-
 @dataclass(frozen=True)
 class SampleCounts:
     """What became of the samples.
@@ -115,9 +104,10 @@ class SampleCounts:
 class InertialMeasurements:
     """Samples of one gyro and accelerometer, as factors between all neighbours of a trajectory.
 
-    ``state`` adds the factors once, ``add`` takes samples as they arrive, and ``data`` integrates what lies between
-    nodes at given times, at given biases: a window of some thousand samples in some milliseconds. Nothing is compiled
-    or laid out again in between. The body is the sensor: its place and axes are those of the states.
+    ``add`` takes samples as they arrive. As a term of a window (:class:`unifg.horizon.Window`) it is asked for the
+    rest; in a graph by hand, ``state`` adds the factors once and ``at`` integrates what lies between nodes at given
+    times, at given biases: a window of some thousand samples in some milliseconds. Nothing is compiled or laid out
+    again in between. The body is the sensor: its place and axes are those of the states.
 
     Attributes:
         noise: of the sensor.
@@ -129,11 +119,22 @@ class InertialMeasurements:
         self,
         noise: ImuNoise,
         *,
+        body: str | None = None,
+        bias: str = "bias",
         gap: float = 0.1,
         gravity: tuple[float, float, float] = GRAVITY,
         name: str = "imu",
     ) -> None:
         """Describe the sensor.
+
+        Args:
+            noise: of the sensor.
+            body: component of the states that moves, as :func:`motion` takes it; None for the whole state.
+            bias: on ``preintegration.BIAS``: a component of the states, or the name of a family with a member for
+                each node, or with one, which stays.
+            gap: for how long a sample may be held [s].
+            gravity: in the world [m/s^2].
+            name: of the terms.
 
         Raises:
             ModelError: when the gap is not positive.
@@ -141,44 +142,65 @@ class InertialMeasurements:
         if not gap > 0.0:
             raise ModelError(f"'{name}': gap {gap} must be positive")
         self.noise, self.gap, self.name, self.counts = noise, gap, name, SampleCounts()
-        self._gravity = gravity
-        self._given: _Given | None = None
+        self._body, self._bias, self._gravity = body, bias, gravity
+        self._walk = f"{name}: walk"
+        self._place: slice | None = None  # of biases in states
         self._samples: Array = np.empty((0, 7))  # stamp, rates, forces
 
-    def state(self, graph: Statement, x: Variable, bias: Variable) -> None:
-        """Add factors between all neighbours of ``x``, and of ``bias``, on ``preintegration.BIAS``, one for each node.
+    def state(self, graph: Statement, x: Variable, u: Any = None) -> None:
+        """Add factors between all neighbours of x, and of the biases where there is one for each node.
 
         Raises:
-            ModelError: when it has been stated before, or the numbers of nodes do not fit.
+            ModelError: when there are fewer than two nodes, or the biases do not fit.
         """
-        nodes, biases = as_selection(x), as_selection(bias)
-        if self._given is not None:
-            raise ModelError(f"'{self.name}' has been stated already: each graph takes measurements of its own")
-        if len(nodes) < 2 or len(biases) != len(nodes) or biases.manifold != BIAS:
+        nodes = as_selection(x)
+        body = nodes if self._body is None else getattr(nodes, self._body)
+        biases = as_selection(self._biases(graph, nodes))
+        if len(nodes) < 2 or len(biases) not in (1, len(nodes)) or biases.manifold != BIAS:
             raise ModelError(
-                f"'{self.name}' needs two nodes or more and a bias on {BIAS.name} for each; found {len(nodes)} and "
-                f"{len(biases)} on {biases.manifold.name}"
+                f"'{self.name}' needs two nodes or more and a bias on {BIAS.name}, for each or for all; found "
+                f"{len(nodes)} and {len(biases)} on {biases.manifold.name}"
             )
         n = len(nodes) - 1
-
-        def given(what: str, value: Array) -> Data:
-            return graph.data(f"{self.name}: {what}", np.broadcast_to(value, (n, *value.shape)).copy(), each=True)
-
-        self._given = _Given(
-            given("increment", SE23.identity()),
-            given("by bias", np.zeros((9, 6))),
-            given("reference", np.zeros(6)),
-            given("duration", np.ones(())),
-            given("information", np.eye(9)),
-            given("walk", np.ones(6)),
-            given("known", np.zeros((), dtype=bool)),
-        )
-        factor, before, after = motion(nodes.manifold, self._gravity), np.arange(n), np.arange(1, n + 1)
+        nothing = preintegrate([], np.empty((0, 3)), np.empty((0, 3)), np.arange(n + 1.0), self.noise, np.zeros(6))
+        walking = len(biases) > 1
+        data = {
+            name: graph.data(name, value, each=True)
+            for name, value in self._named(nothing).items()
+            if walking or name != self._walk
+        }
+        *given, information, known = (handle for name, handle in data.items() if name != self._walk)
+        self._place = biases.storage if biases.family is nodes.family else None
         graph.minimize(
-            factor, nodes[before], nodes[after], biases[before], *self._given[:4],
-            information=self._given.information, active=self._given.known, name=self.name,
-        )  # fmt: skip
-        graph.minimize(difference, biases[before], biases[after], sigma=self._given.walk, name=f"{self.name}: biases")
+            motion(body.manifold, self._gravity),
+            *(body[:-1], body[1:], biases[:-1] if walking else biases, *given),
+            information=information,
+            active=known,
+            name=self.name,
+        )
+        if walking:
+            graph.minimize(difference, biases[:-1], biases[1:], sigma=data[self._walk], name=f"{self.name}: biases")
+
+    def _biases(self, graph: Statement, nodes: Selection) -> Variable:
+        if isinstance(nodes.manifold, Product) and self._bias in nodes.manifold.components:
+            found: Selection = getattr(nodes, self._bias)
+            return found
+        if self._bias not in graph.families:
+            raise ModelError(f"'{self.name}': neither {nodes.manifold.name} nor the graph has a '{self._bias}'")
+        return graph.families[self._bias]
+
+    def _named(self, found: Preintegrated) -> dict[str, Array]:
+        """Values of the data, by name, in the order in which they are stated."""
+        known = found.held <= self.gap
+        return {
+            f"{self.name}: increment": found.increment,
+            f"{self.name}: by bias": found.by_bias,
+            f"{self.name}: reference": found.bias,
+            f"{self.name}: duration": found.duration,
+            f"{self.name}: information": np.where(known[:, None, None], found.information, np.eye(9)),
+            f"{self.name}: known": known,
+            self._walk: self.noise.walk(found.duration),
+        }
 
     def add(self, stamp: ArrayLike, gyro: ArrayLike, accelerometer: ArrayLike) -> None:
         """Take samples in any order: one stamp [s] with (3,) rates [rad/s] and forces [m/s^2], or (k,) with (k, 3).
@@ -203,29 +225,45 @@ class InertialMeasurements:
             repeated=self.counts.repeated + int((~first).sum()),
         )
 
-    def data(self, times: ArrayLike, bias: ArrayLike) -> dict[Data, Array]:
-        """What a solve needs, for nodes that stand at these times; samples before the oldest node are forgotten.
+    def data(self, now: Present) -> dict[str, Array]:
+        """Values of the data, by name, for the nodes of a window; biases are those it believes in."""
+        history = now.past
+        times, first = np.array(history.times), int(history.empty)
+        times[:first] = times[first] - np.arange(first, 0, -1.0)  # places that no node has entered yet
+        if self._place is not None:
+            return self._given(times, first, history.states[:-1, self._place])
+        found = self._given(times, first, now.statics[self._bias][0])
+        del found[self._walk]  # there is one bias, which stays
+        return found
+
+    def at(self, graph: Statement, times: ArrayLike, bias: ArrayLike) -> dict[Data, Array]:
+        """What a solve of a graph needs, for nodes that stand at these times; what is older is forgotten.
 
         Args:
+            graph: to which the factors have been added.
             times: (n,) of the nodes, increasing [s].
             bias: (6,) or (n - 1, 6), as they are believed to be.
 
         Raises:
-            ModelError: when nothing has been stated, or times or biases are not what they should be.
+            ModelError: when times or biases are not what they should be.
+            GraphError: when the factors have not been added.
         """
-        if self._given is None:
-            raise ModelError(f"'{self.name}' has not been stated: call state(graph, x, bias) first")
-        at = np.asarray(times, dtype=np.float64)
-        if at.shape != (len(self._given.duration.value) + 1,):
-            raise ModelError(f"'{self.name}': {len(self._given.duration.value) + 1} times are needed, found {at.shape}")
-        old = int(np.searchsorted(self._samples[:, 0], at[0], side="right")) - 1
+        term: Any = graph.term(self.name)
+        needed, at = term.count + 1, np.asarray(times, dtype=np.float64)
+        if at.shape != (needed,):
+            raise ModelError(f"'{self.name}': {needed} times are needed, found {at.shape}")
+        walking = [f"{self.name}: biases"] if f"{self.name}: biases" in (term.name for term in graph.terms) else []
+        return by_handle(graph, (self.name, *walking), self._given(at, 0, bias))
+
+    def _given(self, times: Array, first: int, bias: ArrayLike) -> dict[str, Array]:
+        """Values of the data, by name, for nodes of which those before the first are not there yet."""
+        old = int(np.searchsorted(self._samples[:, 0], times[first], side="right")) - 1
         self._samples = self._samples[max(old, 0) :]  # the one before the oldest node is held into its interval
-        found = preintegrate(self._samples[:, 0], self._samples[:, 1:4], self._samples[:, 4:], at, self.noise, bias)
-        known = found.held <= self.gap
-        information = np.where(known[:, None, None], found.information, np.eye(9))
-        self.counts = replace(self.counts, kept=len(self._samples), unknown=int((~known).sum()))
-        walk = self.noise.walk(found.duration)
-        return dict(zip(self._given, (*found[:4], information, walk, known), strict=True))
+        found = self.integrated(times, bias)
+        found.held[:first] = np.inf
+        unknown = int((found.held[first:] > self.gap).sum())
+        self.counts = replace(self.counts, kept=len(self._samples), unknown=unknown)
+        return self._named(found)
 
     def integrated(self, times: ArrayLike, bias: ArrayLike) -> Preintegrated:
         """The samples integrated between any times, as for a guess by :func:`unifg.models.preintegration.predict`."""

@@ -7,8 +7,9 @@ two nodes gets a fixed number of slots; what is in them are data, and empty slot
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -22,6 +23,31 @@ from unifg.models.interpolation import Interpolation, geodesic
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 CLOSE = 1e-6  # of a step: how far from a node a stamp still falls on it
+
+
+class Nodes(Protocol):
+    """What a window knows of its nodes: :class:`unifg.horizon.History`."""
+
+    times: Array
+
+    @property
+    def empty(self) -> int:
+        """Places that no node has entered yet; the index of the oldest node."""
+        ...
+
+
+class Present(Protocol):
+    """What a term of a window is asked with: :class:`unifg.horizon.Now`."""
+
+    @property
+    def statics(self) -> Mapping[str, Array]:
+        """(count, storage) believed statics, by name."""
+        ...
+
+    @property
+    def past(self) -> Any:
+        """The history: :class:`Nodes`, and what is believed of their states."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -45,22 +71,12 @@ class Counts:
     invalid: int = 0
 
 
-class _Slots(NamedTuple):
-    """Data of the slots, one row each, and the number of nodes."""
-
-    into: Data
-    step: Data
-    value: Data
-    filled: Data
-    nodes: int
-    clocked: bool
-
-
 class StampedMeasurements:
     """One sensor's measurements, as factors between the nodes of a trajectory.
 
-    ``state`` adds the factors once, ``add`` takes measurements as they arrive, in any order, and ``data`` gives what a
-    solve needs of them for nodes that stand at given times. Nothing is compiled or laid out again in between.
+    ``add`` takes measurements as they arrive, in any order. As a term of a window (:class:`unifg.horizon.Window`) it is
+    asked for the rest; in a graph by hand, ``state`` adds the factors once and ``at`` gives what a solve needs of them
+    for nodes that stand at given times. Nothing is compiled or laid out again in between.
 
     A stamp on a node falls on it; equal stamps take a slot each. The oldest nodes leave, and with them the measurements
     before what is the oldest then. What arrives after that is refused and counted, as is all else that finds no slot.
@@ -77,18 +93,26 @@ class StampedMeasurements:
         capacity: int,
         sigma: ArrayLike,
         between: Interpolation | None = None,
+        statics: Sequence[str] = (),
+        offset: str | None = None,
+        component: str | None = None,
         robust: Loss | None = None,
         name: str = "stamped",
     ) -> None:
         """Describe the sensor.
 
         Args:
-            error: ``error(x, z)`` or ``error(x, other, ..., z)``, (n, m): what measurements z (n, size) differ by from
-                what they should be at states x (n, storage). A batched function, or a residual made of one.
+            error: ``error(x, z)`` or, with statics, ``error(x, s_1, ..., z)``, (n, m): what measurements z (n, size)
+                differ by from what they should be at states x (n, storage). A batched function, or a residual made of
+                one.
             size: how many numbers a measurement has.
             capacity: slots of an interval between two nodes.
             sigma: standard deviations, one or (m,).
-            between: how states are interpolated; the geodesic of their manifold by default.
+            between: how states x are interpolated; the geodesic of their manifold by default.
+            statics: names of families of one member that ``error`` takes, too: a landmark, a lever arm.
+            offset: name of a family of one member on Rn(1): by how much the sensor's clock is behind [s], so that a
+                measurement was taken at its stamp plus this. None: not at all.
+            component: of the nodes, which takes the place of x; None for all of them.
             robust: loss.
             name: of the term.
 
@@ -98,56 +122,38 @@ class StampedMeasurements:
         if size < 1 or capacity < 1:
             raise ModelError(f"'{name}': size {size} and capacity {capacity} must be at least 1")
         self.name, self.size, self.capacity = name, size, capacity
+        self.statics, self.offset, self.component = tuple(statics), offset, component
         self._error, self._sigma, self._between, self._robust = _batched(error, name), sigma, between, robust
-        self._slots: _Slots | None = None
         self._stamps: Array = np.empty(0)
         self._values: Array = np.empty((0, size))
-        self._known: BoolArray = np.empty(0, dtype=bool)  # whether data() has placed them before
+        self._known: BoolArray = np.empty(0, dtype=bool)  # whether they have been placed before
         self.counts = Counts()
 
-    def state(self, graph: Statement, nodes: Variable, *others: Any, offset: Variable | None = None) -> str:
-        """Add the factors, all inactive; returns the name of their term.
-
-        Args:
-            graph: to add to.
-            nodes: two or more, in the order of time.
-            *others: arguments of ``error`` after the state, the same for all measurements: selections of length
-                one, constants, or data.
-            offset: a variable on Rn(1): by how much the sensor's clock is behind [s], so that a measurement was taken
-                at its stamp plus this.
+    def state(self, graph: Statement, x: Variable, u: Any = None) -> None:
+        """Add the factors, all inactive, between the nodes x, two or more in the order of time.
 
         Raises:
-            ModelError: when it has been stated before, there are fewer than two nodes, or the offset is no number.
+            ModelError: when there are fewer than two nodes, or the offset is no number.
         """
-        x = as_selection(nodes)
-        if self._slots is not None:
-            raise ModelError(f"'{self.name}' has been stated already: each graph takes measurements of its own")
-        if len(x) < 2:
-            raise ModelError(f"'{self.name}' needs two nodes or more to stand between, found {len(x)}")
-        if offset is not None and (len(offset), as_selection(offset).manifold.dim) != (1, 1):
+        nodes = as_selection(x) if self.component is None else getattr(as_selection(x), self.component)
+        if len(nodes) < 2:
+            raise ModelError(f"'{self.name}' needs two nodes or more to stand between, found {len(nodes)}")
+        clock = [] if self.offset is None else [graph.families[self.offset]]
+        if any((len(family), family.manifold.dim) != (1, 1) for family in clock):
             raise ModelError(f"'{self.name}': the offset of a clock is one variable on Rn(1)")
-        count = (len(x) - 1) * self.capacity
-        slots = _Slots(
-            graph.data(f"{self.name}: time into step", np.zeros(count), each=True),
-            graph.data(f"{self.name}: length of step", np.ones(count), each=True),
-            graph.data(f"{self.name}: values", np.zeros((count, self.size)), each=True),
-            graph.data(f"{self.name}: filled", np.zeros(count, dtype=bool), each=True),
-            len(x),
-            offset is not None,
-        )
-        before = np.repeat(np.arange(len(x) - 1), self.capacity)
-        function = _at_stamp(self._error, self._between or geodesic(x.manifold), offset is not None)
-        clock = () if offset is None else (offset,)
-        name = graph.minimize(
-            function,
-            *(x[before], x[before + 1], *clock, slots.into, slots.step, slots.value, *others),
+        empty = self._filled(np.arange(float(len(nodes))), np.empty(0, dtype=np.intp), 0.0)
+        into, step, values, measured = (graph.data(name, value, each=True) for name, value in empty.items())
+        before = np.repeat(np.arange(len(nodes) - 1), self.capacity)
+        graph.minimize(
+            _at_stamp(self._error, self._between or geodesic(nodes.manifold), bool(clock)),
+            *(nodes[before], nodes[before + 1], *clock, into, step),
+            *(graph.families[name] for name in self.statics),
+            values,
             sigma=self._sigma,
             robust=self._robust,
-            active=slots.filled,
+            active=measured,
             name=self.name,
         )
-        self._slots = slots
-        return name
 
     def add(self, stamp: ArrayLike, value: ArrayLike) -> None:
         """Take measurements: one stamp [s] and (size,) value, or (k,) stamps and (k, size) values, in any order.
@@ -168,32 +174,52 @@ class StampedMeasurements:
         self._values = np.concatenate([self._values, values[good]])
         self._known = np.concatenate([self._known, np.zeros(int(good.sum()), dtype=bool)])
 
-    def data(self, times: ArrayLike, offset: float = 0.0) -> dict[Data, Array]:
-        """What a solve needs, for nodes that stand at these times.
+    def data(self, now: Present) -> dict[str, Array]:
+        """Values of the data, by name, for the nodes of a window."""
+        history: Nodes = now.past
+        offset = 0.0 if self.offset is None else float(np.ravel(now.statics[self.offset])[0])
+        return self._given(np.array(history.times), history.empty, offset)
+
+    def at(self, graph: Statement, times: ArrayLike, offset: float = 0.0) -> dict[Data, Array]:
+        """What a solve of a graph needs, for nodes that stand at these times.
 
         Args:
+            graph: to which the factors have been added.
             times: (n,) of the nodes, increasing [s].
             offset: of the sensor's clock, as it is believed to be: it says between which nodes a measurement lies.
 
         Raises:
-            ModelError: when nothing has been stated, or times are not one for each node, finite and increasing.
+            ModelError: when times are not one for each node, finite and increasing, or the offset is not finite.
+            GraphError: when they have not been added.
         """
-        if self._slots is None:
-            raise ModelError(f"'{self.name}' has not been stated: call state(graph, nodes) first")
-        slots, at = self._slots, np.asarray(times, dtype=np.float64)
-        good = at.shape == (slots.nodes,) and np.isfinite(at).all() and (np.diff(at) > 0.0).all()
+        term: Any = graph.term(self.name)
+        nodes = term.count // self.capacity + 1
+        at = np.asarray(times, dtype=np.float64)
+        good = at.shape == (nodes,) and np.isfinite(at).all() and (np.diff(at) > 0.0).all()
         if not (good and np.isfinite(offset)):
-            raise ModelError(f"'{self.name}': times must be {slots.nodes} finite, increasing numbers, found {at}")
-        interval, place = self._place(at, offset)
-        slot = interval * self.capacity + place
-        count, stamps = len(slots.filled.value), self._stamps[: len(slot)]
-        into, step, filled = np.zeros(count), np.ones(count), np.zeros(count, dtype=bool)
+            raise ModelError(f"'{self.name}': times must be {nodes} finite, increasing numbers, found {at}")
+        return by_handle(graph, (self.name,), self._given(at, 0, offset))
+
+    def _given(self, times: Array, first: int, offset: float) -> dict[str, Array]:
+        """Values of the data, by name, for nodes of which those before the first are not there yet."""
+        if first < len(times) - 1:
+            interval, place = self._place(times[first:], offset)
+            slot = (interval + first) * self.capacity + place
+        else:
+            slot = np.empty(0, dtype=np.intp)
+        return self._filled(times, slot, 0.0 if self.offset else offset)
+
+    def _filled(self, times: Array, slot: IntArray, offset: float) -> dict[str, Array]:
+        """The same, the first measurements being in these slots."""
+        count, interval = (len(times) - 1) * self.capacity, slot // self.capacity
+        into, step, measured = np.zeros(count), np.ones(count), np.zeros(count, dtype=bool)
         values = np.zeros((count, self.size))
-        into[slot] = (stamps - at[interval]) + (0.0 if slots.clocked else offset)
-        step[slot] = np.diff(at)[interval]
+        into[slot] = (self._stamps[: len(slot)] - times[interval]) + offset
+        step[slot] = np.diff(times)[interval]
         values[slot] = self._values[: len(slot)]
-        filled[slot] = True
-        return {slots.into: into, slots.step: step, slots.value: values, slots.filled: filled}
+        measured[slot] = True
+        names = (f"{self.name}: time into step", f"{self.name}: length of step", self.name, f"{self.name}: measured")
+        return dict(zip(names, (into, step, values, measured), strict=True))
 
     def _place(self, at: Array, offset: float) -> tuple[IntArray, IntArray]:
         """Keep what has a slot, first, and what waits; returns intervals and places in them of the former."""
@@ -248,10 +274,21 @@ def _batched(error: Function | Residual, name: str) -> Function:
 def _at_stamp(error: Function, between: Interpolation, clocked: bool) -> Function:
     """The residual of a measurement between two nodes, at the fraction that its stamp says."""
 
-    def stamped(x: Array, y: Array, into: Array, step: Array, z: Array, *others: Any) -> Array:
-        return error(between(x, y, into / step, step), *others, z)
+    def stamped(x: Array, y: Array, into: Array, step: Array, *measured: Array) -> Array:
+        return error(between(x, y, into / step, step), *measured)
 
-    def clocked_stamped(x: Array, y: Array, late: Array, into: Array, step: Array, z: Array, *others: Any) -> Array:
-        return error(between(x, y, (into + late[:, 0]) / step, step), *others, z)
+    def clocked_stamped(x: Array, y: Array, late: Array, into: Array, step: Array, *measured: Array) -> Array:
+        return error(between(x, y, (into + late[:, 0]) / step, step), *measured)
 
     return clocked_stamped if clocked else stamped
+
+
+def by_handle(graph: Statement, terms: Sequence[str], values: Mapping[str, Array]) -> dict[Data, Array]:
+    """Values of data by the handles that terms of a graph read."""
+    found: dict[Data, Array] = {}
+    for name in terms:
+        term: Any = graph.term(name)
+        for handle in (*term.arguments, term.active, term.sigma, term.information):
+            if isinstance(handle, Data) and handle.name in values:
+                found[handle] = values[handle.name]
+    return found

@@ -329,7 +329,7 @@ def estimator(
     graph = fg.Graph()
     x, bias = graph.variables("x", manifold, nodes), graph.variables("bias", BIAS, nodes)
     imu = InertialMeasurements(NOISE)
-    imu.state(graph, x, bias)
+    imu.state(graph, x)
     fixes = graph.data("places", np.zeros((nodes, 3)), each=True)
     graph.minimize(lambda x, z: x[:, :3] - z, x, fixes, sigma=0.02, name="places")
     graph.minimize(fg.prior, bias[0], np.zeros(6), sigma=[0.1] * 3 + [0.5] * 3, name="bias")
@@ -351,7 +351,7 @@ def test_states_and_biases_are_estimated_consistently(manifold: fg.Manifold, rng
         places = at[:, :3] + 0.02 * rng.standard_normal((41, 3))
         believed = np.zeros(6)
         for _ in range(2):
-            data = imu.data(times, believed)  # forgets the last flight
+            data = imu.at(graph, times, believed)  # forgets the last flight
             assert imu.counts.kept == len(t) and imu.counts.unknown == 0
             first = predict(at[0], imu.integrated(times, believed))
             start = {x: in_parts(first) if manifold is STATE else first, bias: np.tile(believed, (41, 1))}
@@ -385,7 +385,7 @@ def test_a_window_slides_with_one_structure(rng: Generator) -> None:
                 imu.add(t[k], w[k], a[k])
         fed = ready
         at = states[np.round(times * 200.0).astype(int)]
-        data = {**imu.data(times, np.zeros(6)), fixes: at[:, :3], start: at[0]}
+        data = {**imu.at(graph, times, np.zeros(6)), fixes: at[:, :3], start: at[0]}
         with counting() as tally:
             solution = run.solve({x: at, bias: np.zeros((nodes, 6))}, data=data)
         assert tick == nodes - 1 or not (tally.compiled or tally.generated)
@@ -403,26 +403,26 @@ def test_order_of_arrival_changes_no_bit_of_the_data(rng: Generator) -> None:
     t, w, a = log_of(50, rng)
     answers = []
     for order in (np.arange(50), rng.permutation(50)):
-        _, _, _, imu, _ = estimator(3)
+        graph, _, _, imu, _ = estimator(3)
         for k in order:
             imu.add(t[k], w[k], a[k])
-        answers.append(imu.data([0.01, 0.1, 0.2], np.zeros(6)))
+        answers.append(imu.at(graph, [0.01, 0.1, 0.2], np.zeros(6)))
     for mine, other in zip(*(answer.values() for answer in answers), strict=True):
         assert np.array_equal(mine, other)
 
 
 def test_misuse_of_the_bookkeeping_is_named() -> None:
-    graph, x, bias, imu, _ = estimator(3)
-    with pytest.raises(ModelError, match="stated already"):
-        imu.state(graph, x, bias)
+    graph, x, _, imu, _ = estimator(3)
     fresh = InertialMeasurements(NOISE)
-    with pytest.raises(ModelError, match="has not been stated"):
-        fresh.data([0.0, 1.0], NONE)
-    for nodes, biases in ((x[:1], bias[:1]), (x, bias[:2]), (x, x)):
+    with pytest.raises(fg.GraphError, match="imu"):
+        fresh.at(fg.Graph(), [0.0, 1.0], NONE)
+    with pytest.raises(ModelError, match="neither SE23 nor the graph has a 'offset'"):
+        InertialMeasurements(NOISE, bias="offset").state(graph, x)
+    for nodes, bias in ((x[:1], "bias"), (x[:2], "bias"), (x, "x")):
         with pytest.raises(ModelError, match="a bias on"):
-            fresh.state(graph, nodes, biases)
+            InertialMeasurements(NOISE, bias=bias).state(graph, nodes)
     with pytest.raises(ModelError, match="3 times are needed"):
-        imu.data([0.0, 1.0], NONE)
+        imu.at(graph, [0.0, 1.0], NONE)
     with pytest.raises(ModelError, match=r"need rates and forces \(2, 3\)"):
         imu.add([0.0, 1.0], np.zeros((2, 3)), np.zeros(3))
     for gap in (0.0, np.nan):
@@ -442,6 +442,6 @@ def test_the_factor_is_compiled_with_exact_derivatives(rng: Generator) -> None:
     graph, x, bias, imu, _ = estimator(3)
     t, w, a = log_of(100, rng)
     imu.add(t, w, a)
-    data = imu.data([0.0, 0.2, 0.4], NONE)
+    data = imu.at(graph, [0.0, 0.2, 0.4], NONE)
     routes = graph.check({x: SE23.random(rng, (3,)), bias: np.zeros((3, 6))}, data=data).routes
     assert "derivatives exact" in routes["imu"]

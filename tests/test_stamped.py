@@ -181,7 +181,7 @@ def test_a_stamp_on_a_node_is_a_factor_of_that_node(rng: Generator) -> None:
     values = rng.normal(size=(3, 2))
     graph, x, fixes = window()
     fixes.add(TIMES[[4, 0, 2]], values)
-    solution = GaussNewton().solve(graph, {x: ZERO}, data=fixes.data(TIMES), check=True)
+    solution = GaussNewton().solve(graph, {x: ZERO}, data=fixes.at(graph, TIMES), check=True)
     assert fixes.counts == Counts(placed=3)
 
     plain, y, _ = window()
@@ -197,10 +197,10 @@ def test_order_of_arrival_changes_no_bit(rng: Generator) -> None:
     values[3] = values[5]
     answers = []
     for order in (np.arange(8), np.argsort(stamps), rng.permutation(8)):
-        _, _, fixes = window(capacity=8)
+        graph, _, fixes = window(capacity=8)
         for k in order:
             fixes.add(stamps[k], values[k])
-        answers.append(list(fixes.data(TIMES).values()))
+        answers.append(list(fixes.at(graph, TIMES).values()))
         assert fixes.counts.placed == 8
     for other in answers[1:]:
         for found, wanted in zip(other, answers[0], strict=True):
@@ -208,7 +208,7 @@ def test_order_of_arrival_changes_no_bit(rng: Generator) -> None:
 
 
 def test_what_is_refused_is_counted() -> None:
-    _, _, fixes = window(capacity=2)
+    graph, _, fixes = window(capacity=2)
     value = np.zeros(2)
     fixes.add(np.nan, value)
     fixes.add(0.1, [np.inf, 0.0])
@@ -216,38 +216,38 @@ def test_what_is_refused_is_counted() -> None:
     fixes.add(-0.01, value)  # before the oldest node
     fixes.add(0.41, value)  # after the newest
     fixes.add(np.full(9, 1e12), np.zeros((9, 2)))  # a clock gone mad
-    fixes.data(TIMES)
+    fixes.at(graph, TIMES)
     assert fixes.counts == Counts(placed=2, waiting=8, late=1, full=2, ahead=2, invalid=2)
-    fixes.data(TIMES)  # nothing is counted twice
+    fixes.at(graph, TIMES)  # nothing is counted twice
     assert fixes.counts == Counts(placed=2, waiting=8, late=1, full=2, ahead=2, invalid=2)
-    given = fixes.data(TIMES + 0.1)  # what waited near is placed; all that was placed stays
+    given = fixes.at(graph, TIMES + 0.1)  # what waited near is placed; all that was placed stays
     assert fixes.counts == Counts(placed=3, waiting=7, late=1, full=2, ahead=2, invalid=2)
-    filled = next(value for data, value in given.items() if data.name == "fixes: filled")
+    filled = next(value for data, value in given.items() if data.name == "fixes: measured")
     assert filled.tolist() == [False, False, True, True, False, False, True, False]
-    fixes.data(TIMES + 0.45)  # placed ones leave with their nodes: not late
+    fixes.at(graph, TIMES + 0.45)  # placed ones leave with their nodes: not late
     assert fixes.counts == Counts(placed=0, waiting=7, late=1, full=2, ahead=2, invalid=2)
     fixes.add(0.3, value)
-    fixes.data(TIMES + 0.45)
+    fixes.at(graph, TIMES + 0.45)
     assert fixes.counts == Counts(placed=0, waiting=7, late=2, full=2, ahead=2, invalid=2)
 
 
 def test_first_come_keeps_its_slot() -> None:
-    _, _, fixes = window(capacity=1)
+    graph, _, fixes = window(capacity=1)
     fixes.add(0.15, [1.0, 1.0])
-    fixes.data(TIMES)
+    fixes.at(graph, TIMES)
     fixes.add(0.12, [2.0, 2.0])
-    given = fixes.data(TIMES)
-    assert next(value for data, value in given.items() if data.name == "fixes: values")[1].tolist() == [1.0, 1.0]
+    given = fixes.at(graph, TIMES)
+    assert next(value for data, value in given.items() if data.name == "fixes")[1].tolist() == [1.0, 1.0]
     assert fixes.counts == Counts(placed=1, full=1)
 
 
 @pytest.mark.parametrize("epoch", [0.0, 1.7e9])
 def test_rounding_of_node_times_keeps_measurements_on_the_ends(epoch: float) -> None:
     """Times counted back from now differ from those counted forward by rounding; so do stamps of other clocks."""
-    _, _, fixes = window()
+    graph, _, fixes = window()
     end = epoch + 0.1 * 3 + 0.1  # 0.4 and a little
     fixes.add([np.nextafter(end, np.inf), np.nextafter(epoch, -np.inf)], np.zeros((2, 2)))
-    fixes.data(epoch + TIMES)
+    fixes.at(graph, epoch + TIMES)
     assert fixes.counts == Counts(placed=2)
 
 
@@ -257,20 +257,18 @@ def test_shapes_and_times_are_checked() -> None:
         fixes.add(0.1, np.zeros(3))
     with pytest.raises(ModelError, match=r"need values \(3, 2\), found \(2, 2\)"):
         fixes.add(np.zeros(3), np.zeros((2, 2)))
-    with pytest.raises(ModelError, match="stated already"):
-        fixes.state(graph, x)
     for times in (TIMES[:4], TIMES[::-1], np.zeros(5), [0.0, 0.1, np.nan, 0.3, 0.4]):
         with pytest.raises(ModelError, match="5 finite, increasing numbers"):
-            fixes.data(times)
+            fixes.at(graph, times)
     with pytest.raises(ModelError, match="finite, increasing"):
-        fixes.data(TIMES, offset=np.nan)
-    fresh = StampedMeasurements(place, 2, capacity=1, sigma=1.0)
-    with pytest.raises(ModelError, match="has not been stated"):
-        fresh.data(TIMES)
+        fixes.at(graph, TIMES, offset=np.nan)
+    fresh = StampedMeasurements(place, 2, capacity=1, sigma=1.0, offset="x")
+    with pytest.raises(fg.GraphError, match="stamped"):
+        fresh.at(graph, TIMES)
     with pytest.raises(ModelError, match="two nodes or more"):
         fresh.state(graph, x[0])
     with pytest.raises(ModelError, match=r"one variable on Rn\(1\)"):
-        fresh.state(graph, x, offset=x[0])
+        fresh.state(graph, x)
     for size, capacity in ((0, 1), (1, 0)):
         with pytest.raises(ModelError, match="must be at least 1"):
             StampedMeasurements(place, size, capacity=capacity, sigma=1.0)
@@ -278,7 +276,7 @@ def test_shapes_and_times_are_checked() -> None:
     ranges.add([0.1, 0.2], [1.0, 2.0])  # single numbers need no second axis
     ranges.add(0.3, 3.0)
     ranges.state(graph, x)
-    ranges.data(TIMES)
+    ranges.at(graph, TIMES)
     assert ranges.counts.placed == 3
 
 
@@ -299,11 +297,12 @@ def test_a_sliding_window_with_delays_is_the_batch_of_what_has_come(rng: Generat
     def direction(x: Array, z: Array) -> Array:
         return fg.wrap_angle(x[:, 2:] - z)
 
-    def gap(x: Array, beacon: Array, z: Array) -> Array:
+    beacon = drive(1.0)[:2] + np.array([3.0, 2.0])
+
+    def gap(x: Array, z: Array) -> Array:
         found: Array = np.linalg.norm(x[:, :2] - beacon, axis=1, keepdims=True) - z
         return found
 
-    beacon = drive(1.0)[:2] + np.array([3.0, 2.0])
     step, count = 0.1, 6
     readings: list[tuple[float, str, float, Array]] = []  # arrival, sensor, stamp, value
     for rate, name, lag in ((7.3, "fix", 0.17), (23.0, "direction", 0.0), (4.0, "gap", 0.6)):
@@ -323,8 +322,8 @@ def test_a_sliding_window_with_delays_is_the_batch_of_what_has_come(rng: Generat
             "direction": StampedMeasurements(direction, 1, capacity=3, sigma=0.01, name="direction"),
             "gap": StampedMeasurements(gap, 1, capacity=1, sigma=0.01, name="gap", robust=fg.Huber(3.0)),
         }
-        for name, sensor in sensors.items():
-            sensor.state(graph, x, *((beacon,) if name == "gap" else ()))
+        for sensor in sensors.values():
+            sensor.state(graph, x)
         odometry = fg.SE2.exp(step * np.array([1.0, 0.0, 0.6]))
         graph.minimize(fg.between, x[:-1], x[1:], odometry, sigma=[0.01, 0.01, 0.01])
         return sensors
@@ -341,7 +340,7 @@ def test_a_sliding_window_with_delays_is_the_batch_of_what_has_come(rng: Generat
         while waiting and waiting[0][0] <= times[-1]:
             _, name, stamp, value = waiting.pop(0)
             sensors[name].add(stamp, value)
-        data = {key: part for sensor in sensors.values() for key, part in sensor.data(times).items()}
+        data = {key: part for sensor in sensors.values() for key, part in sensor.at(graph, times).items()}
         guess = {x: np.array([drive(t) for t in times])}
         data[start] = guess[x][0]
         if tick == count:
@@ -364,7 +363,7 @@ def test_a_sliding_window_with_delays_is_the_batch_of_what_has_come(rng: Generat
             def between(a: Array, b: Array, s: float = s) -> Array:
                 return fg.SE2.compose(a, fg.SE2.exp(s * fg.SE2.log(fg.SE2.compose(fg.SE2.inverse(a), b))))
 
-            error = {"fix": fix, "direction": direction, "gap": lambda x, z: gap(x, beacon, z)}[name]
+            error = {"fix": fix, "direction": direction, "gap": gap}[name]
             own.minimize(
                 fg.residual(lambda a, b, z, e=error, m=between: e(m(a, b), z), derivatives="differences"),
                 y[k], y[k + 1], value, sigma=0.01, robust=fg.Huber(3.0) if name == "gap" else None,
@@ -389,15 +388,15 @@ def test_the_offset_of_a_clock_is_estimated(between: Interpolation | None, rng: 
         truth = np.concatenate([truth, np.tile([1.0, 0.0, 0.6], (count, 1))], axis=1)
     graph = fg.Graph()
     x, late = graph.variables("x", manifold, count), graph.variables("late", fg.Rn(1), 1)
-    fixes = StampedMeasurements(place, 2, capacity=2, sigma=0.01, between=between, name="fixes")
-    fixes.state(graph, x, offset=late)
+    fixes = StampedMeasurements(place, 2, capacity=2, sigma=0.01, between=between, offset="late", name="fixes")
+    fixes.state(graph, x)
     graph.minimize(fg.prior, x, truth, sigma=0.01, name="own clock")
     graph.minimize(fg.prior, late, [0.0], sigma=1.0, name="offset")
     stamps = np.arange(0.02, 1.95, 0.07)
     fixes.add(stamps, np.array([drive(t + offset)[:2] for t in stamps]))
     believed = 0.0
     for _ in range(2):  # placed anew by what is believed
-        data = fixes.data(step * np.arange(count), offset=believed)
+        data = fixes.at(graph, step * np.arange(count), offset=believed)
         solution = LevenbergMarquardt().solve(graph, {x: truth, late: [[0.0]]}, data=data, check=True)
         believed = float(solution[late][0, 0])
     assert abs(believed - offset) < 1e-4
@@ -405,9 +404,9 @@ def test_the_offset_of_a_clock_is_estimated(between: Interpolation | None, rng: 
 
 
 def test_an_offset_that_is_known_moves_the_stamps() -> None:
-    _, _, fixes = window()
+    graph, _, fixes = window()
     fixes.add([0.02, 0.39], np.zeros((2, 2)))
-    given = {data.name: value for data, value in fixes.data(TIMES, offset=0.09).items()}
+    given = {data.name: value for data, value in fixes.at(graph, TIMES, offset=0.09).items()}
     assert fixes.counts == Counts(placed=1, waiting=1)
     np.testing.assert_allclose(given["fixes: time into step"][3], 0.01, atol=1e-15)
 
@@ -417,9 +416,9 @@ def test_errors_may_be_shipped_residuals_with_landmarks(rng: Generator) -> None:
     graph = fg.Graph()
     x, mark = graph.variables("x", STATE, 4), graph.variables("mark", fg.Rn(2), 1)
     seen = StampedMeasurements(
-        landmarks.bearing_range, 2, capacity=2, sigma=[0.01, 0.02], between=cubic(STATE), name="seen"
+        landmarks.bearing_range, 2, capacity=2, sigma=[0.01, 0.02], between=cubic(STATE), statics=("mark",), name="seen"
     )
-    seen.state(graph, x, mark)
+    seen.state(graph, x)
     truth = np.tile(STATE.identity(), (4, 1))
     truth[:, 0], truth[:, 7] = [0.0, 1.0, 2.0, 3.0], 10.0
     graph.minimize(fg.prior, x, truth, sigma=0.001)
@@ -428,7 +427,7 @@ def test_errors_may_be_shipped_residuals_with_landmarks(rng: Generator) -> None:
         state = STATE.identity()
         state[0] = 10.0 * t
         seen.add(t, landmarks.observe(state, place[None])[0])
-    data = seen.data([0.0, 0.1, 0.2, 0.3])
+    data = seen.at(graph, [0.0, 0.1, 0.2, 0.3])
     solution = LevenbergMarquardt().solve(graph, {x: truth, mark: [[1.0, 1.0]]}, data=data, check=True)
     np.testing.assert_allclose(solution[mark][0], place, atol=1e-9)
     assert graph.check({x: truth, mark: [[1.0, 1.0]]}).routes["seen"] == "traced, its derivatives exact"
@@ -456,5 +455,5 @@ def test_untraceable_errors_still_work(solver: Callable[[], fg.Solver]) -> None:
     fixes.state(graph, x)
     graph.minimize(fg.prior, x, np.zeros(3), sigma=1.0)
     fixes.add(0.05, [0.1, 0.2])
-    solution = solver().solve(graph, {x: np.zeros((3, 3))}, data=fixes.data([0.0, 0.1, 0.2]), check=True)
+    solution = solver().solve(graph, {x: np.zeros((3, 3))}, data=fixes.at(graph, [0.0, 0.1, 0.2]), check=True)
     assert solution[x][0, 0] > 0.04

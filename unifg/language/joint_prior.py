@@ -15,14 +15,14 @@ import numpy as np
 from unifg.errors import GraphError
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import Residual, residual
-from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Manifold, Rn, se2, se3, so2, so3
+from unifg.lie import SE2, SE3, SE23, SO2, SO3, LieGroup, Manifold, Rn, se2, se3, se23, so2, so3
 from unifg.lie.product import leaves
 from unifg.machine.calls import local_matrix, vector
 from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 VECTOR = 0  # how a leaf is compared; groups by their numbers in GROUPS
-GROUPS: dict[Manifold, int] = {SO2: 1, SE2: 2, SO3: 3, SE3: 4}
+GROUPS: dict[Manifold, int] = {SO2: 1, SE2: 2, SO3: 3, SE3: 4, SE23: 5}
 
 
 def joint_prior(*manifolds: Manifold) -> Residual:
@@ -81,7 +81,7 @@ def _stacked(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
     if derive:
         J[:] = 0.0
     at = row = 0
-    block = local_matrix(6, 6)
+    block = local_matrix(9, 9)
     for leaf in range(len(table) // 3):
         kind, storage, dim = int(table[3 * leaf]), int(table[3 * leaf + 1]), int(table[3 * leaf + 2])
         if kind == 0:
@@ -101,9 +101,12 @@ def _stacked(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
             elif kind == 3:
                 so3.local(reference, here, out)
                 so3.right_jacobian_inverse(out, square)
-            else:
+            elif kind == 4:
                 se3.local(reference, here, out)
                 se3.right_jacobian_inverse(out, square)
+            else:
+                se23.local(reference, here, out)
+                se23.right_jacobian_inverse(out, square)
             if derive:
                 for i in range(dim):
                     for k in range(dim):

@@ -120,6 +120,14 @@ def between(x: Array, y: Array, out: Array) -> None:
 
 
 @compiled
+def local(x: Array, y: Array, out: Array) -> None:
+    """``Log(x^-1 y)``, the short way round."""
+    seen = local_vector(10)
+    between(x, y, seen)
+    log(seen, out)
+
+
+@compiled
 def act(x: Array, p: Array, out: Array) -> None:
     """Bring a (3,) point from the body frame to the world."""
     part = local_vector(7)
@@ -202,6 +210,7 @@ class ExtendedPoses(LieGroup):
     compose = elementwise(compose)
     inverse = elementwise(inverse)
     between = elementwise(between)
+    local = elementwise(local)
     act = elementwise(act)
     matrix = elementwise(matrix)
     adjoint = elementwise(adjoint)

@@ -1,0 +1,179 @@
+"""Measurements with stamps, and gyro and accelerometer, as terms of a window and of a loop."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.random import Generator
+
+import unifg as fg
+from unifg.horizon import ControlCost, Dynamics, Loop, Measurement, Now, Robot, Static, Window
+from unifg.lie import SE23, SO3
+from unifg.models.inertial import InertialMeasurements
+from unifg.models.interpolation import cubic
+from unifg.models.preintegration import BIAS, ImuNoise, predict, preintegrate
+from unifg.models.stamped import Counts, StampedMeasurements
+from unifg.solvers import SQP, LevenbergMarquardt
+from unifg.typing import Array
+
+H = 0.1
+
+
+def drift(x: Array, u: Array, y: Array, h: Array) -> Array:
+    return (y - x) - np.reshape(h, (-1, 1)) * u
+
+
+def place(x: Array, z: Array) -> Array:
+    return x - z
+
+
+def step(x: Array, u: Array) -> Array:
+    return x + H * u
+
+
+POINT = Robot(fg.Rn(2), fg.Rn(2), predict=step)
+
+
+def walk(rng: Generator, count: int) -> tuple[Array, Array, list[tuple[float, float, Array]]]:
+    """Controls, true places, and fixes (arrival, stamp, value) that come up to two steps late."""
+    controls = rng.normal(size=(count, 2))
+    truth = np.cumsum(np.concatenate([np.zeros((1, 2)), H * controls + 0.01 * rng.normal(size=(count, 2))]), axis=0)
+    fixes = []
+    for stamp in np.sort(rng.uniform(0.0, H * count, 2 * count)):
+        k = min(int(stamp / H), count - 1)
+        at = truth[k] + (stamp / H - k) * (truth[k + 1] - truth[k])
+        fixes.append((stamp + rng.uniform(0.0, 2.0 * H), stamp, at + 0.05 * rng.normal(size=2)))
+    return controls, truth, sorted(fixes, key=lambda fix: fix[0])
+
+
+def fixes_of(capacity: int = 8) -> StampedMeasurements:
+    return StampedMeasurements(place, 2, capacity=capacity, sigma=0.05, name="fixes")
+
+
+def test_a_window_equals_the_whole_history(rng: Generator) -> None:
+    """Linear, so that marginalising loses nothing: from the first tick on, late fixes among them."""
+    count, start = 14, np.zeros(2)
+    controls, _, fixes = walk(rng, count)
+    sensor, solver = fixes_of(), LevenbergMarquardt(tolerance=1e-10)
+    window = Window(POINT, 4, [Dynamics(drift, H, sigma=0.01), sensor], start=start, sigma=0.2, solver=solver)
+    waiting, fed = list(fixes), 0
+    for tick in range(1, count + 1):
+        window.move(controls[tick - 1], H * tick)
+        while waiting and waiting[0][0] <= H * tick:
+            _, stamp, value = waiting.pop(0)
+            sensor.add(stamp, value)
+            fed += 1
+        window.estimate()
+
+        graph = fg.Graph()
+        x = graph.variables("x", fg.Rn(2), tick + 1)
+        graph.minimize(fg.prior, x[0], start, sigma=0.2)
+        graph.minimize(drift, x[:-1], controls[:tick], x[1:], H, sigma=0.01)
+        whole = fixes_of(16)
+        whole.state(graph, x)
+        for arrival, stamp, value in fixes:
+            if arrival <= H * tick:
+                whole.add(stamp, value)
+        data = whole.at(graph, H * np.arange(tick + 1))
+        batch = solver.solve(graph, {x: np.zeros((tick + 1, 2))}, data=data, check=True)
+        np.testing.assert_allclose(window.present, batch[x][-1], atol=1e-9)
+        np.testing.assert_allclose(window.state_covariance, batch.covariance(x[-1]), atol=1e-12)
+    assert fed > 20 and sensor.counts.late == sensor.counts.full == 0
+
+
+def test_the_present_alone_keeps_what_comes() -> None:
+    """Before the first step there is no interval: measurements wait, and are placed with the next node."""
+    sensor = fixes_of()
+    window = Window(POINT, 3, [Dynamics(drift, H, sigma=0.01), sensor], start=np.zeros(2), sigma=0.2)
+    sensor.add([0.0, 0.05], [[1.0, 0.0], [1.0, 0.0]])
+    window.estimate()
+    assert sensor.counts == Counts()
+    window.move(np.zeros(2), H)
+    window.estimate()
+    assert sensor.counts == Counts(placed=2) and window.present[0] > 0.9
+
+
+def test_one_sensor_stands_in_both_graphs_of_a_joint_loop(rng: Generator) -> None:
+    """In the window alone and in past and future: the same fixes, counted once; with the clock's offset unknown."""
+    count, offset = 25, 0.04
+    late = Static("clock", fg.Rn(1), [0.0], 0.1)
+    robot = Robot(fg.Rn(2), fg.Rn(2), statics=(late,), predict=step)
+    found = {}
+    for coupling in ("sequential", "joint"):
+        draw = np.random.default_rng(3)
+        sensor = StampedMeasurements(place, 2, capacity=3, sigma=0.01, offset="clock", name="fixes")
+        known = Measurement("own", fg.prior, (2,), 0.01)
+        window = Window(robot, 8, [Dynamics(drift, H, sigma=0.01), sensor, known], start=np.zeros(2), sigma=0.2)
+
+        class Goal:
+            def state(self, graph: fg.Graph, x: fg.Family, u: fg.Family) -> None:
+                graph.minimize(fg.prior, x[1:], [5.0, 3.0], sigma=1.0, name="goal")
+                graph.bound(u, lower=-1.0, upper=1.0)
+
+            def data(self, now: Now[None]) -> dict[str, Array]:
+                return {}
+
+        terms = [Dynamics(drift, H), Goal(), ControlCost(sigma=[3.0, 3.0])]
+        loop = Loop(robot, 6, terms, solver=SQP(), window=window, coupling=coupling)  # type: ignore[arg-type]
+        truth, before = np.zeros(2), np.zeros(2)
+        for tick in range(count):
+            for s in (0.5, 0.9) if tick else ():  # stamps of a clock that is behind
+                stamp = H * (tick - 1 + s)
+                sensor.add(stamp - offset, before + s * (truth - before) + 0.01 * draw.normal(size=2))
+            plan = loop.tick(measured={"own": truth + 0.01 * draw.normal(size=2)}, time=H * tick)
+            assert plan.source == "solved"
+            before, truth = truth, step(truth, plan.control)
+        assert loop.statuses[fg.Status.CONVERGED] == count
+        found[coupling] = loop.statics["clock"][0, 0]
+        assert abs(found[coupling] - offset) < 0.02
+        assert sensor.counts.late == sensor.counts.full == sensor.counts.invalid == 0
+    assert found["joint"] != found["sequential"]
+
+
+@pytest.mark.parametrize("static", [False, True], ids=["biases that walk", "one bias"])
+def test_inertial_navigation_in_a_window(static: bool, rng: Generator) -> None:
+    """Biases are a component of the states, or one static unknown; fixes between nodes at 3.7 Hz."""
+    noise, rate = ImuNoise(1e-3, 1e-2, 1e-4, 1e-3), 100.0
+    state = SE23 if static else fg.Product(body=SE23, bias=BIAS)
+    bias = np.array([0.01, -0.02, 0.01, 0.1, 0.05, -0.1])
+    statics = (Static("bias", BIAS, np.zeros(6), [0.05] * 3 + [0.3] * 3),) if static else ()
+    robot = Robot(state, fg.Rn(1), statics=statics)
+    body = None if static else "body"
+    imu = InertialMeasurements(noise, body=body)
+    fixes = StampedMeasurements(
+        lambda x, z: x[:, :3] - z, 3, capacity=2, sigma=0.02, between=cubic(SE23), component=body, name="fixes"
+    )
+    t = np.arange(800) / rate
+    w = np.stack([0.5 * np.sin(t), 0.3 * np.cos(2.0 * t), np.full_like(t, 0.4)], axis=1)
+    a = np.stack([np.sin(1.5 * t), np.cos(t), 9.81 + 0.3 * np.sin(3.0 * t)], axis=1)
+    start = SE23.from_parts(np.zeros(3), [0.5, 0.0, 0.0], SO3.from_rpy(0.05, 0.0, 1.0))
+    truth = predict(start, preintegrate(t, w, a, np.append(t, t[-1] + 1.0 / rate), noise, np.zeros(6)))
+    spread = np.sqrt(rate) * np.repeat([noise.gyro, noise.accelerometer], 3)
+    shown = np.concatenate([w, a], axis=1) + bias + spread * rng.normal(size=(len(t), 6))
+    sigma = [0.02] * 3 + [0.1] * 3 + [0.02] * 3 + ([] if static else [0.05] * 3 + [0.3] * 3)
+    begin = start if static else np.concatenate([start, np.zeros(6)])
+    # What leaves says little of biases alone, and a static's prior stays behind: it is tried where nothing leaves.
+    window = Window(robot, 40 if static else 10, [imu, fixes], start=begin, sigma=sigma)
+    fixed = np.arange(0.13, 7.9, 1.0 / 3.7)
+    step, errors = 0.2, []
+    for tick in range(1, 36):
+        now = step * tick
+        window.move(np.zeros(1), now)
+        fresh = (t > now - step - 1e-9) & (t < now - 1e-9) if tick > 1 else t < now
+        imu.add(t[fresh], shown[fresh, :3], shown[fresh, 3:])
+        for stamp in fixed[(fixed > now - step) & (fixed <= now)]:
+            k = int(stamp * rate)
+            fixes.add(stamp, truth[k, :3] + (stamp * rate - k) * (truth[k + 1, :3] - truth[k, :3]))
+        history = window.history  # a first guess of the new node: the last one, moved
+        believed = history.statics["bias"][0] if static else history.states[-2, 10:]
+        moved = predict(history.states[-2, :10], imu.integrated(history.times[-2:], believed))[1]
+        history.states[-1] = moved if static else np.concatenate([moved, believed])
+        solution = window.estimate()
+        assert solution.converged
+        errors.append(SE23.local(window.present[:10], truth[round(now * rate)]))
+    final = history.statics["bias"][0] if static else window.present[10:]
+    assert np.abs(final[:3] - bias[:3]).max() < 0.01 and np.abs(final[3:] - bias[3:]).max() < 0.1
+    assert np.abs(np.array(errors[10:])[:, :3]).max() < 0.1
+    assert imu.counts.unknown == 0 and fixes.counts.late == 0
+    sigmas = np.sqrt(np.diag(window.state_covariance))[:9]
+    assert np.all(np.abs(errors[-1]) < 5.0 * sigmas)
