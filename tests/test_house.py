@@ -25,7 +25,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("lie", "elimination"),
     ("kernels",),
     ("language",),
-    ("program",),
+    ("program", "plots"),
     ("answers",),
     ("solvers", "smoothing", "pose_graphs", "models"),
     ("horizon",),

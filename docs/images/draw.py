@@ -41,7 +41,7 @@ def main() -> None:
     """Draw all pictures, or those named on the command line."""
     plt.rcParams.update({"font.size": 10, "font.family": "DejaVu Sans", "savefig.dpi": 130})
     pictures = {"worked-problem": worked_problem, "graphs": graphs, "joint": joint, "overview": overview}
-    pictures["bayes-tree"] = bayes_tree
+    pictures |= {"bayes-tree": bayes_tree, "factor-graph": factor_graph, "solution": solution_plot}
     for name in sys.argv[1:] or pictures:
         pictures[name]().savefig(HERE / f"{name}.png", bbox_inches="tight", facecolor="white")
 
@@ -49,13 +49,29 @@ def main() -> None:
 # ---------------------------------------------------------------- the worked problem of the README
 
 
-def worked_problem() -> Any:
-    """Past, present and future of the README's script."""
+def worked() -> dict[str, Any]:
+    """What the README's script leaves behind."""
     scope: dict[str, Any] = {}
     for block in fences(CHECKOUT / "README.md"):
         if block.language == "python":
             with contextlib.redirect_stdout(io.StringIO()):
                 exec(block.code, scope)
+    return scope
+
+
+def factor_graph() -> Any:
+    """Its graph, as ``graph.draw()`` shows it."""
+    return worked()["graph"].draw()
+
+
+def solution_plot() -> Any:
+    """Its solution, as ``solution.plot()`` shows it."""
+    return worked()["solution"].plot()
+
+
+def worked_problem() -> Any:
+    """Past, present and future of the README's script."""
+    scope = worked()
     poses, now = scope["solution"][scope["x"]], scope["now"]
     figure, ax = plt.subplots(figsize=(9.0, 3.7))
     ax.add_patch(Circle((1.9, 0.6), 0.4, color=css("fixed"), alpha=0.85, lw=0))

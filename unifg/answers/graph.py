@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,8 +13,12 @@ from unifg.answers.solution import AnyGuess, values_of
 from unifg.elimination.tree import EliminationTree
 from unifg.language.statement import Statement
 from unifg.language.variables import Data
+from unifg.plots.factor_graph import draw_graph
 from unifg.program.program import Program, compile_graph
 from unifg.typing import ArrayLike
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class Graph(Statement):
@@ -36,6 +41,16 @@ class Graph(Statement):
     def routes(self) -> dict[str, str]:
         """For each term by name, how it is evaluated and differentiated; nothing before the graph is compiled."""
         return {term.name: term.route for term in self.compiled.terms} if isinstance(self.compiled, Program) else {}
+
+    def draw(self) -> Figure:
+        """Draw the factor graph: variables as circles, factors as squares, of large graphs families and terms.
+
+        The figure is a matplotlib ``Figure`` that belongs to nobody else; ``.savefig("graph.png")`` writes it.
+
+        Raises:
+            ViewError: there are no variables.
+        """
+        return draw_graph(list(self.families.values()), self.terms, self.fixes)
 
     def compile(self) -> Program:
         """Offsets, ordering and sparsity; computed once and kept until the graph changes.

@@ -9,14 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from unifg.errors import GraphError, UnifgError
 from unifg.language.variables import Family
+from unifg.plots.descent import draw_descent
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.typing import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class FactorNorms(Mapping[str, Array]):
@@ -143,6 +148,21 @@ class Iteration:
                 index=self.number,
             )
         return found
+
+
+class History(list[Iteration]):
+    """Rows of a solve, the first being the start."""
+
+    def plot(self) -> Figure:
+        """Cost, KKT numbers and steps over the iterations; what must become small on a logarithmic axis.
+
+        Raises:
+            ViewError: there are no rows.
+        """
+        kkt = ("stationarity", "violation", "complementarity")
+        errors = {name: np.array([getattr(row, name) for row in self]) for name in kkt}
+        errors["step"] = np.array([row.step_norm for row in self])
+        return draw_descent(np.array([row.cost for row in self]), errors)
 
 
 HEADER = (

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from unifg.answers.covariance import Covariances
-from unifg.answers.history import HEADER, FactorNorms, Iteration, factor_norms, line
+from unifg.answers.history import HEADER, FactorNorms, History, Iteration, factor_norms, line
 from unifg.answers.marginal import Variables, information, marginal_prior
 from unifg.answers.optimality import Optimality
 from unifg.answers.shift import Shifts
@@ -18,9 +18,13 @@ from unifg.answers.status import Status
 from unifg.answers.verdict import Verdict
 from unifg.errors import GraphError, UnifgError
 from unifg.language.variables import Family, Selection, Variable, as_selection
+from unifg.plots.shown import Shown, apart, draw_shown
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.typing import Array, ArrayLike, BoolArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -89,10 +93,10 @@ class Solution:
         self.solver = solver
 
     @property
-    def history(self) -> list[Iteration]:
-        """One row per iteration, row 0 being the start."""
-        if callable(self._history):
-            self._history = self._history()
+    def history(self) -> History:
+        """One row per iteration, row 0 being the start; ``history.plot()`` draws them."""
+        if not isinstance(self._history, History):
+            self._history = History(self._history() if callable(self._history) else self._history)
         return self._history
 
     @history.setter
@@ -226,6 +230,56 @@ class Solution:
         and errors in :func:`unifg.answers.marginal.marginal_prior`.
         """
         return marginal_prior(self._program, self._lin, terms, remove, keep, self._equality)
+
+    def plot(self, *variables: Variable, marginals: bool = False) -> Figure:
+        """Draw families, selections or components; all families where none is named.
+
+        Poses are drawn as paths with headings, rotations as angles, vectors over the index of the member, with the
+        limits of bounds shaded; see :mod:`unifg.plots.shown`. The figure is a matplotlib ``Figure`` that belongs to
+        nobody else.
+
+        Args:
+            *variables: what to draw.
+            marginals: whether to show two standard deviations of each member, as :meth:`marginals` has them.
+
+        Raises:
+            GraphError: for variables of another graph, or when there are no covariances.
+            ViewError: when there is more than fits into one figure.
+        """
+        selections = [as_selection(variable) for variable in variables or self._program.families]
+        for selection in selections:
+            self._require(selection)
+        parts = [self._shown(selection, marginals) for selection in selections]
+        return draw_shown(parts, f"{self.solver}: {self.status.name.lower().replace('_', ' ')}, cost {self.cost:.6g}")
+
+    def _shown(self, selection: Selection, marginals: bool) -> Shown:
+        program, family = self._program, selection.family
+        everywhere = family.count, family.manifold.storage
+        lower, upper = np.full(everywhere, -np.inf), np.full(everywhere, np.inf)
+        pairs = [np.empty((0, 2), dtype=np.intp)]
+        for term, rows in zip(program.constraint_terms, program.slices, strict=True):
+            own = term.gathers[0].selection
+            if term.is_bound and own.family is family:
+                shape, place = (
+                    (term.count, term.size),
+                    np.ix_(own.indices, np.arange(family.manifold.storage)[own.storage]),
+                )
+                lower[place] = np.maximum(lower[place], self._lower[rows].reshape(shape))
+                upper[place] = np.minimum(upper[place], self._upper[rows].reshape(shape))
+        for term in program.terms:
+            ends = [s for s in term.term.selections if s.family is family]
+            if len(ends) == 2:
+                pairs.append(np.stack([np.broadcast_to(s.indices, term.count) for s in ends], axis=1))
+        return Shown(
+            f"{family.name}.{selection.component}" if selection.component else family.name,
+            selection.manifold,
+            selection.indices,
+            self[selection],
+            lower[selection.indices, selection.storage],
+            upper[selection.indices, selection.storage],
+            apart(np.concatenate(pairs), selection.indices),
+            self.marginals(selection) if marginals else None,
+        )
 
     def report(self) -> str:
         """The status sentence with the numbers behind it."""

@@ -79,13 +79,13 @@ def inventory(
     held = {family: _held(family, fixes) for family in families}
     unknowns = sum(family.count * family.manifold.dim - held[family] for family in families)
     rows = [(term, term.count * term.size) for term in terms]
-    counted = [
+    sizes = [
         f"{unknowns} unknowns",
         f"{sum(n for term, n in rows if isinstance(term, Cost))} rows of costs",
         f"{sum(n for term, n in rows if isinstance(term, Constraint))} of constraints",
     ]
-    parts = [f"Graph of {_many(len(families), 'family', 'families')} and {_many(len(terms), 'term')}: "
-             + ", ".join(counted)]  # fmt: skip
+    parts = [f"Graph of {counted(len(families), 'family', 'families')} and {counted(len(terms), 'term')}: "
+             + ", ".join(sizes)]  # fmt: skip
     tables = [
         _aligned("<><>>>", _families(families, held)),
         _aligned("<<>><<<<", _terms(terms, routes)),
@@ -143,7 +143,9 @@ def weight(term: Term) -> str:
         low, high = _numbers(term.lower), _numbers(term.upper)
         if term.kind == "equality" and low == high:
             return f"= {low}"
-        return " .. ".join(("" if low == "-inf" else low, "" if high == "inf" else high)).strip()
+        if "-inf" == low or "inf" == high:
+            return (f"<= {high}" if high != "inf" else "") if low == "-inf" else f">= {low}"
+        return f"{low} .. {high}"
     return ""
 
 
@@ -201,7 +203,8 @@ def _held(family: Family, fixes: Iterable[Fix]) -> int:
     return sum(len(fix.selection) * fix.selection.manifold.dim for fix in fixes if fix.selection.family is family)
 
 
-def _many(count: int, one: str, several: str = "") -> str:
+def counted(count: int, one: str, several: str = "") -> str:
+    """A number and what is counted."""
     return f"{count} {one if count == 1 else several or one + 's'}"
 
 
