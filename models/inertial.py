@@ -25,8 +25,9 @@ from unifg.kernels.residuals import Residual, residual
 from unifg.language.factors import difference
 from unifg.language.statement import Statement
 from unifg.language.variables import Data, Selection, Variable, as_selection
-from unifg.lie import SE23, SO3, Manifold, Product, Rn
+from unifg.lie import SE23, SO3, Manifold, Product
 from unifg.models.preintegration import BIAS, GRAVITY, ImuNoise, Preintegrated, preintegrate
+from unifg.models.rigid import motion_parts
 from unifg.models.stamped import Present, by_handle
 from unifg.typing import Array, ArrayLike
 
@@ -53,7 +54,7 @@ def motion(state: Manifold = SE23, gravity: tuple[float, float, float] = GRAVITY
 @cache
 def _kernel(manifold: Hashable, gravity: tuple[float, ...]) -> StatedKernel:
     state = cast(Manifold, manifold)
-    p, v, R = _parts(state)
+    p, v, R = motion_parts(state, "inertial motion")
 
     def inertial(
         x: Array, y: Array, bias: Array, increment: Array, by_bias: Array, reference: Array, duration: Array
@@ -69,19 +70,6 @@ def _kernel(manifold: Hashable, gravity: tuple[float, ...]) -> StatedKernel:
 
     shapes = (state, state, BIAS, (10,), (9, 6), (6,), ())
     return StatedKernel(inertial, shapes, 9, name="inertial motion")
-
-
-def _parts(state: Manifold) -> tuple[slice, slice, slice]:
-    """Where position, velocity and orientation are stored."""
-    if state == SE23:
-        return slice(0, 3), slice(3, 6), slice(6, 10)
-    parts = state.components if isinstance(state, Product) else {}
-    if all(name in parts and parts[name].manifold == kind for name, kind in (("p", Rn(3)), ("v", Rn(3)), ("R", SO3))):
-        return parts["p"].storage, parts["v"].storage, parts["R"].storage
-    raise ModelError(
-        f"inertial motion needs a position, a velocity and an orientation, which {state.name} has not: use SE23, or a "
-        "product with components p=Rn(3), v=Rn(3) and R=SO3"
-    )
 
 
 @dataclass(frozen=True)

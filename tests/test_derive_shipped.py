@@ -12,7 +12,7 @@ from scipy.special import zeta
 
 import unifg as fg
 from test_derive import Open, compared, curved, evaluated, numpy_of_casadi
-from test_jacobians import CAR, CASES, COUNT, GRID
+from test_jacobians import CAR, CASES, COUNT, GRID, MOUNT
 from unifg.kernels.derive.expression import traced
 from unifg.kernels.derive.lookup import Lookup
 from unifg.kernels.kernel import Argument, evaluate_rows
@@ -243,6 +243,31 @@ def inertial_motion(at: tuple[slice, slice, slice]) -> Function:
     return motion
 
 
+def bearing_in_space(position: slice, orientation: slice, mount: Array | None = None) -> Function:
+    """The angle between two directions, along axes across the measured one."""
+
+    def seen_from(x: Array, mark: Array) -> Any:
+        seen = SO3.act(SO3.inverse(x[:, orientation]), mark - x[:, position])
+        return seen if mount is None else SO3.act(SO3.inverse(mount[None, 3:]), seen - mount[:3])
+
+    def bearing(x: Array, mark: Array, z: Array) -> Any:
+        m, seen = z[:, :3] / np.linalg.norm(z[:, :3], axis=1)[:, None], seen_from(x, mark)
+        distance = np.linalg.norm(seen, axis=1)
+        unit = seen / distance[:, None]
+        sign = np.where(m[:, 2] >= 0.0, 1.0, -1.0)
+        a, zero = -1.0 / (sign + m[:, 2]), 0.0 * sign
+        axes = [np.stack([1.0 + zero, zero, -sign * m[:, 0]], axis=1), np.stack([zero, sign, -m[:, 1]], axis=1)]
+        in_plane = m[:, 0] * a, m[:, 1] * a
+        first = np.sum(axes[0] * unit, axis=1) + sign * in_plane[0] * (m[:, 0] * unit[:, 0] + m[:, 1] * unit[:, 1])
+        second = np.sum(axes[1] * unit, axis=1) + in_plane[1] * (m[:, 0] * unit[:, 0] + m[:, 1] * unit[:, 1])
+        sine = np.hypot(first, second)
+        scale = np.arctan2(sine, np.sum(m * unit, axis=1)) / sine
+        rows = [scale * first, scale * second]
+        return np.stack([*rows, distance - z[:, 3]] if z.shape[1] == 4 else rows, axis=1)
+
+    return bearing
+
+
 def step(group: Any, F: Function, tableau: Tableau) -> Function:
     """The defect of a step, as the tableau says."""
     weights, matrix, ends, flat = tableau.weights, tableau.matrix, tableau.ends, tableau.flat
@@ -290,6 +315,8 @@ DEFINED: dict[str, Function] = {
     "vehicle.dynamics": vehicle, "quadrotor.dynamics": undisturbed, "quadrotor.disturbed_dynamics": disturbed,
     "inertial.motion": inertial_motion((slice(0, 3), slice(3, 6), slice(6, 10))),
     "inertial.motion, in parts": inertial_motion((slice(0, 3), slice(7, 10), slice(3, 7))),
+    "space_landmarks.bearing_range_3d": bearing_in_space(slice(0, 3), slice(3, 7), MOUNT),
+    "space_landmarks.bearing_3d": bearing_in_space(slice(0, 3), slice(3, 7)),
     "landmarks.bearing_range": bearing_range, "landmarks.height": height, "landmarks.tilt": tilt,
     "avoidance.cylinder_clearance": discs, "avoidance.landmark_clearance": landmark_clearance,
     "avoidance.segment_clearance": segments, "avoidance.sphere_clearance": spheres,

@@ -28,6 +28,7 @@ from unifg.models import (
     preintegration,
     quadrotor,
     rkmk,
+    space_landmarks,
     unicycle,
     vehicle,
 )
@@ -205,6 +206,16 @@ for inertial_case, states in (("inertial.motion", fg.SE23), ("inertial.motion, i
         inertial.motion(states), [states.random(RNG, (COUNT,)), states.random(RNG, (COUNT,)), vectors(6)],
         [states, states, preintegration.BIAS], INCREMENTS,
     )  # fmt: skip
+MOUNT = fg.SE3.from_parts([0.3, -0.2, 0.1], fg.SO3.from_rpy(0.4, -1.2, 2.0))
+SEEN = np.concatenate([vectors(3), RNG.uniform(1.0, 5.0, (COUNT, 1))], axis=1)
+CASES["space_landmarks.bearing_range_3d"] = (
+    space_landmarks.bearing_range_3d(fg.SE3, MOUNT), [fg.SE3.random(RNG, (COUNT,)), 3.0 * vectors(3)],
+    [fg.SE3, fg.Rn(3)], [SEEN],
+)  # fmt: skip
+CASES["space_landmarks.bearing_3d"] = (
+    space_landmarks.bearing_3d(quadrotor.STATE), [quadrotor.STATE.random(RNG, (COUNT,)), 3.0 * vectors(3)],
+    [quadrotor.STATE, fg.Rn(3)], [SEEN[:, :3]],
+)  # fmt: skip
 PLACES, WALL = vectors(3), RNG.normal(size=(5, 2, 2))
 CASES["avoidance.cylinder_clearance"] = (avoidance.cylinder_clearance, [PLACES], [fg.Rn(3)], DISCS)
 CASES["avoidance.landmark_clearance"] = (

@@ -112,7 +112,7 @@ def test_inequalities_and_ties_are_refused() -> None:
 
 
 def manifolds() -> tuple[Manifold, ...]:
-    return fg.Product(p=fg.Rn(3), R=fg.SO3, v=fg.Rn(3)), fg.SE2, fg.Rn(2), fg.SE3, fg.SO2
+    return fg.Product(p=fg.Rn(3), R=fg.SO3, v=fg.Rn(3)), fg.SE2, fg.Rn(2), fg.SE3, fg.SE23, fg.SO2
 
 
 def test_a_joint_prior_is_priors_side_by_side(rng: np.random.Generator) -> None:
@@ -120,8 +120,8 @@ def test_a_joint_prior_is_priors_side_by_side(rng: np.random.Generator) -> None:
     graph = fg.Graph()
     families = [graph.variables(f"v{k}", kind, 1) for k, kind in enumerate(kinds)]
     reference = [kind.random(rng) for kind in kinds]
-    information = rng.normal(size=(21, 21))
-    information = information @ information.T + np.eye(21)
+    information = rng.normal(size=(30, 30))
+    information = information @ information.T + np.eye(30)
     joint = fg.joint_prior(*kinds)
     graph.minimize(joint, *families, np.concatenate(reference), information=information)
     guess = {f: f.manifold.random(rng)[None] for f in families}
