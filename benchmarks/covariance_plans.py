@@ -18,10 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 
 import unifg as fg
-from benchmarks import belief_plans, campaign
-from benchmarks.belief_plans import Guess, Plan
+from benchmarks import campaign
 from benchmarks.campaign import Row, digits, interval, where
 from benchmarks.report import command, machine, publish, table
+from problems import belief_plans
+from problems.belief_plans import Guess, Plan
 
 RESERVE = 0.05  # margin of those plans that keep standard deviations [m]: the robot cuts corners between nodes
 DEVIATIONS = (1.0, 2.0, 2.5, 3.0, 3.5)

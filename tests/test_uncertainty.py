@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from benchmarks import belief_plans, covariance_plans
-from benchmarks.belief_plans import DENSITY, GAIN, SENSOR, START, Layout, Planner
+from problems import belief_plans
+from problems.belief_plans import DENSITY, GAIN, SENSOR, START, Layout, Planner
 from unifg.lie import SE2
 from unifg.models import uncertainty
 from unifg.models.uncertainty import BeaconSensor, Forecast
@@ -166,34 +166,6 @@ def test_drives_deviate_as_foreseen(plans: dict[float, belief_plans.Plan]) -> No
     assert abs(np.mean(seen / foreseen) - 1.0) < 0.1
     assert np.sqrt(np.mean(drives.arrival**2)) == pytest.approx(plan.deviation[-1], rel=0.25)
     assert drives.collisions < belief_plans.drive(plans[0.0], WORLD, 1000, 3).collisions / 3
-
-
-def row(way: str, seed: int, found: list[tuple[float, float] | None]) -> dict[str, object]:
-    """A row of the campaign with (time, collisions) of each setting."""
-    numbers = {"clearance": 0.1, "miss": 0.1, "sigma": 0.1}
-    return {
-        "way": way, "seed": seed, "drives": 10, "seconds": 0.1,
-        "found": [None if f is None else {"time": f[0], "collisions": f[1], **numbers} for f in found],
-    }  # fmt: skip
-
-
-def test_settings_are_compared_at_equal_risk(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(covariance_plans, "WAYS", {"margin": (0.1, 0.5), "in the graph": (1.0, 3.0)})
-    rows = [
-        row("margin", 0, [(10.0, 0.2), (12.0, 0.01)]), row("margin", 1, [(10.0, 0.04), None]),
-        row("in the graph", 0, [(10.5, 0.01), (11.5, 0.0)]), row("in the graph", 1, [(10.2, 0.03), (11.0, 0.0)]),
-        row("in the graph", 2, [None, None]),
-    ]  # fmt: skip
-    found = covariance_plans.Campaign(rows, 10)
-    assert found.seeds == [0, 1]
-    assert found.collisions("margin", 0) == pytest.approx(0.12)
-    settings = [found.setting("in the graph", target) for target in (0.05, 0.001)]
-    assert found.setting("margin", 0.05) == 1 and settings == [0, 1]
-    assert found.setting("margin", 0.001) is None
-    np.testing.assert_array_equal(found.best("margin", 0.02), [12.0, np.nan])
-    np.testing.assert_array_equal(found.best("in the graph", 0.02), [10.5, 11.0])
-    text = covariance_plans.render(found, 10)
-    assert "| margin 0.5 m | 1 / 2 |" in text and "| 2% | in the graph | 2 / 2 | -1.5 (-1.5 .. -1.5), n=1 |" in text
 
 
 def test_lagging_plans_keep_their_own_deviations() -> None:

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from matplotlib.patches import Circle, Ellipse
 
-from benchmarks import belief_plans
-from benchmarks.belief_plans import SENSOR, Layout, Plan, Planner, sweep
 from benchmarks.covariance_plans import RESERVE
+from problems import belief_plans
+from problems.belief_plans import SENSOR, Layout, Plan, Planner, sweep
 from unifg.models import uncertainty
-from unifg.scenarios.show.style import COLOURS, GREY, css, new_figure, write_figure
+from unifg.style.colours import GREY, css
+from unifg.style.figures import new_figure, write_figure
 
 HERE = Path(__file__).resolve().parent
 SEED, MARGIN, SIGMAS = 2, 0.4, 3.0
@@ -53,9 +54,7 @@ def drawn(ax: Any, world: Layout, plan: Plan) -> None:
         values, vectors = np.linalg.eigh(P)
         angle = np.degrees(pose[2] + np.arctan2(vectors[1, 1], vectors[0, 1]))
         size = 4.0 * np.sqrt(values[::-1]) + 2.0 * belief_plans.ROBOT
-        ax.add_patch(
-            Ellipse(pose[:2], *size, angle=angle, fill=False, color=f"#{COLOURS['estimate']:06x}", lw=0.8, zorder=4)
-        )
+        ax.add_patch(Ellipse(pose[:2], *size, angle=angle, fill=False, color=css("estimate"), lw=0.8, zorder=4))
     ax.set_aspect("equal")
     ax.set_xlim(-0.6, belief_plans.LENGTH + 0.6)
     ax.set_ylim(-3.9, 3.9)

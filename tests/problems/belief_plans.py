@@ -1,8 +1,7 @@
 """Plans of a unicycle that knows how well it will know where it is, and what becomes of them in a closed loop.
 
-Shared by the studies of covariance in a plan (:mod:`benchmarks.covariance_plans`) and of perception that is planned
-(:mod:`benchmarks.active_perception`): random layouts of discs and beacons, the graph, guesses around either side, and
-drives of the plan with a filter, feedback on its estimate and noise.
+Random layouts of discs and beacons, the graph, guesses around either side, and drives of the plan with a filter,
+feedback on its estimate and noise.
 """
 
 from __future__ import annotations
