@@ -307,6 +307,88 @@ def accelerated(x: Array, u: Array) -> Any:
 
 MOVING = fg.Product(pose=fg.SE2, v=fg.Rn(2))
 FULL, SIMPLE, HERMITE = METHODS["full trapezoid"], METHODS["simplified trapezoid"], METHODS["hermite-simpson"]
+
+
+def universal_field(x: Array, a: Array) -> Any:
+    up = np.array([0.0, 0.0, 9.81])
+    return SO3.act(x[:, 3:7], a) - up
+
+
+def universal_dynamics(x: Array, u: Array, y: Array, h: Array) -> Any:
+    h, up, back = h[:, None], np.array([0.0, 0.0, 9.81]), SO3.inverse(x[:, 3:7])
+    moved = SO3.act(back, y[:, :3] - x[:, :3] - h * x[:, 7:] + 0.5 * h**2 * up) - 0.5 * h**2 * u[:, 3:]
+    turned = SO3.log(SO3.compose(back, y[:, 3:7])) - h * u[:, :3]
+    return np.concatenate([moved, turned, SO3.act(back, y[:, 7:] - x[:, 7:] + h * up) - h * u[:, 3:]], axis=1)
+
+
+def increments(x: Array, u: Array, y: Array, h: Array) -> Any:
+    return universal_dynamics(x, u, y, h)[:, 3:] / h[:, None]
+
+
+def consistency(x: Array, y: Array, h: Array) -> Any:
+    return y[:, :3] - x[:, :3] - 0.5 * h[:, None] * (x[:, 7:] + y[:, 7:])
+
+
+def resting(x: Array) -> Any:
+    up = SO3.act(x[:, 3:7], np.array([0.0, 0.0, 1.0]))
+    return np.concatenate([x[:, 7:], up[:, :2]], axis=1)
+
+
+def moving_spheres(p: Array, t: Array, centre: Array, velocity: Array, radius: Array) -> Any:
+    return np.linalg.norm(p[:, None, :] - centre - t[:, None, None] * velocity, axis=2) - radius
+
+
+def decay(x: Array, y: Array, t: Array, dt: Array, *spheres: Array) -> Any:
+    return moving_spheres(y, t + dt, *spheres) - np.exp(-1.3 * dt)[:, None] * moving_spheres(x, t, *spheres)
+
+
+def apart(p: Array, v: Array, t: Array, centre: Array, velocity: Array, radius: Array) -> Any:
+    """Where spheres are seen from, relative velocity, distance from their centres, and how fast that grows."""
+    to, by = p[:, None, :] - centre - t[:, None, None] * velocity, v[:, None, :] - velocity
+    d = np.linalg.norm(to, axis=2)
+    return to, by, d, np.sum(to * by, axis=2) / d
+
+
+def distance_condition(p: Array, v: Array, t: Array, *spheres: Array) -> Any:
+    _, _, d, growing = apart(p, v, t, *spheres)
+    return growing + 1.3 * (d - spheres[2])
+
+
+def velocity_condition(x: Array, u: Array, t: Array, *spheres: Array) -> Any:
+    to, by, d, growing = apart(x[:, :3], x[:, 7:], t, *spheres)
+    pushed = np.sum(by * by + to * universal_field(x, u[:, 3:])[:, None, :], axis=2) / d - growing**2 / d
+    whole = d - spheres[2] + 0.3
+    return growing / whole**2 + 0.7 * pushed + 1.3 * (1.0 / 0.3 - 1.0 / whole + 0.7 * growing)
+
+
+def published_condition(x: Array, u: Array, t: Array, *spheres: Array) -> Any:
+    """Eq. 22: in h' the obstacle rests, and what is spent is the barrier of the distance."""
+    to, by, d, growing = apart(x[:, :3], x[:, 7:], t, *spheres)
+    own, push = x[:, None, 7:], universal_field(x, u[:, 3:])[:, None, :]
+    nearing = np.sum(to * own, axis=2) / d
+    pushed = np.sum(own * by + to * push, axis=2) / d - growing * nearing / d
+    whole = d - spheres[2] + 0.3
+    return nearing / whole**2 + 0.7 * pushed + 1.3 * (1.0 / 0.3 - 1.0 / whole)
+
+
+def thrown(p: Array, q: Array, c: Array, v: Array, t: Array, dt: Array, radius: Array) -> Any:
+    def away(x: Array, s: Array) -> Any:
+        s = s[:, None]
+        ball = c + s * v - s**2 * np.array([0.0, 0.0, 0.5 * 9.81])
+        return np.linalg.norm(x - ball, axis=1)[:, None] - radius[:, None]
+
+    return away(q, t + dt) - np.exp(-1.3 * dt)[:, None] * away(p, t)
+
+
+def uncertain(p: Array, t: Array, root: Array, centre: Array, radius: Array) -> Any:
+    to = p[:, None, :2] - centre
+    d = np.linalg.norm(to, axis=2)
+    along = (
+        np.sum(to[:, :, None, :] * np.stack([root[:, :2, 0], root[:, :2, 1]], axis=1)[:, None], axis=3) / d[:, :, None]
+    )
+    return d - radius - 2.0 * np.linalg.norm(along, axis=2)
+
+
 DEFINED: dict[str, Function] = {
     "unicycle.dynamics": unicycle_dynamics, "unicycle.tracking": tracking, "unicycle.rate": difference(Rn(2)),
     "obstacles.disc_clearance": discs, "obstacles.wall_distance": wall_distance, "lidar.endpoint": endpoint,
@@ -336,6 +418,11 @@ DEFINED: dict[str, Function] = {
     "bicycle.dynamics": step(bicycle.STATE, bicycle.field(bicycle.Bicycle()), HERMITE),
     "cart_pole.dynamics": step(cart_pole.STATE, cart_pole.field(cart_pole.CartPole()), HERMITE),
     "manipulator.dynamics": step(manipulator.STATE, manipulator.field(manipulator.Arm()), HERMITE),
+    "universal.dynamics": universal_dynamics, "universal.increments": increments,
+    "universal.consistency": consistency, "terminal.resting": resting,
+    "barriers.decay": decay, "barriers.condition": distance_condition,
+    "barriers.condition, velocity": velocity_condition, "barriers.condition, published": published_condition,
+    "barriers.decay, thrown and estimated": thrown, "barriers.uncertain": uncertain,
 }  # fmt: skip
 for group in (Rn(3), SO2, SE2, MOVING):
     DEFINED[f"prior on {group.name}"] = prior(group)

@@ -13,13 +13,16 @@ import pytest
 
 import unifg as fg
 import unifg.models
+from unifg.kernels.derive.stated import StatedKernel
 from unifg.kernels.differences import jacobian
 from unifg.kernels.residuals import Residual
 from unifg.machine.jit import compiled
 from unifg.models import (
     avoidance,
+    barriers,
     bicycle,
     cart_pole,
+    clearances,
     inertial,
     landmarks,
     lidar,
@@ -29,7 +32,9 @@ from unifg.models import (
     quadrotor,
     rkmk,
     space_landmarks,
+    terminal,
     unicycle,
+    universal,
     vehicle,
 )
 from unifg.models.compiled_field import CompiledField
@@ -230,6 +235,68 @@ CASES["avoidance.inverse_distance_root"] = (
 )  # fmt: skip
 CASES["avoidance.inverse_distance_root, landmark"] = (
     avoidance.inverse_distance_root(avoidance.landmark_clearance, 0.2), [PLACES, MARKS], [fg.Rn(3), fg.Rn(2)], [0.3],
+)  # fmt: skip
+
+# Barriers of four spheres that move, and of one that is estimated, on positions and on whole states.
+SPHERES: list[object] = [RNG.normal(size=(4, 3)), RNG.normal(size=(4, 3)), np.full(4, 0.3)]
+SHAPES: list[Any] = [(), (), (4, 3), (4, 3), (4,)]
+BALLS = barriers.moving(avoidance.sphere_clearance)
+EXTENDED = barriers.velocity_extended(barriers.inverse(BALLS, 0.3), BALLS, 0.7)
+
+THROWN = barriers.decay(barriers.thrown(clearances.to_point), 1.3)
+
+
+def stated(function: Any, arguments: list[Any], rows: int) -> Residual:
+    return fg.residual(StatedKernel(function, tuple(arguments), rows))
+
+
+CASES["universal.dynamics"] = (
+    universal.dynamics, [FLIGHT[0], vectors(6), LANDED], [quadrotor.STATE, fg.Rn(6), quadrotor.STATE], [0.3],
+)  # fmt: skip
+CASES["universal.increments"] = (
+    universal.increments, [FLIGHT[0], vectors(6), LANDED], [quadrotor.STATE, fg.Rn(6), quadrotor.STATE], [0.3],
+)  # fmt: skip
+CASES["universal.consistency"] = (
+    universal.consistency, [FLIGHT[0], LANDED], [quadrotor.STATE, quadrotor.STATE], [0.3],
+)  # fmt: skip
+CASES["terminal.resting"] = (terminal.resting, [FLIGHT[0]], [quadrotor.STATE], [])
+CASES["barriers.decay"] = (
+    stated(barriers.decay(BALLS, 1.3), [fg.Rn(3), fg.Rn(3), *SHAPES], 4),
+    [PLACES, vectors(3)], [fg.Rn(3), fg.Rn(3)], [0.4, 0.1, *SPHERES],
+)  # fmt: skip
+CASES["barriers.condition"] = (
+    stated(barriers.condition(BALLS, 1.3, fg.Rn(3), lambda p, v: v), [fg.Rn(3), fg.Rn(3), *SHAPES[1:]], 4),
+    [PLACES, vectors(3)], [fg.Rn(3), fg.Rn(3)], [0.4, *SPHERES],
+)  # fmt: skip
+CASES["barriers.condition, velocity"] = (
+    stated(
+        barriers.condition(EXTENDED, 1.3, quadrotor.STATE, universal.field),
+        [quadrotor.STATE, fg.Rn(6), *SHAPES[1:]], 4,
+    ),
+    [FLIGHT[0], vectors(6)], [quadrotor.STATE, fg.Rn(6)], [0.4, *SPHERES],
+)  # fmt: skip
+CASES["barriers.condition, published"] = (
+    stated(
+        barriers.condition(
+            EXTENDED, 1.3, quadrotor.STATE, universal.field, as_published=True,
+            lost=lambda x, t, *o: barriers.inverse(BALLS, 0.3)(x[:, :3], t, *o),
+        ),
+        [quadrotor.STATE, fg.Rn(6), *SHAPES[1:]], 4,
+    ),
+    [FLIGHT[0], vectors(6)], [quadrotor.STATE, fg.Rn(6)], [0.4, *SPHERES],
+)  # fmt: skip
+CASES["barriers.decay, thrown and estimated"] = (
+    stated(
+        lambda p, after, centre, velocity, *rest: THROWN(p, after, *rest[:2], centre, velocity, rest[2]),
+        [fg.Rn(3)] * 4 + [()] * 3, 1,
+    ),
+    [PLACES, vectors(3), vectors(3), vectors(3)], [fg.Rn(3)] * 4, [0.4, 0.1, 0.3],
+)  # fmt: skip
+CASES["barriers.uncertain"] = (
+    stated(
+        barriers.uncertain(barriers.still(avoidance.cylinder_clearance), 2.0), [fg.Rn(3), (), (3, 2), (4, 2), (4,)], 4
+    ),
+    [PLACES], [fg.Rn(3)], [0.0, RNG.normal(size=(3, 2)), *DISCS],
 )  # fmt: skip
 
 # Their search Jacobians are the derivative of nothing; everything else about them is tested like the rest.

@@ -91,6 +91,36 @@ class Kernel:
         """The number of rows m, given the shape of each parameter for one factor."""
         return self.rows if isinstance(self.rows, int) else int(self.rows(*shapes))
 
+    def rows_of(self, arguments: Sequence[Any]) -> list[Any]:
+        """The arguments with one row per factor or a single one.
+
+        Raises:
+            GraphError: when a shape does not fit.
+        """
+        if len(arguments) != len(self.arguments):
+            raise GraphError(f"{self.name} takes {len(self.arguments)} arguments, found {len(arguments)}")
+        found = []
+        for place, (expected, given) in enumerate(zip(self.arguments, arguments, strict=True)):
+            array = given if isinstance(given, np.ndarray) else np.asarray(given)
+            if isinstance(expected, int | tuple):
+                axes, shape = (expected, None) if isinstance(expected, int) else (len(expected), expected)
+                rows = array if array.ndim == axes + 1 else array[None]
+                if rows.ndim != axes + 1 or shape not in (None, rows.shape[1:]):
+                    wanted = f"{axes} axes" if shape is None else str(shape)
+                    raise GraphError(
+                        f"{self.name}: argument {place} has shape {array.shape}, expected {wanted}, or one axis more "
+                        "with a row for each factor"
+                    )
+            else:
+                rows = array if array.ndim == 2 else array[None]
+                if rows.ndim != 2 or rows.shape[1] != expected.storage:
+                    raise GraphError(
+                        f"{self.name}: argument {place} has shape {np.shape(given)}, expected (n, {expected.storage}) "
+                        f"for {expected.name}"
+                    )
+            found.append(rows)
+        return found
+
     def split(self, arguments: Sequence[Any], count: int | None) -> tuple[list[Array], list[Array], int]:
         """Variables and parameters as arrays with one row per factor or a single one.
 
@@ -104,29 +134,9 @@ class Kernel:
         Raises:
             GraphError: when a shape does not fit.
         """
-        if len(arguments) != len(self.arguments):
-            raise GraphError(f"{self.name} takes {len(self.arguments)} arguments, found {len(arguments)}")
-        variables, parameters = [], []
-        for place, (expected, given) in enumerate(zip(self.arguments, arguments, strict=True)):
-            array = np.asarray(given, dtype=np.float64)
-            if isinstance(expected, int | tuple):
-                axes, shape = (expected, None) if isinstance(expected, int) else (len(expected), expected)
-                rows = array if array.ndim == axes + 1 else array[None]
-                if rows.ndim != axes + 1 or shape not in (None, rows.shape[1:]):
-                    wanted = f"{axes} axes" if shape is None else str(shape)
-                    raise GraphError(
-                        f"{self.name}: argument {place} has shape {array.shape}, expected {wanted}, or one axis more "
-                        "with a row for each factor"
-                    )
-                parameters.append(rows)
-            else:
-                array = array if array.ndim == 2 else array[None]
-                if array.ndim != 2 or array.shape[1] != expected.storage:
-                    raise GraphError(
-                        f"{self.name}: argument {place} has shape {np.shape(given)}, expected (n, {expected.storage}) "
-                        f"for {expected.name}"
-                    )
-                variables.append(array)
+        rows = self.rows_of([np.asarray(given, dtype=np.float64) for given in arguments])
+        variables = [row for row, a in zip(rows, self.arguments, strict=True) if not isinstance(a, int | tuple)]
+        parameters = [row for row, a in zip(rows, self.arguments, strict=True) if isinstance(a, int | tuple)]
         lengths = {len(array) for array in (*variables, *parameters)} - {1}
         if count is not None and count > 1:
             lengths.add(count)

@@ -182,6 +182,19 @@ def _chained(tape: Tape, i: int, by: dict[int, dict[int, int]]) -> dict[int, int
     return found
 
 
+def derivatives_by(tape: Tape, outputs: Sequence[int], leaf: int) -> list[int]:
+    """Derivative of every output by one leaf."""
+    by = dict[int, dict[int, int]]()
+    for i in tape.live(outputs):
+        if i == leaf:
+            by[i] = {i: tape.one}
+        elif tape.op[i] > Op.TANGENT and tape.op[i] not in STEADY:
+            found = _chosen(tape, i, by) if tape.op[i] == Op.SELECT else _chained(tape, i, by)
+            if found:
+                by[i] = found
+    return [by.get(output, {}).get(leaf, tape.zero) for output in outputs]
+
+
 def _forwards(tape: Tape, outputs: Sequence[int], width: int) -> dict[tuple[int, int], int]:
     waists = _waists(tape, outputs)
     found = dict[tuple[int, int], int]()

@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 
 from unifg.kernels.derive.lookup import Lookup
+from unifg.kernels.kernel import Kernel
+from unifg.kernels.residuals import Residual
 from unifg.lie import Manifold
 from unifg.machine.jit import is_compiled
 from unifg.typing import Array
@@ -183,6 +185,8 @@ class _Walk:
     def _other(self, value: Any, where: str) -> Hashable:
         if isinstance(value, np.ufunc | Manifold | Enum):
             return type(value), value
+        if isinstance(value, Residual):  # of which only what it computes is called
+            return "residual", self.value(value.function, where)
         if isinstance(value, Lookup) and _trusted(type(value).__module__):
             return type(value), value.digest
         if isinstance(value, BuiltinFunctionType) and isinstance(value.__self__, ModuleType | type | None):
@@ -196,7 +200,8 @@ class _Walk:
         if type(value).__module__.partition(".")[0] == "numpy" and callable(value) and hasattr(value, "__name__"):
             return "numpy", value.__name__, id(value)  # functions of NumPy that are not written in Python
         if is_dataclass(value) and getattr(vars(type(value)).get("__dataclass_params__"), "frozen", False):
-            self._refuse_methods(value, where)
+            if not isinstance(value, Kernel):  # whose methods nobody changes
+                self._refuse_methods(value, where)
             parts = tuple(self.value(getattr(value, f.name), f"{where}.{f.name}") for f in fields(value))
             return type(value), parts
         self.refuse(f"{where} is {_kind(value)}, which may change")

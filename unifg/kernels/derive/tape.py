@@ -269,6 +269,16 @@ class Tape:
                 place[i] = new.apply(op, place[a], place[b] if b >= 0 else -1, place[c] if c >= 0 else -1)
         return new, [place[i] for i in outputs]
 
+    def where_zero(self, outputs: Sequence[int], leaf: int) -> list[int]:
+        """The outputs, on the same tape, with one leaf zero."""
+        place = {leaf: self.zero}
+        for i in self.live(outputs):
+            if self.op[i] > Op.TANGENT:
+                taken = [j if j < 0 else place.get(j, j) for j in (self.a[i], self.b[i], self.c[i])]
+                if taken != [self.a[i], self.b[i], self.c[i]]:
+                    place[i] = self.apply(self.op[i], *taken)
+        return [place.get(i, i) for i in outputs]
+
     def evaluate(self, outputs: Sequence[int], variables: Sequence[float], parameters: Sequence[float]) -> list[float]:
         """Run the tape in Python, all tangent coordinates zero and all weights one: slow, for small things."""
         given = {Op.VARIABLE: variables, Op.PARAMETER: parameters}

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import CellType, CodeType, FunctionType, MethodType, ModuleType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -34,11 +34,14 @@ from unifg.kernels.derive.symbols import (
     wrapped,
 )
 from unifg.kernels.derive.tape import Tape
+from unifg.kernels.kernel import NOTHING, Argument, Kernel
+from unifg.kernels.residuals import Residual
 from unifg.lie import ManifoldBase, Product, so2, wrap_angle
 from unifg.machine import calls
 from unifg.machine.jit import is_compiled, source_of
 
 FUNCTIONS.update(TABLE)
+NOWHERE = np.zeros((0, 0))  # where a kernel that is not asked for them would write derivatives
 
 
 def run(function: Callable[..., Any], arguments: Sequence[Any], tape: Tape, rebound: Rebound, rows: int = 0) -> Any:
@@ -138,6 +141,32 @@ class Rebound:
                 names[name] = self.thing(python.__globals__[name])
         return copy
 
+    def residual(self, residual: Residual | Kernel) -> Callable[..., Any]:
+        """A residual that another function calls: what its kernel is written as, row by row where that is compiled."""
+        kernel = residual if isinstance(residual, Kernel) else residual.kernel
+        if kernel is None:
+            assert isinstance(residual, Residual)
+            if residual.rows:
+                raise TraceError(f"calls '{residual.name}', which is compiled for one factor; give a batched function")
+            return cast(Callable[..., Any], self.callable(residual.function))
+        called = self.function(kernel.function)
+
+        def batched(*arguments: Any) -> Any:
+            return called(*kernel.rows_of(arguments))
+
+        def one_by_one(*arguments: Any) -> Any:
+            rows = kernel.rows_of(arguments)
+            count = max(map(len, rows))
+            size = kernel.size([r.shape[1:] for r, a in zip(rows, kernel.arguments, strict=True) if not _varies(a)])
+            found = symbols((count, size))
+            for i in range(count):
+                row = [r[i if len(r) > 1 else 0] for r in rows]
+                v, p = _side_by_side(kernel, row, True), _side_by_side(kernel, row, False)
+                found[i] = _written(kernel, called, v, p, size)
+            return found
+
+        return one_by_one if is_compiled(kernel.function) else batched
+
     def thing(self, thing: Any) -> Any:
         """What a name means while a function is traced."""
         if id(thing) in self.given:
@@ -150,6 +179,8 @@ class Rebound:
             return BORROWED[id(thing)]
         if isinstance(thing, ManifoldBase | Product):
             return Symbolic(thing, self.callable)
+        if isinstance(thing, Residual | Kernel):
+            return self.residual(thing)
         if thing is so2.wrap or thing is wrap_angle:
             return _wrapped
         if is_compiled(thing):
@@ -164,6 +195,31 @@ class Rebound:
         if isinstance(thing, partial | MethodType):
             return self.callable(thing)
         return CONSTRUCTORS.get(id(thing), thing) if callable(thing) else thing
+
+
+def _varies(argument: Argument) -> bool:
+    """Whether an argument of a kernel is a variable."""
+    return not isinstance(argument, int | tuple)
+
+
+def _side_by_side(kernel: Kernel, row: Sequence[Any], varying: bool) -> Any:
+    """Variables of one factor, or its parameters, flat."""
+    parts = [part.ravel() for part, a in zip(row, kernel.arguments, strict=True) if _varies(a) == varying]
+    return wrapped(np.concatenate([NOTHING, *parts]))
+
+
+def _written(kernel: Kernel, called: Callable[..., Any], v: Any, p: Any, size: int) -> list[Any]:
+    """What a compiled kernel writes for one factor, whichever way it goes."""
+    tape = next((entry.tape for entry in (*v, *p) if isinstance(entry, Symbol)), None)
+
+    def once() -> Any:
+        r = symbols((size,), math.nan)
+        called(v.copy(), p.copy(), kernel.table, r, NOWHERE)
+        return r
+
+    if tape is None:
+        return list(once())
+    return [Symbol.of(tape, node) for node in every_way(tape, lambda: [node_of(tape, entry) for entry in once()])]
 
 
 def _names_of(code: CodeType) -> set[str]:

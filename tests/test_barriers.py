@@ -1,0 +1,634 @@
+"""Barriers: what they compute, how they are held, what they are worth between nodes, where a plan may end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from judge import judge
+from problems.guarded_flight import NAMES, SPHERES, START, GuardedFlight
+from unifg.errors import GraphError, ModelError
+from unifg.kernels.derive.rates import rate
+from unifg.models import (
+    avoidance,
+    barriers,
+    between_nodes,
+    clearances,
+    keeping,
+    obstacles,
+    quadrotor,
+    terminal,
+    universal,
+)
+from unifg.models.distance_map import DistanceMap
+from unifg.models.spline import SplineField
+from unifg.solvers import SQP, InteriorPoint
+from unifg.solvers.names import backends
+from unifg.typing import Array
+
+RNG = np.random.default_rng(5)
+EXACT = "traced, its derivatives exact"
+CENTRE, RADIUS = np.array([[0.0, 0.0, 0.0], [1.5, 0.2, 0.1]]), np.array([0.4, 0.3])
+
+
+def spheres(p: Array) -> Array:
+    found: Array = np.linalg.norm(p[:, None] - CENTRE, axis=2) - RADIUS
+    return found
+
+
+# ---------------------------------------------------------------- rates inside functions
+
+
+def test_a_rate_is_the_derivative_along_the_motion() -> None:
+    p, v = RNG.normal(size=(6, 3)), RNG.normal(size=(6, 3))
+    found = rate(lambda s, p, v: avoidance.sphere_clearance(p + s * v, CENTRE, RADIUS), p, v)
+    to = p[:, None] - CENTRE
+    np.testing.assert_allclose(found, np.einsum("nmi,ni->nm", to, v) / np.linalg.norm(to, axis=2), atol=1e-14)
+
+
+def test_rates_of_rates_are_second_derivatives() -> None:
+    p, v = RNG.normal(size=(4, 3)), RNG.normal(size=(4, 3))
+
+    def distance(s: Any, p: Array) -> Array:
+        return avoidance.sphere_clearance(p + s * v, CENTRE, RADIUS)
+
+    def faster(s: Any, p: Array) -> Array:
+        found: Array = rate(distance, p + s * v)
+        return found
+
+    to = p[:, None] - CENTRE
+    length = np.linalg.norm(to, axis=2)
+    along = np.einsum("nmi,ni->nm", to, v) / length
+    np.testing.assert_allclose(rate(faster, p), ((v**2).sum(axis=1)[:, None] - along**2) / length, atol=1e-12)
+
+
+def test_a_rate_at_the_centre_is_a_number() -> None:
+    still = rate(lambda s, p: avoidance.sphere_clearance(p + s * 1.0, CENTRE[:1], RADIUS[:1]), np.zeros((1, 3)))
+    assert still.tolist() == [[0.0]]
+
+
+def test_a_rate_of_what_is_known_is_refused_in_a_trace() -> None:
+    graph = fg.Graph()
+    p = graph.variables("p", fg.Rn(3), 2)
+    wrong = fg.residual(lambda p: p + rate(lambda s, c: s * c, 2.0), derivatives="trace")
+    graph.minimize(wrong, p)
+    with pytest.raises(GraphError, match="depends on nothing unknown"):
+        graph.compile()
+
+
+WALL = np.zeros((20, 30), dtype=bool)
+WALL[8:12, 10:20] = True
+FIELD = SplineField.of_map(DistanceMap.from_occupancy(WALL, 0.1, (-1.0, -1.0, 0.0)))
+SEGMENTS = np.array([[[-1.0, 0.5], [1.0, 0.8]], [[0.3, -1.0], [0.3, -0.4]]])
+CLEARANCES: dict[str, tuple[Any, fg.Manifold, tuple[Any, ...]]] = {
+    "spheres": (avoidance.sphere_clearance, fg.Rn(3), (CENTRE, RADIUS)),
+    "cylinders": (avoidance.cylinder_clearance, fg.Rn(3), (CENTRE[:, :2], RADIUS)),
+    "segments": (avoidance.segment_clearance, fg.Rn(3), (SEGMENTS, np.full(2, 0.2))),
+    "discs": (obstacles.disc_clearance, fg.SE2, (CENTRE[:, :2], RADIUS)),
+    "fence": (clearances.inside_sphere, fg.Rn(3), (np.zeros(3), 2.0)),
+    "planes": (clearances.polyhedron, fg.Rn(3), (np.eye(3), np.full(3, 1.5))),
+    "map": (lambda p: FIELD(p[:, :2])[:, None] - 0.1, fg.Rn(3), ()),
+    "one sphere": (clearances.to_point, fg.Rn(3), (CENTRE[1], 0.2)),
+    "points of a body": (
+        clearances.on_body(avoidance.sphere_clearance, [[0.2, 0.0, 0.0], [-0.2, 0.0, 0.1]]), quadrotor.STATE,
+        (CENTRE, RADIUS),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CLEARANCES)
+def test_every_clearance_has_a_barrier_with_exact_derivatives(name: str) -> None:
+    clearance, manifold, obstacle = CLEARANCES[name]
+    x = manifold.random(RNG, (5,))
+    h = barriers.still(clearance)
+    graph = fg.Graph()
+    family, along = graph.variables("x", manifold, 5), graph.variables("u", fg.Rn(manifold.dim), 4)
+    graph.minimize(fg.prior, family, x)
+    graph.minimize(fg.prior, along, np.zeros(manifold.dim))
+    graph.constrain(barriers.decay(h, 0.7), family[:-1], family[1:], 0.0, 0.1, *obstacle, lower=-1e3, name="decay")
+    limit = barriers.condition(h, 0.7, manifold, lambda x, u: u)
+    graph.constrain(limit, family[:-1], along, 0.0, *obstacle, lower=-1e3, name="condition")
+    found = graph.check({family: x, along: RNG.normal(size=(4, manifold.dim))})
+    assert {found.routes[name] for name in ("decay", "condition")} == {EXACT}
+    assert found, str(found)
+    values = clearance(x, *obstacle)
+    kept = barriers.decay(h, 0.7)(x[:-1], x[1:], 0.0, 0.1, *obstacle)
+    np.testing.assert_allclose(kept, values[1:] - np.exp(-0.07) * values[:-1], atol=1e-12)
+
+
+def test_the_other_way_round_of_a_fence() -> None:
+    """Inside it is positive, and a vehicle that leaves the centre loses as much as it travels."""
+    p = np.array([[0.5, 0.0, 0.0], [2.5, 0.0, 0.0]])
+    np.testing.assert_allclose(clearances.inside_sphere(p, np.zeros(3), 2.0)[:, 0], [1.5, -0.5])
+    np.testing.assert_allclose(
+        clearances.inside_sphere(p + np.array([0.0, 0.0, 9.0]), np.zeros(2), 2.0)[:, 0], [1.5, -0.5]
+    )
+
+
+def test_critical_points_turn_with_the_body() -> None:
+    x = quadrotor.STATE.identity()[None].copy()
+    x[0, 3:7] = fg.SO3.exp(np.array([0.0, 0.0, np.pi / 2]))
+    x[0, :3] = 3.0, 0.0, 0.0
+    found = clearances.on_body(avoidance.sphere_clearance, [[0.5, 0.0, 0.0], [0.0, 1.0, 0.0]])(
+        x, CENTRE[:1], RADIUS[:1]
+    )
+    np.testing.assert_allclose(found, [[np.hypot(3.0, 0.5) - 0.4, 2.0 - 0.4]], atol=1e-12)
+
+
+# ---------------------------------------------------------------- formulas
+
+
+def test_the_decay_is_exponential_whatever_the_step() -> None:
+    """With 1 - alpha dt a long step would ask for the other side."""
+    h = barriers.still(lambda x: x)
+    x, after = np.array([[2.0]]), np.array([[0.5]])
+    for alpha, dt in ((0.0, 0.1), (3.0, 0.05), (3.0, 10.0), (1e9, 1.0), (3.0, 0.0)):
+        assert barriers.decay(h, alpha)(x, after, 0.0, dt)[0, 0] == pytest.approx(0.5 - 2.0 * np.exp(-alpha * dt))
+
+
+def test_intervals_may_differ() -> None:
+    h = barriers.still(lambda x: x)
+    found = barriers.decay(h, 2.0)(np.ones((2, 1)), np.ones((2, 1)), np.zeros(2), np.array([0.01, 0.05]))
+    np.testing.assert_allclose(found[:, 0], 1.0 - np.exp([-0.02, -0.1]))
+
+
+def test_obstacles_move_with_the_time_at_each_end() -> None:
+    h, velocity = barriers.moving(avoidance.sphere_clearance), np.array([[1.0, 0.0, 0.0], [0.0, -2.0, 0.0]])
+    p, q, t, dt = RNG.normal(size=(3, 3)), RNG.normal(size=(3, 3)), np.array([0.0, 0.3, 0.7]), 0.1
+    found = barriers.decay(h, 1.1)(p, q, t, dt, CENTRE, velocity, RADIUS)
+    for k in range(3):
+        now, then = CENTRE + t[k] * velocity, CENTRE + (t[k] + dt) * velocity
+        expected = np.linalg.norm(q[k] - then, axis=1) - RADIUS
+        expected = expected - np.exp(-0.11) * (np.linalg.norm(p[k] - now, axis=1) - RADIUS)
+        np.testing.assert_allclose(found[k], expected, atol=1e-13)
+
+
+def test_what_is_thrown_falls() -> None:
+    h = barriers.thrown(clearances.to_point)
+    found = h(np.zeros((1, 3)), 0.5, np.array([[1.0, 0.0, 2.0]]), np.array([[-1.0, 0.0, 1.0]]), 0.1)
+    assert found[0, 0] == pytest.approx(np.hypot(0.5, 2.0 + 0.5 - 0.125 * 9.81) - 0.1)
+
+
+def test_in_the_papers_units_the_boundary_is_the_same() -> None:
+    h = barriers.inverse(barriers.still(clearances.to_point), 0.75)
+    for d in (0.75, 0.5, 2.0):
+        assert h(np.array([[d, 0.0, 0.0]]), 0.0, np.zeros(3), 0.75)[0, 0] == pytest.approx(1 / 0.75 - 1 / d)
+
+
+def test_a_receding_vehicle_may_be_inside_the_velocity_extended_set() -> None:
+    """{h_v >= 0} is no subset of {h >= 0}, nor the other way round."""
+    h = barriers.moving(avoidance.sphere_clearance)
+    extended = barriers.velocity_extended(h, h, 0.5)
+    x = np.tile(quadrotor.STATE.identity(), (2, 1))
+    x[0, :3], x[0, 7:] = (0.3, 0.0, 0.0), (1.0, 0.0, 0.0)  # inside, receding
+    x[1, :3], x[1, 7:] = (0.6, 0.0, 0.0), (-1.0, 0.0, 0.0)  # outside, approaching
+    found = extended(x, 0.0, CENTRE[:1], np.zeros((1, 3)), RADIUS[:1])[:, 0]
+    np.testing.assert_allclose(found, [-0.1 + 0.5, 0.2 - 0.5], atol=1e-12)
+    off = barriers.velocity_extended(h, h, 0.0)(x, 0.0, CENTRE[:1], np.zeros((1, 3)), RADIUS[:1])
+    np.testing.assert_allclose(off[:, 0], [-0.1, 0.2], atol=1e-12)
+    chased = extended(x, 0.0, CENTRE[:1], np.array([[1.0, 0.0, 0.0]]), RADIUS[:1])[:, 0]  # it follows as fast
+    np.testing.assert_allclose(chased, [-0.1, 0.2 - 1.0], atol=1e-12)
+
+
+def test_as_published_the_obstacle_rests_in_the_derivative() -> None:
+    h = barriers.moving(avoidance.sphere_clearance)
+    p, v, velocity = np.array([[2.0, 0.0, 0.0]]), np.array([[-0.5, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0]])
+    ours = barriers.condition(h, 0.3, fg.Rn(3), lambda p, v: v)(p, v, 0.0, CENTRE[:1], velocity, RADIUS[:1])
+    theirs = barriers.condition(h, 0.3, fg.Rn(3), lambda p, v: v, as_published=True)
+    assert ours[0, 0] == pytest.approx(-0.5 - 1.0 + 0.3 * 1.6)
+    assert theirs(p, v, 0.0, CENTRE[:1], velocity, RADIUS[:1])[0, 0] == pytest.approx(-0.5 + 0.3 * 1.6)
+
+
+def test_the_condition_is_what_the_decay_comes_to() -> None:
+    """(h(x + dt v) - exp(-alpha dt) h(x)) / dt tends to h' + alpha h."""
+    h = barriers.moving(avoidance.sphere_clearance)
+    p, v, velocity, dt = RNG.normal(size=(5, 3)), RNG.normal(size=(5, 3)), RNG.normal(size=(2, 3)), 1e-6
+    obstacle = CENTRE, velocity, RADIUS
+    whole = barriers.decay(h, 2.0)(p, p + dt * v, 0.3, dt, *obstacle) / dt
+    np.testing.assert_allclose(
+        barriers.condition(h, 2.0, fg.Rn(3), lambda p, v: v)(p, v, 0.3, *obstacle), whole, atol=1e-4
+    )
+
+
+def test_the_uncertainty_counts_along_the_obstacle_only() -> None:
+    h = barriers.still(avoidance.sphere_clearance)
+    p, root = np.array([[2.0, 0.0, 0.0]]), np.diag([0.1, 5.0, 5.0])
+    found = barriers.uncertain(h, 3.0)(p, 0.0, root, CENTRE[:1], RADIUS[:1])
+    assert found[0, 0] == pytest.approx(1.6 - 3.0 * 0.1)
+    assert barriers.uncertain(h, 0.0)(p, 0.0, root, CENTRE[:1], RADIUS[:1])[0, 0] == pytest.approx(1.6)
+
+
+@pytest.mark.parametrize("value", [-1.0, np.inf, np.nan])
+def test_gains_that_mean_nothing_are_refused(value: float) -> None:
+    h = barriers.still(avoidance.sphere_clearance)
+    makers: dict[str, Callable[[], Any]] = {
+        "alpha": lambda: barriers.decay(h, value),
+        "alpha of a barrier": lambda: barriers.condition(h, value, fg.Rn(3), lambda p, v: v),
+        "gamma": lambda: barriers.velocity_extended(h, h, value),
+        "k": lambda: barriers.uncertain(h, value),
+        "d_safe": lambda: barriers.inverse(h, value),
+        "travel": lambda: between_nodes.sag(value, 1.0),
+        "deceleration": lambda: terminal.brakeable(h, 1.0, value),
+    }
+    for name, make in makers.items():
+        with pytest.raises(ModelError, match=name):
+            make()
+
+
+def test_zero_radius_has_no_inverse() -> None:
+    with pytest.raises(ModelError, match="use the distance itself"):
+        barriers.inverse(barriers.still(clearances.to_point), 0.0)
+
+
+# ---------------------------------------------------------------- small problems, every backend, judged from outside
+
+
+def push(
+    form: keeping.Form, start: Array, centre: Array, radius: Array, alpha: float = 2.0, dt: Any = 0.1, **more: Any
+) -> Any:
+    """A point that wants to be at (3, 0.1, 0), six steps, no faster than 5 m/s; spheres in between."""
+    graph = fg.Graph()
+    p = graph.variables("p", fg.Rn(3), 7)
+    graph.fix(p[0], start)
+    graph.minimize(fg.prior, p[1:], np.array([3.0, 0.1, 0.0]), sigma=1.0, name="goal")
+    graph.minimize(fg.difference, p[:-1], p[1:], sigma=0.2, name="slow")
+    graph.constrain(lambda x, y: y - x, p[:-1], p[1:], lower=-0.5, upper=0.5, name="speed")
+    h = barriers.still(avoidance.sphere_clearance)
+    kept = keeping.keep(
+        graph,
+        barriers.decay(h, alpha),
+        p[:-1],
+        p[1:],
+        0.0,
+        dt,
+        centre,
+        radius,
+        obstacles=len(radius),
+        form=form,
+        **more,
+    )
+    way = np.linspace(0.0, 1.0, 7)[:, None]
+    guess = {p: start + way * (np.array([3.0, 0.6, 0.3]) - start), **kept.guess()}
+    return graph, p, kept, guess
+
+
+# Barriers bend as much as what they are weighed against: Gauss-Newton steps of SQP get there in hundreds of iterations.
+INEQUALITIES: dict[str, fg.Solver] = {**backends("ipm", "alm"), "sqp": SQP(hessian="exact")}
+FAR = np.array([-1.0, 0.0, 0.0])
+SETTINGS = {
+    "outside": (FAR, CENTRE, RADIUS, 2.0, 0.1),
+    "inside": (np.array([0.2, 0.05, 0.1]), CENTRE, RADIUS, 2.0, 0.1),
+    "touching spheres": (FAR, np.array([[0.0, -0.4, 0.0], [0.0, 0.4, 0.0]]), np.full(2, 0.4), 2.0, 0.1),
+    "a point": (FAR, CENTRE, np.zeros(2), 2.0, 0.1),
+    "no decay at all": (FAR, CENTRE, RADIUS, 0.0, 0.1),
+    "all of it at once": (FAR, CENTRE, RADIUS, 1e6, 0.1),
+    "steps of no time": (FAR, CENTRE, RADIUS, 2.0, 0.0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("where", SETTINGS)
+@pytest.mark.parametrize("name", INEQUALITIES)
+def test_backends_answer_barriers(name: str, where: str) -> None:
+    solver = INEQUALITIES[name]
+    start, centre, radius, alpha, dt = SETTINGS[where]
+    for form in ("hinge", "hard", "slack"):
+        weight = None if form == "hard" else 1e3
+        graph, p, _, guess = push(form, start, centre, radius, alpha, dt, weight=weight)
+        found = solver.solve(graph, guess)
+        assert found.converged, (form, found.report())
+        assert judge(graph, found).worst() < 1e-4, form
+        assert np.isfinite(found[p]).all()
+
+
+def test_a_start_at_the_very_centre_is_left() -> None:
+    """The norm has no direction there; the plan finds one, and the slack says which sphere it was."""
+    graph, p, _, guess = push("slack", np.zeros(3), CENTRE, RADIUS, 5.0, 0.1)
+    found = InteriorPoint().solve(graph, guess)
+    assert found.converged
+    assert spheres(found[p])[-1].min() > -0.05
+
+
+def test_the_slack_names_the_obstacle() -> None:
+    """A wall of speed that is too low to get out of the way of what comes: only the first of two is hit."""
+    graph = fg.Graph()
+    p = graph.variables("p", fg.Rn(3), 6)
+    start = np.array([0.0, 0.05, 0.0])
+    graph.fix(p[0], start)
+    graph.minimize(fg.prior, p[1:], start, sigma=1.0)
+    graph.constrain(lambda x, y: y - x, p[:-1], p[1:], lower=-0.02, upper=0.02)
+    centre, velocity = np.array([[1.0, 0.0, 0.0], [0.0, 5.0, 0.0]]), np.array([[-4.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    times = 0.1 * np.arange(5)
+    barrier = barriers.decay(barriers.moving(avoidance.sphere_clearance), 1.0)
+    arguments = p[:-1], p[1:], times, 0.1, centre, velocity, np.array([0.3, 0.3])
+    kept = keeping.keep(graph, barrier, *arguments, obstacles=("lorry", "tree"))
+    found = InteriorPoint().solve(graph, {p: np.tile(start, (6, 1)), **kept.guess()})
+    assert found.converged
+    used = kept.used(found)
+    assert [use.obstacle for use in used] == ["lorry"]
+    assert 0.1 < used[0].amount and used[0].interval <= 2
+    assert kept.used(found, beyond=10.0) == []
+    hard = keeping.keep(graph, barrier, *arguments, obstacles=2, form="hard", name="hard")
+    assert not InteriorPoint().solve(graph, {p: np.tile(start, (6, 1)), **kept.guess()}).converged
+    assert hard.used(found) == [] and hard.guess() == {} and hard.obstacles == ("hard 0", "hard 1")
+
+
+def test_a_slack_that_is_not_needed_costs_a_millimetre_or_nothing() -> None:
+    """Squared, it is its multiplier over the weight; priced as it is, zero where the price exceeds the multiplier."""
+    arguments = np.array([-1.0, 0.0, 0.0]), CENTRE, RADIUS, 2.0, 0.1
+    tight = InteriorPoint(tolerance=1e-9)
+    graph, _, _, guess = push("hard", *arguments)
+    hard = tight.solve(graph, guess)
+    multiplier = -hard.dual("barrier").min()
+    assert hard.converged and multiplier > 1.0
+    graph, _, kept, guess = push("slack", *arguments)
+    soft = tight.solve(graph, guess)
+    np.testing.assert_allclose(soft[kept.slack], -soft.dual("barrier") / 1e6, atol=1e-9)
+    assert soft[kept.slack].max() == pytest.approx(multiplier / 1e6, rel=1e-2)
+    for price, least, most in ((10.0 * multiplier, 0.0, 1e-6), (0.1 * multiplier, 1e-3, 1.0)):
+        graph, _, kept, guess = push("exact slack", *arguments, weight=price)
+        priced = tight.solve(graph, guess)
+        assert priced.converged and least <= priced[kept.slack].max() <= most
+
+
+def test_what_cannot_be_held_is_refused_by_name() -> None:
+    graph = fg.Graph()
+    p = graph.variables("p", fg.Rn(3), 2)
+    with pytest.raises(ModelError, match="found 'soft'"):
+        keeping.keep(graph, spheres, p, obstacles=2, form="soft")  # type: ignore[arg-type]
+    with pytest.raises(ModelError, match="no obstacle"):
+        keeping.keep(graph, avoidance.sphere_clearance, p, CENTRE, RADIUS, obstacles=())
+    for weight in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ModelError, match="weight"):
+            keeping.keep(graph, avoidance.sphere_clearance, p, CENTRE, RADIUS, obstacles=2, weight=weight)
+    centres = graph.data("where the spheres are", CENTRE)
+    keeping.keep(graph, avoidance.sphere_clearance, p, centres, RADIUS, obstacles=2)
+    run = InteriorPoint().prepare(graph)
+    with pytest.raises(GraphError, match=r"where the spheres are.*NaN"):
+        run.solve({p: np.ones((2, 3))}, data={centres: np.full((2, 3), np.nan)})
+
+
+def test_inactive_intervals_are_not_held() -> None:
+    graph = fg.Graph()
+    p = graph.variables("p", fg.Rn(3), 2)
+    graph.minimize(fg.prior, p, np.array([0.1, 0.0, 0.0]))
+    kept = keeping.keep(
+        graph, avoidance.sphere_clearance, p, CENTRE, RADIUS, obstacles=2, active=np.array([True, False])
+    )
+    found = InteriorPoint().solve(graph, {p: np.full((2, 3), 0.7), **kept.guess()}, check=True)
+    reached = spheres(found[p])[:, 0]
+    assert reached[0] > -1e-3 and reached[1] == pytest.approx(-0.3, abs=1e-4)
+
+
+def test_the_first_interval_is_a_tick() -> None:
+    begins, lengths = keeping.grid(4, 0.01, 0.05)
+    np.testing.assert_allclose(lengths, [0.01, 0.05, 0.05, 0.05])
+    np.testing.assert_allclose(begins, [0.0, 0.01, 0.06, 0.11])
+    for count, tick, node in ((0, 0.01, 0.05), (3, 0.0, 0.05), (3, 0.1, 0.05), (3, 0.01, np.inf), (3, np.nan, 0.1)):
+        with pytest.raises(ModelError, match="grid"):
+            keeping.grid(count, tick, node)
+
+
+# ---------------------------------------------------------------- between nodes
+
+
+def test_nodes_that_keep_the_margin_are_never_inside_in_between() -> None:
+    """Random steps, accelerations up to the limit, dense samples; and the margin is no more than it has to be."""
+    rng = np.random.default_rng(3)
+    least = np.inf
+    s = np.linspace(0.0, 1.0, 401)[:, None]
+    for _ in range(3000):
+        rho, a, dt = (float(rng.uniform(*span)) for span in [(0.0, 1.0), (0.0, 8.0), (0.02, 0.4)])
+        way = rng.normal(size=3) * rng.uniform(0.0, 1.5)
+        margin = float(between_nodes.sag(np.linalg.norm(way), rho, a, dt))
+        turn = rng.normal(size=3)
+        turn -= (turn @ way) / (float(way @ way) + 1e-12) * way
+        out = turn / np.linalg.norm(turn)
+        reach = rho + margin
+        height = np.sqrt(max(reach**2 - float(way @ way) / 4.0, 0.0))  # both ends on the ball that nodes keep out of
+        aside = -out if rng.random() < 0.7 else rng.normal(size=3)
+        aside /= float(np.linalg.norm(aside))
+        path = out * height + (s - 0.5) * way + 0.5 * a * dt**2 * s * (1.0 - s) * aside
+        ends = np.linalg.norm(path[[0, -1]], axis=1)
+        assert (ends >= reach - 1e-9).all()
+        least = min(least, (np.linalg.norm(path, axis=1) - rho).min())
+    assert -1e-9 < least < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ((0.15, 0.75), 0.15**2 / 8 / 0.75),  # 3 m/s at 50 ms past 0.75 m
+        ((0.0, 0.75, 4.0, 0.1), 4.0 * 0.01 / 8),
+        ((0.3, 0.0), 0.15),
+    ],
+)
+def test_the_size_of_the_sag(arguments: tuple[float, ...], expected: float) -> None:
+    assert float(between_nodes.sag(*arguments)) == pytest.approx(expected, rel=0.01)
+
+
+def test_passing_is_the_least_of_dense_samples() -> None:
+    p, q = RNG.normal(size=(40, 3)), RNG.normal(size=(40, 3))
+    after = CENTRE + RNG.normal(size=(2, 3))
+    s = np.linspace(0.0, 1.0, 4001)
+    found = between_nodes.passing(p, q, CENTRE, after, RADIUS)
+    for k in range(40):
+        ways = p[k] + s[:, None] * (q[k] - p[k])
+        centres = CENTRE + s[:, None, None] * (after - CENTRE)
+        sampled = (np.linalg.norm(ways[:, None] - centres, axis=2) - RADIUS).min(axis=0)
+        np.testing.assert_allclose(found[k], sampled, atol=1e-3)
+        assert (found[k] <= sampled + 1e-12).all()
+    rests = between_nodes.passing(p, p, CENTRE, CENTRE, RADIUS)
+    np.testing.assert_allclose(rests, spheres(p), atol=1e-14)
+    flat = between_nodes.passing(p, q, CENTRE[:, :2], CENTRE[:, :2], RADIUS)
+    np.testing.assert_allclose(flat, between_nodes.passing(p[:, :2], q[:, :2], CENTRE[:, :2], CENTRE[:, :2], RADIUS))
+
+
+def test_passing_has_exact_derivatives_in_a_graph() -> None:
+    graph = fg.Graph()
+    p = graph.variables("p", fg.Rn(3), 9)
+    graph.minimize(fg.prior, p, np.zeros(3))
+    graph.constrain(between_nodes.passing, p[:-1], p[1:], CENTRE, CENTRE + 0.2, RADIUS, lower=-10.0, name="passing")
+    found = graph.check({p: RNG.normal(size=(9, 3))})
+    assert found and found.routes["passing"] == EXACT
+
+
+# ---------------------------------------------------------------- universal dynamics
+
+
+def test_steps_have_no_defect() -> None:
+    x, u = quadrotor.STATE.random(RNG, (6,)), RNG.normal(size=(6, 6))
+    after = universal.step(x, u, 0.1)
+    assert np.abs(universal.dynamics(x, u, after, 0.1)).max() < 1e-12
+    assert np.abs(universal.increments(x, u, after, 0.1)).max() < 1e-11
+    assert np.abs(universal.consistency(x, after, 0.1)).max() < 1e-12
+    held = universal.step(x, universal.hover(x), 0.1)
+    np.testing.assert_allclose(held[:, 7:], x[:, 7:], atol=1e-12)
+    np.testing.assert_allclose(held[:, :3], x[:, :3] + 0.1 * x[:, 7:], atol=1e-12)
+    with pytest.raises(ModelError, match="found \\(10,\\)"):
+        universal.hover(x[0])
+
+
+def test_the_step_follows_the_field() -> None:
+    x, u, h = quadrotor.STATE.random(RNG, (6,)), RNG.normal(size=(6, 6)), 1e-6
+    moved = quadrotor.STATE.local(x, universal.step(x, u, h)) / h
+    np.testing.assert_allclose(moved, universal.field(x, u), atol=1e-5)
+
+
+def test_a_quadrotor_is_a_universal_vehicle() -> None:
+    x, u = quadrotor.STATE.random(RNG, (6,)), RNG.normal(size=(6, 4))
+    whole = np.concatenate([u[:, :3], np.zeros((6, 2)), u[:, 3:] / 1.3], axis=1)
+    none = np.zeros((1, 1))
+    theirs = quadrotor.field(x, u, np.zeros((1, 6)), np.array([[1.3]]), np.zeros((1, 3)), np.zeros((1, 2)), none)
+    np.testing.assert_allclose(universal.field(x, whole), theirs, atol=1e-12)
+
+
+def test_the_covariance_is_that_of_noisy_controls_and_has_rank_six() -> None:
+    dt, sigma_a, sigma_omega = 0.1, 0.3, 0.05
+    P = universal.covariance(dt, sigma_a, sigma_omega)
+    eye = np.eye(3)
+    np.testing.assert_allclose(P[:3, :3], dt**2 * 0.25 * dt**2 * sigma_a**2 * eye)
+    np.testing.assert_allclose(P[:3, 6:], dt**2 * 0.5 * dt * sigma_a**2 * eye)
+    np.testing.assert_allclose(P[3:6, 3:6], dt**2 * sigma_omega**2 * eye)
+    np.testing.assert_allclose(P[6:, 6:], dt**2 * sigma_a**2 * eye)
+    assert np.linalg.matrix_rank(P) == 6
+    rng = np.random.default_rng(0)
+    x, u = quadrotor.STATE.random(rng, (20000,)), rng.normal(size=(20000, 6))
+    noise = rng.normal(size=(20000, 6)) * ([sigma_omega] * 3 + [sigma_a] * 3)
+    defects = universal.dynamics(x, u, universal.step(x, u + noise, dt), dt)
+    np.testing.assert_allclose(defects.T @ defects / len(defects), P, atol=0.05 * dt**2 * sigma_a**2)
+
+
+def test_three_equalities_and_six_costs_weigh_what_the_covariance_says() -> None:
+    """|r|^2 under the pseudo-inverse of eq. 11, wherever the equality holds."""
+    dt, sigma_a, sigma_omega = 0.1, 0.3, 0.05
+    x, u = quadrotor.STATE.random(RNG, (6,)), RNG.normal(size=(6, 6))
+    after = universal.step(x, u + 0.1 * RNG.normal(size=(6, 6)), dt)
+    r = universal.dynamics(x, u, after, dt)
+    weighed = np.einsum("ni,ij,nj->n", r, np.linalg.pinv(universal.covariance(dt, sigma_a, sigma_omega)), r)
+    ours = universal.increments(x, u, after, dt) / ([sigma_omega] * 3 + [sigma_a] * 3)
+    np.testing.assert_allclose((ours**2).sum(axis=1), weighed, rtol=1e-9)
+
+
+def test_controls_beyond_their_limits() -> None:
+    found = universal.excess(np.array([[-2.0, 0.5, 3.0]]), np.full(3, -1.0), np.full(3, 1.0))
+    np.testing.assert_allclose(found, [[1.0, 0.0, 2.0]])
+
+
+# ---------------------------------------------------------------- where a plan may end
+
+
+POINT = fg.Rn(6)  # position and velocity, pushed by an acceleration
+
+
+def advance(x: Array, u: Array, dt: float) -> Array:
+    return np.concatenate([x[:, :3] + dt * x[:, 3:] + 0.5 * dt**2 * u, x[:, 3:] + dt * u], axis=1)
+
+
+def closed_loop(
+    end: str, seed: int, ticks: int = 35, alpha: float = 20.0, size: float = 2.0
+) -> tuple[list[bool], Array]:
+    """A double integrator that is sent through spheres by short plans; whether each solve had an answer."""
+    rng = np.random.default_rng(seed)
+    centre, radius = rng.uniform([1.0, -0.6, -0.6], [4.0, 0.6, 0.6], (3, 3)), rng.uniform(0.2, 0.5, 3)
+    centre, radius = centre + np.array([3.0 * size - 3.0, 0.0, 0.0]), size * radius  # larger and further away
+    dt, n, push = 0.1, 4, 3.0
+    graph = fg.Graph()
+    x, u = graph.variables("x", POINT, n + 1), graph.variables("u", fg.Rn(3), n)
+    start = graph.data("start", np.zeros(6))
+    graph.fix(x[0], start)
+    graph.constrain(lambda x, u, y: y - advance(x, u, dt), x[:-1], u, x[1:], lower=0.0, upper=0.0, name="motion")
+    graph.bound(u, lower=-push, upper=push, name="push")
+    graph.minimize(lambda x: x[:, :3] - [5.0, 0.0, 0.0], x[1:], sigma=0.1)
+    graph.minimize(fg.prior, u, np.zeros(3), sigma=10.0)
+    h = barriers.still(avoidance.sphere_clearance)
+    of_state = barriers.decay(lambda x, t, *o: h(x[:, :3], t, *o), alpha)
+    graph.constrain(of_state, x[:-1], x[1:], 0.0, dt, centre, radius, lower=0.0, name="barrier")
+    if end == "rest":
+        graph.constrain(lambda x: x[:, 3:], x[-1:], lower=0.0, upper=0.0, name="end")
+    elif end == "brake":
+        left = terminal.brakeable(h, alpha, push, p=slice(0, 3), v=slice(3, 6))
+        graph.constrain(left, x[-1:], 0.0, centre, radius, lower=0.0, name="end")
+    run = InteriorPoint(tolerance=1e-6).prepare(graph)
+    state = np.zeros(6)
+    plan = np.zeros((n + 1, 6)), np.zeros((n, 3))
+    plan[0][:, 3] = 0.01
+    held, states = [], [state]
+    for _ in range(ticks):
+        found = run.solve({x: plan[0], u: plan[1]}, data={start: state})
+        held.append(found.violation < 1e-6)
+        if not held[-1]:
+            break
+        plan = np.concatenate([found[x][1:], found[x][-1:]]), np.concatenate([found[u][1:], np.zeros((1, 3))])
+        state = found[x][1]
+        states.append(state)
+    return held, np.linalg.norm(np.array(states)[:, None, :3] - centre, axis=2) - radius
+
+
+@pytest.mark.parametrize("end", ["rest", "brake"])
+def test_a_terminal_set_keeps_hard_plans_possible(end: str) -> None:
+    for seed in range(6):
+        held, away = closed_loop(end, seed)
+        assert all(held) and away.min() > -1e-6, (end, seed, len(held))
+
+
+def test_without_a_terminal_set_hard_plans_end() -> None:
+    assert not any(all(closed_loop("", seed)[0]) for seed in range(3))
+
+
+def test_braking_stays_in_the_set() -> None:
+    """From random states in it, straight at the nearest obstacle: h and the set hold until it rests."""
+    h = barriers.still(avoidance.sphere_clearance)
+    alpha, a, dt = 1.7, 3.0, 4e-3
+    left = terminal.brakeable(h, alpha, a, p=slice(0, 3), v=slice(3, 6))
+    rng = np.random.default_rng(2)
+    for _ in range(8):
+        p = rng.normal(size=3) * 2.0
+        away = spheres(p[None])[0]
+        if away.min() <= 0.0:
+            continue
+        to = CENTRE[away.argmin()] - p
+        v = to / np.linalg.norm(to) * min(alpha * away.min(), a / alpha)
+        x = np.concatenate([p, v])[None]
+        assert left(x, 0.0, CENTRE, RADIUS).min() > -1e-9
+        while np.linalg.norm(x[0, 3:]) > a * dt:
+            after = advance(x, -a * x[:, 3:] / np.linalg.norm(x[:, 3:]), dt)
+            assert (
+                barriers.decay(lambda x, t, *o: h(x[:, :3], t, *o), alpha)(x, after, 0.0, dt, CENTRE, RADIUS).min()
+                > -1e-9
+            )
+            assert left(after, 0.0, CENTRE, RADIUS).min() > -1e-9
+            x = after
+
+
+# ---------------------------------------------------------------- in flight
+
+
+@pytest.mark.parametrize("name", INEQUALITIES)
+def test_a_tick_of_the_guarded_flight(name: str) -> None:
+    flight, solver = GuardedFlight("slack"), replace(INEQUALITIES[name], tolerance=1e-5)
+    found = solver.solve(flight.graph, flight.guess())
+    assert found.converged, found.report()
+    assert judge(flight.graph, found).worst() < 1e-3
+    routes = flight.graph.check(flight.guess()).routes
+    assert routes["motion"] == routes["spheres"] == EXACT
+    h = flight.clearance(found[flight.x])
+    assert (h > 0.0).all()
+
+
+def test_a_loop_of_ticks_keeps_clear() -> None:
+    flight = GuardedFlight("slack")
+    run = InteriorPoint().prepare(flight.graph)
+    begin: Any = flight.guess()
+    state = START.copy()
+    for tick in range(60):
+        begin = found = run.solve(begin, data=flight.data(state, tick * flight.tick))
+        assert found.converged
+        before = flight.clearance(state[None])[0]
+        state = quadrotor.fly(state, found[flight.u][0], flight.tick, quadrotor.Parameters())
+        assert flight.clearance(state[None])[0] > np.exp(-flight.alpha * flight.tick) * before - 1e-3
+    assert flight.kept is not None and flight.kept.obstacles == NAMES and len(SPHERES) == len(NAMES)
