@@ -236,6 +236,10 @@ SCENARIOS = {
         "A quadrotor's flight past three walls and a cylinder, optimised as a whole.",
         "SECOND_ORDER",
     ),
+    "quadrotor-cbf": Scenario(
+        "safe_flights",
+        "A quadrotor keeps its distance by control barriers: a cylinder, things that move, clutter, a thrown ball.",
+    ),
 }
 """Everything ``unifg run`` can run."""
 

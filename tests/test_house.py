@@ -42,7 +42,7 @@ STOREYS: tuple[tuple[str, ...], ...] = (
     ("horizon", "options", "stopwatch", "ways"),
     ("seeing",),
     ("worlds",),
-    ("driving", "flying"),
+    ("driving", "flying", "safety"),
     ("log",),
     ("",),
     ("show",),

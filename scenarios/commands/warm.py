@@ -9,7 +9,7 @@ from pathlib import Path
 import unifg as fg
 from unifg.machine import shipped
 from unifg.machine.tally import Tally
-from unifg.scenarios import course, flight, manoeuvres, navigation, velocity_tracking
+from unifg.scenarios import course, flight, manoeuvres, navigation, safe_flight, velocity_tracking
 from unifg.scenarios.commands.outcome import Progress
 from unifg.scenarios.flying.flight_pilot import COUPLINGS
 from unifg.warming import Job, jobs, perform
@@ -50,6 +50,7 @@ def _scenarios() -> Iterator[Job]:
         settings = flight.FlightSettings(coupling=coupling)
         yield f"flight, {coupling}", partial(flight.Flight, settings)
     yield "course", course.run_course
+    yield "flight past a cylinder", partial(safe_flight.flights, safe_flight.SafeSettings())
     yield "velocity tracking", velocity_tracking.run_tracking
     for name, case in manoeuvres.CASES.items():
         yield f"manoeuvre {name}", partial(manoeuvres.run_manoeuvre, case)

@@ -1,0 +1,86 @@
+"""``unifg run quadrotor-cbf``: what flights past obstacles leave in their folder, and the table for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from unifg.scenarios import safe_flight
+from unifg.scenarios.commands.outcome import Outcome, Progress
+from unifg.scenarios.log.metrics import write_metrics
+from unifg.scenarios.log.safe_log import SafeLog, safe_metrics
+from unifg.scenarios.show.safe_plot import picture
+from unifg.scenarios.show.safe_scene import safe_scene
+from unifg.style.figures import write_figure
+
+__all__ = ["SETTINGS", "run", "summary", "write_results"]
+
+SETTINGS = safe_flight.SafeSettings
+
+
+def run(settings: safe_flight.SafeSettings, progress: Progress) -> Outcome:
+    """Fly all that is asked for.
+
+    Raises:
+        KeyboardInterrupt: when stopped before the first tick.
+        ScenarioError: for a case or a controller that is unknown.
+    """
+    logs = [log for log in safe_flight.run_safe_flights(settings, progress) if log.ticks]
+    if not logs:
+        raise KeyboardInterrupt
+    succeeded = all(log.succeeded for log in logs)
+    return Outcome(succeeded, logs[-1].interrupted, summary(logs), lambda folder: write_results(folder, logs))
+
+
+def write_results(folder: str | Path, logs: Sequence[SafeLog]) -> list[Path]:
+    """Write numbers, one picture of all flights, and a scene of the first.
+
+    Args:
+        folder: existing folder; files of the same names are replaced.
+        logs: flights of one case, of at least one tick each.
+
+    Returns:
+        The files written: ``scene.html``, ``flights.png`` and ``metrics.json``.
+    """
+    folder = Path(folder)
+    scenario = {"scenario": "quadrotor-cbf", "case": logs[0].settings["case"]}
+    found = {
+        **scenario,
+        "succeeded": all(log.succeeded for log in logs),
+        "flights": [safe_metrics(log) for log in logs],
+    }
+    numbers = write_metrics(folder / "metrics.json", found)
+    shown = write_figure(folder / "flights.png", picture(logs), 110)
+    return [safe_scene(logs[0]).write(folder / "scene.html"), shown, numbers]
+
+
+def summary(logs: Sequence[SafeLog]) -> str:
+    """The outcome for people, one line for each flight."""
+    heads = ("flight", "boundary distance", "path kept to", "top speed", "decided in", "outcome")
+    rows = [heads]
+    for log in logs:
+        m = safe_metrics(log)
+        near = m["min_boundary_distance_m"]
+        kept = "TOUCHED" if log.touched else "margin NOT KEPT" if log.violated else "kept its distance"
+        words = [kept] if len(log.radii) else []
+        words += (
+            ["interrupted"]
+            if log.interrupted
+            else []
+            if log.end is None
+            else ["arrived" if log.arrived else "NOT THERE"]
+        )
+        rows.append(
+            (
+                log.label,
+                "-" if near is None else f"{near:.3f} m",
+                "{rms:.3f} m rms".format(**m["tracking_error_m"]),
+                f"{m['max_speed_m_per_s']:.2f} m/s",
+                "{p50:.2f} ms, p99 {p99:.2f}".format(**m["decide_ms"]),
+                ", ".join(words) or "flown to the end",
+            )
+        )
+    widths = [max(len(row[k]) for row in rows) for k in range(len(heads))]
+    return "\n".join(
+        "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    )

@@ -1,0 +1,258 @@
+"""Flight that must keep its distance (FactorMPC, section IV): a truth, what is seen of it, and who decides.
+
+A vehicle that follows body rates and thrust late and softly, whose mass and drag are not those in the books, is seen a
+hundred times a second. Who decides knows the vehicle from the books and, if asked to estimate, from how it has moved;
+it knows how late its commands act and predicts where the vehicle will be when the next one does. Obstacles are seen
+with their velocities; where they will be is guessed from that alone.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+
+import unifg as fg
+from unifg.models import quadrotor
+from unifg.scenarios.episode import Progress, run_ticks, silent
+from unifg.scenarios.log.columns import Recorder
+from unifg.scenarios.log.safe_log import SafeLog
+from unifg.scenarios.options import count, option, positive
+from unifg.scenarios.safety.flatness import TUNED, FlatnessController, Gains, flat_flight
+from unifg.scenarios.safety.keeper import Decision, Keeper, KeeperSettings, Obstacles
+from unifg.scenarios.safety.situations import Kind, Situation, situation
+from unifg.scenarios.safety.weighing import Weighing, WeighingSettings
+from unifg.scenarios.worlds.body_rate import SUBSTEP, Airframe, BodyRatePlant
+from unifg.scenarios.worlds.disturbance import DisturbanceModel, Disturbances
+from unifg.typing import Array
+
+__all__ = ["CONTROLLERS", "Controller", "Knowledge", "SafeFlight", "SafeSettings", "flights", "run_safe_flights"]
+
+Controller = Literal["barrier", "flatness"]
+Knowledge = Literal["estimated", "books"]
+CONTROLLERS: tuple[Controller, ...] = get_args(Controller)
+
+_TAG = 72  # keeps the noise apart from other numbers of the same seed
+
+
+class _Swept(NamedTuple):
+    alpha: tuple[float, ...] = (1.2,)
+    speed: tuple[float, ...] = (2.0,)
+    controller: tuple[Controller, ...] = ("barrier",)
+
+
+_SWEPT: dict[Kind, _Swept] = {
+    "static": _Swept(alpha=(1.2, 0.3, 0.1, 3.0)),
+    "ellipse": _Swept(),
+    "cluttered": _Swept(),
+    "figure8": _Swept(speed=(1.0, 2.0, 3.0), controller=("barrier", "flatness")),
+    "ball": _Swept(alpha=(3.0,), speed=(3.2,)),
+}
+"""What a case is flown with when nothing else is asked for."""
+
+
+def _true_vehicle() -> quadrotor.Parameters:
+    return quadrotor.Parameters(1.1, (0.3, 0.3, 0.15))
+
+
+@dataclass(frozen=True)
+class SafeSettings:
+    """What is to be flown; of several alphas, speeds and controllers all combinations.
+
+    Attributes:
+        case: static cylinder, obstacle on an ellipse, cluttered course, figure eight, or a ball thrown at a vehicle
+            that hovers.
+        alpha: rate at which a clearance may shrink [1/s]; may be repeated.
+        speed: of the path at its fastest [m/s]; may be repeated.
+        controller: who decides, barrier or flatness; may be repeated.
+        knowledge: "estimated" mass and drag with prediction of what is pending, or what is in the "books" without.
+        seed: of sizes, places, phases and noise; without one, the case as it is described.
+        solver: one of `unifg.solvers.names.CONSTRAINED`.
+        margin: to be kept between hull and obstacles [m].
+        faster: speed limit along each axis over the speed of the path.
+        dt: length of a tick [s].
+        books: vehicle that everybody believes in at first.
+        truth: the vehicle.
+        gains: of the controller by flatness.
+        keeper: numbers of the controller by barriers.
+        weighing: numbers of the estimate.
+        seen: standard deviations of position, attitude and velocity as they are seen [m, rad, m/s].
+        disturbance: of rates and accelerations.
+    """
+
+    case: Kind = option("static")
+    alpha: tuple[float, ...] | None = option(None, text=positive, metavar="A", many=True)
+    speed: tuple[float, ...] | None = option(None, text=positive, metavar="V", many=True)
+    controller: tuple[Controller, ...] | None = option(None, choices=CONTROLLERS, many=True)
+    knowledge: Knowledge = option("estimated")
+    seed: int | None = option(None, text=count, metavar="S")
+    solver: str = "ipm"
+    margin: float = 0.05
+    faster: float = 1.25
+    dt: float = 0.01
+    books: Airframe = field(default_factory=Airframe)
+    truth: quadrotor.Parameters = field(default_factory=_true_vehicle)
+    gains: Gains = TUNED
+    keeper: KeeperSettings = field(default_factory=KeeperSettings)
+    weighing: WeighingSettings = field(default_factory=WeighingSettings)
+    seen: tuple[float, float, float] = (1e-3, 3e-3, 1e-2)
+    disturbance: DisturbanceModel = field(default_factory=DisturbanceModel)
+
+
+class SafeFlight:
+    """One flight.
+
+    Attributes:
+        settings: of all.
+        situation: what it is about.
+        label: what tells it from those beside it.
+    """
+
+    def __init__(
+        self, settings: SafeSettings, about: Situation, controller: Controller, alpha: float, label: str, speed: float
+    ) -> None:
+        """Prepare.
+
+        Args:
+            settings: of all flights.
+            about: path and bodies.
+            controller: who decides.
+            alpha: of the barriers [1/s].
+            label: what tells it from those beside it.
+            speed: of the path at its fastest [m/s].
+        """
+        s = self.settings = settings
+        self.situation, self.label = about, label
+        self._known = {"case": about.kind, "controller": controller, "alpha_per_s": alpha, "speed_m_per_s": speed,
+                       "knowledge": s.knowledge, "seed": s.seed, "solver": s.solver}  # fmt: skip
+        noise, shake = np.random.default_rng([_TAG, s.seed or 0]).spawn(2)
+        self._noise, self._shake = noise, Disturbances(s.disturbance, shake)
+        truth = replace(s.books, parameters=s.truth)
+        start = flat_flight(about.path.at(np.zeros(1)), s.truth)[0][0]
+        self.plant, self.model = BodyRatePlant(truth, start, s.dt), BodyRatePlant(s.books, start, s.dt)
+        estimating = s.knowledge == "estimated"
+        self.weighing = Weighing(s.weighing, s.books.parameters, s.dt) if estimating else None
+        lead = s.books.loops.delay + s.dt if estimating else 0.0
+        self.lead = round(lead / SUBSTEP) * SUBSTEP
+        self._decide = self._deciders(controller, alpha, s.faster * speed)
+
+    def _deciders(
+        self, controller: Controller, alpha: float, limit: float
+    ) -> Callable[[Array, float, Obstacles], Decision]:
+        s, path = self.settings, self.situation.path
+        if controller == "barrier":
+            bodies = len(self.situation.bodies)
+            numbers = replace(s.keeper, alpha=alpha, speed=limit, slots=min(s.keeper.slots, bodies))
+            keeper = Keeper(numbers, s.books, path, s.dt, self.weighing, s.solver)
+            return lambda state, now, seen: keeper.decide(state, now + self.lead, seen, now)
+        flat = FlatnessController(s.gains, s.books.least, s.books.most)
+
+        def follow(state: Array, now: float, seen: Obstacles) -> Decision:
+            begin, p = time.thread_time(), self.believed
+            control = flat.control(state, path.at(np.array([now + self.lead])), p)
+            elapsed = 1e3 * (time.thread_time() - begin)
+            return Decision(control, state[None, :3], "none", 0, 0.0, p.mass, np.array(p.drag), elapsed)
+
+        return follow
+
+    @property
+    def believed(self) -> quadrotor.Parameters:
+        """Mass and drag as the past says, or as in the books."""
+        return self.settings.books.parameters if self.weighing is None else self.weighing.believed
+
+    def see(self) -> tuple[Array, Obstacles]:
+        """State (10,) and obstacles as they are seen now."""
+        s, now = self.settings, np.array([self.plant.time])
+        sigma = np.repeat(s.seen, 3) * self._noise.standard_normal(9)
+        state = quadrotor.STATE.retract(self.plant.state[None], sigma[None])[0]
+        bodies = self.situation.bodies
+        place, velocity = (part[0] for part in bodies.at(now))
+        keep = bodies.radii + s.books.radius + s.margin
+        return state, Obstacles(place, velocity, keep, bodies.upright, bodies.falls)
+
+    def run(self, progress: Progress = silent) -> SafeLog:
+        """Fly to the end, or until the user stops it."""
+        s, about = self.settings, self.situation
+        total = round(about.duration / s.dt)
+        record = Recorder(
+            SafeLog, label=self.label, settings=self._known, dt=s.dt, hull=s.books.radius, margin=s.margin,
+            radii=about.bodies.radii, upright=about.bodies.upright,
+            end=None if about.end is None else np.array(about.end),
+        )  # fmt: skip
+
+        def tick(number: int) -> tuple[float, str]:
+            now = self.plant.time
+            state, obstacles = self.see()
+            if self.weighing is not None:
+                self.weighing.see(state, float(self.model.loops[6]))
+                self.model.airframe = replace(s.books, parameters=self.believed)
+            before = self.plant.state.copy()
+            decision = self._decide(self.model.ahead(state, self.lead), now, obstacles)
+            self.model.state = state.copy()
+            self.model.tick(decision.control)
+            path = self.plant.tick(decision.control, self._shake.draw(s.dt))
+            times = now + SUBSTEP * np.arange(len(path), dtype=np.float64)
+            wanted = about.path.at(times[:1])
+            record.add(
+                time=now, states=before, wanted=np.concatenate([wanted.position[0], wanted.velocity[0]]),
+                controls=decision.control, plans=decision.plan, bodies=about.bodies.at(times[:1])[0][0],
+                near=about.bodies.nearest(path, times).min(axis=0, initial=np.inf), slack=decision.slack,
+                mass=decision.mass, drag=decision.drag, decide_ms=decision.milliseconds, steps=decision.iterations,
+                statuses=decision.status,
+            )  # fmt: skip
+            return (number + 1) / total, f"{self.label}: {now:.1f} s"
+
+        stopped = run_ticks(total, tick, progress)
+        return record.finish(interrupted=stopped)
+
+
+def flights(settings: SafeSettings) -> list[SafeFlight]:
+    """Every flight that is asked for, in order.
+
+    Raises:
+        ScenarioError: for a case or a controller that is unknown.
+    """
+    s = settings
+    if s.case not in _SWEPT:
+        situation(s.case)
+    swept = _SWEPT[s.case]
+    all_alphas, speeds = s.alpha or swept.alpha, s.speed or swept.speed
+    controllers = s.controller or swept.controller
+    for name in controllers:
+        if name not in CONTROLLERS:
+            raise fg.ScenarioError(f"unknown controller {name!r}: choose one of {', '.join(CONTROLLERS)}")
+    made = []
+    for speed in speeds:
+        about = situation(s.case, speed, s.seed)
+        for controller in controllers:
+            barriers = controller != "flatness" and len(about.bodies) > 0
+            alphas = all_alphas if barriers else all_alphas[:1]
+            for alpha in alphas:
+                told = [f"{speed:g} m/s"] * (len(speeds) > 1) + [controller] * (len(controllers) > 1)
+                told += [f"alpha {alpha:g}"] * (len(alphas) > 1)
+                label = ", ".join(told) or (f"alpha {alpha:g}" if barriers else controller)
+                made.append(SafeFlight(s, about, controller, alpha, label, speed))
+    return made
+
+
+def run_safe_flights(settings: SafeSettings | None = None, progress: Progress = silent) -> list[SafeLog]:
+    """Fly all that is asked for, one after the other; a flight that the user stops is the last one.
+
+    Raises:
+        ScenarioError: for a case or a controller that is unknown.
+        BackendError: for an unknown solver.
+    """
+    every = flights(settings or SafeSettings())
+    logs: list[SafeLog] = []
+    for k, flight in enumerate(every):
+
+        def tell(done: float, text: str, k: int = k) -> None:
+            progress((k + done) / len(every), text)
+
+        logs.append(flight.run(tell))
+        if logs[-1].interrupted:
+            break
+    return logs

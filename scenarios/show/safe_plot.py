@@ -1,0 +1,121 @@
+"""Flights that must keep their distance, side by side: ways from above, speeds, distances, time to decide.
+
+After FactorMPC, Fig. 4 to 7 and 10: the speed of the path is the dashed curve, distances are those beyond the margin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from unifg.scenarios.log.safe_log import SafeLog
+from unifg.style.colours import GREY, INK, css
+from unifg.style.figures import discs, face, ground, headline, new_figure
+from unifg.typing import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["picture", "plot_above", "plot_distance", "plot_error", "plot_speed", "plot_time"]
+
+_LINES = ("robot", "estimate", "horizon", "scan", "trail", "moving", "fixed", "start")
+_STAMPS = 6  # places drawn of a body that moves
+_STILL = 1e-9  # [m]
+_BESIDE = 0.6  # around everything [m]
+_TITLES = {
+    "static": "A quadrotor is to follow a line through a cylinder",
+    "ellipse": "A quadrotor is to follow a line that a sphere keeps crossing on an ellipse",
+    "cluttered": "A quadrotor is to follow a line through things at rest and things that move",
+    "figure8": "A quadrotor whose mass and drag are not in the books follows a figure eight",
+    "ball": "A ball is thrown at a quadrotor that hovers",
+}
+
+
+def picture(logs: Sequence[SafeLog]) -> Figure:
+    """Four panels of one or more flights of the same case."""
+    with new_figure((11.0, 8.0), min((log.ticks for log in logs), default=0)) as figure:
+        top, bottom = figure.subplots(2, 2, width_ratios=(1.15, 1.0))
+        plot_above(logs, top[0])
+        plot_speed(logs, top[1])
+        (plot_distance if len(logs[0].radii) else plot_error)(logs, bottom[0])
+        plot_time(logs, bottom[1])
+        figure.legend(*top[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        headline(figure, _TITLES[str(logs[0].settings["case"])])
+    return figure
+
+
+def plot_above(logs: Sequence[SafeLog], ax: Axes) -> Axes:
+    """Ways from above; what moves is drawn at a few times, the later the darker."""
+    first = logs[0]
+    for body, (radius, upright) in enumerate(zip(first.radii.tolist(), first.upright.tolist(), strict=True)):
+        places = first.bodies[:, body]
+        still = float(np.ptp(places, axis=0).max()) < _STILL
+        stamps = [0] if still else np.linspace(0, first.ticks - 1, _STAMPS).round().astype(int).tolist()
+        colour = css("trail" if still else "moving")
+        for k, tick in enumerate(stamps):
+            row = [*places[tick, :2].tolist(), radius]
+            share = 0.9 if still else 0.15 + 0.5 * k / _STAMPS
+            discs(ax, row, fc=colour, ec=INK, lw=0.6, alpha=share, zorder=2 + upright, label=None)
+            keep = [*places[tick, :2].tolist(), radius + first.hull + first.margin]
+            if still:
+                discs(ax, keep, None, fc="none", ec=GREY, lw=0.9, ls=(0, (2, 2)), zorder=4)
+        if not still:
+            ax.plot(*places[:, :2].T, color=css("moving"), lw=0.7, alpha=0.5, zorder=1)
+    ax.plot(*first.wanted[:, :2].T, color=GREY, lw=1.2, ls="--", zorder=5, label="path")
+    for log, colour in _coloured(logs):
+        ax.plot(*log.states[:, :2].T, color=colour, lw=1.7, zorder=6, label=log.label)
+    ends = np.concatenate([log.states[:, :2] for log in logs] + [first.wanted[:, :2]])
+    if len(first.radii):
+        near = first.bodies[0][:, :2]
+        inside = np.abs(near).max(axis=1) < 50.0
+        reach = first.radii[inside, None]
+        ends = np.concatenate([ends, near[inside] - reach, near[inside] + reach])
+    ground(ax, ends.min(axis=0) - _BESIDE, ends.max(axis=0) + _BESIDE)
+    ax.set_title("From above; dotted: nearer than this the margin is not kept")
+    return ax
+
+
+def plot_speed(logs: Sequence[SafeLog], ax: Axes) -> Axes:
+    """How fast, and how fast the path is."""
+    paths: list[Array] = []
+    for log, colour in _coloured(logs):
+        wanted = np.linalg.norm(log.wanted[:, 3:], axis=1)
+        if not any(len(path) == len(wanted) and np.allclose(path, wanted) for path in paths):
+            ax.plot(log.time, wanted, color=GREY, lw=1.2, ls="--")
+            paths.append(wanted)
+        ax.plot(log.time, np.linalg.norm(log.states[:, 7:], axis=1), color=colour, lw=1.3)
+    return face(ax, "Speed; dashed: of the path", "[m/s]", "time [s]")
+
+
+def plot_distance(logs: Sequence[SafeLog], ax: Axes) -> Axes:
+    """Boundary distance: between hull and the nearest surface, beyond the margin."""
+    for log, colour in _coloured(logs):
+        ax.plot(log.time, log.boundary, color=colour, lw=1.4)
+        least = int(np.argmin(log.boundary))
+        ax.plot(log.time[least], log.boundary[least], "o", color=colour, ms=4)
+    ax.axhline(0.0, color=css("moving"), lw=1.0)
+    ax.set_ylim(top=min(ax.get_ylim()[1], 4.0))
+    return face(ax, "Boundary distance: beyond the margin, along the whole way", "[m]", "time [s]")
+
+
+def plot_error(logs: Sequence[SafeLog], ax: Axes) -> Axes:
+    """Distance from where the path is."""
+    for log, colour in _coloured(logs):
+        ax.plot(log.time, 1e3 * np.linalg.norm(log.error, axis=1), color=colour, lw=1.0)
+    return face(ax, "Distance from the path", "[mm]", "time [s]")
+
+
+def plot_time(logs: Sequence[SafeLog], ax: Axes) -> Axes:
+    """Share of the ticks that were decided within a time."""
+    for log, colour in _coloured(logs):
+        ax.plot(np.sort(log.decide_ms), 100.0 * np.arange(1, log.ticks + 1) / log.ticks, color=colour, lw=1.4)
+    ax.set_ylim(0.0, 102.0)
+    ax.set_xlim(left=0.0)
+    return face(ax, "Ticks decided within a processor time", "[%]", "[ms]")
+
+
+def _coloured(logs: Sequence[SafeLog]) -> list[tuple[SafeLog, str]]:
+    return [(log, css(_LINES[k % len(_LINES)])) for k, log in enumerate(logs)]

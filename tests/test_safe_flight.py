@@ -1,0 +1,291 @@
+"""Flight that must keep its distance: flatness, the weighing of the past, barriers in a plan, and whole flights."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from unifg.errors import ScenarioError
+from unifg.lie import SO3
+from unifg.models import quadrotor
+from unifg.scenarios import command
+from unifg.scenarios.log.safe_log import SafeLog, safe_metrics
+from unifg.scenarios.safe_flight import SafeFlight, SafeSettings, flights, run_safe_flights
+from unifg.scenarios.safety.flatness import TUNED, FlatnessController, flat_flight
+from unifg.scenarios.safety.keeper import Keeper, KeeperSettings, Obstacles
+from unifg.scenarios.safety.situations import SITUATIONS, situation
+from unifg.scenarios.safety.weighing import Weighing, WeighingSettings
+from unifg.scenarios.ways.flat_path import FigureEight, Hover, Line
+from unifg.scenarios.worlds.body_rate import Airframe, BodyRatePlant
+from unifg.scenarios.worlds.disturbance import DisturbanceModel
+
+HEAVY = quadrotor.Parameters(1.1, (0.3, 0.3, 0.15))
+WINDY = quadrotor.Parameters(0.9, (0.2, 0.2, 0.2), (0.5, -0.3), 0.2)
+NOTHING = Obstacles(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=bool), np.zeros(0, dtype=bool))
+
+
+def short(settings: SafeSettings, seconds: float) -> SafeFlight:
+    """The first flight that is asked for, cut short."""
+    flight = flights(settings)[0]
+    flight.situation = replace(flight.situation, duration=seconds)
+    return flight
+
+
+# ---------------------------------------------------------------- flatness
+
+
+@pytest.mark.parametrize("vehicle", [HEAVY, WINDY, quadrotor.Parameters(2.0, (0.0, 0.0, 0.4))])
+def test_flat_controls_fly_the_path(vehicle: quadrotor.Parameters) -> None:
+    path, h = FigureEight(3.0), 2e-3
+    states, controls = flat_flight(path.at(h * np.arange(601, dtype=np.float64)), vehicle)
+    state = states[0]
+    for k in range(600):
+        state = quadrotor.fly(state, 0.5 * (controls[k] + controls[k + 1]), h, vehicle, substeps=1)
+    np.testing.assert_allclose(state, states[-1], atol=2e-5)
+
+
+def test_the_nose_points_along_x() -> None:
+    states, _ = flat_flight(FigureEight(3.0).at(np.linspace(0.0, 5.0, 50)), HEAVY)
+    turn = SO3.to_matrix(states[:, 3:7])
+    np.testing.assert_allclose(turn[:, 0, 1], 0.0, atol=1e-12)  # what is left of the vehicle is left of x
+    assert (turn[:, 0, 0] > 0.5).all()
+
+
+def test_feedback_is_none_on_the_path_and_limited_far_away() -> None:
+    air = Airframe(HEAVY)
+    controller = FlatnessController(TUNED, air.least, air.most)
+    flown = FigureEight(2.0).at(np.array([0.7]))
+    states, controls = flat_flight(flown, HEAVY)
+    np.testing.assert_allclose(controller.control(states[0], flown, HEAVY), controls[0], atol=1e-9)
+    np.testing.assert_allclose(
+        controller.control(-states[0] * [-1, -1, -1, 1, 1, 1, 1, -1, -1, -1], flown, HEAVY), controls[0], atol=1e-9
+    )
+    over = states[0].copy()
+    over[3:7] = SO3.exp(np.array([np.pi, 0.0, 0.0]))  # on its back
+    for wild in (over, states[0] + np.array([50.0, -50.0, 9.0, 0, 0, 0, 0, 9.0, 9.0, -9.0])):
+        control = controller.control(wild, flown, HEAVY)
+        assert (control >= air.least).all() and (control <= air.most).all()
+
+
+@pytest.mark.parametrize(
+    ("axis", "row"),
+    [((1.0, 0.0, 0.0), 0), ((0.0, 1.0, 0.0), 1), ((0.0, 0.0, 1.0), 2)],
+)
+def test_errors_of_the_attitude_are_turned_back(axis: tuple[float, float, float], row: int) -> None:
+    air, hover = Airframe(), Hover((0.0, 0.0, 1.0)).at(np.zeros(1))
+    controller = FlatnessController(TUNED, air.least, air.most)
+    state = np.concatenate([[0.0, 0.0, 1.0], SO3.exp(0.1 * np.array(axis)), np.zeros(3)])
+    rates = controller.control(state, hover, air.parameters)[:3]
+    gain = TUNED.heading if row == 2 else TUNED.tilt
+    np.testing.assert_allclose(rates, -0.1 * gain * np.array(axis), rtol=3e-3, atol=1e-9)
+
+
+# ---------------------------------------------------------------- weighing
+
+
+def weighed(seconds: float, noise: float, truth: quadrotor.Parameters) -> Weighing:
+    """What the past says after flying an eight blindly beside it."""
+    books = Airframe()
+    plant, model = (
+        BodyRatePlant(
+            replace(books, parameters=truth), flat_flight(FigureEight(3.0).at(np.zeros(1)), truth)[0][0], 0.01
+        ),
+        None,
+    )
+    model = BodyRatePlant(books, plant.state, 0.01)
+    weighing = Weighing(WeighingSettings(), books.parameters, 0.01)
+    controller, rng = FlatnessController(TUNED, books.least, books.most), np.random.default_rng(1)
+    for _ in range(round(100 * seconds)):
+        seen = quadrotor.STATE.retract(
+            plant.state[None], noise * np.repeat([1e-3, 3e-3, 1e-2], 3)[None] * rng.standard_normal(9)
+        )[0]
+        weighing.see(seen, float(model.loops[6]))
+        control = controller.control(plant.state, FigureEight(3.0).at(np.array([plant.time])), truth)
+        model.state = seen
+        model.tick(control)
+        plant.tick(control)
+    return weighing
+
+
+@pytest.mark.parametrize(("noise", "of_mass", "of_drag"), [(0.0, 0.003, 0.02), (1.0, 0.01, 0.06)])
+def test_mass_and_drag_are_found(noise: float, of_mass: float, of_drag: float) -> None:
+    found = weighed(3.5, noise, HEAVY).believed
+    assert found.mass == pytest.approx(1.1, abs=of_mass)
+    np.testing.assert_allclose(found.drag[:2], 0.3, atol=of_drag)
+
+
+def test_before_anything_was_seen_the_books_are_believed() -> None:
+    weighing = weighed(0.04, 1.0, HEAVY)
+    assert weighing.believed == quadrotor.Parameters()
+
+
+# ---------------------------------------------------------------- a plan
+
+
+def pillar(x: float, y: float, velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Obstacles:
+    """One cylinder whose axis is to be kept 0.75 m away."""
+    return Obstacles(
+        np.array([[x, y, 0.0]]), np.array([velocity]), np.array([0.75]), np.ones(1, dtype=bool), np.zeros(1, dtype=bool)
+    )
+
+
+def keeper(**numbers: Any) -> Keeper:
+    return Keeper(
+        KeeperSettings(**{"slots": 1, **numbers}), Airframe(), Line((-4.0, 0.0, 1.5), (4.0, 0.0, 1.5), 2.0, 1.5), 0.01
+    )
+
+
+def test_plans_lose_their_share_of_the_clearance_and_no_more() -> None:
+    plans, start = keeper(alpha=1.0), np.array([-1.9, 0.05, 1.5, 1.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0])
+    moving = pillar(0.0, 0.0, (-0.3, 0.1, 0.0))
+    decision = plans.decide(start, 2.0, moving, 1.95)
+    assert decision.status == "converged" and decision.slack < 1e-3
+    place = np.array([0.0, 0.0]) + np.array([-0.3, 0.1]) * (0.05 + plans.nodes)[:, None]
+    clearance = np.linalg.norm(decision.plan[:, :2] - place, axis=1) - 0.75
+    left = clearance[1:] - np.exp(-np.diff(plans.nodes)) * clearance[:-1]
+    assert left.min() > -5e-3  # what slack costs
+    assert (left < 1e-2).sum() > 3  # and it does bind
+    assert np.diff(plans.nodes)[0] == pytest.approx(0.01)
+
+
+def test_where_no_plan_keeps_its_distance_the_slack_says_so() -> None:
+    start = np.array([-0.85, 0.0, 1.5, 1.0, 0.0, 0.0, 0.0, 3.0, 0.0, 0.0])
+    decision = keeper(alpha=1.0, speed=6.0).decide(start, 2.0, pillar(0.0, 0.02), 2.0)
+    assert decision.slack > 0.05 and np.isfinite(decision.control).all()
+
+
+def test_the_nearest_are_looked_at_and_falling_ones_fall() -> None:
+    rng = np.random.default_rng(0)
+    places = rng.uniform(-5.0, 5.0, (20, 3))
+    upright = np.arange(20) % 2 == 0
+    many = Obstacles(places, np.ones((20, 3)), np.linspace(0.2, 2.0, 20), upright, np.arange(20) % 3 == 0)
+    away = places.copy()
+    away[upright, 2] = 0.0
+    near = many.nearest(np.zeros(3), 4)
+    np.testing.assert_array_equal(near.keep, many.keep[np.argsort(np.linalg.norm(away, axis=1) - many.keep)[:4]])
+    two = replace(many.nearest(np.zeros(3), 2), falls=np.array([True, False]), velocity=np.zeros((2, 3)))
+    gone = two.at(np.array([0.0, 0.5]))
+    np.testing.assert_allclose(gone[1] - gone[0], [[0.0, 0.0, -0.125 * quadrotor.GRAVITY], [0.0, 0.0, 0.0]], atol=1e-12)
+    far = NOTHING.nearest(np.zeros(3), 3)
+    assert far.position.shape == (3, 3) and np.linalg.norm(far.position, axis=1).min() > 100.0
+
+
+# ---------------------------------------------------------------- whole flights
+
+
+def test_situations_are_what_they_are_called_and_a_seed_moves_them() -> None:
+    for kind in SITUATIONS:
+        one, same, other = situation(kind, seed=1), situation(kind, seed=1), situation(kind, seed=2)
+        for k in range(3):
+            times = np.array([0.4 * k])
+            np.testing.assert_array_equal(one.bodies.at(times)[0], same.bodies.at(times)[0])
+        if len(one.bodies):
+            assert not np.array_equal(one.bodies.at(np.array([2.5]))[0], other.bodies.at(np.array([2.5]))[0])
+            start = one.path.at(np.zeros(1)).position
+            assert one.bodies.nearest(np.tile(start, (2, 1)), np.array([0.0, 1e-3])).min() > 0.3
+    assert len(situation("cluttered").bodies) >= 20
+    with pytest.raises(ScenarioError, match="unknown case 'flat': choose one of static"):
+        situation("flat")  # type: ignore[arg-type]
+
+
+def test_the_same_seed_flies_the_same_flight() -> None:
+    settings = SafeSettings(alpha=(3.0,), seed=4)
+    one, two = (short(settings, 0.4).run() for _ in range(2))
+    other = short(replace(settings, seed=5), 0.4).run()
+    for name in ("states", "controls", "near", "mass"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    assert not np.array_equal(one.states, other.states)
+
+
+def test_what_is_pending_is_predicted_and_in_the_books_it_is_not() -> None:
+    calm = {"seen": (0.0, 0.0, 0.0), "disturbance": DisturbanceModel.calm(), "truth": quadrotor.Parameters()}
+    errors = {}
+    for knowledge in ("estimated", "books"):
+        settings = SafeSettings(case="figure8", controller=("flatness",), speed=(3.0,), knowledge=knowledge, **calm)  # type: ignore[arg-type]
+        log = short(settings, 3.0).run()
+        errors[knowledge] = np.linalg.norm(log.error[150:], axis=1).max()
+    assert errors["estimated"] < 0.5 * errors["books"]
+
+
+def test_who_is_asked_for_flies() -> None:
+    labels = [flight.label for flight in flights(SafeSettings(case="figure8", speed=(1.0, 2.0)))]
+    assert labels == ["1 m/s, barrier", "1 m/s, flatness", "2 m/s, barrier", "2 m/s, flatness"]
+    assert [flight.label for flight in flights(SafeSettings(alpha=(0.5,), controller=("flatness",)))] == ["flatness"]
+    with pytest.raises(ScenarioError, match="unknown controller 'pilot': choose one of barrier, flatness"):
+        flights(SafeSettings(controller=("pilot",)))  # type: ignore[arg-type]
+
+
+def test_an_interrupt_keeps_what_was_flown() -> None:
+    def stop(done: float, text: str) -> None:
+        if 0.01 < done < 0.5:
+            raise KeyboardInterrupt
+
+    logs = run_safe_flights(SafeSettings(case="ball", controller=("flatness",)), stop)
+    assert len(logs) == 1 and logs[0].interrupted and 0 < logs[0].ticks < 100
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of a flight past the cylinder, from the command line."""
+    out = tmp_path_factory.mktemp("flight")
+    assert command.main(["run", "quadrotor-cbf", "--alpha", "3", "--out", str(out)]) == 0
+    return out
+
+
+def test_the_cylinder_is_passed_beyond_the_margin(folder: Path) -> None:
+    told = json.loads((folder / "metrics.json").read_text())
+    (flight,) = told["flights"]
+    assert told["case"] == "static" and flight["label"] == "alpha 3" and flight["succeeded"]
+    assert 0.0 < flight["min_boundary_distance_m"] < 0.25
+    assert flight["min_clearance_m"] == pytest.approx(flight["min_boundary_distance_m"] + 0.05)
+    assert flight["mass_kg"] == pytest.approx(1.1, abs=0.01)
+    assert flight["statuses"].get("not_finite", 0) == 0
+
+
+def test_a_flight_leaves_a_picture_and_a_scene(folder: Path) -> None:
+    assert (folder / "flights.png").stat().st_size > 20_000
+    page = (folder / "scene.html").read_text(encoding="utf-8")
+    assert "quadrotor-cbf, static" in page and "kept its distance, arrived" in page
+
+
+def test_a_smaller_alpha_keeps_farther_away() -> None:
+    """Fig. 5, on the way to the cylinder."""
+    near = {}
+    for alpha in (0.1, 3.0):
+        near[alpha] = short(SafeSettings(alpha=(alpha,)), 1.6).run().boundary.min()
+    assert near[0.1] > near[3.0] + 0.5
+
+
+def judged(near: float, end: float) -> SafeLog:
+    """A record of two ticks."""
+    zero = np.zeros(2)
+    states = np.zeros((2, 10))
+    states[:, 0] = end
+    return SafeLog(
+        label="", settings={"case": "static"}, dt=0.01, hull=0.25, margin=0.05, radii=np.ones(1),
+        upright=np.zeros(1, dtype=bool), end=np.zeros(3), time=np.array([0.0, 0.01]), states=states,
+        wanted=np.zeros((2, 6)), controls=np.zeros((2, 4)), plans=np.zeros((2, 1, 3)), bodies=np.zeros((2, 1, 3)),
+        near=np.array([[1.0], [near]]), slack=zero, mass=zero, drag=np.zeros((2, 3)), decide_ms=zero,
+        steps=np.zeros(2, dtype=np.intp), statuses=["none", "none"],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("near", "end", "touched", "violated", "succeeded"),
+    [
+        (0.35, 0.0, False, False, True),
+        (0.2995, 0.0, False, False, True),  # what the last iterate leaves
+        (0.298, 0.0, False, True, False),
+        (0.24, 0.0, True, True, False),
+        (0.35, 0.4, False, False, False),
+    ],
+)
+def test_flights_are_judged(near: float, end: float, touched: bool, violated: bool, succeeded: bool) -> None:
+    log = judged(near, end)
+    assert (log.touched, log.violated, log.succeeded) == (touched, violated, succeeded)
+    assert safe_metrics(log)["min_clearance_m"] == pytest.approx(near - 0.25)
