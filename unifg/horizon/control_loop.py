@@ -62,7 +62,9 @@ class Loop:
         failed: whether the last plan was refused.
         kept: the last plan that was accepted.
         lagging: ticks for which plans have ended behind.
-        applied: (m,) control of the last plan.
+        applied: (m,) control that acts until the next tick: that of the last plan, unless plans act later.
+        delay: ticks between the present of a plan and when it acts.
+        sent: (delay, m) controls that have been decided and act from the next tick on, the next one first.
         estimate: (storage,) present state as it is believed after the last tick.
         statics: (count, storage) statics as they are believed after the last tick, by name.
         solution: of the last tick; None before.
@@ -88,6 +90,7 @@ class Loop:
         starts: Starts | None = None,
         believable: Callable[[Solution, Choice], bool] | None = None,
         deadline: float = np.inf,
+        delay: int = 0,
         patience: int = 10,
         clock: Callable[[], float] = clocks.perf_counter,
     ) -> None:
@@ -109,12 +112,15 @@ class Loop:
             believable: whether what a joint solve says of the present is believed; by default when its plan is
                 applied and bends no constraint by more than ``CLOSE``.
             deadline: for a tick [s]: the solver is given what is left of it; a plan that comes later is not applied.
+            delay: ticks after which a plan acts, because solving takes time. The horizon begins where the controls
+                that have been sent until then lead by the robot's model, and the first control of a plan acts there;
+                ``applied`` is what acts in the meantime, at first zero.
             patience: ticks of ending behind before a solve begins anew.
             clock: seconds of the wall.
 
         Raises:
-            GraphError: for an unknown coupling, a joint one without a window, sizes that do not fit, or a term that
-                cannot be stated.
+            GraphError: for an unknown coupling, a joint one without a window, sizes that do not fit, a term that
+                cannot be stated, or a delay of a joint coupling or of a robot without a model.
         """
         if coupling not in COUPLINGS:
             raise GraphError(f"unknown coupling '{coupling}': choose {', '.join(COUPLINGS)}")
@@ -124,7 +130,12 @@ class Loop:
             raise GraphError(f"the deadline must be positive, got {deadline} s")
         if not (control_weight > 0.0 and np.isfinite(control_weight)):
             raise GraphError(f"control_weight must be positive and finite, got {control_weight}")
-        self.robot, self.steps, self.coupling, self.window = robot, steps, coupling, window
+        if delay < 0 or (delay and (coupling == "joint" or robot.predict is None)):
+            raise GraphError(
+                f"delay={delay}: a plan acts now or later; later takes a robot that predicts, and not the coupling "
+                "'joint', where the future begins at the present"
+            )
+        self.robot, self.steps, self.coupling, self.window, self.delay = robot, steps, coupling, window, delay
         self._terms, self._deadline, self._clock, self._patience = tuple(terms), deadline, clock, patience
         graph = Graph()
         self.tie: Tie = self._tied(graph, pull)
@@ -149,6 +160,7 @@ class Loop:
         self.guess: Guess | None = None
         self.solution: Solution | None = None
         self.lagging, self._begun = 0, False
+        self.sent: Array = np.zeros((delay, size))
         self.reset()
 
     def _tied(self, graph: Graph, pull: float | Sequence[float] | Array) -> Tie:
@@ -216,8 +228,9 @@ class Loop:
         """Data of the whole graph."""
         return self.tie.data(now) | values_of(self._terms, now, self._handles)
 
-    def _plan(self, now: Now[Any], begin: float) -> Plan:
+    def _plan(self, present: Now[Any], begin: float) -> Plan:
         """Solve, judge, and remember."""
+        now = self._acting(present)
         data = self.data(now)
         run, guess = self.begin(now)
         if np.isfinite(self._deadline):
@@ -239,15 +252,22 @@ class Loop:
         else:
             self.failed = True
             self.guess = None if choice.after is None else self.guess_of(*choice.after, now)
-        self._believe(solution, choice, now)
+        self._believe(solution, choice, present)
         self.sources[choice.source] += 1
-        self.applied = choice.controls[0].copy()
+        decided = np.concatenate([self.sent, choice.controls[:1]])
+        self.applied, self.sent = decided[0], decided[1:]
         elapsed = 1e3 * (self._clock() - begin)
         self.milliseconds.append(elapsed)
         return Plan(
             choice.controls, choice.states, solution.status, solution.iterations, choice.source, self.kept.excess,
             elapsed,
         )  # fmt: skip
+
+    def _acting(self, now: Now[Any]) -> Now[Any]:
+        """What terms are asked with, when the plan acts."""
+        if not self.delay:
+            return now
+        return replace(now, present=self.robot.rollout(now.present, self.sent)[-1], last=self.sent[-1].copy())
 
     def begin(self, now: Now[Any]) -> tuple[Prepared, Guess]:
         """Which backend solves next, and from where."""
@@ -304,6 +324,7 @@ class Loop:
         self.kept.clear()
         self.lagging = 0
         self.applied = np.zeros(self.robot.control.storage)
+        self.sent = np.zeros_like(self.sent)
         self.solution = None
         self._begun = False
         if self.window is not None:

@@ -20,7 +20,7 @@ class Plan:
     """What a tick decided.
 
     Attributes:
-        controls: (N, m), the first to be applied now.
+        controls: (N, m), the first to be applied when the plan acts: now, or after the loop's delay.
         states: (N + 1, storage) predicted, the first being the present.
         status: of the solve.
         iterations: of the backend.
@@ -39,7 +39,7 @@ class Plan:
 
     @property
     def control(self) -> Array:
-        """(m,) to be applied now."""
+        """(m,) to be applied when the plan acts."""
         first: Array = self.controls[0]
         return first
 

@@ -30,8 +30,8 @@ class Now(Generic[G]):
 
     Attributes:
         given: what the caller hands to this tick: a reference, a goal, a map.
-        present: (storage,) state by the past alone.
-        last: (m,) control that was applied last.
+        present: (storage,) state by the past alone; for a plan that acts later, where the robot will be by then.
+        last: (m,) control that was applied last, before the horizon begins.
         statics: (count, storage) values by the past alone, by name.
         history: what was done and measured; None without a window.
     """
