@@ -27,7 +27,8 @@ from unifg.horizon import (
 )
 from unifg.machine.tally import counting
 from unifg.models import unicycle
-from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, InteriorPoint
+from unifg.solvers import SQP, GaussNewton, InteriorPoint
+from unifg.solvers.names import backends
 from unifg.typing import Array, ArrayLike
 
 # ---------------------------------------------------------------- a linear robot, and what everybody knows about it
@@ -307,7 +308,7 @@ def drive(loop: Loop, ticks: int, seed: int = 0) -> tuple[list[Plan], Array]:
     return plans, np.array(states)
 
 
-BACKENDS = {"ipm": InteriorPoint(), "sqp": SQP(), "alm": AugmentedLagrangian()}
+BACKENDS = backends("ipm", "sqp", "alm")
 
 
 def test_backends_and_couplings_find_the_same_way() -> None:
