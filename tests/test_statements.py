@@ -155,6 +155,68 @@ def test_a_refused_statement_leaves_the_graph_as_it_was(case: str) -> None:
     assert [term.name for term in graph.terms] == ["kept", "prior", "t", "t 2"]
 
 
+def attached(*blocks: Any) -> fg.Residual:
+    """A position with a Jacobian that returns what it is told to."""
+    found = blocks if len(blocks) != 1 or not np.isscalar(blocks[0]) else blocks[0]
+    return fg.residual(lambda p: p[:, :2], lambda p: found)  # type: ignore[arg-type, return-value]
+
+
+def undefined(p: Array) -> list[Array]:
+    """A Jacobian that does not exist at the origin."""
+    raise ZeroDivisionError
+
+
+@pytest.mark.parametrize(
+    ("jacobian", "message"),
+    [
+        (attached(np.zeros((4, 2, 2))), r"returned shapes \[\(4, 2, 2\)\], expected \[\(4, 2, 3\)\]"),
+        (attached(np.zeros((2, 3))), "returned shapes"),
+        (attached(), "returned shapes"),
+        (attached(np.zeros((4, 2, 3)), np.zeros((4, 2, 3))), None),  # of a constant, left out
+        (attached(np.zeros((4, 2, 3), dtype=np.float32)), "attached Jacobian returned float32"),
+        (attached(1.0), "returned float, expected one array for each variable"),
+        (fg.residual(lambda p: p[:, :2], undefined), None),  # nothing can be said at identity elements
+    ],
+)  # fmt: skip
+def test_an_attached_jacobian_of_the_wrong_shape_is_refused(jacobian: fg.Residual, message: str | None) -> None:
+    graph, x, _ = stage()
+    before = stated(graph)
+    if message is None:
+        assert graph.minimize(jacobian, x, name="t") == "t"
+        return
+    with pytest.raises(fg.GraphError, match=message) as caught:
+        graph.minimize(jacobian, x, name="t")
+    assert caught.value.term == "t" and caught.value.family == "x" and stated(graph) == before
+
+
+@pytest.mark.parametrize("wrong", ["1.0", 1j, None, [[1.0], [1.0, 2.0]], np.array([None, 1.0]), [True, False]])
+def test_data_and_guesses_that_are_no_numbers_are_refused(wrong: Any) -> None:
+    graph, x = line(1)
+    goal, on = graph.data("goal", [1.0, 2.0]), graph.data("on", [True], each=True)
+    graph.minimize(fg.prior, x, goal, active=on)
+    run = SQP().prepare(graph)
+    with pytest.raises(fg.GraphError, match="data 'goal'"):
+        run.solve({x: [[0.0, 0.0]]}, data={goal: wrong})
+    if wrong is not None:
+        with pytest.raises(fg.GraphError, match="guess for family 'x'"):
+            run.solve({x: wrong})
+    with pytest.raises(fg.GraphError, match="data 'on'"):
+        run.solve({x: [[0.0, 0.0]]}, data={on: [1] if isinstance(wrong, list) else wrong})
+    given: dict[fg.Data, Any] = {goal: [3, np.float32(4.0)], on: np.array([True])}
+    assert run.solve({x: [[0, 0]]}, data=given)[x].tolist() == [[3.0, 4.0]]
+
+
+def test_smoothers_refuse_the_same_and_go_on() -> None:
+    smoother = fg.Incremental()
+    x = smoother.variables("x", fg.Rn(2))
+    for wrong, message in (("0.1", "real numbers"), (np.array([1j, 1j]), "complex"), ([0.1, -1.0], "found -1")):
+        with pytest.raises(fg.GraphError, match=f"sigma.*{message}"):
+            smoother.minimize(fg.prior, x[0], [1.0, 2.0], sigma=wrong, name="t")
+    smoother.minimize(fg.prior, x[0], [1.0, 2.0], sigma=0.1, name="t")
+    smoother.update({x: [[0.0, 0.0]]})
+    np.testing.assert_allclose(smoother.estimate(x[0]), [[1.0, 2.0]])
+
+
 def test_what_a_function_itself_raises_names_the_term_and_what_it_was_called_with() -> None:
     graph, x, _ = stage()
     before = stated(graph)

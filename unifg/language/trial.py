@@ -46,7 +46,62 @@ def rows_of(name: str, residual: Residual, arguments: Sequence[Any], count: int,
     given = [argument.value if isinstance(argument, Data) else argument for argument in arguments]
     batched.bind(given, places, [])
     points = [np.tile(a.manifold.identity(), (count, 1)) for a in arguments if isinstance(a, Selection)]
-    return size_of(tried(batched, points, lambda: told(arguments, count)), name, arguments, count, scalar)
+    size = size_of(tried(batched, points, lambda: told(arguments, count)), name, arguments, count, scalar)
+    if residual.jacobian is not None and not scalar:
+        _try_jacobian(name, residual.jacobian, batched.fill(points), arguments, (count, size))
+    return size
+
+
+def blocks_of(name: str, found: Any, arguments: Sequence[Any], count: int, size: int) -> list[Array]:
+    """One (n, m, d_k) array for each variable of a term, of what an attached Jacobian returned.
+
+    Blocks of arguments that are constants here are left out.
+
+    Raises:
+        GraphError: naming the term, when shapes or types are others.
+    """
+    places = [k for k, argument in enumerate(arguments) if isinstance(argument, Selection)]
+    try:
+        blocks = [_as_jacobian(name, block) for block in found]
+    except TypeError:
+        raise GraphError(
+            f"term '{name}': the attached Jacobian returned {type(found).__name__}, expected one array for each "
+            "variable",
+            term=name,
+        ) from None
+    if len(blocks) > len(places) and len(blocks) > max(places):
+        blocks = [blocks[place] for place in places]
+    wanted = [(count, size, arguments[place].manifold.dim) for place in places]
+    if [block.shape for block in blocks] != wanted:
+        raise GraphError(
+            f"term '{name}': the attached Jacobian returned shapes {[b.shape for b in blocks]}, expected {wanted}",
+            term=name,
+        )
+    return blocks
+
+
+def _try_jacobian(
+    name: str, jacobian: Callable[..., Any], filled: Sequence[Any], arguments: Sequence[Any], shape: tuple[int, int]
+) -> None:
+    """Call an attached Jacobian once; at identity elements it may have none, which is no mistake."""
+    try:
+        with np.errstate(all="ignore"):
+            found = jacobian(*filled)
+    except Exception:
+        return
+    blocks_of(name, found, arguments, *shape)
+
+
+def _as_jacobian(name: str, block: Any) -> Array:
+    """A block of an attached Jacobian as an array; whole numbers are exact.
+
+    Raises:
+        GraphError: when it is made of coarser or complex numbers.
+    """
+    array = np.asarray(block)
+    if array.dtype != np.float64 and array.dtype.kind not in "iub":
+        raise GraphError(f"term '{name}': its attached Jacobian returned {array.dtype}, expected float64", term=name)
+    return np.asarray(array, dtype=np.float64)
 
 
 def tried(batched: Batched, points: Sequence[Array], arguments: Callable[[], str]) -> Array:

@@ -120,9 +120,13 @@ class Data:
         """Return ``value`` as an array of the declared shape.
 
         Raises:
-            GraphError: when the shape differs or an entry is NaN.
+            GraphError: when shape or kind differ - numbers, or booleans - or an entry is NaN.
         """
-        array: Array = np.asarray(value, dtype=self.value.dtype)
+        array = doubles(f"data '{self.name}'", value, flags=self.value.dtype == bool)
+        if array.dtype != self.value.dtype:
+            raise GraphError(
+                f"data '{self.name}' was declared with booleans, found numbers: compare them, as in v != 0"
+            )
         if array.shape != self.value.shape:
             raise GraphError(
                 f"data '{self.name}' has shape {array.shape}, but was declared with {self.value.shape}: "

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from unifg.errors import GraphError
+from unifg.language.doubles import doubles
 from unifg.language.statement import Statement
 from unifg.language.variables import Family
 from unifg.lie import LieGroup, Manifold
@@ -62,7 +63,7 @@ class GuessReader:
                     )
                 own[:] = family.manifold.identity()
                 continue
-            array = np.asarray(given, dtype=np.float64)
+            array = doubles(f"the guess for family '{family.name}'", given)
             if array.shape != own.shape:
                 raise GraphError(
                     f"the guess for family '{family.name}' has shape {array.shape}, expected {own.shape}",

@@ -32,7 +32,7 @@ from unifg.kernels.per_factor import per_factor
 from unifg.kernels.residuals import Residual
 from unifg.kernels.whitening import DIAGONAL, FULL, reciprocals, square_roots
 from unifg.language.terms import Constraint, Cost, Parameter, ScalarCost, Term
-from unifg.language.trial import size_of, told, tried
+from unifg.language.trial import blocks_of, size_of, told, tried
 from unifg.language.variables import Data, Selection
 from unifg.lie import Manifold
 from unifg.program.columns import Columns, Values
@@ -399,16 +399,8 @@ class CompiledTerm:
         if attached is None or numerical:
             blocks = slopes(self._batched, self._directions, points)
         else:
-            blocks = [_as_jacobian(self.name, block) for block in attached(*self._batched.fill(points))]
-            if len(blocks) > len(self.dims) and len(blocks) > max(self._places):
-                blocks = [blocks[place] for place in self._places]  # some of its arguments are constants here
-            wanted = [(self.count, self.size, dim) for dim in self.dims]
-            if [block.shape for block in blocks] != wanted:
-                raise GraphError(
-                    f"term '{self.name}': the attached Jacobian returned shapes {[b.shape for b in blocks]}, "
-                    f"expected {wanted}",
-                    term=self.name,
-                )
+            found = attached(*self._batched.fill(points))
+            blocks = blocks_of(self.name, found, self.term.arguments, self.count, self.size)
         return [self._masked(block) for block in blocks]
 
     def require_clean(self, values: Values) -> None:
@@ -636,18 +628,6 @@ def resolve(parameter: Parameter, data: Bound) -> Array:
     if isinstance(parameter, Data):
         return data.get(parameter, parameter.value)
     return np.asarray(parameter, dtype=np.float64)
-
-
-def _as_jacobian(name: str, block: Any) -> Array:
-    """A block of an attached Jacobian as an array; whole numbers are exact.
-
-    Raises:
-        GraphError: when it is made of coarser or complex numbers.
-    """
-    array = np.asarray(block)
-    if array.dtype != FLOAT64 and array.dtype.kind not in "iub":
-        raise GraphError(f"term '{name}': its attached Jacobian returned {array.dtype}, expected float64", term=name)
-    return np.asarray(array, dtype=np.float64)
 
 
 def _notice_no_information(name: str, whitener: Array) -> None:

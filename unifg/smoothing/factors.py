@@ -19,6 +19,7 @@ from unifg.kernels.kernel import Kernel, side_by_side
 from unifg.kernels.residuals import Residual
 from unifg.kernels.robust import QUADRATIC, Form, Loss, form_of
 from unifg.kernels.whitening import DIAGONAL, FULL, quick_roots, reciprocals, square_roots
+from unifg.language.doubles import doubles
 from unifg.language.factors import prior
 from unifg.language.statement import AnyResidual, complete
 from unifg.language.terms import Cost, Parameter, prepare_arguments
@@ -154,12 +155,13 @@ class Types:
         size = kernel.size(shapes)
         whitening, whitener = 0, np.zeros((1, 0))
         if sigma is not None:
-            whitening, whitener = DIAGONAL, reciprocals(name, _numbers(sigma), count, size)
+            whitening, whitener = DIAGONAL, reciprocals(name, _numbers(name, "sigma", sigma), count, size)
         elif information is not None:
-            stack = np.array(_numbers(information), ndmin=3, order="C")
+            matrices = _numbers(name, "information", information)
+            stack = np.array(matrices, ndmin=3, order="C")
             whitener = np.empty((len(stack), size * size))
             if stack.shape[1:] != (size, size) or len(stack) not in (1, count) or not quick_roots(stack, whitener):
-                roots = square_roots(name, _numbers(information), count, size)
+                roots = square_roots(name, matrices, count, size)
                 whitener = roots.reshape(len(roots), size * size)
             whitening = FULL
         data = side_by_side([*parameters, whitener], count)
@@ -283,9 +285,9 @@ def _active(staged: Staged, active: Any) -> Staged:
     return staged
 
 
-def _numbers(parameter: Parameter) -> Array:
-    """The present value of a parameter."""
-    return np.asarray(parameter.value if isinstance(parameter, Data) else parameter, dtype=np.float64)
+def _numbers(name: str, which: str, parameter: Parameter) -> Array:
+    """The present value of a parameter of a term."""
+    return parameter.value if isinstance(parameter, Data) else doubles(f"term '{name}': {which}", parameter, term=name)
 
 
 class Parts:
