@@ -135,3 +135,87 @@ def test_own_robot_loop(run: Run) -> None:
         assert away < 0.03
         assert friction == pytest.approx([0.8, 0.4], abs=0.05)
         assert converged > 55
+
+
+def test_own_group(run: Run) -> None:
+    ran = run("own_group")
+    x, S2, N = ran["x"], ran["S2"], ran["N"]
+    assert fg.check_manifold(S2).ok and "8 axioms hold" in ran.printed
+    routes = ran["graph"].check(ran["guess"]).routes
+    assert set(routes.values()) == {"traced, its derivatives exact"}
+    for solution in ran["solutions"]:
+        assert right(ran["graph"], solution)
+        steps = np.linalg.norm(S2.local(solution[x][:-1], solution[x][1:]), axis=1)
+        assert np.allclose(steps, np.radians(ran["shortest"]) / N, rtol=1e-4)  # chords of the arc, as good as arcs
+        assert (solution[x] @ ran["sun"]).max() < np.cos(ran["away"]) + 1e-6
+
+
+def test_real_time_iteration(run: Run) -> None:
+    ran = run("real_time_iteration")
+    best = ran["results"]["to the end"][0]
+    assert list(ran["results"]) == ["to the end", "one program", "one step"]
+    for cost, driven in ran["results"].values():
+        assert cost < 1.005 * best
+        assert np.abs(driven[-5:, 0] + 0.5).max() < 0.1 and np.abs(driven[:, 1] - np.pi).max() < 0.5
+        assert np.abs(driven[:, 0]).max() < 1.2
+
+
+def test_quadrotor_figure8(run: Run) -> None:
+    ran = run("quadrotor_figure8")
+    assert len(ran["results"]) == 3
+    for off, tilt, status in ran["results"].values():
+        assert off < 0.04 and 20.0 < tilt < 35.0 and status is fg.Status.CONVERGED
+
+
+def test_range_only_slam(run: Run) -> None:
+    ran = run("range_only_slam")
+    assert ran["echoes"].sum() > 40
+    (plain, off, sigmas, _), *robust = ran["results"].values()
+    assert plain.converged and off > 1.0 and sigmas > 10.0  # sure of what is wrong
+    for solution, off, sigmas, misjudged in robust:
+        assert solution.converged and off < 0.4 and sigmas < 3.0 and misjudged < 6
+    assert ran["results"]["GNC"][0].verdict is not None
+
+
+def test_casadi_model(run: Run) -> None:
+    pytest.importorskip("casadi")
+    ran = run("casadi_model")
+    state = ran["state"]
+    for solution in ran["solutions"].values():
+        assert right(ran["graph"], solution)
+        assert np.abs(solution[state][:, 1]).max() == pytest.approx(0.1, abs=1e-6)
+        reached = ran["ends"][0]
+        for push in solution[ran["push"]]:
+            reached = np.asarray(ran["step"](reached, push)).ravel()
+        assert np.allclose(reached, [4.0, 0.0, 0.0, 0.0], atol=1e-5)
+
+
+def test_casadi_model_says_what_is_missing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "casadi", None)
+    with pytest.raises(SystemExit, match=r'pip install "unifg\[casadi\]"'):
+        run("casadi_model")
+
+
+def test_own_backend_constrained(run: Run) -> None:
+    """On the table of problems: test_own_backend.py."""
+    ran = run("own_backend_constrained")
+    own, kkt, augmented = ran["solutions"]
+    for solution in (own, kkt, augmented):
+        assert right(ran["graph"], solution)
+        assert np.allclose(solution.dual("motion"), kkt.dual("motion"), atol=1e-3)
+    assert own.iterations <= kkt.iterations + 2
+
+
+def test_own_qp_solver(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    import qpsolvers
+
+    for names in ("available_solvers", "dense_solvers"):  # it adds itself
+        monkeypatch.setattr(qpsolvers, names, list(getattr(qpsolvers, names)))
+    monkeypatch.setitem(qpsolvers.solvers.solve_function, "mehrotra", None)
+    ran = run("own_qp_solver")
+    assert {"mehrotra", "piqp"} <= set(ran["solutions"])
+    for name, solution in ran["solutions"].items():
+        assert right(ran["graph"], solution), name
+        assert solution.cost == pytest.approx(8.257403, abs=1e-5), name
+    own = ran["solutions"]["mehrotra"]
+    assert {row.details["qp"] for row in own.history[1:]} == {"mehrotra"}
