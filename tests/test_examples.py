@@ -221,3 +221,26 @@ def test_own_qp_solver(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
         assert solution.cost == pytest.approx(8.257403, abs=1e-5), name
     own = ran["solutions"]["mehrotra"]
     assert {row.details["qp"] for row in own.history[1:]} == {"mehrotra"}
+
+
+def test_scene_of_my_graph(run: Run) -> None:
+    ran = run("scene_of_my_graph")
+    x, solution = ran["x"], ran["solution"]
+    off = np.linalg.norm((solution[x] - ran["truth"])[:, :3], axis=1)
+    drifted = np.linalg.norm((ran["guess"] - ran["truth"])[:, :3], axis=1)
+    assert solution.converged and off[-1] < 0.5 * drifted[-1]
+    for name, title in {"solution": "A tower", "iterates": "How it was solved", "flight": "A flight"}.items():
+        text = (ran.folder / f"{name}.html").read_text(encoding="utf-8")
+        assert title in text and "http://" not in text.split("<script", 1)[0]
+    assert {"x", "truth"} <= set(ran["scene"].layers)
+
+
+def test_live_view(run: Run) -> None:
+    ran = run("live_view")
+    assert re.search(r"open http://127\.0\.0\.1:\d+/", ran.printed)
+    assert ran["live"].watching == 0 and len(ran["scene"].shots) == ran["ticks"]
+    assert np.linalg.norm(ran["pose"][:2] - ran["goal"][:2]) < 0.15
+    driven = np.array([shot.trails["driven"] for shot in ran["scene"].shots])
+    gaps = np.linalg.norm(driven[:, None, :2] - ran["discs"][:, :2], axis=2) - ran["discs"][:, 2]
+    assert 0.15 - 1e-3 < gaps.min() < 0.2
+    assert "Live" in (ran.folder / "live_view.html").read_text(encoding="utf-8")

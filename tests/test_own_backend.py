@@ -1,4 +1,4 @@
-"""The backend that docs/own-backend.md builds, on the table of problems."""
+"""The backends that docs/own-backend.md builds, on the table of problems."""
 
 from __future__ import annotations
 
@@ -12,16 +12,23 @@ import unifg as fg
 from fences import fences
 from judge import judge
 from problems.known import PROBLEMS, Problem
+from unifg.solvers import KKT
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "own-backend.md"
 
 
 @pytest.fixture(scope="module")
-def backend() -> fg.Solver:
+def page() -> dict[str, Any]:
     scope: dict[str, Any] = {"__name__": "own_backend"}
-    code = next(block.code for block in fences(PAGE) if block.language == "python")
-    exec(compile(code, str(PAGE), "exec", dont_inherit=True), scope)
-    solver = scope["Newton"]()
+    for block in fences(PAGE):
+        if block.language == "python":
+            exec(compile(block.code, str(PAGE), "exec", dont_inherit=True), scope)
+    return scope
+
+
+@pytest.fixture(scope="module")
+def backend(page: dict[str, Any]) -> fg.Solver:
+    solver = page["Newton"]()
     assert isinstance(solver, fg.Solver)
     return solver
 
@@ -38,3 +45,27 @@ def test_solves_what_has_no_constraints_and_refuses_the_rest(backend: fg.Solver,
     assert judge(graph, solution).worst() < 2e-6
     if np.isfinite(problem.cost):
         assert solution.cost == pytest.approx(problem.cost, rel=1e-6, abs=1e-7)
+
+
+@pytest.mark.parametrize("problem", PROBLEMS, ids=lambda p: p.name)
+def test_solves_equalities_and_refuses_the_rest(page: dict[str, Any], problem: Problem) -> None:
+    solver = page["Lagrange"]()
+    graph, guess = problem.build()
+    try:
+        solution = solver.solve(graph, guess)
+    except fg.BackendError:
+        with pytest.raises(fg.BackendError):
+            KKT().solve(graph, guess)  # which knows equalities and no scalar costs either
+        return
+    assert solution.converged, solution.report()
+    assert judge(graph, solution).worst() < 2e-6
+    if np.isfinite(problem.cost):
+        assert solution.cost == pytest.approx(problem.cost, rel=1e-6, abs=1e-7)
+    for name, expected in problem.duals.items():
+        assert np.allclose(solution.dual(name), expected, atol=1e-5)
+
+
+def test_page_and_example_have_the_same_backend() -> None:
+    example = (PAGE.parent.parent / "examples" / "own_backend_constrained.py").read_text(encoding="utf-8")
+    (own,) = (block.code for block in fences(PAGE) if "class Lagrange" in block.code)
+    assert own[own.index("class Lagrange") :].strip() in example
