@@ -138,6 +138,7 @@ class Episode:
             seed=s.seed,
             control_limits=s.controller.limits,
             scan_angles=self.world.lidar.angles,
+            obstacle_moving=self.world.obstacle_states()[:, 3].astype(bool),
         )
         self._reached = [False] * len(self.goals)
         self._goal, self._driven, self._dead_reckoning = 0, 0.0, self.pilot.pose
@@ -146,7 +147,6 @@ class Episode:
         return self._recorder.finish(
             collisions=self.world.collisions,
             reached=self._reached,
-            obstacle_moving=self.world.obstacle_states()[:, 3].astype(bool),
             interrupted=interrupted,
         )
 
@@ -181,7 +181,10 @@ class Episode:
             true_pose=world.pose,
             estimate=pilot.pose,
             dead_reckoning=self._dead_reckoning,
+            covariance=pilot.estimator.covariance,
             control=plan.control,
+            route=self.legs[self._goal].path,
+            contacts=world.collisions,
             horizon=plan.states,
             scan=scan.ranges,
             obstacles=world.obstacle_states()[:, :3],

@@ -347,7 +347,7 @@ def only_a_moment(monkeypatch: pytest.MonkeyPatch, change: Callable[[FlightLog],
 
 def test_the_command_writes_its_results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     only_a_moment(monkeypatch, lambda log: log)
-    no_scene = SimpleNamespace(write=lambda path: path)
+    no_scene = SimpleNamespace(save=lambda path: path)
     monkeypatch.setattr(results, "flight_scene", lambda log: no_scene)  # takes seconds, and has tests of its own
     assert command.main(["run", "quadrotor-mpc", "--seed", str(SEED), "--out", str(tmp_path)]) == 1  # not there yet
     metrics = json.loads((tmp_path / "metrics.json").read_text())

@@ -71,7 +71,7 @@ def test_names_from_outside_cannot_become_markup(log: EpisodeLog) -> None:
 
 
 def test_same_log_same_bytes_in_two_processes(page: str, tmp_path: Path, log: EpisodeLog) -> None:
-    assert drive_scene(log).write(tmp_path / "scene.html").read_bytes() == page.encode()
+    assert drive_scene(log).save(tmp_path / "scene.html").read_bytes() == page.encode()
     code = (
         "import hashlib; from episodes import episode; from unifg.scenarios.show.drive_scene import drive_scene;"
         "print(hashlib.sha256(drive_scene(episode(ticks=12, obstacles=4)).html().encode()).hexdigest())"
@@ -113,16 +113,21 @@ def test_every_frame_is_packed_and_shown_in_turn(page: str, log: EpisodeLog) -> 
     objects = {c["path"].removeprefix("/meshcat/") for c in commands if c["type"] == "set_object"}
     tracks = tracks_of(commands)
     last = log.ticks - 1
-    for tick in range(log.ticks):
-        path = f"frames/{tick}"
-        assert f"{path}/scan" in objects and f"{path}/horizon" in objects
-        assert (f"{path}/detected" in objects) == (len(log.detected[tick]) > 0)
+
+    def shown(path: str, moment: int) -> bool:
         keys = dict(tracks[path][".visible"])
         assert min(keys) == 0  # otherwise the viewer holds the first key backwards
         assert max(keys) == last  # otherwise this track would end before the others
-        for moment in range(log.ticks):
-            shown = keys[max(time for time in keys if time <= moment)]
-            assert shown is (moment == tick)
+        return bool(keys[max(time for time in keys if time <= moment)])
+
+    for tick in range(log.ticks):
+        for part in ("scan", "horizon"):
+            assert f"{part}/{tick}" in objects
+            assert [shown(f"{part}/{tick}", moment) for moment in range(log.ticks)] == [
+                moment == tick for moment in range(log.ticks)
+            ]
+        found = [path for path in objects if path.startswith("detected/") and shown(path, tick)]
+        assert (len(found) == 1) == (len(log.detected[tick]) > 0)
 
 
 def test_all_tracks_start_at_zero_and_end_together(page: str, log: EpisodeLog) -> None:
@@ -141,9 +146,9 @@ def test_robot_ghost_and_movers_follow_the_log(page: str, log: EpisodeLog) -> No
         turns = np.array([value for _, value in track[".quaternion"]])
         np.testing.assert_allclose(places[:, :2], poses[:, :2])
         np.testing.assert_allclose(2 * np.arctan2(turns[:, 2], turns[:, 3]), poses[:, 2], atol=1e-12)
-    assert log.moving().tolist() == [True, False, False, True]
-    moved = {path for path in tracks if path.startswith("obstacles/")}
-    assert moved == {"obstacles/0", "obstacles/3"}
+    assert log.obstacle_moves.tolist() == [True, False, False, True]
+    moved = {path for path in tracks if path.startswith("obstacle")}
+    assert moved == {"obstacle 0", "obstacle 3"}
 
 
 def test_the_trail_appears_piece_by_piece_as_the_robot_passes(page: str, log: EpisodeLog) -> None:
@@ -178,7 +183,7 @@ def test_objects_are_packed_as_the_viewer_wants_them(page: str) -> None:
 
 def test_horizon_ends_where_the_plan_ends(page: str, log: EpisodeLog) -> None:
     for command in commands_of(page):
-        if command.get("path") == "/meshcat/frames/5/horizon":
+        if command.get("path") == "/meshcat/horizon/5":
             data = command["object"]["geometries"][0]["data"]["attributes"]["position"]["array"].data
             sides = np.frombuffer(data, dtype=np.float32).reshape(-1, 2, 3)
             assert len(sides) == HORIZON + 1
@@ -215,7 +220,7 @@ def test_odd_episodes_are_drawn_too(log: EpisodeLog) -> None:
     overview(single)
     lost = replace(log, horizon=np.full_like(log.horizon, np.nan), scan=np.full_like(log.scan, np.nan))
     paths = {command.get("path") for command in commands_of(drive_scene(lost).html())}
-    assert "/meshcat/frames/0/horizon" not in paths and "/meshcat/frames/0/scan" not in paths
+    assert not any(path and path.startswith(("/meshcat/horizon", "/meshcat/scan")) for path in paths)
     with pytest.raises(ViewError, match="no tick"):
         drive_scene(replace(log, time=log.time[:0]))
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from scenes import commands_of, data_of
 from unifg.errors import ScenarioError
 from unifg.files.g2o import read_g2o, write_g2o
 from unifg.files.toro import write_toro
@@ -185,18 +186,20 @@ def test_the_scene_needs_nothing_else(city: Path, tmp_path: Path) -> None:
     from unifg.view.shapes import strips
 
     solved = solve_file(SolveSettings(city))
-    scene, shown = graph_scene(solved), shown_steps(solved)
-    paths = {str(command["path"]) for command in scene.recorder.commands if command["type"] == "set_object"}
+    text, shown = graph_scene(solved).html(), shown_steps(solved)
+    data = data_of(text)
+    paths = {str(command["path"]) for command in commands_of(text) if command["type"] == "set_object"}
     assert shown == list(range(len(solved.steps)))
-    assert {f"/meshcat/steps/{k}/{part}" for k in shown for part in ("trajectory", "closures")} <= paths
+    assert {f"/meshcat/{part}/{k}" for k in shown for part in ("trajectory", "closures")} <= paths
     assert {"/meshcat/start", "/meshcat/first"} <= paths
     assert command.main(["solve", str(city), "--out", str(tmp_path)]) == 0
     page = (tmp_path / "scene.html").read_text()
     assert "default-src 'none'" in page and "@@" not in page.split("<script>")[0]
-    assert scene.page.numbers == [0, *scene.page.numbers[1:-1], solved.solution.iterations]
-    assert len(scene.page.readouts[0].texts) == len(shown) == len(scene.ticks)
-    switched = {f"/meshcat/{part}" for key in scene.page.legend for part in key.parts}
-    assert switched == paths - {"/meshcat/first"}  # the legend names everything that can be switched off
+    assert data["numbers"] == [0, *data["numbers"][1:-1], solved.solution.iterations]
+    assert len(data["readouts"][0]["texts"]) == len(shown) == len(data["ticks"])
+    switched = {f"/meshcat/{part}" for key in data["legend"] for part in key["parts"]}
+    drawn = {"/".join(path.split("/")[:3]) for path in paths}
+    assert switched == drawn - {"/meshcat/first"}  # the legend names everything that can be switched off
     assert not re.search(r"(src|href)=\"http", page)
     lines = np.array([[[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]], [[1.0, 1.0, 0.0], [1.0, 1.0, 3.0]]])
     vertices, faces = strips(lines, 0.2, crossed=True)

@@ -229,7 +229,7 @@ def overview() -> Any:
     log = run_navigation(NavigationSettings(obstacles=3, seed=0))
     if not log.succeeded:
         raise SystemExit("the demonstration did not reach its goals: no picture of that")
-    index = int(np.flatnonzero(~log.moving())[-1])  # shown from near; a standing disc needs no prediction
+    index = int(np.flatnonzero(~log.obstacle_moves)[-1])  # shown from near; a standing disc needs no prediction
     gap = np.hypot(*(log.true_pose[:, :2] - log.obstacles[:, index, :2]).T) - log.obstacles[:, index, 2]
     tick = int(np.argmin(np.where(gap > 0.9, gap, np.inf)[: int(gap.argmin())]))
     figure, (whole, near) = plt.subplots(1, 2, figsize=(13.0, 5.9), gridspec_kw={"width_ratios": [1.32, 1.0]})
@@ -317,7 +317,7 @@ def walls(ax: Axes, log: EpisodeLog) -> None:
 
 def discs(ax: Axes, log: EpisodeLog, tick: int) -> None:
     """True obstacles at one tick."""
-    for (x, y, radius), moving in zip(log.obstacles[tick], log.moving(), strict=True):
+    for (x, y, radius), moving in zip(log.obstacles[tick], log.obstacle_moves, strict=True):
         ax.add_patch(Circle((x, y), radius, color=css("moving" if moving else "fixed"), zorder=4))
 
 

@@ -90,7 +90,7 @@ def write_results(folder: str | Path, course: Course) -> list[Path]:
     folder = Path(folder)
     numbers = write_metrics(folder / "metrics.json", course_metrics(course))
     shown = write_figure(folder / "iterates.png", picture(course), 90)
-    return [flight_scene(course_log(course)).write(folder / "scene.html"), shown, numbers]
+    return [flight_scene(course_log(course)).save(folder / "scene.html"), shown, numbers]
 
 
 def summary(course: Course) -> str:

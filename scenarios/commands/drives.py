@@ -51,7 +51,7 @@ def write_results(folder: Path, log: EpisodeLog) -> list[Path]:
     trajectory = write_tum(folder / "trajectory.tum", log.time, log.true_pose)
     estimate = write_tum(folder / "estimate.tum", log.time, log.estimate)
     picture = write_figure(folder / "overview.png", overview(log), 130)
-    scene = drive_scene(log).write(folder / "scene.html")
+    scene = drive_scene(log).save(folder / "scene.html")
     return [scene, picture, metrics, trajectory, estimate]
 
 

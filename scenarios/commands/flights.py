@@ -56,7 +56,7 @@ def write_results(folder: str | Path, log: FlightLog, metrics: Mapping[str, obje
     if has_estimate(log):
         pictures.append(write_figure(folder / "estimates.png", estimates(log), 120))
     pictures.append(write_figure(folder / "control.png", control(log), 120))
-    return [flight_scene(log).write(folder / "scene.html"), *pictures, numbers, stored]
+    return [flight_scene(log).save(folder / "scene.html"), *pictures, numbers, stored]
 
 
 def summary(log: FlightLog) -> str:

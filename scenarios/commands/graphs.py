@@ -45,7 +45,7 @@ def write_results(folder: Path, solved: SolvedGraph) -> list[Path]:
     trajectory = write_tum(folder / "trajectory.tum", np.arange(len(poses), dtype=np.float64), poses)
     numbers = write_metrics(folder / "metrics.json", metrics(solved), sort_keys=False)
     shown = write_figure(folder / "graph.png", picture(solved), 130)
-    scene = graph_scene(solved).write(folder / "scene.html")
+    scene = graph_scene(solved).save(folder / "scene.html")
     return [scene, shown, graph, trajectory, numbers]
 
 

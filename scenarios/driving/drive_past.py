@@ -126,6 +126,11 @@ class Smoother:
         return self.window.present
 
     @property
+    def covariance(self) -> Array:
+        """(3, 3) of the present pose, in the tangent space."""
+        return self.window.state_covariance
+
+    @property
     def iterations(self) -> int:
         """Gauss-Newton iterations of the last registration."""
         return self.window.iterations

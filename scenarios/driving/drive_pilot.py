@@ -34,6 +34,11 @@ class Estimator(Protocol):
         """(3,) present estimate [m, m, rad]."""
         ...
 
+    @property
+    def covariance(self) -> Array:
+        """(3, 3) of it, in the tangent space."""
+        ...
+
     def update(self, scan: Scan, odometry: Array | None, dt: float) -> None:
         """Take in a scan and the odometry (2,) since the last one, None on the first."""
         ...

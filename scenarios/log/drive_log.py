@@ -62,8 +62,12 @@ class EpisodeLog:
     """Localised pose."""
     dead_reckoning: Array = column("m, m, rad", 3)
     """Pose integrated from the wheel odometry alone."""
+    covariance: Array = column("m^2, m rad, rad^2", 3, 3)
+    """Of the estimate, in its tangent space."""
     control: Array = column("m/s, rad/s", 2)
     """Commanded v and omega."""
+    route: list[Array] = ragged("m, m, rad", 3)
+    """The path to the present goal, as repaired so far."""
     horizon: Array = column("m, m, rad", None, 3)
     """Predicted poses."""
     scan: Array = column("m", None)
@@ -90,6 +94,8 @@ class EpisodeLog:
     """Worst violation of a control bound by the plan that is driven, as the solver returned it, before any clipping."""
     clearance: Array = column("m")
     """Distance from the robot's hull to the nearest thing."""
+    contacts: IntArray = column("events", dtype=np.intp)
+    """Contacts so far."""
     goal_index: IntArray = column(dtype=np.intp)
     """Goal being approached."""
     emergency: BoolArray = column(dtype=np.bool_)
@@ -105,7 +111,8 @@ class EpisodeLog:
         """True only if every goal was reached without a collision, in an episode run to its end."""
         return not self.interrupted and bool(self.reached) and all(self.reached) and self.collisions == 0
 
-    def moving(self) -> BoolArray:
+    @property
+    def obstacle_moves(self) -> BoolArray:
         """(K,) True for the obstacles that move, by design or as seen over the episode."""
         if self.obstacle_moving is not None:
             return self.obstacle_moving
@@ -115,3 +122,9 @@ class EpisodeLog:
         travel = np.abs(places - places[:1]).max(axis=(0, 2), initial=0.0)
         moved: BoolArray = np.asarray(travel > 1e-6)
         return moved
+
+    @property
+    def obstacles_first(self) -> Array:
+        """(K, 3) the obstacles at the beginning."""
+        first: Array = self.obstacles[0]
+        return first

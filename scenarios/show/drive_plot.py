@@ -122,7 +122,7 @@ def plot_controls(log: EpisodeLog, ax: tuple[Axes, Axes] | None = None) -> tuple
 
 def _obstacles(log: EpisodeLog, ax: Axes) -> None:
     """Discs at their last place; those that move also at places passed, fading into the past."""
-    moving = log.moving()
+    moving = log.obstacle_moves
     style: dict[str, Any] = {"edgecolor": "none", "zorder": 2}
     if len(log.obstacles[-1, ~moving]):
         discs(ax, log.obstacles[-1, ~moving], "unforeseen obstacle", fc=css("fixed"), alpha=0.95, **style)

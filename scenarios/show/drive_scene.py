@@ -1,125 +1,130 @@
-"""A drive as a scene: the building, the robot and what it saw, estimated and planned."""
+"""A drive as a scene: the building, the robot and what it saw, estimated and planned.
+
+The same few functions show a whole log, and a drive while it goes on: they read one tick of it.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
+from unifg.errors import ViewError
+from unifg.lie import SE2
 from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors
+from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.log.metrics import collision_words
 from unifg.typing import Array, IntArray
-from unifg.view import shapes
-from unifg.view.page import Key, Label, Page, Readout, View
-from unifg.view.stage import Stage
+from unifg.view import Frame, Part, Scene, shapes
 
-__all__ = ["drive_scene", "scan_points"]
+__all__ = ["drive_frame", "drive_scene", "drive_stage", "scan_points"]
 
 _MAX_POINTS = 90_000  # lidar points of the whole file; beyond, every second beam, every third, ...
+_FRAMES = 500  # that a file shows
 _WALL = 0.6  # height of walls and obstacles [m]: low enough to look into rooms
 _BODY = 0.3  # height of the robot [m]
 _NODES = 16  # of the predicted way
 _ABOVE = (0.0, -math.cos(1.1), math.sin(1.1))  # where the camera stands
+_SIGMAS, _ENLARGED = 3.0, 10.0  # of the ellipse of the estimate: centimetres in a building
 
 
-def drive_scene(log: EpisodeLog) -> Stage:
+def drive_scene(log: EpisodeLog) -> Scene:
     """The scene of a drive.
 
     Raises:
-        ViewError: the drive has no tick, or meshcat is not installed.
+        ViewError: the drive has no tick.
     """
-    stage = Stage(log.ticks, log.dt)
-    extent = float(np.ptp(shapes.known_corners(log.occupancy), axis=0).max())
+    if log.ticks == 0:
+        raise ViewError("there is no tick, and nothing to show")
+    scene = drive_stage(log)
+    for tick in range(log.ticks):
+        drive_frame(scene.frame(), log, tick, min(log.ticks, _FRAMES))
+    m = episode_metrics(log)
+    stopped = ", interrupted by the user" if m["interrupted"] else ""
+    scene.outcome = f"{m['goals_reached']} of {m['goals']} goals reached, {collision_words(m['collisions'])}{stopped}"
+    scene.good = m["succeeded"]
+    scene.facts |= {
+        "driven": f"{m['path_length_m']:.1f} m in {m['duration_s']:.1f} s",
+        "closest approach": f"{max(0.0, m['min_clearance_m']):.2f} m",
+        "localisation error": f"{100 * m['localisation_error_m']['mean']:.1f} cm on average",
+        "odometry error": f"{m['odometry_error_m']['max']:.2f} m at worst",
+    }
+    return scene
+
+
+def drive_stage(log: Any) -> Scene:
+    """What stays throughout a drive, and the bodies that move in it.
+
+    Args:
+        log: an `EpisodeLog`, or one in the making: what is known before the first tick is asked of it.
+    """
+    scene = Scene(f"unifg: {log.scenario} on {log.occupancy.name}", dt=log.dt)
+    corners = shapes.known_corners(log.occupancy)
+    extent = float(np.ptp(corners, axis=0).max())
     stroke = float(np.clip(0.004 * extent, 0.03, 0.14))  # width of ribbons [m]
     pin = float(np.clip(0.035 * extent, 0.3, 1.4))  # height of pins and flags [m]
-    _building(stage, log)
-    _route(stage, log, stroke, pin)
-    _robots(stage, log, pin)
-    _obstacles(stage, log)
-    _trail(stage, log, stroke)
-    _frames(stage, log, stroke)
-    return stage.finish(_page(log, stage.ticks))
-
-
-def _building(stage: Stage, log: EpisodeLog) -> None:
-    occupancy = log.occupancy
-    stage.mesh("building/floor", shapes.flat(occupancy, occupancy.free, 0.0), "floor")
-    if occupancy.occupied.any():
-        stage.mesh("building/walls", shapes.extrude(occupancy, _WALL), "wall", lit=True)
-
-
-def _route(stage: Stage, log: EpisodeLog, stroke: float, pin: float) -> None:
-    """The planned path, the start, and goals with flags."""
+    scene.around = np.concatenate([np.column_stack([corners, np.full(4, z)]) for z in (0.0, _WALL)])
+    scene.speeds = (1, 2, 4, 8)
+    scene.facts |= {"solver": f"{log.solver} ({log.coupling})", "seed": str(log.seed)}
+    _robots(scene, log.robot_radius, pin)
+    _growing(scene, stroke)
+    _goals(scene, log, stroke, pin)
     if len(log.path) > 1:
-        stage.mesh("plan", shapes.ribbon(log.path, 0.6 * stroke, 0.02), "plan")
-    stage.mesh("start", shapes.ring(log.start[:2], 0.0, 1.2 * log.robot_radius, 0.03), "start")
-    for index, (x, y, _) in enumerate(log.goals.tolist()):
-        path = f"goals/{index}"
-        stage.mesh(f"{path}/ring", shapes.ring(np.array([x, y]), 1.3 * log.robot_radius, stroke, 0.03), "goal")
-        stage.cylinder(f"{path}/pole", pin, 0.25 * stroke, "pole", (x, y))
-        flag = np.array([[x, y, 0.62 * pin], [x, y, pin], [x + 0.55 * pin, y, 0.81 * pin]])
-        stage.mesh(f"{path}/flag", (flag, np.array([[0, 1, 2]])), "goal")
+        scene.way(
+            "plan", log.path[:, :2], width=0.4 * stroke, colour="odometry", legend="first route, on the map alone"
+        )
+    _obstacles(scene, log)
+    scene.map("building", log.occupancy, height=_WALL, legend="walls and furniture on the map")
+    scene.label("start", log.start[:2])
+    for index, goal in enumerate(log.goals):
+        scene.label("goal" if len(log.goals) == 1 else f"goal {index + 1}", goal[:2])
+    scene.label("robot", follows="robot")
+    scene.label("odometry alone", follows="odometry", minor=True)
+    scene.view("overview", "Whole building", _ABOVE)
+    scene.view("follow", "Follow robot", _ABOVE, follows="robot", distance=30.0)
+    scene.plot("localise + plan", unit="ms", log=True)
+    scene.plot("localisation error", unit="cm", colour="estimate")
+    scene.plot("clearance", unit="m", limit=0.0, colour="horizon")
+    return scene
 
 
-def _robots(stage: Stage, log: EpisodeLog, pin: float) -> None:
-    """The robot where it truly is, where it believes to be, and where its wheels alone would put it."""
-    radius = log.robot_radius
-    stage.cylinder("robot/body", _BODY, radius, "robot")
-    stage.mesh("robot/heading", shapes.wedge(1.2 * radius, _BODY + 0.02), "heading")
-    # A pin hovers above the robot, which would be a few pixels in a whole building.
-    stage.cylinder("robot/pin", 0.75 * pin, 0.0, "robot", z=_WALL + 0.05, top=0.25 * pin)
-    stage.cylinder("estimate/body", _BODY + 0.12, radius + 0.06, "estimate", opacity=0.3)
-    stage.mesh("estimate/heading", shapes.wedge(1.2 * radius, _BODY + 0.14), "estimate", opacity=0.55)
-    stage.cylinder("odometry/body", _BODY, radius, "odometry", opacity=0.55)
-    stage.mesh("odometry/heading", shapes.wedge(1.2 * radius, _BODY + 0.02), "odometry", opacity=0.8)
-    for path, poses in (("robot", log.true_pose), ("estimate", log.estimate), ("odometry", log.dead_reckoning)):
-        stage.move(path, shapes.on_ground(poses), poses[:, 2])
+def drive_frame(frame: Frame, log: Any, tick: int, frames: int = 1) -> None:
+    """What a tick of a drive shows.
 
-
-def _obstacles(stage: Stage, log: EpisodeLog) -> None:
-    for index, moves in enumerate(log.moving().tolist()):
-        places, path = log.obstacles[:, index], f"obstacles/{index}"
-        x, y, radius = places[0].tolist()
-        if moves:
-            stage.cylinder(f"{path}/body", _WALL, radius, "moving")
-            stage.move(path, shapes.on_ground(places))
-        else:
-            stage.cylinder(f"{path}/body", _WALL, radius, "fixed", (x, y))
-
-
-def _trail(stage: Stage, log: EpisodeLog, stroke: float) -> None:
-    """The way driven so far."""
-    for begin, end in stage.pieces():
-        piece = log.true_pose[begin : end + 1]
-        if np.ptp(piece[:, :2], axis=0).max() >= 1e-3:
-            stage.mesh(f"trail/{begin}", shapes.ribbon(piece, 0.9 * stroke, 0.04), "trail")
-            stage.appear(f"trail/{begin}", end)
-
-
-def _frames(stage: Stage, log: EpisodeLog, stroke: float) -> None:
-    """Scan, predicted way and detections of each frame."""
-    beams = np.arange(0, len(log.scan_angles), math.ceil(len(stage.ticks) * len(log.scan_angles) / _MAX_POINTS))
-    nodes = np.unique(np.linspace(0, log.horizon.shape[1] - 1, _NODES).round().astype(np.intp))
-    for tick, ending in stage.turns():
-        path = f"frames/{tick}"
-        hits = scan_points(log, tick, beams)
-        if len(hits):
-            stage.points(f"{path}/scan", np.column_stack([hits, np.full(len(hits), _WALL + 0.02)]), "scan", 4.0)
-        horizon = log.horizon[tick][nodes]
-        if len(horizon) > 1 and np.isfinite(horizon).all():
-            stage.mesh(f"{path}/horizon", shapes.ribbon(horizon, stroke, 0.06), "horizon")
-        rings = [
-            shapes.ring(x[:2], float(x[2]) + 0.03, 0.5 * stroke, _WALL + 0.01, corners=10) for x in log.detected[tick]
-        ]
-        if rings:
-            stage.mesh(f"{path}/detected", shapes.merge(rings), "detected")
-        stage.appear(path, tick, ending)
+    Args:
+        frame: to be drawn on.
+        log: an `EpisodeLog`, or one in the making.
+        tick: which.
+        frames: how many the file will hold.
+    """
+    truth, estimate = log.true_pose[tick], log.estimate[tick]
+    for name, pose in (("robot", truth), ("estimate", estimate), ("odometry", log.dead_reckoning[tick])):
+        frame.place(name, pose)
+    rotation = SE2.matrix(estimate)[:2, :2]
+    spread = rotation @ log.covariance[tick][:2, :2] @ rotation.T
+    frame.ellipse("sigma", estimate[:2], spread, sigmas=_SIGMAS * _ENLARGED, z=_BODY + 0.13)
+    frame.trail("trail", truth[:2])
+    frame.way("route", log.route[tick][:, :2], colour="plan")
+    beams = np.arange(0, len(log.scan_angles), math.ceil(frames * len(log.scan_angles) / _MAX_POINTS))
+    hits = scan_points(log, tick, beams)
+    frame.points("scan", np.column_stack([hits, np.full(len(hits), _WALL + 0.02)]), pixels=4.0)
+    horizon = log.horizon[tick]
+    nodes = np.unique(np.linspace(0, len(horizon) - 1, _NODES).round().astype(np.intp))
+    if len(nodes) > 1 and np.isfinite(horizon[nodes]).all():
+        frame.way("horizon", horizon[nodes, :2])
+    rings = [shapes.ring(x[:2], float(x[2]) + 0.03, 0.06, _WALL + 0.01, corners=10) for x in log.detected[tick]]
+    if rings:
+        frame.mesh("detected", shapes.merge(rings))
+    for index in np.flatnonzero(log.obstacle_moves).tolist():
+        frame.place(f"obstacle {index}", [*log.obstacles[tick][index][:2], 0.0])
+    _touch(frame, log, tick)
+    _say(frame, log, tick)
 
 
 def scan_points(log: EpisodeLog, tick: int, beams: IntArray) -> Array:
     """World points (n, 2) [m] where the chosen beams of a tick really ended; dropouts and misses are left out."""
-    ranges = log.scan[tick, beams]
+    ranges = log.scan[tick][beams]
     returned = np.isfinite(ranges)
     x, y, heading = log.true_pose[tick]
     angles = log.scan_angles[beams][returned] + heading
@@ -127,72 +132,104 @@ def scan_points(log: EpisodeLog, tick: int, beams: IntArray) -> Array:
     return hits
 
 
-def _page(log: EpisodeLog, ticks: IntArray) -> Page:
-    m = episode_metrics(log)
-    moving = log.moving()
-    stopped = ", interrupted by the user" if m["interrupted"] else ""
-    legend = [
-        Key("robot", "disc", "robot, where it truly is (pin above it)"),
-        Key("estimate", "ghost", "where the robot believes it is: lidar localisation"),
-        Key("odometry", "ghost", "where wheel odometry alone would put it"),
-        Key("scan", "dots", "lidar hits of this moment"),
-        Key("horizon", "line", "way the controller predicts for the next seconds"),
-        Key("trail", "line", "way driven so far"),
-        Key("plan", "line", "planned path"),
-        Key("goal", "flag", "goals"),
-    ]
-    if (~moving).any():
-        legend.append(Key("fixed", "disc", "obstacle that is not on the map"))
-    if moving.any():
-        legend.append(Key("moving", "disc", "obstacle that moves"))
-    if any(len(found) for found in log.detected):
-        legend.append(Key("detected", "ring", "obstacle as the robot has detected it"))
-    legend.append(Key("wall", "block", "walls and furniture on the map"))
-    labels = [Label("start", [*log.start[:2].tolist(), 0.0])]
-    for index, goal in enumerate(log.goals):
-        labels.append(Label("goal" if len(log.goals) == 1 else f"goal {index + 1}", [*goal[:2].tolist(), 0.0]))
-    labels += [Label("robot", follows="robot"), Label("odometry alone", follows="odometry", minor=True)]
-    error, _ = pose_errors(log.estimate, log.true_pose)
-    corners = shapes.known_corners(log.occupancy)
-    return Page(
-        title=f"unifg: {log.scenario} on {log.occupancy.name}",
-        outcome=f"{m['goals_reached']} of {m['goals']} goals reached, {collision_words(m['collisions'])}{stopped}",
-        good=m["succeeded"],
-        facts={
-            "solver": f"{m['solver']} ({m['coupling']})",
-            "seed": str(m["seed"]),
-            "driven": f"{m['path_length_m']:.1f} m in {m['duration_s']:.1f} s",
-            "closest approach": f"{max(0.0, m['min_clearance_m']):.2f} m",
-            "localisation error": f"{100 * m['localisation_error_m']['mean']:.1f} cm on average",
-            "odometry error": f"{m['odometry_error_m']['max']:.2f} m at worst",
-        },
-        corners=np.concatenate([np.column_stack([corners, np.full(4, z)]) for z in (0.0, _WALL)]),
-        legend=legend,
-        labels=labels,
-        readouts=[
-            Readout("speed", [f"{v:.2f} m/s" for v in log.control[ticks, 0]]),
-            Readout("turn", [f"{omega:.2f} rad/s" for omega in log.control[ticks, 1]]),
-            Readout("goal", [f"{goal + 1} of {len(log.goals)}" for goal in log.goal_index[ticks]]),
-            Readout("localisation error", [f"{100 * e:.1f} cm" for e in error[ticks]]),
-            Readout("clearance", [f"{c:.2f} m" if np.isfinite(c) else "\u2013" for c in log.clearance[ticks]]),
-            Readout("localise, plan", _times(log, ticks), (log.compiled[ticks] > 0).tolist()),
-            Readout(
-                "plan",
-                [log.status[k].replace("_", " ") + (": stored one driven" if log.emergency[k] else "") for k in ticks],
-                log.emergency[ticks].tolist(),
-            ),
-        ],
-        views=[
-            View("overview", "Whole building", _ABOVE, 20.0),
-            View("follow", "Follow robot", _ABOVE, 20.0, follows="robot", distance=30.0),
-        ],
-        speeds=(1, 2, 4, 8),
+def _robots(scene: Scene, radius: float, pin: float) -> None:
+    """The robot where it truly is, where it believes to be, and where its wheels alone would put it."""
+    middle, none = np.zeros((1, 3)), np.zeros(3)
+
+    def upright(height: float, wide: float) -> shapes.Mesh:
+        return shapes.copies(shapes.column(), middle, np.diag([wide, wide, height])[None])
+
+    # A pin hovers above the robot, which would be a few pixels in a whole building.
+    tip = shapes.copies(
+        shapes.column(bottom=0.0), none[None] + [0.0, 0.0, _WALL + 0.05], np.diag([0.25, 0.25, 0.75])[None] * pin
     )
-
-
-def _times(log: EpisodeLog, ticks: IntArray) -> list[str]:
-    """What both took in each tick, and whether that is more than their work."""
-    return [
-        f"{log.localise_ms[k]:.1f} ms, {log.plan_ms[k]:.1f} ms" + (" (compiled)" if log.compiled[k] else "")
-        for k in ticks
+    heading = shapes.wedge(1.2 * radius, _BODY + 0.02)
+    robot = [
+        Part("body", upright(_BODY, radius), "robot"),
+        Part("heading", heading, "heading", False),
+        Part("pin", tip, "robot"),
     ]
+    scene.body("robot", robot, colour="robot", legend="robot, where it truly is")
+    believed = [
+        Part("body", upright(_BODY + 0.12, radius + 0.06), "estimate", True, 0.3),
+        Part("heading", shapes.wedge(1.2 * radius, _BODY + 0.14), "estimate", False, 0.55),
+    ]
+    words = "where it believes it is: lidar localisation"
+    scene.body("estimate", believed, colour="estimate", swatch="ghost", legend=words)
+    words = f"how sure it is: {_SIGMAS:g}\u03c3, {_ENLARGED:g} times enlarged"
+    scene.body("sigma", "ellipse", colour="estimate", swatch="ring", legend=words)
+    drifted = [
+        Part("body", upright(_BODY, radius), "odometry", True, 0.55),
+        Part("heading", heading, "odometry", False, 0.8),
+    ]
+    words = "where its wheels alone would put it"
+    scene.body("odometry", drifted, colour="odometry", swatch="ghost", legend=words)
+
+
+def _growing(scene: Scene, stroke: float) -> None:
+    """Names, words and widths of what changes with the ticks."""
+    scene.layer("scan", "dots", "scan", "lidar hits")
+    scene.layer("horizon", "line", "horizon", "plan for the next seconds", width=stroke)
+    scene.layer("trail", "line", "trail", "way driven so far", width=0.9 * stroke)
+    words = "route it follows, repaired where blocked"
+    scene.layer("route", "line", "plan", words, width=0.6 * stroke)
+    scene.layer("detected", "ring", "detected", "obstacle as detected")
+    scene.layer("contact", "block", "moving", "contact")
+
+
+def _goals(scene: Scene, log: Any, stroke: float, pin: float) -> None:
+    """The start, and goals with flags."""
+    radius, flags, poles = log.robot_radius, [], []
+    scene.mesh("start", shapes.ring(log.start[:2], 0.0, 1.2 * radius, 0.03), colour="start", legend="")
+    for x, y, _ in log.goals.tolist():
+        flags.append(shapes.ring(np.array([x, y]), 1.3 * radius, stroke, 0.03))
+        flag = np.array([[x, y, 0.62 * pin], [x, y, pin], [x + 0.55 * pin, y, 0.81 * pin]])
+        flags.append((flag, np.array([[0, 1, 2]])))
+        poles.append([x, y, 0.25 * stroke])
+    scene.mesh("goals", shapes.merge(flags), colour="goal", swatch="flag", legend="goals")
+    scene.discs("poles", poles, height=pin, colour="pole", legend="")
+
+
+def _obstacles(scene: Scene, log: Any) -> None:
+    """Those that stand stay; those that move are bodies, switched by one line of the legend."""
+    moves, places = log.obstacle_moves, log.obstacles_first
+    if (~moves).any():
+        words = "obstacle not on the map"
+        scene.discs("obstacles", places[~moves], height=_WALL, colour="fixed", legend=words)
+    first: str | None = None
+    for index in np.flatnonzero(moves).tolist():
+        name, radius = f"obstacle {index}", float(places[index, 2])
+        mesh = shapes.copies(shapes.column(), np.zeros((1, 3)), np.diag([radius, radius, _WALL])[None])
+        words = "obstacle that moves" if first is None else ""
+        scene.body(name, [Part("body", mesh, "moving")], colour="moving", legend=words, like=first)
+        first = first or name
+
+
+def _touch(frame: Frame, log: Any, tick: int) -> None:
+    """A pole where each contact so far began."""
+    begun = [k for k in range(1, tick + 1) if log.contacts[k] > log.contacts[k - 1]]
+    if begun:
+        rows = [[*log.true_pose[k][:2], 0.5 * log.robot_radius] for k in begun]
+        frame.discs("contact", rows, height=2.0 * _WALL)
+
+
+def _say(frame: Frame, log: Any, tick: int) -> None:
+    """Numbers of the moment."""
+    error = float(np.hypot(*(log.estimate[tick] - log.true_pose[tick])[:2]))
+    clearance, stored = float(log.clearance[tick]), bool(log.emergency[tick])
+    spent = f"{log.localise_ms[tick]:.1f} ms, {log.plan_ms[tick]:.1f} ms"
+    deviations = 100.0 * np.sqrt(np.linalg.eigvalsh(log.covariance[tick][:2, :2])[[1, 0]])
+    status = log.status[tick].replace("_", " ")
+    frame.readout("speed", f"{log.control[tick][0]:.2f} m/s")
+    frame.readout("turn", f"{log.control[tick][1]:.2f} rad/s")
+    frame.readout("goal", f"{log.goal_index[tick] + 1} of {len(log.goals)}")
+    frame.readout("localisation error", f"{100 * error:.1f} cm")
+    frame.readout("believed \u03c3", f"{deviations[0]:.1f} and {deviations[1]:.1f} cm")
+    frame.readout("clearance", f"{clearance:.2f} m" if np.isfinite(clearance) else "\u2013")
+    frame.readout("contacts", str(int(log.contacts[tick])), alarm=bool(log.contacts[tick]))
+    frame.readout("localise, plan", spent + " (compiled)" * bool(log.compiled[tick]), alarm=bool(log.compiled[tick]))
+    frame.readout("plan", status + ": stored one driven" * stored, alarm=stored)
+    frame.readout("iterations of it", str(int(log.plan_iterations[tick])))
+    frame.value("localise + plan", float(log.solve_ms[tick]))
+    frame.value("localisation error", 100.0 * error)
+    frame.value("clearance", clearance)

@@ -2,8 +2,6 @@
 
 from unifg.view.bodies import Part
 from unifg.view.canvas import Frame
-
-# from unifg.view.live import Live
 from unifg.view.live import Live
 from unifg.view.scene import Scene
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from unifg.errors import ViewError
 from unifg.view import drone
-from unifg.view.shapes import Mesh, box, column, copies, merge, sphere, tube, wedge
+from unifg.view.shapes import Mesh, box, column, copies, merge, ring, sphere, tube, wedge
 
 __all__ = ["BODIES", "Part", "body_of"]
 
@@ -53,6 +53,12 @@ def disc(size: float, colour: str) -> list[Part]:
     ]
 
 
+def ellipse(size: float, colour: str) -> list[Part]:
+    """A flat disc of that radius with an edge, to be stretched."""
+    edge, face = ring(np.zeros(2), 0.86 * size, 0.14 * size, 0.005, 32), ring(np.zeros(2), 0.0, size, 0.0, 32)
+    return [Part("disc", face, colour, False, 0.4), Part("edge", edge, colour, False)]
+
+
 def car(size: float, colour: str) -> list[Part]:
     """A car of that length between its bumpers, its origin in the middle of the rear axle."""
     along, wide = 0.6 * size, 0.42 * size
@@ -82,7 +88,7 @@ def quadrotor(size: float, colour: str) -> list[Part]:
 
 
 BODIES: Mapping[str, Callable[[float, str], list[Part]]] = {
-    "arrow": arrow, "axes": axes, "ball": ball, "disc": disc, "car": car, "quadrotor": quadrotor,
+    "arrow": arrow, "axes": axes, "ball": ball, "disc": disc, "ellipse": ellipse, "car": car, "quadrotor": quadrotor,
 }  # fmt: skip
 """Kinds of bodies, each made from a size [m] and a colour."""
 

@@ -20,7 +20,9 @@ from unifg.view.things import Thing
 __all__ = ["Canvas", "Frame"]
 
 # How many of each may stand in a file, over all its frames: some ten megabytes.
-_WAYS, _TUBES, _DOTS, _LINES, _MARKS, _OUTLINES = 100_000, 40_000, 200_000, 60_000, 8_000, 4_000
+_WAYS, _TUBES, _DOTS, _MARKS, _OUTLINES = 100_000, 40_000, 200_000, 8_000, 4_000
+_STILL = 0.02  # share of its half axis by which an ellipse moves or grows before it is placed anew
+_HAIRS, _STRIPS = 300_000, 60_000
 
 
 class Canvas:
@@ -47,7 +49,13 @@ class Canvas:
         """
         places, flat = self._places(name, points)
         layer = self._content.layer(name, "line", colour, legend)
-        given = {"points": places, "flat": flat, "colour": layer.colour, "width": width, "level": layer.level}
+        given = {
+            "points": places,
+            "flat": flat,
+            "colour": layer.colour,
+            "width": width or layer.width,
+            "level": layer.level,
+        }
         self._drawn[name] = Thing(things.draw_way, given, places, len(places), _WAYS if flat else _TUBES)
 
     def points(
@@ -80,8 +88,16 @@ class Canvas:
         flat = ends.shape[2] == 2
         full = np.concatenate([ends, np.zeros((len(ends), 2, 1))], axis=2) if flat else ends.copy()
         layer = self._content.layer(name, "thin" if width is None else "line", colour, legend)
-        given = {"lines": full, "flat": flat, "colour": layer.colour, "width": width, "level": layer.level}
-        self._drawn[name] = Thing(things.draw_segments, given, full.reshape(-1, 3), len(full), _LINES)
+        given = {
+            "lines": full,
+            "flat": flat,
+            "colour": layer.colour,
+            "width": width or layer.width,
+            "level": layer.level,
+        }
+        self._drawn[name] = Thing(
+            things.draw_segments, given, full.reshape(-1, 3), len(full), _HAIRS if width is None else _STRIPS
+        )
 
     def poses(
         self, name: str, poses: ArrayLike, *, length: float | None = None, colour: str | None = None,
@@ -297,6 +313,45 @@ class Frame(Shot, Canvas):
             half = 0.5 * row[2]
             row = np.array([row[0], row[1], 0.0, math.cos(half), 0.0, 0.0, math.sin(half)])
         self.placed[name] = Placement(row[:3], row[3:], stretch)
+
+    def ellipse(
+        self, name: str, middle: ArrayLike, covariance: ArrayLike, *, sigmas: float = 3.0, z: float = 0.0
+    ) -> None:
+        """Stretch a body of radius 1 to the ellipse of a covariance: cheaper than to draw it anew in every frame.
+
+        Args:
+            name: of the body, usually of the kind "ellipse".
+            middle: (2,) [m].
+            covariance: (2, 2) [m^2].
+            sigmas: half axes in standard deviations.
+            z: height [m].
+
+        Raises:
+            ViewError: there is no such body, or a number is not finite.
+        """
+        place, spread = np.asarray(middle, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
+        if place.shape != (2,) or spread.shape != (2, 2):
+            raise ViewError(
+                f"'{name}': an ellipse has a middle (2,) and a covariance (2, 2), found {place.shape}, {spread.shape}"
+            )
+        finite(name, place[None], "middle")
+        finite(name, spread[None], "covariance")
+        long, short, direction = shapes.ellipse_axes(spread, sigmas)
+        before = self._content.ellipses.get(name)
+        if before is not None:
+            values = before[0]
+            moved = float(np.abs(place - values[:2]).max()) / max(values[2], 1e-6)
+            grown = np.abs(np.array([long, short]) - values[2:4]).max() / max(values[2], 1e-6)
+            if name in self._content.bodies and max(moved, grown) < _STILL:
+                self.placed[name] = before[1]  # it would only tremble
+                return
+            # A direction and its opposite are the same: the nearer one, lest the ellipse spin.
+            last = float(values[4])
+            direction = last + (direction - last + math.pi / 2.0) % math.pi - math.pi / 2.0
+        half = 0.5 * direction
+        pose = [*place.tolist(), z, math.cos(half), 0.0, 0.0, math.sin(half)]
+        self.place(name, pose, scale=(max(long, 1e-6), max(short, 1e-6), 1.0))
+        self._content.ellipses[name] = np.array([*place, long, short, direction]), self.placed[name]
 
     def trail(self, name: str, place: ArrayLike, *, colour: str | None = None, legend: str | None = None) -> None:
         """A place (2,) or (3,) [m] of a way that grows from frame to frame and stays.

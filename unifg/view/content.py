@@ -28,13 +28,15 @@ class Layer:
         path: of its objects.
         level: rank from the ground up.
         key: its line of the legend, None for none.
-        colour: of what is drawn without saying which.
+        colour: of everything drawn.
+        width: of lines where they are not given one [m].
     """
 
     path: str
     level: int
     key: Key | None
     colour: str
+    width: float | None = None
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,7 @@ class Content:
         numbers: what is counted, one per frame; None for 0, 1, ...
         speeds: to choose from where time passes.
         whole: whether the view of everything holds every frame, or only the last one and what stays.
+        around: (n, 3) places that a view of everything must hold [m]; None for all that is drawn.
         ground: whether lines on the ground give the scale.
         things: what stays, by layer.
         layers: everything drawn, by name.
@@ -103,6 +106,7 @@ class Content:
         readouts: names of the lines of the panel, in order.
         plots: how numbers are plotted.
         flat_trails: which ways that grow lie in the plane.
+        ellipses: middle, half axes and direction of ellipses when they last changed, and how that was placed.
         watchers: to be told of each frame that is done.
     """
 
@@ -117,17 +121,30 @@ class Content:
         self.numbers: list[int] | None = None
         self.speeds: tuple[float, ...] = (0.25, 0.5, 1, 2, 4, 8)
         self.whole = self.ground = True
+        self.around: Array | None = None
         self.things: dict[str, Thing] = {}
         self.layers: dict[str, Layer] = {}
         self.bodies: dict[str, Body] = {}
         self.readouts: dict[str, None] = {}
         self.plots: dict[str, Plot] = {}
         self.flat_trails: dict[str, bool] = {}
+        self.ellipses: dict[str, tuple[Array, Placement]] = {}
         self.watchers: list[Callable[[Shot], None]] = []
         self.lock = threading.RLock()
 
-    def layer(self, name: str, swatch: str, colour: str | None, legend: str | None) -> Layer:
-        """The layer of a name; a new one gets a line of the legend.
+    def layer(
+        self, name: str, swatch: str, colour: str | None, legend: str | None, width: float | None = None,
+        like: str | None = None,
+    ) -> Layer:  # fmt: skip
+        """The layer of a name; a new one gets a line of the legend, in the order of making.
+
+        Args:
+            name: of everything drawn in it.
+            swatch: of its line: disc, ghost, ring, line, thin, dots, block, flag, arrow or axes.
+            colour: of it; None for the next of a palette.
+            legend: words; None for the name, empty for no line.
+            width: of lines where they are not given one [m].
+            like: another layer, whose line of the legend switches this one too.
 
         Raises:
             ViewError: the name is empty, or there is no such colour.
@@ -141,6 +158,8 @@ class Content:
                 rgb(chosen)
                 path = _RESERVED.sub(lambda found: f"%{ord(found[0]):02x}", name)
                 text = name if legend is None else legend
-                key = Key(chosen, swatch, text, [path]) if text else None
-                layer = self.layers[name] = Layer(path, len(self.layers) + 1, key, chosen)
+                key = Key(chosen, swatch, text, [path]) if text and like is None else None
+                if like is not None and (other := self.layers[like].key) is not None:
+                    other.parts.append(path)
+                layer = self.layers[name] = Layer(path, len(self.layers) + 1, key, chosen, width)
         return layer

@@ -265,7 +265,10 @@ class Live:
                 known.trails[name] = passed
                 layer, flat = content.layers[name], content.flat_trails[name]
                 path = f"{layer.path}/way"
-                draw_way(stage, path, 400, points=points, flat=flat, colour=layer.colour, width=None, level=layer.level)
+                draw_way(
+                    stage, path, 400, points=points, flat=flat, colour=layer.colour, width=layer.width,
+                    level=layer.level,
+                )  # fmt: skip
         commands = stage.recorder.packed_base64()
         return json.dumps({"page": self._words(shot, ground), "commands": commands}, allow_nan=False)
 

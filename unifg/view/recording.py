@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -110,7 +111,9 @@ def ground_of(content: Content, shots: list[Shot]) -> Ground:
     if earlier is None:
         raise ViewError("nothing is drawn: give families to Scene.of, or draw on the scene or on a frame of it")
     low, high = earlier
-    if last is not None and not content.whole:
+    if content.around is not None:
+        low, high = content.around.min(axis=0), content.around.max(axis=0)
+    elif last is not None and not content.whole:
         reach = _AROUND * float((last[1] - last[0]).max())
         low, high = np.maximum(low, last[0] - reach), np.minimum(high, last[1] + reach)
     size = float((high - low).max())
@@ -232,16 +235,29 @@ def _move(stage: Stage, layer: Layer, body: Body, shots: list[Shot], name: str) 
     if not any(name in shots[tick].placed for tick in stage.ticks):
         return
     set_body(stage, layer, body)
-    stretched = any(bool((shot.placed[name].scale != 1.0).any()) for shot in shots if name in shot.placed)
-    seen = [name in shots[tick].placed for tick in stage.ticks]
-    for k, tick in enumerate(stage.ticks.tolist()):
-        placed = shots[tick].placed.get(name)
-        if not all(seen) and (k == 0 or seen[k] != seen[k - 1] or tick == stage.last):
-            stage.key(f"{layer.path}/parts", tick, visible=seen[k])
-        if placed is not None:
-            stage.key(layer.path, tick, position=placed.position, quaternion=placed.attitude)
-            if stretched:
-                stage.key(f"{layer.path}/parts", tick, scale=np.maximum(placed.scale, 1e-9))
+    ticks = stage.ticks.tolist()
+    there = [(tick, placed) for tick in ticks if (placed := shots[tick].placed.get(name)) is not None]
+    _animate(stage, layer.path, [(tick, {"position": placed.position}) for tick, placed in there])
+    _animate(stage, layer.path, [(tick, {"quaternion": placed.attitude}) for tick, placed in there])
+    if any(bool((placed.scale != 1.0).any()) for _, placed in there):
+        scales = [(tick, {"scale": np.maximum(placed.scale, 1e-9)}) for tick, placed in there]
+        _animate(stage, f"{layer.path}/parts", scales)
+    if len(there) < len(ticks):
+        seen = [name in shots[tick].placed for tick in ticks]
+        _animate(stage, f"{layer.path}/parts", [(t, {"visible": v}) for t, v in zip(ticks, seen, strict=True)], True)
+
+
+def _animate(stage: Stage, path: str, keys: list[tuple[int, dict[str, Any]]], sudden: bool = False) -> None:
+    """Animate one property, without the keys that say nothing: it stood as it is, and stays so.
+
+    What stands still for a while needs a key at its end, or it would creep to the next one.
+    """
+    values = [np.asarray(next(iter(given.values()))) for _, given in keys]
+    for k, (tick, given) in enumerate(keys):
+        inner = 0 < k < len(keys) - 1
+        stood = inner and np.array_equal(values[k], values[k - 1])
+        if not (stood and (sudden or np.array_equal(values[k], values[k + 1]))):
+            stage.key(path, tick, **given)
 
 
 def _grow(stage: Stage, layer: Layer, shots: list[Shot], name: str, flat: bool) -> None:
@@ -251,8 +267,9 @@ def _grow(stage: Stage, layer: Layer, shots: list[Shot], name: str, flat: bool) 
         if len(points) > 1:
             path = f"{layer.path}/{begin}"
             things.draw_way(
-                stage, path, len(points), points=points, flat=flat, colour=layer.colour, width=None, level=layer.level
-            )
+                stage, path, len(points), points=points, flat=flat, colour=layer.colour, width=layer.width,
+                level=layer.level,
+            )  # fmt: skip
             stage.appear(path, end)
 
 

@@ -21,8 +21,6 @@ from unifg.typing import Array, ArrayLike
 from unifg.view.bodies import Part, body_of
 from unifg.view.canvas import Canvas, Frame
 from unifg.view.content import Body, Content
-
-# from unifg.view.live import Live
 from unifg.view.live import Live
 from unifg.view.members import Position
 from unifg.view.page import Label, Plot, View
@@ -170,7 +168,7 @@ class Scene(Content, Canvas):
 
     def body(
         self, name: str, kind: str | Iterable[Part] = "arrow", *, size: float = 1.0, colour: str | None = None,
-        swatch: str = "disc", legend: str | None = None,
+        swatch: str = "disc", legend: str | None = None, like: str | None = None,
     ) -> None:  # fmt: skip
         """Something rigid that frames place.
 
@@ -181,11 +179,12 @@ class Scene(Content, Canvas):
             colour: of the body.
             swatch: of the legend.
             legend: words of the legend.
+            like: another layer, whose line of the legend switches this one too.
 
         Raises:
             ViewError: there is no such kind, or the size is not positive.
         """
-        layer = self.layer(name, swatch, colour, legend)
+        layer = self.layer(name, swatch, colour, legend, like=like)
         parts = body_of(kind, size, layer.colour) if isinstance(kind, str) else list(kind)
         reach = max(float(np.linalg.norm(part.mesh[0], axis=1).max()) for part in parts)
         self.bodies[name] = Body(parts, reach)

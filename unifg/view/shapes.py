@@ -260,12 +260,12 @@ def sphere(bands: int = 6, corners: int = 10) -> Mesh:
     return vertices, faces
 
 
-def column(corners: int = 24) -> Mesh:
-    """An upright cylinder of radius 1 from z = 0 to z = 1, its top apart from its side."""
+def column(corners: int = 24, bottom: float = 1.0) -> Mesh:
+    """An upright cylinder of radius 1 from z = 0 to z = 1, or a cone below its top, which is apart from its side."""
     angles = np.linspace(0.0, 2.0 * np.pi, corners + 1)
     rim = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(corners + 1)])
-    up = np.array([0.0, 0.0, 1.0])
-    sides = quads(np.stack([rim[:-1], rim[1:], rim[1:] + up, rim[:-1] + up], axis=1))
+    up, low = np.array([0.0, 0.0, 1.0]), bottom * rim
+    sides = quads(np.stack([low[:-1], low[1:], rim[1:] + up, rim[:-1] + up], axis=1))
     top = np.concatenate([up[None], rim[:-1] + up])
     step = np.arange(corners)
     fan = np.column_stack([np.zeros(corners, dtype=np.intp), step + 1, (step + 1) % corners + 1])

@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -93,38 +92,6 @@ class Stage:
         vertices, faces = mesh
         self._send(path, TriangularMeshGeometry(vertices - self._here, faces), material, colour, opacity)
 
-    def cylinder(
-        self,
-        path: str,
-        height: float,
-        radius: float,
-        colour: str,
-        place: ArrayLike = (0.0, 0.0),
-        *,
-        z: float = 0.0,
-        top: float | None = None,
-        opacity: float = 1.0,
-    ) -> None:
-        """Send an upright cylinder, or a cone where the radius at its top differs, that stands on height z [m]."""
-        from meshcat.geometry import Cylinder, MeshLambertMaterial
-
-        shape = Cylinder(height, radiusBottom=radius, radiusTop=radius if top is None else top)
-        self._send(path, shape, MeshLambertMaterial, colour, opacity)
-        # The cylinder's axis is y there: turned by a quarter about x, it is z.
-        upright = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, z + height / 2.0], [0, 0, 0, 1]], dtype=np.float64)
-        upright[:2, 3] = place
-        upright[:3, 3] -= self._here
-        self._viewer[path].set_transform(upright)
-
-    def ball(self, path: str, radius: float, colour: str, place: Array) -> None:
-        """Send a ball around a place (3,) [m]."""
-        from meshcat.geometry import MeshLambertMaterial, Sphere
-
-        self._send(path, Sphere(radius), MeshLambertMaterial, colour)
-        transform = np.eye(4)
-        transform[:3, 3] = place - self._here
-        self._viewer[path].set_transform(transform)
-
     def points(self, path: str, points: Array, colour: str, pixels: float) -> None:
         """Send points (n, 3) [m] of a size on the screen."""
         from meshcat.geometry import GenericMaterial, Points, PointsGeometry
@@ -173,16 +140,6 @@ class Stage:
                 plain = [*plain[1:], plain[0]]  # three.js puts w last
             target.set_property(name, _KINDS[name], plain)
 
-    def move(self, path: str, places: Array, attitudes: Array | None = None) -> None:
-        """Animate an object through places (T, 3) [m] and attitudes, (T,) headings [rad] or (T, 4) (w, x, y, z)."""
-        if attitudes is not None and attitudes.ndim == 1:
-            half, zero = attitudes / 2.0, np.zeros(len(attitudes))
-            attitudes = np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1)
-        for tick in self.ticks.tolist():
-            self.key(path, tick, position=places[tick])
-            if attitudes is not None:
-                self.key(path, tick, quaternion=attitudes[tick])
-
     def appear(self, path: str, begin: int, end: int | None = None) -> None:
         """Show an object from one tick to another (or for good).
 
@@ -213,12 +170,6 @@ class Stage:
         self._viewer.set_animation(self._animation, play=True, repetitions=1)
         self.page = page
         return self
-
-    def write(self, path: str | Path) -> Path:
-        """Write the page of a finished scene and return its path; an existing file is replaced."""
-        path = Path(path)
-        path.write_text(self.html(), encoding="utf-8", newline="\n")
-        return path
 
     def html(self) -> str:
         """The page of a finished scene, which refers to no other file."""

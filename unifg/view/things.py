@@ -67,8 +67,10 @@ class Thing:
     def _alike(self, one: Any, other: Any) -> bool:
         if one is other:
             return True
+        if isinstance(one, tuple):
+            return all(self._alike(*pair) for pair in zip(one, other, strict=True))
         if not isinstance(one, np.ndarray):
-            return not isinstance(one, tuple) and bool(one == other)
+            return bool(one == other)
         return one.shape == other.shape and bool((np.abs(one - other) <= self.slack).all())
 
 
