@@ -51,7 +51,7 @@ def write_results(folder: str | Path, logs: Sequence[SafeLog]) -> list[Path]:
     }
     numbers = write_metrics(folder / "metrics.json", found)
     shown = write_figure(folder / "flights.png", picture(logs), 110)
-    return [safe_scene(logs[0]).write(folder / "scene.html"), shown, numbers]
+    return [safe_scene(logs[0]).save(folder / "scene.html"), shown, numbers]
 
 
 def summary(logs: Sequence[SafeLog]) -> str:

@@ -6,11 +6,10 @@ import math
 
 import numpy as np
 
+from unifg.errors import ViewError
 from unifg.scenarios.log.safe_log import SafeLog
-from unifg.typing import Array, IntArray
-from unifg.view import drone, shapes
-from unifg.view.page import Key, Label, Page, Readout, View
-from unifg.view.stage import Stage
+from unifg.typing import Array
+from unifg.view import Frame, Part, Scene, shapes
 
 __all__ = ["safe_scene"]
 
@@ -21,19 +20,38 @@ _NODES = 16  # of a plan
 _BESIDE = 1.0  # around the flight [m]
 
 
-def safe_scene(log: SafeLog) -> Stage:
+def safe_scene(log: SafeLog) -> Scene:
     """The scene of one flight.
 
     Raises:
-        ViewError: the flight has no tick, or meshcat is not installed.
+        ViewError: the flight has no tick.
     """
-    stage = Stage(log.ticks, log.dt)
+    if log.ticks == 0:
+        raise ViewError("there is no tick, and nothing to show")
+    scene = Scene(f"unifg: quadrotor-cbf, {log.settings['case']}", dt=log.dt)
     low, high = _extent(log)
-    _floor(stage, low, high)
-    _bodies(stage, log)
-    _vehicle(stage, log)
-    _ways(stage, log)
-    return stage.finish(_page(log, stage.ticks, low, high))
+    corners = [[x, y, z] for z in (0.0, _HEIGHT) for x in (low[0], high[0]) for y in (low[1], high[1])]
+    scene.around, scene.ground, scene.speeds = np.array(corners), False, (0.1, 0.25, 0.5, 1, 2)
+    scene.layer("flown", "line", "trail", "way flown", width=0.05)
+    scene.layer("path", "line", "plan", "path to follow", width=0.024)
+    scene.layer("plan", "line", "horizon", "plan", width=0.07)
+    _floor(scene, low, high)
+    _vehicle(scene, log)
+    still = _bodies(scene, log)
+    if not _rests(log.wanted[:, :3]):
+        scene.way("path", shapes.thin(log.wanted[:, :3], 200))
+    scene.label("drone", follows="drone", above=True)
+    scene.view("overview", "Overview", [-0.55, -0.75, 0.8], 24.0)
+    scene.view("follow", "Follow drone", [-1.0, -0.45, 0.7], 30.0, follows="drone", distance=9.0)
+    scene.view("top", "From above", [0.0, -0.001, 1.0], 10.0)
+    if len(log.radii):
+        scene.plot("boundary distance", unit="m", limit=0.0, colour="horizon")
+    scene.plot("from the path", unit="cm", colour="estimate")
+    scene.plot("decided in", unit="ms", log=True)
+    for tick in range(log.ticks):
+        _frame(scene.frame(), log, tick, still)
+    _words(scene, log)
+    return scene
 
 
 def _extent(log: SafeLog) -> tuple[Array, Array]:
@@ -42,62 +60,65 @@ def _extent(log: SafeLog) -> tuple[Array, Array]:
     return ways.min(axis=0) - _BESIDE, ways.max(axis=0) + _BESIDE
 
 
-def _floor(stage: Stage, low: Array, high: Array) -> None:
+def _floor(scene: Scene, low: Array, high: Array) -> None:
     """With lines every metre to judge distances by."""
     (left, near), (right, far) = low.tolist(), high.tolist()
     corners = np.array([[[left, near, _FLOOR], [right, near, _FLOOR], [right, far, _FLOOR], [left, far, _FLOOR]]])
-    stage.mesh("ground/floor", shapes.quads(corners), "floor")
+    scene.mesh("floor", shapes.quads(corners), colour="floor", legend="")
     across = [[[x, near], [x, far]] for x in np.arange(math.ceil(left), right)]
     along = [[[left, y], [right, y]] for y in np.arange(math.ceil(near), far)]
-    stage.mesh("ground/metres", shapes.merge([shapes.ribbon(np.array(w), 0.02, 0.0) for w in across + along]), "metres")
+    lines = shapes.merge([shapes.ribbon(np.array(w), 0.02, 0.0) for w in across + along])
+    scene.mesh("metres", lines, colour="metres", legend="")
 
 
-def _bodies(stage: Stage, log: SafeLog) -> None:
-    for index, (radius, upright) in enumerate(zip(log.radii.tolist(), log.upright.tolist(), strict=True)):
-        path, places = f"bodies/{index}", log.bodies[:, index]
-        still = _rests(places)
-        colour = "fixed" if still else "moving"
-        if upright:
-            stage.cylinder(f"{path}/body", _HEIGHT, radius, colour)
-            edge = shapes.ring(np.zeros(2), radius + log.hull + log.margin - 0.02, 0.02, 0.014, corners=48)
-            stage.mesh(f"{path}/margin", edge, "moving")
-            places = shapes.on_ground(places)
-        else:
-            stage.ball(f"{path}/body", radius, colour, np.zeros(3))
-        if still:
-            for tick in (0, stage.last):
-                stage.key(path, tick, position=places[0])
-        else:
-            stage.move(path, places)
-
-
-def _vehicle(stage: Stage, log: SafeLog) -> None:
+def _vehicle(scene: Scene, log: SafeLog) -> None:
     """The vehicle and its shadow."""
-    stage.mesh("drone/body", drone.body(log.hull), "robot", lit=True)
-    stage.mesh("drone/nose", drone.nose(log.hull), "goal", lit=True)
-    stage.mesh("drone/arms", drone.arms(log.hull), "dark", lit=True)
-    for name, front, colour in (("front", True, "scan"), ("back", False, "dark")):
-        stage.mesh(f"drone/{name}/rotors", drone.rotors(log.hull, front=front), colour)
-        stage.mesh(f"drone/{name}/swept", drone.swept(log.hull, front=front), colour, opacity=0.4)
-    stage.move("drone", log.states[:, :3], log.states[:, 3:7])
-    stage.mesh("shadow", shapes.ring(np.zeros(2), 0.0, log.hull, 0.016, corners=24), "start", opacity=0.4)
-    stage.move("shadow", shapes.on_ground(log.states))
+    scene.body("drone", "quadrotor", size=log.hull, colour="robot", legend="")
+    shadow = shapes.ring(np.zeros(2), 0.0, log.hull, 0.016, corners=24)
+    scene.body("shadow", [Part("disc", shadow, "start", False, 0.4)], legend="")
 
 
-def _ways(stage: Stage, log: SafeLog) -> None:
-    """The path, the way flown so far, and the plan of each frame."""
-    if not _rests(log.wanted[:, :3]):
-        stage.mesh("path", shapes.tube(shapes.thin(log.wanted[:, :3], 200), 0.012), "plan", opacity=0.6)
-    for begin, end in stage.pieces():
-        points = shapes.thin(log.states[begin : end + 1, :3], 3)
-        if not _rests(points):
-            stage.mesh(f"flown/{begin}", shapes.tube(points, 0.025), "trail")
-            stage.appear(f"flown/{begin}", end)
-    for tick, ending in stage.turns():
-        plan = log.plans[tick]
-        if len(plan) > 1 and np.isfinite(plan).all() and not _rests(plan):
-            stage.mesh(f"frames/{tick}", shapes.tube(shapes.thin(plan, _NODES), 0.035), "horizon")
-            stage.appear(f"frames/{tick}", tick, ending)
+def _bodies(scene: Scene, log: SafeLog) -> list[bool]:
+    """What is to be kept clear of, with its margin on the ground; returns which of them rest."""
+    still = [_rests(log.bodies[:, index]) for index in range(len(log.radii))]
+    first: dict[str, str] = {}
+    for index, (radius, upright) in enumerate(zip(log.radii.tolist(), log.upright.tolist(), strict=True)):
+        colour = "fixed" if still[index] else "moving"
+        name, words = f"body {index}", {"fixed": "at rest", "moving": "moves"}[colour]
+        like = first.get(colour)
+        if upright:
+            column = shapes.copies(shapes.column(), np.zeros((1, 3)), np.diag([radius, radius, _HEIGHT])[None])
+            edge = shapes.ring(np.zeros(2), radius + log.hull + log.margin - 0.02, 0.02, 0.014, corners=48)
+            parts = [Part("body", column, colour), Part("margin", edge, "moving", False)]
+            scene.body(name, parts, colour=colour, legend=words, like=like)
+        else:
+            scene.body(name, "ball", size=radius, colour=colour, legend=words, like=like)
+        first.setdefault(colour, name)
+    return still
+
+
+def _frame(frame: Frame, log: SafeLog, tick: int, still: list[bool]) -> None:
+    """What a tick shows."""
+    state, plan = log.states[tick], log.plans[tick]
+    frame.place("drone", state[:7])
+    frame.place("shadow", [state[0], state[1], 0.0])
+    for index, place in enumerate(log.bodies[0 if all(still) else tick]):
+        z = 0.0 if log.upright[index] else place[2]
+        frame.place(f"body {index}", [place[0], place[1], z, 1.0, 0.0, 0.0, 0.0])
+    frame.trail("flown", state[:3])
+    if len(plan) > 1 and np.isfinite(plan).all() and not _rests(plan):
+        frame.way("plan", shapes.thin(plan, _NODES))
+    error = 100.0 * float(np.linalg.norm(log.error[tick]))
+    frame.readout("speed", f"{np.linalg.norm(state[7:]):.2f} m/s")
+    if len(log.radii):
+        near = float(log.boundary[tick])
+        frame.readout("boundary distance", f"{near:.3f} m", alarm=near < 0.0)
+        frame.value("boundary distance", near)
+    frame.readout("from the path", f"{error:.1f} cm")
+    frame.value("from the path", error)
+    frame.readout("mass believed", f"{log.mass[tick]:.3f} kg")
+    frame.readout("decided in", f"{log.decide_ms[tick]:.1f} ms")
+    frame.value("decided in", float(log.decide_ms[tick]))
 
 
 def _rests(points: Array) -> bool:
@@ -105,51 +126,18 @@ def _rests(points: Array) -> bool:
     return bool(np.ptp(points, axis=0).max() < _STILL)
 
 
-def _page(log: SafeLog, ticks: IntArray, low: Array, high: Array) -> Page:
+def _words(scene: Scene, log: SafeLog) -> None:
+    """How it ended."""
     words = "kept its distance" if not log.violated else "came TOO NEAR" if not log.touched else "TOUCHED something"
     arrived = "" if log.end is None else ", arrived" if log.arrived else ", did NOT arrive"
     stopped = ", interrupted by the user" if log.interrupted else ""
-    corners = [[x, y, z] for z in (0.0, _HEIGHT) for x in (low[0], high[0]) for y in (low[1], high[1])]
     error = np.linalg.norm(log.error, axis=1)
-    readouts = [
-        Readout("speed", _texts(np.linalg.norm(log.states[ticks, 7:], axis=1), "{:.2f} m/s")),
-        Readout("from the path", _texts(100.0 * error[ticks], "{:.1f} cm")),
-        Readout("mass believed", _texts(log.mass[ticks], "{:.3f} kg")),
-        Readout("decided in", _texts(log.decide_ms[ticks], "{:.1f} ms")),
-    ]
-    if len(log.radii):
-        near = log.boundary[ticks]
-        readouts.insert(1, Readout("boundary distance", _texts(near, "{:.3f} m"), (near < 0.0).tolist()))
-    keys = (
-        (True, Key("trail", "line", "way flown")),
-        (not _rests(log.wanted[:, :3]), Key("plan", "line", "path to follow")),
-        (log.plans.shape[1] > 1, Key("horizon", "line", "plan")),
-        (len(log.radii) > 0, Key("fixed", "disc", "at rest")),
-        (len(log.radii) > 0, Key("moving", "disc", "moves")),
-    )
-    return Page(
-        title=f"unifg: quadrotor-cbf, {log.settings['case']}",
-        outcome=(words if len(log.radii) else "nothing in the way") + arrived + stopped,
-        good=log.succeeded,
-        facts={
-            "flight": log.label,
-            "controller": str(log.settings["controller"]),
-            "least boundary distance": f"{log.boundary.min():.3f} m" if len(log.radii) else "",
-            "from the path": f"{100.0 * math.sqrt(float(np.mean(error**2))):.1f} cm rms",
-            "decided in": f"{np.median(log.decide_ms):.2f} ms median",
-        },
-        corners=np.array(corners),
-        legend=[key for here, key in keys if here],
-        labels=[Label("drone", follows="drone", above=True)],
-        readouts=readouts,
-        views=[
-            View("overview", "Overview", [-0.55, -0.75, 0.8], 24.0),
-            View("follow", "Follow drone", [-1.0, -0.45, 0.7], 30.0, follows="drone", distance=9.0),
-            View("top", "From above", [0.0, -0.001, 1.0], 10.0),
-        ],
-        speeds=(0.1, 0.25, 0.5, 1, 2),
-    )
-
-
-def _texts(values: Array, form: str) -> list[str]:
-    return [form.format(value) for value in values.tolist()]
+    scene.outcome = (words if len(log.radii) else "nothing in the way") + arrived + stopped
+    scene.good = log.succeeded
+    scene.facts |= {
+        "flight": log.label,
+        "controller": str(log.settings["controller"]),
+        "least boundary distance": f"{log.boundary.min():.3f} m" if len(log.radii) else "",
+        "from the path": f"{100.0 * math.sqrt(float(np.mean(error**2))):.1f} cm rms",
+        "decided in": f"{np.median(log.decide_ms):.2f} ms median",
+    }
