@@ -95,16 +95,14 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "scenarios/driving/drive_pilot.py": ("navigation", "joint"),
     "scenarios/ways/grid.py": ("planner", "route"),
     "scenarios/driving/route.py": ("route", "navigation"),
-    "unifg/horizon/control_loop.py": ("horizon", "examples", "control_decisions"),
+    "unifg/horizon/control_loop.py": ("horizon", "examples", "control_decisions", "quadrotor_decisions"),
     "unifg/horizon/coupled.py": ("horizon", "joint"),
     "unifg/horizon/decision.py": ("horizon", "control_decisions"),
-    "unifg/horizon/past.py": ("horizon", "joint"),
+    "unifg/horizon/past.py": ("horizon", "joint", "quadrotor_estimator"),
     "unifg/horizon/recorded.py": ("horizon",),
     "unifg/horizon/robot.py": ("horizon",),
     "unifg/horizon/statements.py": ("horizon", "examples"),
-    "unifg/horizon/window.py": ("horizon", "joint"),
-    "scenarios/horizon/loop.py": ("control_decisions", "quadrotor_decisions", "navigation"),
-    "scenarios/horizon/past.py": ("joint", "control_decisions", "quadrotor_estimator"),
+    "unifg/horizon/window.py": ("horizon", "joint", "quadrotor_estimator"),
     "scenarios/log/columns.py": ("metrics",),
     "scenarios/options.py": ("cli",),
     "scenarios/show/drive_scene.py": ("scene",),
@@ -126,7 +124,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "scenarios/show/flight_scene.py": ("quadrotor_scene",),
     "scenarios/flying/slots.py": ("quadrotor_decisions", "quadrotor_controller"),
     "scenarios/seeing/line_tracker.py": ("quadrotor_estimator", "quadrotor_world"),
-    "scenarios/flying/flight_window.py": ("quadrotor_estimator", "quadrotor_joint"),
+    "scenarios/flying/flight_past.py": ("quadrotor_estimator", "quadrotor_joint"),
 }
 
 

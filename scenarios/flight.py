@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from unifg.errors import ScenarioError, UnifgError
+from unifg.horizon import Plan
 from unifg.machine.tally import counting
 from unifg.models import quadrotor
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
@@ -20,7 +21,6 @@ from unifg.scenarios.flying.braking import braking_control
 from unifg.scenarios.flying.estimator import EstimatorSettings
 from unifg.scenarios.flying.flight_pilot import COUPLINGS, make_pilot
 from unifg.scenarios.flying.flight_settings import ControllerSettings
-from unifg.scenarios.horizon.loop import Plan
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.options import option, share
@@ -172,7 +172,7 @@ class Flight:
             believed_sigma=belief.sigma,
             controls=control,
             plans=np.tile(belief.state[:3], (settings.horizon + 1, 1)) if plan is None else plan.states[:, :3],
-            pasts=pilot.estimator.window.states[:, :3],
+            pasts=pilot.estimator.window.history.states[:, :3],
             landmarks=(marks.ids, marks.positions, marks.covariances, marks.radii),
             parameters=belief.parameters.packed,
             parameters_sigma=belief.parameters_sigma,

@@ -23,7 +23,6 @@ from unifg.models.rkmk import integrator
 from unifg.models.tableau import Tableau
 from unifg.pose_graphs.generate import manhattan
 from unifg.pose_graphs.residuals import chart_between, sighting
-from unifg.scenarios.flying.standardised import standardised
 from unifg.solvers import SQP
 
 EXCEPTIONS = {
@@ -138,7 +137,6 @@ def test_a_residual_on_the_wrong_manifold_names_term_and_family(function: fg.Man
 
 
 REFUSED: list[tuple[str, Callable[[], object], type[fg.UnifgError], str]] = [
-    ("standardised", lambda: standardised(Sphere()), fg.GraphError, "Lie group"),  # type: ignore[arg-type]
     ("mass", lambda: quadrotor.Parameters(mass=-1.0), fg.ModelError, "mass"),
     ("grid", lambda: DistanceMap(np.zeros(3), 0.1, (0.0, 0.0, 0.0)), fg.ModelError, "grid"),
     ("method", lambda: integrator(fg.SE2, lambda x, u: u, "rk5"), fg.ModelError, "rk5"),  # type: ignore[arg-type]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -9,15 +10,17 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from unifg.horizon import Static, Term
 from unifg.lie import SO3
 from unifg.models import avoidance, quadrotor
 from unifg.scenarios.flying.braking import brake, stopping_path
 from unifg.scenarios.flying.flight_control import Controller
+from unifg.scenarios.flying.flight_joint import SharedMotion
 from unifg.scenarios.flying.flight_parts import GivenFlight
+from unifg.scenarios.flying.flight_past import MANIFOLDS
 from unifg.scenarios.flying.flight_settings import ControllerSettings
 from unifg.scenarios.flying.guide import Guide, GuideSettings
 from unifg.scenarios.flying.slots import FAR_AWAY, Obstacles, Slots
-from unifg.scenarios.horizon.part import known_present
 from unifg.scenarios.seeing.belief import Belief, Landmarks
 from unifg.scenarios.seeing.tracks import Tracks
 from unifg.solvers.names import CONSTRAINED
@@ -176,41 +179,35 @@ def test_a_doubtful_landmark_is_given_more_room(controllers: dict[str, Controlle
 def test_terms_of_the_estimate_can_be_replaced() -> None:
     """Parameters and landmarks as variables, as in a joint graph: fixed where they were given, they change nothing."""
 
-    class Shared(GivenFlight):
-        def state(self, graph: fg.Graph, x: fg.Family, u: fg.Family) -> Any:
-            data = known_present(graph, x, u)
-            manifolds = (quadrotor.MASS, quadrotor.DRAG, quadrotor.WIND, quadrotor.UPDRAFT)
-            self.shared = [graph.variables(m, g, 1) for m, g in zip("mdwu", manifolds, strict=True)]
-            values = np.split(HEAVY.packed, [1, 4, 6])
-            for family, value in zip(self.shared, values, strict=True):
-                graph.fix(family[:], value)
-            function, dt = quadrotor.disturbed_dynamics, ControllerSettings().dt
-            still = graph.variables("still", fg.Rn(6), 1)
-            graph.fix(still[:], np.zeros(6))
-            graph.constrain(function, x[:-1], u, still[:], *self.shared, x[1:], dt, lower=0, upper=0, name="dynamics")
-            self.values = {f: np.zeros((1, f.manifold.storage)) for f in (*self.shared, still)}
-            return data
+    values = np.split(HEAVY.packed, [1, 4, 6])
+    statics = [Static(name, kind, value, 0.0) for (name, kind), value in zip(MANIFOLDS.items(), values, strict=True)]
 
-        def places(self, graph: fg.Graph, x: fg.Family, u: fg.Family) -> Any:
-            places = graph.variables("landmark", fg.Rn(2), len(AHEAD))
-            graph.fix(places[:], AHEAD.positions)
-            least = HULL + ControllerSettings().margin
+    class Places:
+        def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+            least, places = HULL + ControllerSettings().margin, graph.families["places"]
             for k, radius in enumerate(AHEAD.radii.tolist()):
                 graph.constrain(
                     avoidance.landmark_clearance, x.p[1:], places[k], radius, lower=least, name=f"landmark {k}"
                 )
-            self.values[places] = AHEAD.positions
-            return lambda now: {}
+
+        def data(self, now: object) -> Mapping[str, Array]:
+            return {}
+
+    class Shared(GivenFlight):
+        def __init__(self, settings: ControllerSettings) -> None:
+            super().__init__(settings)
+            places = Static("places", fg.Rn(2), AHEAD.positions, 0.0)
+            self.robot = replace(self.robot, statics=(*statics, places))
+
+        def motion(self) -> list[Term]:
+            return [SharedMotion(self.settings, drag=False)]
+
+        def apart(self, squares: bool | None) -> list[Term]:
+            return [Places()]
 
         def split(self, obstacles: Obstacles) -> tuple[Obstacles, Any, list[int]]:
             nowhere = replace(obstacles, centres=np.full_like(obstacles.centres, FAR_AWAY))
             return nowhere, np.ones(len(obstacles.names), dtype=bool), []
-
-        def apart(self, squares: bool | None) -> Any:
-            return (self.places,)
-
-        def begin(self, guess: fg.Guess, now: object) -> fg.Guess:
-            return fg.Guess({**guess.values, **self.values})
 
     usual = Controller(TARGET, WALLS, bounds=BOUNDS).plan(MOVING)
     past = Shared(ControllerSettings())
@@ -286,7 +283,7 @@ def test_a_flight_past_cylinders_seen_late_arrives() -> None:
     states = fly(controller, state(1.0), known, 150, HEAVY)
     assert gaps(states, known).min() > HULL + 0.04
     assert np.linalg.norm(states[-1, :3] - TARGET) < 0.1 and np.linalg.norm(states[-1, 7:]) < 0.1
-    assert not any(controller.emergencies.values())
+    assert set(controller.loop.sources) == {"solved"}
 
 
 @pytest.mark.parametrize("aware", [True, False])
@@ -344,7 +341,7 @@ def test_plans_that_may_not_be_flown_are_replaced() -> None:
         here = quadrotor.fly(here, plan.controls[0], settings.dt, quadrotor.Parameters())
         plan = controller.plan(belief(here))
         sources.append(plan.source)
-    assert sources[-1] == "braking" and controller.emergencies["braking"] == sources.count("braking")
+    assert sources[-1] == "braking" and controller.loop.sources["braking"] == sources.count("braking")
     assert np.linalg.norm(here[7:]) < 0.1
     controller.settings = settings
     assert controller.plan(belief(here)).source == "solved"

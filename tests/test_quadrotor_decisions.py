@@ -10,8 +10,10 @@ import pytest
 
 import unifg as fg
 from test_quadrotor_controller import BOUNDS, TARGET, WALLS, belief, landmarks, state
+from unifg.horizon import Now
 from unifg.models import quadrotor
 from unifg.scenarios.flying.flight_control import KEPT, LEFT_BEHIND, PATIENCE, Controller, is_behind
+from unifg.scenarios.flying.flight_parts import Flown
 from unifg.scenarios.flying.flight_settings import ControllerSettings
 from unifg.scenarios.flying.guide import Reference
 from unifg.scenarios.flying.slots import Slots
@@ -135,12 +137,19 @@ def test_the_nearest_movers_are_those_whose_hulls_are_nearest() -> None:
 def test_the_control_that_is_flown_is_what_the_next_one_changes_from() -> None:
     controller, here = Controller(TARGET, WALLS, settings=SETTINGS, bounds=BOUNDS), belief(state(1.0))
     hover = quadrotor.hover(here.parameters)
-    assert np.array_equal(controller.now(here, Tracks.none()).last, hover)
-    plan = controller.plan(here)
-    assert not np.allclose(plan.controls[0], hover)
-    assert np.array_equal(controller.now(here, Tracks.none()).last, plan.controls[0])
+    lasts, inner = [], controller.loop.data
+
+    def data(now: Now[Flown]) -> Any:
+        lasts.append(now.last)
+        return inner(now)
+
+    controller.loop.data = data  # type: ignore[method-assign]
+    plans = [controller.plan(here), controller.plan(here)]
     controller.forget()
-    assert np.array_equal(controller.now(here, Tracks.none()).last, hover)
+    controller.plan(here)
+    assert not np.allclose(plans[0].controls[0], hover)
+    for last, expected in zip(lasts, (hover, plans[0].controls[0], hover), strict=True):
+        assert np.array_equal(last, expected)
 
 
 def test_the_first_control_does_not_leap_from_the_last() -> None:
@@ -148,7 +157,9 @@ def test_the_first_control_does_not_leap_from_the_last() -> None:
     thrust = []
     for more in (0.0, 4.0):
         controller, here = Controller(TARGET, WALLS, settings=SETTINGS, bounds=BOUNDS), belief(state(1.0))
-        controller._applied = quadrotor.hover(here.parameters) + np.array([0.0, 0.0, 0.0, more])
+        controller.plan(here)
+        controller.loop.forget()
+        controller.loop.applied = quadrotor.hover(here.parameters) + np.array([0.0, 0.0, 0.0, more])
         thrust.append(controller.plan(here).controls[0, 3])
     assert thrust[1] > thrust[0] + 0.1
 
@@ -192,7 +203,7 @@ class Told:
         states = quadrotor.rollout(present, controls, s.dt, quadrotor.Parameters())
         states[-1, 0] += defect
         believed = belief(present, discs)
-        now = c.now(believed, Tracks.none())
+        now = c.loop.now(present, c.given(believed, Tracks.none()))
 
         class Answer:
             def __getitem__(self, variable: Any) -> Array:
@@ -201,7 +212,8 @@ class Told:
             def shifted(self, *families: Any) -> fg.Guess:
                 return SHIFTED
 
-        return c.judge(Answer(), now)  # type: ignore[arg-type]
+        choice = c.loop.decide(Answer(), now)  # type: ignore[arg-type]
+        return choice.controls, choice.states, choice.source
 
 
 HOVER = quadrotor.hover(quadrotor.Parameters())
@@ -215,7 +227,7 @@ def test_a_sound_plan_is_flown_within_the_limits_and_starts_the_next() -> None:
     controls, _, source = told.judge(wild, state(1.0))
     assert source == "solved" and controls[3, 3] == SETTINGS.thrust_limits[1]
     assert told.controller.loop.guess is SHIFTED
-    assert not any(told.controller.emergencies.values())
+    assert told.controller.loop.sources == {"solved": 1}
 
 
 def test_old_plans_are_flown_for_some_ticks_and_then_it_brakes() -> None:
@@ -235,8 +247,8 @@ def test_old_plans_are_flown_for_some_ticks_and_then_it_brakes() -> None:
         guess = told.controller.loop.guess  # one stage later, from what is flown
         assert guess is not None
         assert np.array_equal(guess.values[told.controller.loop.u][:-1], controls[1:])
-        assert np.array_equal(guess.values[told.controller.loop.x][:-1], states[1:])
-    assert told.controller.emergencies == {"violating": 0, "kept": KEPT, "braking": 2}
+        assert np.array_equal(guess.values[told.controller.loop.x.family][:-1], states[1:])
+    assert told.controller.loop.sources == {"solved": 1, "kept": KEPT, "braking": 2}
 
 
 def test_without_an_old_plan_it_brakes() -> None:
@@ -244,9 +256,9 @@ def test_without_an_old_plan_it_brakes() -> None:
     controls, _, source = told.judge(REST, state(1.0, velocity=(1.0, 0.0, 0.0)), defect=1.0)
     assert source == "braking"
     loop = told.controller.loop
-    assert np.all(controls >= loop.least) and np.all(controls <= loop.most)
+    assert np.all(controls >= loop.kept.least) and np.all(controls <= loop.kept.most)
     told.controller.forget()
-    assert not len(loop.left()) and loop.guess is None
+    assert not len(loop.kept.left()) and loop.guess is None
 
 
 SWERVE, STRAIGHT = REST.copy(), REST.copy()
@@ -264,7 +276,7 @@ def test_a_plan_that_comes_too_near_is_flown_where_all_else_comes_nearer() -> No
             assert told.judge(STRAIGHT, FAST)[2] == "solved"
         _, _, source = told.judge(SWERVE, FAST, discs=BEFORE)
         assert source == "violating"
-        assert told.controller.emergencies == {"violating": 1, "kept": 0, "braking": 0}
+        assert told.controller.loop.sources == ({"solved": 1} if old else {}) | {"violating": 1}
     # The same controls with states that do not follow from them say nothing, nor do what is not a number.
     assert Told().judge(SWERVE, FAST, discs=BEFORE, defect=1.0)[2] == "braking"
     assert Told().judge(SWERVE, FAST, discs=BEFORE, defect=np.nan)[2] == "braking"

@@ -11,11 +11,12 @@ from scipy.linalg import null_space
 
 import unifg as fg
 from unifg.answers.solver import Prepared
+from unifg.horizon.past import without
 from unifg.lie import SO3
 from unifg.models import quadrotor
 from unifg.scenarios.flying.arrival import arrival, seen_from_the_vehicle
 from unifg.scenarios.flying.estimator import DeadReckoningEstimator, Estimator, EstimatorSettings
-from unifg.scenarios.flying.flight_window import WindowSettings, without
+from unifg.scenarios.flying.flight_past import WindowSettings
 from unifg.scenarios.seeing.association import DOUBTFUL, NEW, Gates, nearest
 from unifg.scenarios.seeing.belief import Belief, Landmarks
 from unifg.scenarios.seeing.readings import Reading
@@ -159,34 +160,35 @@ def test_the_covariance_is_that_of_the_terms() -> None:
     """Against the inverse of the information on the null space of the constraints, dense."""
     estimator = begin(1)
     belief = beliefs(estimator, flight(1)[:40])[-1]
-    assert estimator.solution is not None
-    program = estimator._run.program
-    lin = program.linearize(estimator.solution.values)
+    solution = estimator.window.solution
+    assert solution is not None
+    program = estimator.window.run.program
+    lin = program.linearize(solution.values)
+    families = {family.name: family for family in solution.values}
+    present = families["x"][-1]
     A = program.constraints.matrix(lin.constraint_jacobian).toarray()
     J = program.costs.matrix(lin.jacobian).toarray()
     Z = null_space(A)
     dense = Z @ np.linalg.solve(Z.T @ J.T @ J @ Z, Z.T)
-    columns = program.columns.unknown[program.columns.of(estimator.terms.present).ravel()]
+    columns = program.columns.unknown[program.columns.of(present).ravel()]
     scale = np.outer(belief.sigma, belief.sigma)
     np.testing.assert_allclose(dense[np.ix_(columns, columns)] / scale, belief.covariance / scale, atol=2e-3)
-    shared = estimator.terms.shared
-    every = [estimator.terms.present, *(family[:] for family in (*shared.parameters[:3], shared.landmarks))]
+    every = [present, *(families[name][:] for name in ("mass", "drag", "wind", "landmarks"))]
     own = program.columns.unknown[np.concatenate([program.columns.of(selection).ravel() for selection in every])]
     scale = np.sqrt(np.outer(dense.diagonal()[own], dense.diagonal()[own]))
-    block = estimator.solution.covariance(*every)
+    block = solution.covariance(*every)
     np.testing.assert_allclose(block / scale, dense[np.ix_(own, own)] / scale, atol=1e-8)
 
 
 def test_the_window_is_a_problem_for_newton_too() -> None:
     """Hard dynamics with noise on some rows, metres beside kilograms and radians: full steps, no line search."""
     estimator = begin(1)
-    run = Prepared(KKT(full_steps=True), estimator._run.program)
+    run = Prepared(KKT(full_steps=True), estimator.window.run.program)
     for reading, control, _ in flight(1):
         estimator.predict(reading, control)
         estimator.see(reading)
-        window, terms = estimator.window, estimator.terms
-        guess = {**terms.guess(window), estimator._present: window.present[None]}
-        solution = run.solve(guess, data=terms.data(window))
+        window = estimator.window
+        solution = run.solve(window.guess(), data=window.data())
         assert solution.converged, solution.report()
         assert solution.iterations <= 6
         estimator.estimate()
@@ -238,11 +240,11 @@ def test_what_is_not_estimated_stays() -> None:
 
 def test_one_structure_serves_a_whole_flight() -> None:
     estimator = begin(1)
-    program = estimator._run.program
-    factorization = estimator._spread._system.factorization.structure
+    program = estimator.window.run.program
+    factorization = estimator.window.spread._system.factorization.structure
     beliefs(estimator, flight(1)[:30])
-    assert estimator._run.program is program
-    assert estimator._spread._system.factorization.structure is factorization
+    assert estimator.window.run.program is program
+    assert estimator.window.spread._system.factorization.structure is factorization
 
 
 # ---------------------------------------------------------------- landmarks
@@ -257,10 +259,10 @@ def test_gating_without_names_makes_no_mistake() -> None:
         truth: dict[int, int] = {}
         for reading, control, _ in flight(seed):
             belief = estimator.update(reading, control)
-            window, atlas = estimator.window, estimator.atlas
+            sightings, atlas = estimator.window.history.recorded("sightings")[0][-1], estimator.atlas
             seen += len(reading.ids)
-            for slot in np.flatnonzero(window.seen[-1]).tolist():
-                row = int(np.argmin(np.abs(reading.ranges - window.sightings[-1, slot, 1])))
+            for slot in np.flatnonzero(sightings[:, 2]).tolist():
+                row = int(np.argmin(np.abs(reading.ranges - sightings[slot, 1])))
                 used += 1
                 wrong += truth.setdefault(int(atlas.names[slot]), int(reading.ids[row])) != int(reading.ids[row])
         assert len(set(truth.values())) == len(truth) == len(belief.landmarks)

@@ -13,6 +13,7 @@ import pytest
 
 import unifg as fg
 from benchmarks import quadrotor_pull
+from unifg.horizon import Plan
 from unifg.lie import SO3
 from unifg.models import quadrotor
 from unifg.program.program import Program
@@ -20,12 +21,10 @@ from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.flying.estimator import Estimator
 from unifg.scenarios.flying.flight_control import Controller
 from unifg.scenarios.flying.flight_joint import JointSettings, SharedFlight
+from unifg.scenarios.flying.flight_past import packed
 from unifg.scenarios.flying.flight_pilot import joint_controller, make_pilot
 from unifg.scenarios.flying.flight_settings import ControllerSettings
-from unifg.scenarios.flying.flight_terms import Shared, StateTerms
 from unifg.scenarios.flying.slots import FAR_AWAY
-from unifg.scenarios.flying.standardised import standardised
-from unifg.scenarios.horizon.loop import Plan
 from unifg.scenarios.seeing.belief import Belief
 from unifg.scenarios.seeing.tracks import Tracks
 from unifg.scenarios.worlds.layouts import Layout
@@ -92,16 +91,14 @@ def latest(controller: Controller) -> Belief:
     return controller.past.latest
 
 
-def alone(past: Past) -> tuple[fg.Solution, fg.Family, Shared]:
-    """The past's terms in a graph of their own, solved to the end."""
-    window, graph = past.estimator.window, fg.Graph()
-    present = graph.variables("present", quadrotor.STATE, 1)
-    shared = Shared(graph, window.settings, window.parameters)
-    terms = StateTerms(graph, present[:], shared, window.settings)
-    guess = {**terms.guess(window), present: window.present[None]}
-    solution = InteriorPoint(tolerance=1e-9).solve(graph, guess, data=terms.data(window))
+def alone(past: Past) -> tuple[Array, dict[str, Array]]:
+    """Present state and statics by the past's terms in a graph of their own, solved to the end."""
+    window = past.estimator.window
+    solver = InteriorPoint(tolerance=1e-9)
+    solution = solver.solve(window.run.program.graph, window.guess(), data=window.data())
     assert solution.status.converged
-    return solution, present, shared
+    values = {family.name: solution[family] for family in solution.values}
+    return values["x"][-1], values
 
 
 def defects(plan: Plan, parameters: quadrotor.Parameters, dt: float) -> Array:
@@ -130,13 +127,12 @@ def test_without_wishes_the_past_decides(past: Past) -> None:
     # With weights of 1e-9 rounding keeps one solve in forty above 1e-7.
     controller = past.controller(FREE, control_weight=1e-9, tolerance=1e-6)
     assert controller.plan(past.belief).status is fg.Status.CONVERGED
-    solution, present, shared = alone(past)
+    present, statics = alone(past)
     marks = [past.estimator.atlas.slot_of(name) for name in past.belief.landmarks.ids.tolist()]
     believed = latest(controller)
-    assert np.abs(quadrotor.STATE.local(solution[present], believed.state[None])).max() < 1e-6
-    assert np.abs(believed.landmarks.positions - solution[shared.landmarks][marks]).max() < 1e-6
-    found = np.concatenate([solution[family][0] for family in shared.parameters])
-    assert np.abs(believed.parameters.packed - found).max() < 1e-6
+    assert np.abs(quadrotor.STATE.local(present, believed.state)).max() < 1e-6
+    assert np.abs(believed.landmarks.positions - statics["landmarks"][marks]).max() < 1e-6
+    assert np.abs(believed.parameters.packed - packed(statics)).max() < 1e-6
 
 
 def test_wishes_pull_on_what_is_shared(past: Past) -> None:
@@ -245,14 +241,14 @@ def test_no_wish_makes_drag_negative() -> None:
 def test_a_solve_that_bends_its_constraints_is_not_believed(past: Past, monkeypatch: pytest.MonkeyPatch) -> None:
     """A first step from far away says little; the vehicle brakes, and the estimate is that of the past."""
     controller = past.controller(JointSettings(0.5), control_weight=100.0)
-    before = past.estimator.window.states.copy()
+    before = past.estimator.window.history.states.copy()
     loop = controller.loop
     monkeypatch.setattr(loop, "cold", InteriorPoint(max_iterations=1).prepare(loop.cold.program.graph))
     plan = controller.plan(past.belief)
     assert plan.status is fg.Status.ITERATION_LIMIT
     assert plan.emergency
     assert latest(controller) is past.belief
-    assert np.array_equal(past.estimator.window.states, before)
+    assert np.array_equal(past.estimator.window.history.states, before)
 
 
 def test_multipliers_stay_with_what_they_belong_to(past: Past) -> None:
@@ -260,18 +256,16 @@ def test_multipliers_stay_with_what_they_belong_to(past: Past) -> None:
     controller.plan(past.belief)
     joint = controller.past
     assert isinstance(joint, SharedFlight)
-    now = controller.now(past.belief, Tracks.none())
+    now = controller.loop.now(past.belief.state, controller.given(past.belief, Tracks.none()))
     guess = controller.loop.guess
     assert guess is not None
     given = {name: np.ones_like(value) for name, value in guess.multipliers.items()}
-    given["dynamics"] = np.arange(given["dynamics"].size, dtype=float).reshape(given["dynamics"].shape)
-    others, held, slots = now.others, now.held, now.marks
+    others, held, slots = now.given.others, now.given.held, now.given.marks
     assert held.sum() == len(slots) >= 3
     assert np.all(others.centres[:, held] == FAR_AWAY)  # nothing is both data and variable
     gone = slots[0]
     joint.names[gone] = 99  # at the last solve the slot held something else
-    given = controller.kept_multipliers(fg.Guess(guess.values, given), now)
-    kept = joint.kept_multipliers(fg.Guess(guess.values, given), now)
+    kept = controller.carry(fg.Guess(guess.values, given), now).multipliers
     pairs = kept["landmarks"].reshape(controller.settings.horizon, -1)
     expected = np.zeros(pairs.shape[1])
     expected[slots[1:]] = 1.0
@@ -279,8 +273,11 @@ def test_multipliers_stay_with_what_they_belong_to(past: Past) -> None:
     assert not kept["pull of landmarks"][gone].any()
     assert kept["pull of landmarks"][slots[1:]].all()
     assert not kept["cylinders"][:, held].any()
-    assert np.array_equal(kept["dynamics"][:-1], given["dynamics"][1:])
-    assert np.array_equal(kept["dynamics"][-1:], given["dynamics now"])
+    # The step that led to the present is the last one between past states now.
+    assert controller.loop.solution is not None
+    before = controller.loop.solution.multipliers["dynamics"]
+    assert np.array_equal(guess.multipliers["dynamics"][:-1], before[1:])
+    assert np.array_equal(guess.multipliers["dynamics"][-1:], before[-1:])
 
 
 def test_the_structure_is_compiled_once(compilations: list[int]) -> None:
@@ -318,7 +315,7 @@ def test_a_flight_believes_what_the_joint_graph_says(association: str) -> None:
         differences.append(np.abs(step / past.sigma).max())
         assert np.array_equal(past.covariance, pilot.belief.covariance)  # of the past's terms alone
         world.step(control, settings.controller.dt)
-    assert world.collisions == 0 and not any(pilot.controller.emergencies.values())
+    assert world.collisions == 0 and set(pilot.controller.loop.sources) == {"solved"}
     assert world.state[0] > flight.conditions.layout.start[0] + 2.0
     assert max(errors) < 0.1
     assert 1e-3 < max(differences) < 0.51
@@ -331,34 +328,16 @@ def test_the_window_goes_on_from_the_past_alone() -> None:
     controller.plan(past.belief)
     assert np.abs(latest(controller).state - past.belief.state).max() > 1e-5
     assert np.array_equal(past.estimator.window.present, past.belief.state)
-    assert past.estimator.window.parameters[0] != latest(controller).parameters.mass
+    assert past.estimator.parameters[0] != latest(controller).parameters.mass
 
 
-# ---------------------------------------------------------------- settings and residuals
+# ---------------------------------------------------------------- settings
 
 
 def test_a_pull_of_nothing_is_refused() -> None:
     for pull in (0.0, -1.0, np.nan):
         with pytest.raises(fg.ScenarioError, match="sequential"):
             JointSettings(pull)
-
-
-@pytest.mark.parametrize("manifold", [quadrotor.STATE, fg.Rn(2)])
-def test_standardised_differences(manifold: fg.Manifold) -> None:
-    rng = np.random.default_rng(0)
-    n, d, step = 4, manifold.dim, 1e-6
-    reference = manifold.retract(np.tile(manifold.identity(), (n, 1)), rng.normal(size=(n, d)))
-    x = manifold.retract(reference, 0.3 * rng.normal(size=(n, d)))
-    sigma = rng.uniform(0.1, 2.0, (n, d))
-    residual = standardised(manifold)
-    assert np.allclose(residual.function(x, reference, sigma), manifold.local(reference, x) / sigma, atol=1e-12)
-    kernel = residual.kernel
-    assert kernel is not None
-    J = kernel.jacobian(x, reference, sigma)[0]
-    for k in range(d):
-        move = step * np.eye(d)[k]
-        ahead, behind = (residual.function(manifold.retract(x, s * move[None]), reference, sigma) for s in (1.0, -1.0))
-        assert np.allclose(J[:, :, k], (ahead - behind) / (2.0 * step), atol=1e-6)
 
 
 # ---------------------------------------------------------------- what is measured

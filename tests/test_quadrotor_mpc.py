@@ -94,9 +94,9 @@ def test_walls_on_the_map_correct_the_heading_and_cylinders_do_not(association: 
         flight.pilot.estimator = estimator(state, flight.conditions.nominal, settings, corners)
         log = flight.run(silent)
         headings.append(abs(state_errors(log)[-1, 5]))
-        window = flight.pilot.estimator.window
-        assert window.surveyed.any() == surveyed
-        for place in window.survey[window.surveyed]:
+        survey = flight.pilot.estimator.survey
+        assert survey.known.any() == surveyed
+        for place in survey.places[survey.known]:
             assert np.linalg.norm(flight.world.layout.corners - place, axis=1).min() == 0.0
     assert headings[0] < 0.005
     assert headings[1] > 0.01

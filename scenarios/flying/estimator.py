@@ -7,16 +7,22 @@ With :class:`DeadReckoning` in their place it has the same sensors and does not.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 import unifg as fg
-from unifg.horizon.spread import JointCovariance
 from unifg.models import quadrotor
-from unifg.scenarios.flying.flight_terms import Shared, StateTerms
-from unifg.scenarios.flying.flight_window import PARAMETER_SIZE, STATE_SIZE, StateWindow, WindowSettings
+from unifg.scenarios.flying.flight_past import (
+    PARAMETER_SIZE,
+    STATE_SIZE,
+    UNKNOWN,
+    Survey,
+    WindowSettings,
+    packed,
+    robot,
+    window,
+)
 from unifg.scenarios.options import option
 from unifg.scenarios.seeing.association import DOUBTFUL, NEW, Gates, expected, nearest, places
 from unifg.scenarios.seeing.atlas import Atlas
@@ -140,17 +146,16 @@ class DeadReckoning(Dynamics):
 class Estimator:
     """A fixed-lag smoother of state, mass, drag, wind and landmarks (Ta et al. 2014, section II-B).
 
-    :meth:`update` is :meth:`predict`, :meth:`see` and :meth:`estimate`. A joint graph of past and future solves the
-    window itself, between :meth:`see` and :meth:`measure`.
+    :meth:`update` is :meth:`predict`, :meth:`see` and :meth:`estimate`.
 
     Attributes:
         settings: priors and noise.
+        own: sizes, noise and sensors of the window.
         model: how the vehicle moves.
         window: the past; a joint graph of past and future works on the same one.
-        terms: its terms in a graph of its own.
+        survey: which landmarks are on the map from the start.
         atlas: what the landmarks' slots hold.
         covariance: (D, D) of state, parameters and landmarks' slots, from past terms only.
-        solution: of the last tick.
     """
 
     def __init__(
@@ -171,24 +176,29 @@ class Estimator:
             model: how the vehicle moves; None for the controller's dynamics.
         """
         self.settings = settings = settings or EstimatorSettings()
-        self._survey = np.zeros((0, 2)) if survey is None else np.asarray(survey, dtype=np.float64)
+        self._corners = np.zeros((0, 2)) if survey is None else np.asarray(survey, dtype=np.float64)
         self.model = model or Dynamics(nominal)
-        own, parameters = self.model.window(settings), self.model.start()
-        sigma = settings.parameters_sigma(nominal)
-        self.window = StateWindow(own, state, np.diag(settings.state_sigma**2), parameters, sigma)
-        self.atlas = Atlas(own.landmarks)
+        self.own = own = self.model.window(settings)
+        parameters, sigma = self.model.start(), settings.parameters_sigma(nominal)
+        state = np.asarray(state, dtype=np.float64)
+        self.survey, self.atlas = Survey(own), Atlas(own.landmarks)
+        # The guess keeps the dynamics to rounding: with a sharper tolerance a step that bends them counts as worse.
+        solver = SQP(max_iterations=settings.iterations, full_steps=True, tolerance=TOLERANCE, step_tolerance=1e-4)
+        vehicle = robot(own, state, parameters, sigma)
+        self.window = window(own, vehicle, self.survey, state, settings.state_sigma, solver)
         self.covariance = np.zeros((FIRST_LANDMARK + 2 * own.landmarks,) * 2)
         self.covariance[:STATE_SIZE, :STATE_SIZE] = np.diag(settings.state_sigma**2)
         self._time: float | None = None
-        graph = fg.Graph()
-        self._present = graph.variables("present", quadrotor.STATE, 1)
-        shared = Shared(graph, own, parameters)
-        self.terms = StateTerms(graph, self._present[:], shared, own)
-        # The guess keeps the dynamics to rounding: with a sharper tolerance a step that bends them counts as worse.
-        solver = SQP(max_iterations=settings.iterations, full_steps=True, tolerance=TOLERANCE, step_tolerance=1e-4)
-        self._run = solver.prepare(graph)
-        self._spread = JointCovariance(self._run.program, self._present, *shared.parameters, shared.landmarks)
-        self.solution: fg.Solution | None = None
+
+    @property
+    def parameters(self) -> Array:
+        """(7,) believed mass, drag, wind and updraft."""
+        return packed(self.window.history.statics)
+
+    @property
+    def landmarks(self) -> Array:
+        """(K, 2) believed places of the slots [m]."""
+        return self.window.history.statics["landmarks"]
 
     def update(self, reading: Reading, control: Array | None) -> Belief:
         """Take in one reading.
@@ -203,22 +213,25 @@ class Estimator:
 
     def predict(self, reading: Reading, control: Array | None) -> None:
         """Move the window on to the time of a reading."""
-        window = self.window
         if self._time is not None and control is not None:
             dt = reading.time - self._time
             control, turned = self.model.motion(reading, np.asarray(control, dtype=np.float64))
             noise = np.zeros(6)
-            noise[:3] = turned * self._gain(dt)
+            noise[:3] = turned * self._gain()
             moved = control + np.concatenate([noise[:3], [0.0]])
-            state = quadrotor.step(window.present[None], moved[None], dt, flyable(window.parameters))[0]
+            state = quadrotor.step(self.window.present[None], moved[None], dt, flyable(self.parameters))[0]
             self._propagate(state, control, noise, dt)
-            window.move(control, dt, state, noise, turned)
+            self.window.move(control, self.window.history.times[-1] + dt, state, {"noise": noise})
+            self.window.record("turned", turned)
         self._time = reading.time
 
     def see(self, reading: Reading) -> None:
         """Attach a reading to the present; what moves by design is tracked elsewhere."""
         window, atlas = self.window, self.atlas
-        window.measure(reading.height, reading.tilt)
+        window.record("height", reading.height)
+        window.record("tilt", reading.tilt)
+        window.record("sightings", np.zeros((self.own.landmarks, 3)))
+        present = window.history.recorded("sightings")[0][-1]
         atlas.tick()
         own = np.flatnonzero(~reading.moving)
         sightings = np.column_stack([reading.bearings, reading.ranges])[own]
@@ -230,29 +243,19 @@ class Estimator:
                 slot = self._slot()
                 if slot is None:
                     continue
-                window.admit(slot, places(window.present, np.array([bearing]), np.array([distance]))[0])
+                place = places(window.present, np.array([bearing]), np.array([distance]))[0]
+                window.admit("landmarks", slot, place, UNKNOWN)
                 name = int(reading.ids[row]) if self.settings.association == "known" else None
                 atlas.admit(slot, int(reading.kinds[row]), name)
                 self._look_up(slot)
-            window.sight(slot, bearing, distance)
+            present[slot] = bearing, distance, 1.0
             atlas.sight(slot, float(reading.radii[row]))
 
     def estimate(self) -> Belief:
         """Solve the window."""
-        window, terms = self.window, self.terms
-        guess = {**terms.guess(window), self._present: window.present[None]}
-        self.solution = self._run.solve(guess, data=terms.data(window))
-        terms.accept(window, self.solution)
-        self.measure(self.solution.values)
+        self.window.estimate()
+        self.covariance = self.window.covariance
         return self.belief()
-
-    def measure(self, values: Mapping[fg.Family, Array]) -> None:
-        """Find the covariance of the past's terms at ``values``, by families of this estimator's graph."""
-        covariance = self._spread(values)
-        if covariance is None:
-            logger.warning("the window's information is singular: the covariance stays that of the prediction")
-        else:
-            self.covariance = covariance
 
     def belief(self) -> Belief:
         """What is known now."""
@@ -261,24 +264,23 @@ class Estimator:
         return Belief(
             state=window.present.copy(),
             covariance=self.covariance[:STATE_SIZE, :STATE_SIZE].copy(),
-            parameters=self.model.believed(window.parameters),
+            parameters=self.model.believed(self.parameters),
             parameters_sigma=np.sqrt(np.diag(self.covariance)[STATE_SIZE:FIRST_LANDMARK]),
-            landmarks=self.atlas.landmarks(window.landmarks, spread),
+            landmarks=self.atlas.landmarks(self.landmarks, spread),
         )
 
     # ---------------------------------------------------------------- steps
 
-    def _gain(self, dt: float) -> Array:
+    def _gain(self) -> Array:
         """(3,) share of the gyro's deviation that is noise of the rates and not of the gyro."""
-        own = self.window.settings
+        own = self.own
         process = np.square(own.noise_sigma[:3])
         return process / (process + (own.gyro_sigma or 0.0) ** 2)
 
     def _propagate(self, state: Array, control: Array, noise: Array, dt: float) -> None:
         """Covariance of the prediction, by the derivatives of the dynamics: A dx + W dw + P drho + B dx' = 0."""
-        window = self.window
-        rho = np.split(window.parameters[None], [1, 4, 6], axis=1)
-        arguments = (window.present[None], control[None], noise[None], *rho, state[None], dt)
+        rho = np.split(self.parameters[None], [1, 4, 6], axis=1)
+        arguments = (self.window.present[None], control[None], noise[None], *rho, state[None], dt)
         A, _, W, mass, drag, wind, updraft, B = (block[0] for block in DYNAMICS.jacobian(*arguments))
         moved = -np.linalg.solve(B, np.concatenate([A, mass, drag, wind, updraft, W], axis=1))
         before = self.covariance
@@ -286,7 +288,7 @@ class Estimator:
         across = F @ before[:FIRST_LANDMARK]
         after = before.copy()
         after[:STATE_SIZE], after[:, :STATE_SIZE] = across, across.T
-        own = window.settings
+        own = self.own
         sigma = np.array(own.noise_sigma)
         if own.gyro_sigma is not None:
             sigma[:3] = 1.0 / np.sqrt(1.0 / sigma[:3] ** 2 + 1.0 / own.gyro_sigma**2)
@@ -301,10 +303,9 @@ class Estimator:
         used = np.flatnonzero(atlas.used)
         if not len(used):
             return np.full(len(own), NEW, dtype=np.intp)
-        window, settings = self.window, self.window.settings
-        noise = np.array([settings.bearing_sigma, settings.range_sigma])
+        noise = np.array([self.own.bearing_sigma, self.own.range_sigma])
         columns = FIRST_LANDMARK + 2 * used
-        forecast, innovation = expected(window.present, self.covariance, window.landmarks[used], columns, noise)
+        forecast, innovation = expected(self.window.present, self.covariance, self.landmarks[used], columns, noise)
         possible = reading.kinds[own][:, None] == atlas.kinds[used][None]
         found = nearest(sightings, forecast, innovation, possible, self.settings.gates)
         return np.where(found >= 0, used[np.maximum(found, 0)], found)
@@ -314,25 +315,26 @@ class Estimator:
         slot = self.atlas.free_slot()
         if slot is not None:
             return slot
-        out_of_sight: BoolArray = ~np.any(self.window.seen, axis=0)
+        sightings = self.window.history.recorded("sightings")[0]
+        out_of_sight: BoolArray = ~np.any(sightings[:, :, 2] > 0.0, axis=0)
         slot = self.atlas.oldest(out_of_sight)
         if slot is None:
             logger.debug("all slots hold landmarks that the window sees: a new one is left out")
             return None
         place = slice(FIRST_LANDMARK + 2 * slot, FIRST_LANDMARK + 2 * slot + 2)
-        self.atlas.retire(slot, self.window.landmarks[slot], self.covariance[place, place])
-        self.window.forget(slot)
+        self.atlas.retire(slot, self.landmarks[slot], self.covariance[place, place])
+        self.window.forget("landmarks", slot)
+        self.survey.known[slot] = False
         return slot
 
     def _look_up(self, slot: int) -> None:
         """Find a new corner on the map."""
-        window = self.window
-        if self.atlas.kinds[slot] != Landmarks.CORNER or not len(self._survey):
+        if self.atlas.kinds[slot] != Landmarks.CORNER or not len(self._corners):
             return
-        gaps = np.hypot(*(self._survey - window.landmarks[slot]).T)
+        gaps = np.hypot(*(self._corners - self.landmarks[slot]).T)
         nearest = int(np.argmin(gaps))
         if gaps[nearest] < SAME_CORNER:
-            window.survey[slot], window.surveyed[slot] = self._survey[nearest], True
+            self.survey.places[slot], self.survey.known[slot] = self._corners[nearest], True
 
 
 class DeadReckoningEstimator(Estimator):

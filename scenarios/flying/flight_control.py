@@ -7,31 +7,28 @@ and walls. With ``avoidance="potential"`` the costs are Ta's own, |p - l_g|^2 an
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
 from typing import Literal, Protocol, TypeAlias
 
 import numpy as np
 
 import unifg as fg
+from unifg.horizon import Choice, ControlCost, Kept, Loop, Now, Plan, Robot, Starts, Term, Window
 from unifg.models import quadrotor
 from unifg.scenarios.flying.braking import brake
+from unifg.scenarios.flying.flight_joint import believable
 from unifg.scenarios.flying.flight_parts import (
-    FlightNow,
+    Clearance,
+    Flown,
+    Following,
     GivenFlight,
-    clearance,
-    following,
-    leaning,
+    Leaning,
+    Limits,
+    Potential,
     level,
-    limits,
-    potential,
 )
 from unifg.scenarios.flying.flight_settings import ControllerSettings, backend
 from unifg.scenarios.flying.guide import Guide, Reference
 from unifg.scenarios.flying.slots import Obstacles, Slots
-from unifg.scenarios.horizon.loop import Loop, Plan
-from unifg.scenarios.horizon.part import Part, effort, stated
-from unifg.scenarios.horizon.past import Past
 from unifg.scenarios.seeing.belief import Belief
 from unifg.scenarios.seeing.tracks import Tracks
 from unifg.solvers import names
@@ -44,22 +41,40 @@ KEPT = 8  # ticks for which an old plan may be flown
 Source: TypeAlias = Literal["solved", "violating", "kept", "braking"]
 
 
-class FlightPast(Past[FlightNow], Protocol):
-    """How a flight is tied to the past: state, parameters and map that are given, or estimated in the same graph."""
+class FlightPast(Protocol):
+    """How a flight is tied to the past: state, parameters and map that are given, or estimated in the same graph.
+
+    Attributes:
+        robot: who flies.
+        window: of the past, in one graph with it; None where its belief is given.
+        pull: see :class:`unifg.horizon.coupled.Joined`.
+    """
+
+    robot: Robot
+    window: Window | None
+    pull: float
+
+    def motion(self) -> list[Term]:
+        """How the vehicle moves."""
+        ...
+
+    def apart(self, squares: bool | None) -> list[Term]:
+        """Keep clear of what is a variable: hard, or for Ta's potential as sums of squares or not."""
+        ...
 
     def split(self, obstacles: Obstacles) -> tuple[Obstacles, BoolArray, list[int]]:
         """Obstacles without those that are variables; which (M,) these are, and the variables."""
         ...
 
-    def apart(self, squares: bool | None) -> Sequence[Part[FlightNow]]:
-        """Parts that keep clear of what is a variable: hard, or for Ta's potential as sums of squares or not."""
+    def carry(self, multipliers: dict[str, Array], now: Now[Flown]) -> dict[str, Array]:
+        """What of the shifted multipliers still holds."""
         ...
 
-    def moving_with(self, solution: fg.Solution, now: FlightNow) -> quadrotor.Parameters:
+    def moving_with(self, solution: fg.Solution, now: Now[Flown]) -> quadrotor.Parameters:
         """Parameters with which a solution moves."""
         ...
 
-    def believed(self, given: Belief) -> Belief:
+    def believed(self, given: Belief, loop: Loop) -> Belief:
         """What is believed after a solve for which a belief was given."""
         ...
 
@@ -72,9 +87,8 @@ class Controller:
         past: what ties the horizon to what is known; without one all that is given.
         guide: what gives the reference.
         slots: what chooses the obstacles.
-        data: what gives the data of the whole graph at a tick.
         loop: the prepared graph.
-        emergencies: how many ticks were flown by plans of each other source than "solved".
+        belief: after the last plan.
     """
 
     def __init__(
@@ -107,22 +121,21 @@ class Controller:
         self.walls = np.asarray(walls, dtype=np.float64)
         target = np.asarray(target, dtype=np.float64)
         self.guide = Guide(target, self.walls, s.guide, bounds)
-        self.emergencies: dict[Source, int] = {"violating": 0, "kept": 0, "braking": 0}
         self.slots = Slots(s, self.walls)
-        parts: list[Part[FlightNow]] = [
-            self.past.state, limits(s), leaning(s), effort(s.weighted(s.control_sigma), s.weighted(s.rate_sigma))
-        ]  # fmt: skip
+        effort = ControlCost(s.weighted(s.control_sigma), s.weighted(s.rate_sigma), wanted=lambda now: now.given.hover)
+        terms = [*self.past.motion(), Limits(s), Leaning(s), effort]
         if s.avoidance == "potential":
             squares = not s.general_costs or not names.entry(solver).made_by.scalar_costs
-            parts += [potential(s, self.walls, target, squares), *self.past.apart(squares)]
+            terms += [Potential(s, self.walls, target, squares), *self.past.apart(squares)]
         else:
-            parts += [following(s), clearance(s, self.walls), *self.past.apart(None)]
-        graph = fg.Graph()
-        x = graph.variables("state", quadrotor.STATE, s.horizon + 1)
-        u = graph.variables("control", quadrotor.CONTROL, s.horizon)
-        self.data = stated(parts, graph, x, u)
-        self.loop = Loop(graph, x, u, backend(solver, s), backend(solver, s, cold=True), s.box, PATIENCE)
-        self._applied: Array | None = None
+            terms += [Following(s), Clearance(s, self.walls), *self.past.apart(None)]
+        window = self.past.window
+        self.loop = Loop(
+            self.past.robot, s.horizon, terms, solver=backend(solver, s), cold=backend(solver, s, cold=True),
+            window=window, coupling="sequential" if window is None else "joint", pull=self.past.pull, limits=s.box,
+            judge=self.judge, starts=Starts(self.along, carry=self.carry), believable=believable, patience=PATIENCE,
+        )  # fmt: skip
+        self._flying = False
 
     def plan(self, belief: Belief, movers: Tracks | None = None) -> Plan:
         """Decide the next controls; never raises for a hard problem.
@@ -131,73 +144,63 @@ class Controller:
             belief: state, parameters and landmarks.
             movers: discs that move.
         """
-        begin = time.perf_counter()
-        now = self.now(belief, movers or Tracks.none())
-        data = self.data(now)
-        run, guess = self.loop.begin(lambda: self.along(now))
-        if self.loop.guess is not None:
-            guess = fg.Guess(guess.values, self.kept_multipliers(guess, now))
-        solution = run.solve(self.past.begin(guess, now), data=data)
-        controls, states, source = self.judge(solution, now)
-        self._applied = controls[0]
-        self.past.take(solution, now, source)
-        elapsed = 1e3 * (time.perf_counter() - begin)
-        return Plan(controls, states, solution.status, solution.iterations, source, self.loop.excess, elapsed)
+        given = self.given(belief, movers or Tracks.none())
+        if not self._flying:
+            self.loop.applied, self._flying = given.hover, True
+        plan = self.loop.plan(belief.state, given)
+        self.belief = self.past.believed(belief, self.loop)
+        return plan
 
-    def now(self, belief: Belief, movers: Tracks) -> FlightNow:
-        """What the graph's parts ask for."""
+    def given(self, belief: Belief, movers: Tracks) -> Flown:
+        """What the terms are given."""
         s = self.settings
         reference = self.guide.reference(belief.state, belief.landmarks, s.horizon + 1, s.dt)
         obstacles = self.slots.fill(belief.state, reference.positions, belief.landmarks, movers)
         hover = quadrotor.hover(belief.parameters)
-        last = hover if self._applied is None else self._applied
-        return FlightNow(belief.state, hover, last, belief, reference, obstacles, *self.past.split(obstacles))
+        return Flown(belief, hover, reference, obstacles, *self.past.split(obstacles))
 
     def forget(self) -> None:
         """Drop the warm start and the stored plan."""
-        self.loop.reset()
-        self._applied = None
+        self.loop.abandon()
+        self._flying = False
 
-    def along(self, now: FlightNow) -> fg.Guess:
+    def along(self, now: Now[Flown]) -> tuple[Array, Array]:
         """Guess a level flight along the reference."""
-        belief, reference = now.belief, now.reference
+        belief, reference = now.given.belief, now.given.reference
         states = np.tile(belief.state, (self.settings.horizon + 1, 1))
         states[1:, :3], states[1:, 7:] = reference.positions[1:], reference.velocities[1:]
         states[1:, 3:7] = level(belief)
-        return fg.Guess({self.loop.x: states, self.loop.u: np.tile(now.wanted, (self.settings.horizon, 1))})
+        return states, np.tile(now.given.hover, (self.settings.horizon, 1))
 
-    def kept_multipliers(self, guess: fg.Guess, now: FlightNow) -> dict[str, Array]:
-        """Multipliers of a guess without those of slots that hold something else now."""
+    def carry(self, guess: fg.Guess, now: Now[Flown]) -> fg.Guess:
+        """A guess without multipliers of slots that hold something else now."""
         multipliers = dict(guess.multipliers)
         if "cylinders" in multipliers:
-            multipliers["cylinders"] = np.where(now.obstacles.changed, 0.0, multipliers["cylinders"])
-        return multipliers
+            multipliers["cylinders"] = np.where(now.given.obstacles.changed, 0.0, multipliers["cylinders"])
+        return fg.Guess(guess.values, self.past.carry(multipliers, now) if multipliers else multipliers)
 
-    def judge(self, solution: fg.Solution, now: FlightNow) -> tuple[Array, Array, Source]:
+    def judge(self, solution: fg.Solution, states: Array, controls: Array, now: Now[Flown], kept: Kept) -> Choice:
         """Fly a plan that keeps the constraints; otherwise what keeps off best of all there is."""
-        s, loop, belief = self.settings, self.loop, now.belief
-        controls, states = solution[loop.u], solution[loop.x]
+        s, given, belief = self.settings, now.given, now.given.belief
         sound = moves(controls, states, s.dt, self.past.moving_with(solution, now), s.feasible)
-        if sound and self._room(states, now.obstacles) >= -s.give:
-            loop.accept(solution, behind=is_behind(states, now.reference))
-            return loop.within(loop.stored), states, "solved"
+        if sound and self._room(states, given.obstacles) >= -s.give:
+            return Choice(kept.within(controls), states, "solved", behind=is_behind(states, given.reference))
         choices: dict[Source, tuple[Array, Array]] = {}
-        age = loop.age + 1
-        if age <= KEPT and age < s.horizon:
-            rest = np.tile(now.wanted, (age, 1))
-            kept = np.concatenate([loop.within(loop.stored[age:]), rest])
-            choices["kept"] = kept, quadrotor.rollout(belief.state, kept, s.dt, belief.parameters)
-        choices["braking"] = brake(belief.state, belief.parameters, s.horizon, s.dt, loop.least, loop.most)
+        if kept.age <= KEPT and kept.age < s.horizon:
+            rest = np.tile(given.hover, (kept.age, 1))
+            old = np.concatenate([kept.within(kept.left()), rest])
+            choices["kept"] = old, quadrotor.rollout(belief.state, old, s.dt, belief.parameters)
+        choices["braking"] = brake(belief.state, belief.parameters, s.horizon, s.dt, kept.least, kept.most)
         if sound:
-            choices["violating"] = loop.within(controls), states
+            choices["violating"] = kept.within(controls), states
         # What is left of an old plan says nothing about the end of the horizon.
-        rooms = {name: self._room(choice[1][: s.horizon + 1 - KEPT], now.obstacles) for name, choice in choices.items()}
+        rooms = {
+            name: self._room(choice[1][: s.horizon + 1 - KEPT], given.obstacles) for name, choice in choices.items()
+        }
         source = max(rooms, key=lambda name: min(rooms[name], -s.give))
         controls, states = choices[source]
-        self.emergencies[source] += 1
         # Go on from what is flown: from the reference the solver would meet the same difficulty again.
-        loop.refuse(fg.Guess({loop.x: _next(states), loop.u: _next(controls)}))
-        return controls, states, source
+        return Choice(controls, states, source, after=(_next(states), _next(controls)))
 
     def _room(self, states: Array, obstacles: Obstacles) -> float:
         """Least distance of states (k, 10) beyond what is to be kept clear [m]; Ta's potential demands nothing."""

@@ -20,29 +20,25 @@ alone. What has left the window's map and what moves are data, as in the control
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from typing import Any
 
 import numpy as np
 
 import unifg as fg
+from unifg.horizon import Loop, Now, Term, Window
 from unifg.models import avoidance, quadrotor
-from unifg.scenarios.flying.estimator import FIRST_LANDMARK, Estimator, flyable
-from unifg.scenarios.flying.flight_parts import FlightNow, repel
+from unifg.scenarios.flying.estimator import Estimator, flyable
+from unifg.scenarios.flying.flight_parts import Flown, repel
+from unifg.scenarios.flying.flight_past import packed, parameters_in
 from unifg.scenarios.flying.flight_settings import ControllerSettings
-from unifg.scenarios.flying.flight_terms import Shared, StateTerms
-from unifg.scenarios.flying.flight_window import PLACES
 from unifg.scenarios.flying.slots import FAR_AWAY, Obstacles
-from unifg.scenarios.flying.standardised import standardised
-from unifg.scenarios.horizon.part import Given, Gives, Part
-from unifg.scenarios.horizon.past import joined
 from unifg.scenarios.seeing.belief import Belief
-from unifg.typing import Array, BoolArray
+from unifg.typing import Array, ArrayLike, BoolArray
 
 STILL = np.zeros(6)  # process noise of the future
 BELIEVABLE = 1e-4  # largest violation of an estimate; a plan may have more, but noise of the past is as small as that
-LEAST_SIGMA = 1e-6  # of what the past knows for certain, so that it can be divided by
 
 
 @dataclass(frozen=True)
@@ -68,13 +64,73 @@ class JointSettings:
             )
 
 
+@dataclass(frozen=True)
+class SharedMotion:
+    """The dynamics with parameters that are estimated in the same graph; no wish makes drag negative."""
+
+    settings: ControllerSettings
+    drag: bool
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the dynamics, and bound the drag if it is estimated."""
+        if self.drag:
+            least = graph.data("least drag", np.zeros(3))
+            graph.bound(graph.families["drag"], lower=least, upper=np.inf, name="drag")
+        motion = (x[:-1], u, STILL, *parameters_in(graph), x[1:], self.settings.dt)
+        graph.constrain(quadrotor.disturbed_dynamics, *motion, lower=0, upper=0, name="flight")
+
+    def data(self, now: Now[Flown]) -> Mapping[str, ArrayLike]:
+        """Drag that the past puts below zero may stay there."""
+        return {"least drag": np.minimum(now.statics["drag"][0], 0.0)} if self.drag else {}
+
+
+@dataclass(frozen=True)
+class KeepClear:
+    """Every node and every landmark of the window: clearance, hard or as Ta's 1/d, and data that say which pairs count.
+
+    Attributes:
+        settings: weights and limits.
+        squares: whether 1/d is stated as a sum of squares; None for a hard clearance.
+    """
+
+    settings: ControllerSettings
+    squares: bool | None
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Pair them."""
+        s, marks = self.settings, graph.families["landmarks"]
+        node, mark = np.repeat(np.arange(s.horizon), len(marks)), np.tile(np.arange(len(marks)), s.horizon)
+        radii = graph.data("radii of landmarks", np.zeros(len(node)), each=True)
+        near = graph.data("landmarks to keep clear of", np.zeros(len(node), dtype=bool), each=True)
+        pairs, kept = (x.p[1:][node], marks[mark], radii), avoidance.landmark_clearance
+        if self.squares is None:
+            least = graph.data("clearances of landmarks", np.zeros((len(node), 1)), each=True)
+            graph.constrain(kept, *pairs, lower=least, active=near, name="landmarks")
+        else:
+            repel(graph, s, self.squares, kept, *pairs, name="landmarks", active=near)
+
+    def data(self, now: Now[Flown]) -> Mapping[str, ArrayLike]:
+        """Which of them are obstacles now, how wide they are, and how far to keep off."""
+        s, given, count = self.settings, now.given, len(now.statics["landmarks"])
+        hulls, limits = np.zeros((2, s.horizon, count))
+        counting = np.zeros((s.horizon, count), dtype=bool)
+        counting[:, given.marks] = True
+        hulls[:, given.marks] = given.obstacles.radii[given.held] + (0.0 if self.squares is None else s.vehicle_radius)
+        limits[:, given.marks] = given.obstacles.limits[:, given.held]
+        found = {"radii of landmarks": hulls.ravel(), "landmarks to keep clear of": counting.ravel()}
+        return found | ({"clearances of landmarks": limits.reshape(-1, 1)} if self.squares is None else {})
+
+
 class SharedFlight:
-    """The past's terms in the graph of the horizon: first state, parameters and map are estimated in the same solve.
+    """A flight whose first state, parameters and map are estimated in the same solve.
 
     Attributes:
         estimator: of the past alone; its window is the joint graph's past.
-        joint: how far the future may lean on the past.
+        robot: who flies.
+        window: of the past.
+        pull: how far the future may lean on the past.
         latest: what the last joint solve says; what the past alone says where that solve was of no use.
+        names: of what the window's slots held at the last solve.
     """
 
     def __init__(self, estimator: Estimator, settings: ControllerSettings, joint: JointSettings) -> None:
@@ -85,89 +141,19 @@ class SharedFlight:
             settings: weights and limits of the future.
             joint: how far it may lean on the past.
         """
-        self.estimator, self.joint, self._settings = estimator, joint, settings
+        self.estimator, self.robot = estimator, estimator.window.robot
+        self.window: Window | None = estimator.window
+        self.settings, self.pull = settings, joint.pull
         self.latest = estimator.belief()
         self.names = estimator.atlas.names.copy()
 
-    # ---------------------------------------------------------------- what the graph says
+    def motion(self) -> list[Term]:
+        """How the vehicle moves."""
+        return [SharedMotion(self.settings, "drag" in self.estimator.own.estimated)]
 
-    def state(self, graph: fg.Graph, x: fg.Family, u: fg.Family) -> Gives[FlightNow]:
-        """Add the past's terms on the first state, the bounds of the pull, and the dynamics of the future."""
-        window = self.estimator.window
-        self._x = x
-        self.shared = shared = Shared(graph, window.settings, window.parameters)
-        self._terms = terms = StateTerms(graph, x[0], shared, window.settings)
-        least_drag = graph.data("least drag", np.zeros(3))
-        if "drag" in window.settings.estimated:
-            graph.bound(shared.drag, lower=least_drag, upper=np.inf, name="drag")
-        pulled = [] if np.isinf(self.joint.pull) else self._bound_pull(graph, x)
-        motion = (x[:-1], u, STILL, *shared.parameters, x[1:], self._settings.dt)
-        graph.constrain(quadrotor.disturbed_dynamics, *motion, lower=0, upper=0, name="flight")
-
-        def data(now: FlightNow) -> Given:
-            drag = np.minimum(window.parameters[PLACES["drag"]], 0.0)
-            found: Given = {**terms.data(window), least_drag: drag}
-            for variable, place, spread in pulled:
-                value, sigma = self._past_says(variable, now.belief)
-                found[place], found[spread] = value, np.maximum(sigma, LEAST_SIGMA)
-            return found
-
-        return data
-
-    def _bound_pull(self, graph: fg.Graph, x: fg.Family) -> list[tuple[fg.Family | fg.Selection, fg.Data, fg.Data]]:
-        """Bound what is shared; the variables, and the data that say where the past puts them and how surely."""
-        estimated, pull = self.estimator.window.settings.estimated, self.joint.pull
-        bounded: list[tuple[str, fg.Family | fg.Selection]] = [("state", x[0]), ("landmarks", self.shared.landmarks)]
-        bounded += [(f.name, f) for f in self.shared.parameters if f.name in estimated]
-        pulled: list[tuple[fg.Family | fg.Selection, fg.Data, fg.Data]] = []
-        for name, variable in bounded:
-            manifold, count = variable.manifold, len(variable)
-            place = graph.data(f"{name}, by the past", np.tile(manifold.identity(), (count, 1)), each=True)
-            sigma = graph.data(f"sigma of {name}, by the past", np.ones((count, manifold.dim)), each=True)
-            graph.constrain(
-                standardised(manifold), variable, place, sigma, lower=-pull, upper=pull, name=f"pull of {name}"
-            )
-            pulled.append((variable, place, sigma))
-        return pulled
-
-    def _past_says(self, variable: fg.Family | fg.Selection, belief: Belief) -> tuple[Array, Array]:
-        """Value and standard deviation of a variable by the past alone; those of an idle slot mean nothing."""
-        estimator = self.estimator
-        if variable is self.shared.landmarks:
-            sigma = np.sqrt(np.diag(estimator.covariance)[FIRST_LANDMARK:]).reshape(-1, 2)
-            return estimator.window.landmarks, sigma
-        if isinstance(variable, fg.Family):
-            place = PLACES[variable.name]
-            return estimator.window.parameters[None, place], belief.parameters_sigma[None, place]
-        return belief.state[None], belief.sigma[None]
-
-    def apart(self, squares: bool | None) -> Sequence[Part[FlightNow]]:
+    def apart(self, squares: bool | None) -> list[Term]:
         """Keep clear of the landmarks' variables; the slots keep what has left the window's map, and movers."""
-        return (partial(self._keep_clear, squares),)
-
-    def _keep_clear(self, squares: bool | None, graph: fg.Graph, x: fg.Family, u: fg.Family) -> Gives[FlightNow]:
-        """Pair every node with every landmark: clearance, hard or as Ta's 1/d, and data that say which pairs count."""
-        s, count = self._settings, len(self.shared.landmarks)
-        node, mark = np.repeat(np.arange(s.horizon), count), np.tile(np.arange(count), s.horizon)
-        radii = graph.data("radii of landmarks", np.zeros(len(node)), each=True)
-        near = graph.data("landmarks to keep clear of", np.zeros(len(node), dtype=bool), each=True)
-        least = graph.data("clearances of landmarks", np.zeros((len(node), 1)), each=True) if squares is None else None
-        pairs, kept = (x.p[1:][node], self.shared.landmarks[mark], radii), avoidance.landmark_clearance
-        if least is not None:
-            graph.constrain(kept, *pairs, lower=least, active=near, name="landmarks")
-        else:
-            repel(graph, s, bool(squares), kept, *pairs, name="landmarks", active=near)
-
-        def data(now: FlightNow) -> Given:
-            hulls, limits = np.zeros((2, s.horizon, count))
-            counting = np.zeros((s.horizon, count), dtype=bool)
-            counting[:, now.marks] = True
-            hulls[:, now.marks] = now.obstacles.radii[now.held] + (0.0 if least is not None else s.vehicle_radius)
-            limits[:, now.marks] = now.obstacles.limits[:, now.held]
-            found: Given = {radii: hulls.ravel(), near: counting.ravel()}
-            return found if least is None else {**found, least: limits.reshape(-1, 1)}
-
-        return data
+        return [KeepClear(self.settings, squares)]
 
     def split(self, obstacles: Obstacles) -> tuple[Obstacles, BoolArray, list[int]]:
         """Obstacles without those that are landmarks of the window; which (M,) these are, and the slots they hold."""
@@ -177,56 +163,44 @@ class SharedFlight:
         centres = np.where(held[:, None], FAR_AWAY, obstacles.centres)
         return replace(obstacles, centres=centres), held, [slot for slot in slots if slot >= 0]
 
-    # ---------------------------------------------------------------- a tick
-
-    def begin(self, guess: fg.Guess, now: FlightNow) -> fg.Guess:
-        """The horizon's guess, begun at the estimate, and what the past alone says."""
-        multipliers = self.kept_multipliers(guess, now) if guess.multipliers else guess.multipliers
-        self.names = self.estimator.atlas.names.copy()
-        past = self._terms.guess(self.estimator.window)
-        return joined(fg.Guess(guess.values, multipliers), self._x, now.present, past)
-
-    def kept_multipliers(self, guess: fg.Guess, now: FlightNow) -> dict[str, Array]:
-        """Multipliers without those of what has changed its slot or its kind; those of the past are moved on."""
-        multipliers = dict(guess.multipliers)
+    def carry(self, multipliers: dict[str, Array], now: Now[Flown]) -> dict[str, Array]:
+        """Multipliers without those of what has changed its slot or its kind."""
+        multipliers = dict(multipliers)
         same = self.estimator.atlas.names == self.names
         near = np.zeros(len(same), dtype=bool)
-        near[now.marks] = True
-        keep = {"cylinders": ~now.held, "landmarks": np.tile(near & same, self._settings.horizon)[:, None]}
+        near[now.given.marks] = True
+        keep = {"cylinders": ~now.given.held, "landmarks": np.tile(near & same, self.settings.horizon)[:, None]}
         for name, kept in (*keep.items(), ("pull of landmarks", same[:, None])):
             if name in multipliers:
                 multipliers[name] = np.where(kept, multipliers[name], 0.0)
-        # The step that led to the present is the last one between past states now.
-        past, last = multipliers["dynamics"], multipliers["dynamics now"]
-        multipliers["dynamics"] = np.concatenate([past[1:], last])
         return multipliers
 
-    def moving_with(self, solution: fg.Solution, now: FlightNow) -> quadrotor.Parameters:
+    def moving_with(self, solution: fg.Solution, now: Now[Flown]) -> quadrotor.Parameters:
         """The parameters that were estimated."""
-        return flyable(self._parameters_of(solution))
+        families = {family.name: family for family in solution.values}
+        return flyable(packed({static.name: solution[families[static.name]] for static in self.robot.statics}))
 
-    def take(self, solution: fg.Solution, now: FlightNow, source: str) -> None:
-        """What the joint solve says, with the covariances of the past; nothing new unless it keeps its constraints."""
-        self.latest = belief = now.belief
-        if not solution.violation <= BELIEVABLE:  # nor if that is not a number
-            return
+    def believed(self, given: Belief, loop: Loop) -> Belief:
+        """What the joint solve says, with the covariances of the past; what was given where it says nothing."""
         atlas = self.estimator.atlas
-        marks = solution[self.shared.landmarks]
-        positions = belief.landmarks.positions.copy()
-        for row, name in enumerate(belief.landmarks.ids.tolist()):
+        self.names = atlas.names.copy()
+        self.latest = given
+        if not loop.believed:
+            return given
+        positions = given.landmarks.positions.copy()
+        for row, name in enumerate(given.landmarks.ids.tolist()):
             slot = atlas.slot_of(name)
             if slot >= 0:
-                positions[row] = marks[slot]
+                positions[row] = loop.statics["landmarks"][slot]
         self.latest = replace(
-            belief,
-            state=solution[self._x][0].copy(),
-            parameters=flyable(self._parameters_of(solution)),
-            landmarks=replace(belief.landmarks, positions=positions),
+            given,
+            state=loop.estimate.copy(),
+            parameters=flyable(packed(loop.statics)),
+            landmarks=replace(given.landmarks, positions=positions),
         )
-
-    def believed(self, given: Belief) -> Belief:
-        """What the joint solve says."""
         return self.latest
 
-    def _parameters_of(self, solution: fg.Solution) -> Array:
-        return np.concatenate([solution[family][0] for family in self.shared.parameters])
+
+def believable(solution: fg.Solution, choice: object) -> bool:
+    """Whether a solve says something about the past, whatever came of its plan; not if its violation is no number."""
+    return solution.violation <= BELIEVABLE

@@ -1,12 +1,15 @@
-"""What the quadrotor's horizon says, part by part (Ta et al. 2014, section V)."""
+"""What the quadrotor's horizon says, term by term (Ta et al. 2014, section V)."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 import unifg as fg
+from unifg.horizon import Loop, Now, Robot, Term, Window
 from unifg.kernels.residuals import Residual
 from unifg.lie import SO3
 from unifg.models import avoidance, landmarks, quadrotor
@@ -14,21 +17,20 @@ from unifg.scenarios.flying.braking import stopping_height
 from unifg.scenarios.flying.flight_settings import ControllerSettings
 from unifg.scenarios.flying.guide import Reference
 from unifg.scenarios.flying.slots import FAR_AWAY, SPARE, Obstacles
-from unifg.scenarios.horizon.part import Given, Gives, Now, Part, known_present
-from unifg.scenarios.horizon.past import GivenPast
 from unifg.scenarios.seeing.belief import Belief
-from unifg.typing import Array, BoolArray
+from unifg.typing import Array, ArrayLike, BoolArray
 
 UP = np.array([0.0, 0.0, 1.0])
 SLOWING = 0.3  # [s] in which a speed above the limit is to fade
 
 
 @dataclass(frozen=True)
-class FlightNow(Now):
-    """What the parts may ask for at a tick.
+class Flown:
+    """What the terms are given at a tick.
 
     Attributes:
         belief: state, parameters and landmarks.
+        hover: (4,) control that hovers.
         reference: where to be.
         obstacles: what fills the slots.
         others: the same without those that are variables of the graph.
@@ -37,6 +39,7 @@ class FlightNow(Now):
     """
 
     belief: Belief
+    hover: Array
     reference: Reference
     obstacles: Obstacles
     others: Obstacles
@@ -44,42 +47,74 @@ class FlightNow(Now):
     marks: list[int]
 
 
-class GivenFlight(GivenPast):
-    """State and parameters are given, and move by the dynamics."""
+@dataclass(frozen=True)
+class GivenMotion:
+    """The dynamics with parameters that are given."""
+
+    settings: ControllerSettings
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the dynamics."""
+        parameters = graph.data("parameters", quadrotor.Parameters().packed)
+        motion = (x[:-1], u, x[1:], parameters, self.settings.dt)
+        graph.constrain(quadrotor.dynamics, *motion, lower=0, upper=0, name="dynamics")
+
+    def data(self, now: Now[Flown]) -> Mapping[str, ArrayLike]:
+        """What is believed."""
+        return {"parameters": now.given.belief.parameters.packed}
+
+
+class GivenFlight:
+    """A flight that is given its state, parameters and map.
+
+    Attributes:
+        robot: who flies.
+        window: of the past; None.
+        pull: of no consequence.
+    """
+
+    window: Window | None = None
+    pull = np.inf
 
     def __init__(self, settings: ControllerSettings) -> None:
         """Take the sampling time from the settings."""
-        self._dt = settings.dt
+        self.robot = Robot(quadrotor.STATE, quadrotor.CONTROL)
+        self.settings = settings
 
-    def state(self, graph: fg.Graph, x: fg.Family, u: fg.Family) -> Gives[FlightNow]:  # type: ignore[override]
-        """Fix the first state, and add the dynamics."""
-        start = known_present(graph, x, u)
-        parameters = graph.data("parameters", quadrotor.Parameters().packed)
-        motion = (x[:-1], u, x[1:], parameters, self._dt)
-        graph.constrain(quadrotor.dynamics, *motion, lower=0, upper=0, name="dynamics")
-        return lambda now: {**start(now), parameters: now.belief.parameters.packed}
+    def motion(self) -> list[Term]:
+        """How the vehicle moves."""
+        return [GivenMotion(self.settings)]
+
+    def apart(self, squares: bool | None) -> list[Term]:
+        """Nothing else is kept clear of."""
+        return []
 
     def split(self, obstacles: Obstacles) -> tuple[Obstacles, BoolArray, list[int]]:
         """All obstacles are data."""
         return obstacles, np.zeros(len(obstacles.names), dtype=bool), []
 
-    def apart(self, squares: bool | None) -> tuple[()]:
-        """Nothing else is kept clear of."""
-        return ()
+    def carry(self, multipliers: dict[str, Array], now: Now[Flown]) -> dict[str, Array]:
+        """Multipliers as they are."""
+        return multipliers
 
-    def moving_with(self, solution: fg.Solution, now: FlightNow) -> quadrotor.Parameters:
+    def moving_with(self, solution: fg.Solution, now: Now[Flown]) -> quadrotor.Parameters:
         """Parameters with which a solution moves."""
-        return now.belief.parameters
+        return now.given.belief.parameters
 
-    def believed(self, given: Belief) -> Belief:
+    def believed(self, given: Belief, loop: Loop) -> Belief:
         """What was given."""
         return given
 
 
-def limits(s: ControllerSettings) -> Part[Now]:
+@dataclass(frozen=True)
+class Limits:
     """What the vehicle can do and where it may be."""
 
-    def state(graph: fg.Graph, x: fg.Family, u: fg.Family) -> Gives[Now]:
+    settings: ControllerSettings
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Bound controls, heights and attitude."""
+        s = self.settings
         graph.bound(u, lower=s.box[0], upper=s.box[1], name="control limits")
         free, lean = np.inf, s.lean_limit
         box = np.full((s.horizon, 3), free)
@@ -90,27 +125,31 @@ def limits(s: ControllerSettings) -> Part[Now]:
             landmarks.tilt, x.R[1:], np.zeros(3), lower=[-lean, -lean, -free], upper=[lean, lean, free], name="lean"
         )
 
-        def data(now: Now) -> Given:  # heights as far as a vehicle keeps them that stops climbing or sinking
-            least, most = (np.full((s.horizon, 3), side * np.inf) for side in (-1.0, 1.0))
-            stop = stopping_height(now.present[2], now.present[9], s.dt * np.arange(1.0, s.horizon + 1))
-            least[:, 2] = np.minimum(s.height_limits[0], stop - SPARE)
-            most[:, 2] = np.maximum(s.height_limits[1], stop + SPARE)
-            return {low: least, high: most}
-
-        return data
-
-    return state
+    def data(self, now: Now[Flown]) -> Mapping[str, ArrayLike]:
+        """Heights as far as a vehicle keeps them that stops climbing or sinking."""
+        s = self.settings
+        least, most = (np.full((s.horizon, 3), side * np.inf) for side in (-1.0, 1.0))
+        stop = stopping_height(now.present[2], now.present[9], s.dt * np.arange(1.0, s.horizon + 1))
+        least[:, 2] = np.minimum(s.height_limits[0], stop - SPARE)
+        most[:, 2] = np.maximum(s.height_limits[1], stop + SPARE)
+        return {"low": least, "high": most}
 
 
-def leaning(s: ControllerSettings) -> Part[FlightNow]:
+@dataclass(frozen=True)
+class Leaning:
     """Cost of leaning otherwise than at hover."""
 
-    def state(graph: fg.Graph, x: fg.Family, u: fg.Family) -> Gives[FlightNow]:
-        upright = graph.data("upright", UP)
-        graph.minimize(landmarks.tilt, x.R[1:], upright, sigma=s.weighted(s.level_sigma), name="level")
-        return lambda now: {upright: SO3.act(SO3.inverse(level(now.belief)), UP)}
+    settings: ControllerSettings
 
-    return state
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the cost."""
+        upright = graph.data("upright", UP)
+        sigma = self.settings.weighted(self.settings.level_sigma)
+        graph.minimize(landmarks.tilt, x.R[1:], upright, sigma=sigma, name="level")
+
+    def data(self, now: Now[Flown]) -> Mapping[str, ArrayLike]:
+        """Where up is at hover."""
+        return {"upright": SO3.act(SO3.inverse(level(now.given.belief)), UP)}
 
 
 def level(belief: Belief) -> Array:
@@ -120,10 +159,15 @@ def level(belief: Belief) -> Array:
     return SO3.compose(quadrotor.hover_attitude(belief.parameters), heading)
 
 
-def following(s: ControllerSettings) -> Part[FlightNow]:
+@dataclass(frozen=True)
+class Following:
     """Costs of leaving the reference in position and velocity, others at its end."""
 
-    def state(graph: fg.Graph, x: fg.Family, u: fg.Family) -> Gives[FlightNow]:
+    settings: ControllerSettings
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the costs."""
+        s = self.settings
         n, last = s.horizon, np.sqrt(s.terminal_weight)
         positions = graph.data("reference positions", np.zeros((n - 1, 3)), each=True)
         velocities = graph.data("reference velocities", np.zeros((n - 1, 3)), each=True)
@@ -134,74 +178,85 @@ def following(s: ControllerSettings) -> Part[FlightNow]:
         graph.minimize(fg.prior, x.p[-1], end, sigma=position / last, name="end of way")
         graph.minimize(fg.prior, x.v[-1], leaving, sigma=velocity / last, name="final pace")
 
-        def data(now: FlightNow) -> Given:
-            places, speeds = now.reference.positions, now.reference.velocities
-            return {positions: places[1:-1], velocities: speeds[1:-1], end: places[-1], leaving: speeds[-1]}
+    def data(self, now: Now[Flown]) -> Mapping[str, ArrayLike]:
+        """The reference."""
+        places, speeds = now.given.reference.positions, now.given.reference.velocities
+        return {
+            "reference positions": places[1:-1],
+            "reference velocities": speeds[1:-1],
+            "end of reference": places[-1],
+            "velocity at the end": speeds[-1],
+        }
 
-        return data
 
-    return state
-
-
-def clearance(s: ControllerSettings, walls: Array) -> Part[FlightNow]:
+@dataclass(frozen=True)
+class Clearance:
     """Hard clearance from cylinders, moving discs and walls (W, 2, 2) [m]."""
 
-    def state(graph: fg.Graph, x: fg.Family, u: fg.Family) -> Gives[FlightNow]:
-        n, m, count = s.horizon, s.cylinders + s.movers, len(walls)
+    settings: ControllerSettings
+    walls: Array
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the constraints."""
+        s = self.settings
+        n, m, count = s.horizon, s.cylinders + s.movers, len(self.walls)
         centres, radii = slots(graph, s)
         least = graph.data("clearances", np.zeros((n, m)), each=True)
         discs = x.p[1:], centres, radii
         graph.constrain(avoidance.cylinder_clearance, *discs, lower=least, name="cylinders")
-        beside = graph.data("wall clearances", np.zeros((n, count)), each=True) if count else None
-        if beside is not None:
-            segments = x.p[1:], walls, np.zeros(count)
+        if count:
+            beside = graph.data("wall clearances", np.zeros((n, count)), each=True)
+            segments = x.p[1:], self.walls, np.zeros(count)
             graph.constrain(avoidance.segment_clearance, *segments, lower=beside, name="walls")
 
-        def data(now: FlightNow) -> Given:
-            others = now.others
-            found: Given = {centres: others.centres, radii: others.radii, least: others.limits}
-            return found if beside is None else {**found, beside: others.wall_limits}
-
-        return data
-
-    return state
+    def data(self, now: Now[Flown]) -> Mapping[str, ArrayLike]:
+        """What fills the slots."""
+        others = now.given.others
+        found: dict[str, ArrayLike] = {"centres": others.centres, "radii": others.radii, "clearances": others.limits}
+        return found | ({"wall clearances": others.wall_limits} if len(self.walls) else {})
 
 
-def potential(s: ControllerSettings, walls: Array, target: Array, squares: bool) -> Part[FlightNow]:
+@dataclass(frozen=True)
+class Potential:
     """Ta's costs |p - l_g|^2 and 1/d, with d between the hull and what stands or moves (section V-A).
 
     Far from its target a vehicle would race: its speed is limited.
 
-    Args:
-        s: weights and limits.
+    Attributes:
+        settings: weights and limits.
         walls: (W, 2, 2) [m].
         target: (3,) [m].
         squares: whether 1/d is stated as a sum of squares.
     """
 
-    def state(graph: fg.Graph, x: fg.Family, u: fg.Family) -> Gives[FlightNow]:
+    settings: ControllerSettings
+    walls: Array
+    target: Array
+    squares: bool
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the costs, and bound the speed."""
+        s = self.settings
         n, most = s.horizon, s.guide.speed
         centres, radii = slots(graph, s)
-        graph.minimize(fg.prior, x.p[1:], target, sigma=s.weighted(s.goal_sigma), name="goal")
+        graph.minimize(fg.prior, x.p[1:], self.target, sigma=s.weighted(s.goal_sigma), name="goal")
         speed = graph.data("speed", np.full((n, 3), most), each=True)
         speed_back = graph.data("speed back", np.full((n, 3), -most), each=True)
         graph.bound(x.v[1:], lower=speed_back, upper=speed, name="speed")
         discs = x.p[1:], centres, radii
-        repel(graph, s, squares, avoidance.cylinder_clearance, *discs, name="cylinders")
-        if len(walls):
-            hulls = x.p[1:], walls, np.full(len(walls), s.vehicle_radius)
-            repel(graph, s, squares, avoidance.segment_clearance, *hulls, name="walls")
+        repel(graph, s, self.squares, avoidance.cylinder_clearance, *discs, name="cylinders")
+        if len(self.walls):
+            hulls = x.p[1:], self.walls, np.full(len(self.walls), s.vehicle_radius)
+            repel(graph, s, self.squares, avoidance.segment_clearance, *hulls, name="walls")
 
-        def data(now: FlightNow) -> Given:
-            times = s.dt * np.arange(1.0, n + 1)
-            excess = np.maximum(np.abs(now.present[7:10]) - most, 0.0) + SPARE
-            allowed = most + excess * np.exp(-times / SLOWING)[:, None]
-            hulls = now.others.radii + s.vehicle_radius
-            return {centres: now.others.centres, radii: hulls, speed: allowed, speed_back: -allowed}
-
-        return data
-
-    return state
+    def data(self, now: Now[Flown]) -> Mapping[str, ArrayLike]:
+        """What fills the slots, and a speed that the vehicle can come down to."""
+        s, others = self.settings, now.given.others
+        times, most = s.dt * np.arange(1.0, s.horizon + 1), s.guide.speed
+        excess = np.maximum(np.abs(now.present[7:10]) - most, 0.0) + SPARE
+        allowed = most + excess * np.exp(-times / SLOWING)[:, None]
+        hulls = others.radii + s.vehicle_radius
+        return {"centres": others.centres, "radii": hulls, "speed": allowed, "speed back": -allowed}
 
 
 def slots(graph: fg.Graph, settings: ControllerSettings) -> tuple[fg.Data, fg.Data]:

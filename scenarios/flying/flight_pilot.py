@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 from unifg.errors import ScenarioError
+from unifg.horizon import Plan
 from unifg.models import quadrotor
 from unifg.scenarios.flying.estimator import DeadReckoningEstimator, Estimator, EstimatorSettings
 from unifg.scenarios.flying.flight_control import Controller
 from unifg.scenarios.flying.flight_joint import BELIEVABLE, JointSettings, SharedFlight
 from unifg.scenarios.flying.flight_settings import ControllerSettings
-from unifg.scenarios.horizon.loop import Plan
 from unifg.scenarios.seeing.belief import Belief
 from unifg.scenarios.seeing.line_tracker import LineTracker
 from unifg.scenarios.seeing.readings import Reading
@@ -55,7 +55,7 @@ class Pilot:
         self.clock.split("estimate")
         plan = self.controller.plan(self.alone, movers)
         self.clock.split("plan")
-        self.belief = self.controller.past.believed(self.alone)
+        self.belief = self.controller.belief
         return plan
 
 

@@ -67,6 +67,7 @@ class Loop:
         sent: (delay, m) controls that have been decided and act from the next tick on, the next one first.
         estimate: (storage,) present state as it is believed after the last tick.
         statics: (count, storage) statics as they are believed after the last tick, by name.
+        believed: whether both are what a joint solve says, and not the past alone.
         solution: of the last tick; None before.
         statuses: how often solves ended in what way.
         sources: how often what was applied; "late" counts plans that came after the deadline.
@@ -159,9 +160,9 @@ class Loop:
         self.milliseconds: deque[float] = deque(maxlen=TIMES)
         self.guess: Guess | None = None
         self.solution: Solution | None = None
-        self.lagging, self._begun = 0, False
         self.sent: Array = np.zeros((delay, size))
-        self.reset()
+        self.lagging, self.failed = 0, False
+        self._believe_nothing()
 
     def _tied(self, graph: Graph, pull: float | Sequence[float] | Array) -> Tie:
         if self.coupling != "joint":
@@ -196,11 +197,10 @@ class Loop:
         if self.window is None:
             raise GraphError("a tick needs a window; without one, give the present to plan()")
         begin = self._clock()
-        if self._begun:
+        if self.window.solution is not None:
             self.window.move(self.applied if applied is None else applied, time)
         elif time is not None:
             self.window.history.times[:] = time
-        self._begun = True
         for name, value in (measured or {}).items():
             self.window.record(name, value)
         self.window.estimate(given)
@@ -213,15 +213,16 @@ class Loop:
         Args:
             present: state.
             given: what terms ask for in ``now.given``.
-            statics: (count, storage) by name; those at the start by default.
+            statics: (count, storage) by name; by default those of the window, without one those at the start.
         """
         begin = self._clock()
         return self._plan(self.now(present, given, statics), begin)
 
     def now(self, present: ArrayLike, given: Any = None, statics: Mapping[str, Array] | None = None) -> Now[Any]:
         """What terms are asked with; arguments as of :meth:`plan`."""
-        known = {static.name: static.values for static in self.robot.statics} | dict(statics or {})
         history = None if self.window is None else self.window.history
+        known = {static.name: static.values for static in self.robot.statics} if history is None else history.statics
+        known = {name: values.copy() for name, values in known.items()} | dict(statics or {})
         return Now(given, np.array(present, dtype=np.float64), self.applied.copy(), known, history)
 
     def data(self, now: Now[Any]) -> dict[Data, ArrayLike]:
@@ -239,10 +240,28 @@ class Loop:
         solution = run.solve(self.tie.begin(guess, now), data=data)
         self.solution = solution
         self.statuses[solution.status] += 1
+        choice = self.decide(solution, now, late=self._clock() - begin > self._deadline)
+        self._believe(solution, choice, present)
+        decided = np.concatenate([self.sent, choice.controls[:1]])
+        self.applied, self.sent = decided[0], decided[1:]
+        elapsed = 1e3 * (self._clock() - begin)
+        self.milliseconds.append(elapsed)
+        return Plan(
+            choice.controls, choice.states, solution.status, solution.iterations, choice.source, self.kept.excess,
+            elapsed,
+        )  # fmt: skip
+
+    def decide(self, solution: Solution, now: Now[Any], *, late: bool = False) -> Choice:
+        """Judge a solve, keep its plan if it may be applied, and say where the next one begins.
+
+        Args:
+            solution: of this tick.
+            now: what the terms were asked with.
+            late: whether the deadline has passed, so that the plan serves the next tick only.
+        """
         states, controls = solution[self.x], solution[self.u]
         self.kept.age += 1
         choice = self.judge(solution, states, controls, now, self.kept)
-        late = self._clock() - begin > self._deadline
         if late and choice.source == "solved":
             instead = KeepThenBrake(self.robot, brake=getattr(self.judge, "brake", None)).instead(now, self.kept)
             self._accept(solution, states, controls, choice)
@@ -252,16 +271,8 @@ class Loop:
         else:
             self.failed = True
             self.guess = None if choice.after is None else self.guess_of(*choice.after, now)
-        self._believe(solution, choice, present)
         self.sources[choice.source] += 1
-        decided = np.concatenate([self.sent, choice.controls[:1]])
-        self.applied, self.sent = decided[0], decided[1:]
-        elapsed = 1e3 * (self._clock() - begin)
-        self.milliseconds.append(elapsed)
-        return Plan(
-            choice.controls, choice.states, solution.status, solution.iterations, choice.source, self.kept.excess,
-            elapsed,
-        )  # fmt: skip
+        return choice
 
     def _acting(self, now: Now[Any]) -> Now[Any]:
         """What terms are asked with, when the plan acts."""
@@ -296,6 +307,7 @@ class Loop:
 
     def _believe(self, solution: Solution, choice: Choice, now: Now[Any]) -> None:
         said = self.tie.believed(solution) if self._believable(solution, choice) else None
+        self.believed = said is not None
         self.estimate, self.statics = said or (now.present, dict(now.statics))
 
     def stays_behind(self, behind: bool) -> bool:
@@ -313,6 +325,12 @@ class Loop:
         self.guess = None
         self.failed = False
 
+    def abandon(self) -> None:
+        """Drop the warm start and the plan that is kept."""
+        self.forget()
+        self.kept.clear()
+        self.lagging = 0
+
     def reset(self, start: ArrayLike | None = None, sigma: ArrayLike | None = None) -> None:
         """Forget the plan that is kept and the past, too; counts of statuses and times stay.
 
@@ -320,17 +338,18 @@ class Loop:
             start: (storage,) believed state; None for that of the beginning.
             sigma: (d,) its standard deviations, or its covariance; None for those of the beginning.
         """
-        self.forget()
-        self.kept.clear()
-        self.lagging = 0
+        self.abandon()
+        if self.window is not None:
+            self.window.reset(start, sigma)
+        self._believe_nothing()
+
+    def _believe_nothing(self) -> None:
+        """What is known before the first tick."""
         self.applied = np.zeros(self.robot.control.storage)
         self.sent = np.zeros_like(self.sent)
         self.solution = None
-        self._begun = False
-        if self.window is not None:
-            self.window.reset(start, sigma)
         self.estimate = self.robot.state.identity() if self.window is None else self.window.present
-        self.statics = {static.name: static.values for static in self.robot.statics}
+        self.statics, self.believed = {static.name: static.values for static in self.robot.statics}, False
 
 
 def _close(solution: Solution, choice: Choice) -> bool:

@@ -176,6 +176,8 @@ class Past:
             if first.min() < 0 or last.max() > self._history.length:
                 raise GraphError(f"term '{term.name}' of the past reaches into the future", term=term.name)
             self.reach = max(self.reach, int((last - first).max()))
+            if self._history.filled:
+                continue
             switch = graph.data(f"{term.name}: entered", np.ones(term.count, dtype=bool), each=True)
             own[switch], term.active = term.active, switch
             switches.append((switch, first.astype(np.intp)))
@@ -184,16 +186,18 @@ class Past:
     def _state_priors(self, graph: Graph) -> None:
         """What was believed at the start, what has left, and what holds empty places."""
         x, history, left = self.x, self._history, self._left
-        count = len(x)
-        self._initial = graph.data("initial", np.zeros(count, dtype=bool), each=True)
+        self._beginning = x[:1] if history.filled else x  # of a window that is never empty it leaves at once
+        self._initial = graph.data("initial", np.zeros(len(self._beginning), dtype=bool), each=True)
         self._start = graph.data("start", left.initial[0]), graph.data("information at the start", left.initial[1])
         start, information = self._start
-        graph.minimize(prior, x, start, information=information, active=self._initial, name="initial")
+        about_start = self._beginning, start
+        graph.minimize(prior, *about_start, information=information, active=self._initial, name="initial")
         self._resting = graph.data("empty places", left.initial[0])
         self._empty = graph.data("empty", np.zeros(history.length, dtype=bool), each=True)
-        graph.minimize(prior, x[:-1], self._resting, active=self._empty, name="empty places")
-        for name, family in self._steps.items():
-            graph.minimize(prior, family, family.manifold.identity(), active=self._empty, name=f"empty {name}")
+        if not history.filled:
+            graph.minimize(prior, x[:-1], self._resting, active=self._empty, name="empty places")
+            for name, family in self._steps.items():
+                graph.minimize(prior, family, family.manifold.identity(), active=self._empty, name=f"empty {name}")
         self._believed: dict[str, tuple[Data, Data]] = {}
         for name, family in self._statics.items():
             if name in self._known:
@@ -237,13 +241,13 @@ class Past:
             found[switch] = entered if own is None else entered & np.asarray(own, dtype=bool)
         found |= {
             self._applied: history.controls,
-            self._initial: history.initial,
+            self._initial: history.initial[: len(self._beginning)],
             self._start[0]: left.initial[0],
             self._start[1]: left.initial[1],
-            self._resting: history.present,
-            self._empty: np.arange(history.length) < history.empty,
             self._arrived: np.array([left.arrival is not None]),
         }
+        if not history.filled:
+            found |= {self._resting: history.present, self._empty: np.arange(history.length) < history.empty}
         for name, (reference, weight) in self._believed.items():
             found[reference], found[weight] = left.statics[name]
         if left.arrival is not None:

@@ -19,6 +19,7 @@ class History:
 
     Attributes:
         length: number L of steps.
+        filled: whether no place is ever empty.
         entered: how many of them have been made.
         states: (L + 1, storage) believed, the present last.
         controls: (L, m) applied from each node to the next.
@@ -28,7 +29,14 @@ class History:
         initial: (L + 1,) whether a node is the one everything began at.
     """
 
-    def __init__(self, robot: Robot, length: int, start: ArrayLike, records: Mapping[str, tuple[int, ...]]) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        length: int,
+        start: ArrayLike,
+        records: Mapping[str, tuple[int, ...]],
+        filled: bool = False,
+    ) -> None:
         """Begin with the present alone.
 
         Args:
@@ -36,6 +44,7 @@ class History:
             length: number of steps.
             start: (storage,) present state.
             records: shapes of what is measured at a node, by name.
+            filled: whether steps of no duration have led to the present, so that no place is empty.
 
         Raises:
             GraphError: when there is no step, or the start is not on the robot's manifold.
@@ -45,7 +54,7 @@ class History:
         present = np.asarray(start, dtype=np.float64)
         if present.shape != (robot.state.storage,) or not np.all(robot.state.is_valid(present)):
             raise GraphError(f"the start {present} is not a point of {robot.state.name}")
-        self.length = length
+        self.length, self.filled = length, filled
         self.states = np.tile(present, (length + 1, 1))
         self.controls = np.zeros((length, robot.control.storage))
         self.times = np.zeros(length + 1)
@@ -59,9 +68,9 @@ class History:
 
     def begin(self, start: Array) -> None:
         """Forget everything; the present is a state (storage,)."""
-        self.entered = 0
+        self.entered = self.length if self.filled else 0
         self.states[:], self.controls[:], self.times[:] = start, 0.0, 0.0
-        self.initial = np.arange(self.length + 1) == self.length
+        self.initial = np.arange(self.length + 1) == self.empty
         self.statics = {name: values.copy() for name, values in self._starting.items()}
         for name, array in self.steps.items():
             array[:] = self._resting[name]

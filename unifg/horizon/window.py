@@ -21,7 +21,7 @@ from unifg.horizon.robot import Robot, information_of
 from unifg.horizon.spread import JointCovariance
 from unifg.horizon.statements import Now, Recording, Term
 from unifg.language.terms import Constraint
-from unifg.language.variables import Selection
+from unifg.language.variables import Data, Family, Selection
 from unifg.solvers.interior_point.method import InteriorPoint
 from unifg.solvers.least_squares import LevenbergMarquardt
 from unifg.typing import Array, ArrayLike
@@ -45,6 +45,7 @@ class Window:
         solution: of the last estimate; None before.
         iterations: of the last estimate.
         run: the prepared solver.
+        spread: what finds covariances.
         statuses: how often estimates ended in what way.
     """
 
@@ -58,6 +59,7 @@ class Window:
         sigma: ArrayLike,
         solver: Solver | None = None,
         arrival: Arrival | None = None,
+        filled: bool = False,
         rounds: int = 1,
         steady: float = 0.0,
     ) -> None:
@@ -72,6 +74,9 @@ class Window:
             solver: of the window's graph; by default Levenberg-Marquardt, where terms of the past constrain the
                 interior point.
             arrival: coordinates of the prior of what has left; by default the variables' own tangent spaces.
+            filled: whether the places before the start are nodes, too, that steps of no duration have led away from:
+                for dynamics that take the duration of a step from ``now.past.times``, and then say that nothing moved.
+                The structure of the problem is that of a full window from the first tick on.
             rounds: how often at most, in one estimate, terms are asked for their data at what is believed and the
                 window is solved: more than once where data depend on beliefs, as associations do.
             steady: a round that moves the present state by less, in every coordinate of its tangent space, is the last.
@@ -87,7 +92,7 @@ class Window:
                 self._records.update(term.records)
         self._start = np.array(start, dtype=np.float64)
         self._sigma = _covariance(sigma, robot.state.dim)
-        self.history = History(robot, length, self._start, self._records)
+        self.history = History(robot, length, self._start, self._records, filled)
         self.left = Left(robot, self._start, self._sigma)
         graph = Graph()
         x = graph.variables("x", robot.state, length + 1)
@@ -99,7 +104,7 @@ class Window:
             solver = InteriorPoint() if constrained else LevenbergMarquardt()
         self.run = solver.prepare(graph)
         self._look = replace(solver, max_iterations=0).prepare(graph)
-        self._spread = JointCovariance(self.run.program, x[-1], *self._past.statics)
+        self.spread = JointCovariance(self.run.program, x[-1], *self._past.statics)
         self.solution: Solution | None = None
         self.statuses: Counter[Status] = Counter()
         self.iterations, self._rounds, self._steady = 0, rounds, steady
@@ -122,7 +127,7 @@ class Window:
         """
         if self._due and self.solution is not None:
             self._due = False
-            found = self._spread(self.solution.values)
+            found = self.spread(self.solution.values)
             if found is None:
                 logger.warning("the window's information is singular: the covariance stays as it was")
             else:
@@ -230,16 +235,24 @@ class Window:
         statics = {name: values.copy() for name, values in history.statics.items()}
         return Now(given, self.present, applied.copy(), statics, history)
 
+    def data(self, given: Any = None) -> dict[Data, ArrayLike]:
+        """Data of the window's own graph."""
+        return self._past.data(self.now(given))
+
+    def guess(self) -> dict[Family, Array]:
+        """What is believed, by the families of the window's own graph."""
+        return {self._past.x.family: self._past.nodes(), **self._past.guess()}
+
     def estimate(self, given: Any = None) -> Solution:
         """Solve the window and believe it, unless the answer is none; then the prediction is kept."""
         past, self.iterations = self._past, 0
         for _ in range(self._rounds):
-            before, data = self.present, past.data(self.now(given))
-            solution = self.run.solve({past.x.family: past.nodes(), **past.guess()}, data=data)
+            before, data = self.present, self.data(given)
+            solution = self.run.solve(self.guess(), data=data)
             self.statuses[solution.status] += 1
             self.iterations += solution.iterations
             if solution.status in USELESS:
-                solution = self._look.solve({past.x.family: past.nodes(), **past.guess()}, data=data)
+                solution = self._look.solve(self.guess(), data=data)
                 break
             past.take(solution)
             if np.abs(self.robot.state.local(before, self.history.present)).max() < self._steady:
@@ -249,8 +262,7 @@ class Window:
 
     def estimate_nothing(self, given: Any = None) -> None:
         """Look at the window where it is believed to be, without moving it."""
-        past = self._past
-        self._conclude(self._look.solve({past.x.family: past.nodes(), **past.guess()}, data=past.data(self.now(given))))
+        self._conclude(self._look.solve(self.guess(), data=self.data(given)))
 
     def _conclude(self, solution: Solution) -> None:
         self.solution, self._due = solution, True
