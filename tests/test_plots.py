@@ -131,6 +131,22 @@ def test_members_stand_below_what_they_are_joined_to() -> None:
     np.testing.assert_allclose(circles[len(x) :, 0], np.arange(len(u)) + 0.5)
 
 
+def test_lines_stand_where_few_edges_cross() -> None:
+    """The second family below the first, later ones above unless they are joined to those below."""
+    graph = fg.Graph()
+    x, u, seen, mass = (graph.variables(*of) for of in (
+        ("x", fg.SE2, 6), ("u", fg.Rn(2), 5), ("seen", fg.Rn(2), 3), ("mass", fg.Rn(1), 1),
+    ))  # fmt: skip
+    graph.minimize(lambda p, q: p[:, :2] - q, x[:3], seen, name="sightings")
+    graph.minimize(lambda p, c, q, m: q[:, :2] - p[:, :2] - m * c, x[:-1], u, x[1:], mass, name="motion")
+    for name, of in (("x own", x), ("u own", u), ("seen own", seen), ("mass own", mass)):
+        graph.minimize(lambda p: p[:, :1], of, name=name)
+    texts = [text for text in graph.draw().axes[0].texts if text.get_text() in graph._names | set(graph.families)]
+    assert [text.get_text() for text in sorted(texts, key=lambda text: -text.get_position()[1])] == [
+        "seen own", "seen", "sightings", "x own", "x", "motion", "u", "u own", "mass", "mass own",
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize("wanted", [[0.0, 0.0, 0.0], [2.0, 1.0, 1.0, 9.0], [5.0], [0.0, 0.4, 3.0, 3.3]])
 def test_places_are_set_apart_about_their_middle(wanted: list[float]) -> None:
     found = _apart(np.array(wanted), 0.5)

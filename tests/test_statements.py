@@ -150,6 +150,8 @@ def test_a_refused_statement_leaves_the_graph_as_it_was(case: str) -> None:
         assert caught.value.term == "t" or "bound" in str(caught.value)
         assert case == "bound on an array" or caught.value.family in ("x", "u"), case
         assert any(word in str(caught.value) for word in ("'x'", "'u'", "of x", "argument", "takes one family")), case
+        said = str(caught.value)
+        assert "(family" not in said or f"'{caught.value.family}'" not in said.partition("(family")[0]  # said once
     graph.minimize(fg.prior, x, np.zeros(3), sigma=[1, 2, 3], name="t")
     graph.bound(u, lower=-1, upper=[1, np.inf], name="t 2")
     assert [term.name for term in graph.terms] == ["kept", "prior", "t", "t 2"]

@@ -34,10 +34,5 @@ def doubles(what: str, given: Any, *, term: str | None = None, flags: bool = Fal
         return np.asarray(array, dtype=np.float64)
     if flags and array.dtype == bool:
         return array
-    if array.dtype.kind == "O" and array.ndim == 0:
-        found = f"{given!r}"[:80]
-    else:
-        found = _KINDS.get(array.dtype.kind, f"an array of {array.dtype} objects")
-        if array.ndim == 0:
-            found = f"{given!r}"[:80]
+    found = _KINDS.get(array.dtype.kind, f"an array of {array.dtype} objects") if array.ndim else f"{given!r}"[:80]
     raise GraphError(f"{what} must be real numbers, found {found}: convert to float64 first", term=term)

@@ -141,16 +141,27 @@ def _apart(wanted: Array, gap: float = 1.0) -> Array:
 
 
 def _lines(terms: Sequence[Term], order: Sequence[Family]) -> list[Line]:
-    """Families from large to small, between them the terms that join them, about them their own."""
+    """The largest family in the middle, others below and above, between them what joins them, about them their own.
+
+    The second stands below; later ones stand above where nothing joins them to those below.
+    """
     groups = alike(terms, ROWS)
     number = {family: k for k, family in enumerate(order)}
+    above = {order[0]}
     lines: list[Line] = []
     for k, family in enumerate(order):
         own = [group for group in groups if group.first.families == [family]]
         own.sort(key=lambda group: -len(group.first.selections))  # those that join members next to them
         joint = [group for group in groups if sorted(map(number.__getitem__, group.first.families))[1:2] == [k]]
         mine = _shifted(own)
-        lines += [*mine[::-1], Line(family)] if k == 0 else [*map(Line, joint), Line(family), *mine]
+        joined = {other for group in groups if family in group.first.families for other in group.first.families}
+        if k == 0:
+            lines = [*mine[::-1], Line(family)]
+        elif k > 1 and joint and joined - {family} <= above:
+            above.add(family)
+            lines = [*mine[::-1], Line(family), *map(Line, joint), *lines]
+        else:
+            lines += [*map(Line, joint), Line(family), *mine]
     return lines
 
 
