@@ -3,8 +3,8 @@
 A barrier function h(x, t, ...) is at least zero where all is well. It is made of a clearance: any residual that says
 how far something is, in metres, one column per obstacle, as those of :mod:`unifg.models.avoidance`, of
 :mod:`unifg.models.obstacles` and of :mod:`unifg.models.clearances`, or a function of one's own. t is the time from now;
-who moves with it is said by :func:`still`, :func:`moving` or :func:`thrown`. Then h' >= -alpha h is asked for (eq. 6),
-in one of two ways:
+who moves with it is said by :func:`still`, :func:`moving`, :func:`accelerated` or :func:`thrown`. Then h' >= -alpha h
+is asked for (eq. 6), in one of two ways:
 
 - :func:`decay`, between two nodes: h(x_next, t + dt) >= exp(-alpha dt) h(x, t), whatever dt. It is what h' >= -alpha h
   comes to after dt seconds, and keeps the sign of h for any alpha; with 1 - alpha dt in the place of the exponential a
@@ -32,7 +32,17 @@ from unifg.lie import Manifold
 from unifg.models import quadrotor
 from unifg.typing import Array
 
-__all__ = ["condition", "decay", "inverse", "moving", "still", "thrown", "uncertain", "velocity_extended"]
+__all__ = [
+    "accelerated",
+    "condition",
+    "decay",
+    "inverse",
+    "moving",
+    "still",
+    "thrown",
+    "uncertain",
+    "velocity_extended",
+]
 
 Clearance: TypeAlias = Callable[..., Array] | Residual
 """``clearance(x, ...)``: (n, M) [m], x (n, storage) positions, poses or states."""
@@ -72,13 +82,23 @@ def moving(clearance: Clearance) -> Barrier:
     return of_moving
 
 
-def thrown(clearance: Clearance) -> Barrier:
-    """``h(x, t, centre, velocity, *rest)``: of what falls freely in space, without drag."""
+def accelerated(clearance: Clearance) -> Barrier:
+    """``h(x, t, centre, velocity, acceleration, *rest)``: of what accelerates, as by falling [m/s^2]."""
     axes = _axes(clearance)
 
-    def of_thrown(x: Array, t: Any, centre: Array, velocity: Array, *rest: Any) -> Array:
+    def of_accelerated(x: Array, t: Any, centre: Array, velocity: Array, acceleration: Array, *rest: Any) -> Array:
         s = _per_factor(t, axes)
-        return clearance(x, centre + s * velocity + 0.5 * s * s * DOWN, *rest)
+        return clearance(x, centre + s * velocity + 0.5 * s * s * acceleration, *rest)
+
+    return of_accelerated
+
+
+def thrown(clearance: Clearance) -> Barrier:
+    """``h(x, t, centre, velocity, *rest)``: of what falls freely in space, without drag."""
+    falling = accelerated(clearance)
+
+    def of_thrown(x: Array, t: Any, centre: Array, velocity: Array, *rest: Any) -> Array:
+        return falling(x, t, centre, velocity, DOWN, *rest)
 
     return of_thrown
 

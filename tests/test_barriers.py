@@ -23,6 +23,7 @@ from unifg.models import (
     obstacles,
     quadrotor,
     terminal,
+    unicycle,
     universal,
 )
 from unifg.models.distance_map import DistanceMap
@@ -79,6 +80,36 @@ def test_a_rate_of_what_is_known_is_refused_in_a_trace() -> None:
     graph.minimize(wrong, p)
     with pytest.raises(GraphError, match="depends on nothing unknown"):
         graph.compile()
+
+
+def test_residuals_may_be_called_in_a_trace() -> None:
+    """Stated as plain functions or compiled by hand, on one row for each factor or on several."""
+    graph = fg.Graph()
+    x, u = graph.variables("x", fg.SE2, 4), graph.variables("u", fg.Rn(2), 3)
+    shifted = fg.residual(lambda p: avoidance.sphere_clearance(p + 1.0, CENTRE, RADIUS))
+    p = graph.variables("p", fg.Rn(3), 2)
+    half = 0.5
+
+    def both(x: Array, u: Array, y: Array) -> Array:
+        return np.concatenate([half * unicycle.dynamics(x, u, y, 0.1), fg.SE2.local(x, y)], axis=1)
+
+    def all_corners(x: Array) -> Array:  # three rows of arguments for each factor
+        corners = np.concatenate([fg.SE2.compose(x, np.array([[a, 0.0, 0.0]])) for a in (-0.3, 0.0, 0.3)])
+        away = obstacles.disc_clearance(corners, CENTRE[:, :2], RADIUS).reshape(3, -1, 2)
+        least: Array = away.min(axis=(0, 2))[:, None]
+        return least
+
+    graph.minimize(both, x[:-1], u, x[1:], name="both")
+    graph.minimize(shifted, p, name="shifted")
+    graph.minimize(all_corners, x, name="corners")
+    graph.minimize(fg.prior, x, [0.0, 0.0, 0.0])
+    graph.minimize(fg.prior, u, [0.0, 0.0])
+    graph.minimize(fg.prior, p, [0.0, 0.0, 0.0])
+    guess = {x: fg.SE2.random(RNG, (4,)), u: RNG.normal(size=(3, 2)), p: RNG.normal(size=(2, 3))}
+    found = graph.check(guess)
+    assert found and {found.routes[name] for name in ("both", "shifted", "corners")} == {EXACT}, str(found)
+    lin = graph.compile().linearize(guess).residual
+    np.testing.assert_allclose(lin[:18].reshape(3, 6), both(guess[x][:-1], guess[u], guess[x][1:]), atol=1e-12)
 
 
 WALL = np.zeros((20, 30), dtype=bool)
@@ -172,6 +203,16 @@ def test_what_is_thrown_falls() -> None:
     h = barriers.thrown(clearances.to_point)
     found = h(np.zeros((1, 3)), 0.5, np.array([[1.0, 0.0, 2.0]]), np.array([[-1.0, 0.0, 1.0]]), 0.1)
     assert found[0, 0] == pytest.approx(np.hypot(0.5, 2.0 + 0.5 - 0.125 * 9.81) - 0.1)
+
+
+def test_some_of_a_set_may_fall() -> None:
+    h = barriers.accelerated(avoidance.sphere_clearance)
+    velocity, fall = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]), np.array([[0.0, 0.0, -9.81], [0.0, 0.0, 0.0]])
+    p, t = RNG.normal(size=(3, 3)), np.array([0.0, 0.2, 0.5])
+    there = CENTRE + t[:, None, None] * velocity + 0.5 * (t**2)[:, None, None] * fall
+    np.testing.assert_allclose(
+        h(p, t, CENTRE, velocity, fall, RADIUS), np.linalg.norm(p[:, None] - there, axis=2) - RADIUS, atol=1e-13
+    )
 
 
 def test_in_the_papers_units_the_boundary_is_the_same() -> None:
@@ -393,6 +434,60 @@ def test_the_first_interval_is_a_tick() -> None:
             keeping.grid(count, tick, node)
 
 
+# ---------------------------------------------------------------- robot and obstacle estimated in the graph of the plan
+
+
+def catch_sight(k: float, seed: int, sightings: int = 8) -> tuple[Array, Array]:
+    """A ball thrown at a vehicle that would rather stay, seen from the past; the plan, and where the ball will be.
+
+    Position and velocity of the ball and the vehicle's own place are unknowns of the one graph; what is known of the
+    difference of both at each node, from the last solve, says how far to keep off.
+    """
+    rng = np.random.default_rng(seed)
+    dt, n, radius, sigma = 0.05, 10, 0.3, 0.04
+    down = np.array([0.0, 0.0, -0.5 * 9.81])
+    place, speed = np.array([3.0, 0.05, 0.3]), np.array([-6.0, 0.0, 2.0])  # of now; in half a second it is here
+    before = -dt * np.arange(sightings)[:, None]
+    seen = place + before * speed + before**2 * down + sigma * rng.normal(size=(sightings, 3))
+    ahead = dt * np.arange(n + 1)
+    graph = fg.Graph()
+    p = graph.variables("p", fg.Rn(3), n + 1)
+    ball, throw = graph.variables("ball", fg.Rn(3), 1), graph.variables("throw", fg.Rn(3), 1)
+    graph.minimize(fg.prior, p[0], np.zeros(3), sigma=0.02, name="where we are")
+
+    def sighting(p: Array, c: Array, v: Array, s: Array, z: Array) -> Array:
+        error: Array = c + s * v + s**2 * down - p - z
+        return error
+
+    here = p[np.zeros(sightings, dtype=int)]
+    graph.minimize(sighting, here, ball, throw, before, seen, sigma=sigma, name="seen")
+    graph.minimize(fg.prior, p[1:], np.zeros(3), sigma=1.0, name="stay")
+    graph.constrain(lambda p, q: q - p, p[:-1], p[1:], lower=-0.15, upper=0.15, name="speed")
+    roots = graph.data("roots", np.zeros((n, 3, 3)), each=True)
+    h = barriers.uncertain(barriers.thrown(clearances.to_point), k)
+    kept = keeping.keep(graph, h, p[1:], ahead[1:], roots, ball, throw, radius, obstacles=["ball"])
+    aside = 0.01 * np.arange(n + 1)[:, None] * [0.0, -1.0, 0.2]
+    guess = {p: aside, ball: place[None], throw: speed[None], **kept.guess()}
+    run = InteriorPoint().prepare(graph)
+    found = run.solve(guess, check=True)
+    joint = found.covariance(p[0], ball[0], throw[0])
+    spread = []
+    for t in ahead[1:]:
+        J = np.concatenate([-np.eye(3), np.eye(3), t * np.eye(3)], axis=1)
+        spread.append(np.linalg.cholesky(J @ joint @ J.T + 1e-12 * np.eye(3)))
+    found = run.solve(found, data={roots: np.array(spread)}, check=True)
+    assert np.linalg.norm(found[throw][0] - speed) < 1.5
+    s = ahead[1:, None]
+    return found[p][1:], np.linalg.norm(found[p][1:] - place - s * speed - s**2 * down, axis=1) - radius
+
+
+def test_three_standard_deviations_keep_off_a_ball_that_is_estimated() -> None:
+    """Without them every throw touches: by the noise, and by a plan that would rather believe the ball elsewhere."""
+    bold, careful = ([catch_sight(k, seed)[1].min() for seed in range(8)] for k in (0.0, 3.0))
+    assert max(bold) < 0.0
+    assert 0.0 < min(careful) and max(careful) < 0.5  # and no farther than the spread asks for
+
+
 # ---------------------------------------------------------------- between nodes
 
 
@@ -578,6 +673,20 @@ def test_a_terminal_set_keeps_hard_plans_possible(end: str) -> None:
 
 def test_without_a_terminal_set_hard_plans_end() -> None:
     assert not any(all(closed_loop("", seed)[0]) for seed in range(3))
+
+
+def test_the_sets_to_end_in_are_what_they_say() -> None:
+    h = barriers.still(avoidance.sphere_clearance)
+    left = terminal.brakeable(h, 2.0, 3.0, p=slice(0, 3), v=slice(3, 6))
+    x = np.array([[1.0, 0.0, 0.0, 0.0, 0.0, 1.0]])  # 0.6 and 0.25 m from the spheres
+    near = float(np.linalg.norm([0.5, 0.2, 0.1])) - 0.3
+    np.testing.assert_allclose(left(x, 0.0, CENTRE, RADIUS), [[0.2, 2.0 * near - 1.0, 0.5]], atol=1e-12)
+    whole = quadrotor.STATE.identity()[None].copy()
+    assert not terminal.resting(whole).any()
+    whole[0, 3:7], whole[0, 7:] = fg.SO3.exp(np.array([0.3, 0.0, 0.0])), (1.0, 2.0, 3.0)
+    np.testing.assert_allclose(terminal.resting(whole), [[1.0, 2.0, 3.0, 0.0, -np.sin(0.3)]], atol=1e-12)
+    whole[0, 3:7], whole[0, 7:] = fg.SO3.exp(np.array([0.0, 0.0, 2.0])), 0.0  # hover faces anywhere
+    np.testing.assert_allclose(terminal.resting(whole), np.zeros((1, 5)), atol=1e-12)
 
 
 def test_braking_stays_in_the_set() -> None:

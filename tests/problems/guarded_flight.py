@@ -42,6 +42,13 @@ def figure_eight(t: Array) -> tuple[Array, Array]:
     return states, controls
 
 
+def gust(now: float) -> Array:
+    """(6,) what the air does to rates [rad/s] and accelerations [m/s^2] at a time."""
+    k = np.arange(6)
+    push: Array = np.repeat([0.05, 0.5], 3) * np.sin((1.3 + 0.37 * k) * 7.0 * now + k)
+    return push
+
+
 def field_of(x: Array, u: Array) -> Array:
     """F of a quadrotor of mass one, written out."""
     lift = fg.SO3.act(x[:, 3:7], u[:, 3:] * np.array([0.0, 0.0, 1.0]))

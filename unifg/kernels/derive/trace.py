@@ -145,9 +145,6 @@ class Rebound:
         """A residual that another function calls: what its kernel is written as, row by row where that is compiled."""
         kernel = residual if isinstance(residual, Kernel) else residual.kernel
         if kernel is None:
-            assert isinstance(residual, Residual)
-            if residual.rows:
-                raise TraceError(f"calls '{residual.name}', which is compiled for one factor; give a batched function")
             return cast(Callable[..., Any], self.callable(residual.function))
         called = self.function(kernel.function)
 
