@@ -20,7 +20,7 @@ from unifg.machine.jit import compiled
 from unifg.models.quadrotor import STATE
 from unifg.typing import Array, ArrayLike
 
-__all__ = ["bearing_range", "height", "observe", "tilt"]
+__all__ = ["bearing_range", "height", "observe", "offset", "tilt"]
 
 
 def _bearing_range(x: Array, l: Array, z: Array) -> Array:  # noqa: E741
@@ -134,3 +134,10 @@ def observe(x: ArrayLike, l: ArrayLike) -> Array:  # noqa: E741
     landmarks = np.asarray(l, dtype=np.float64)
     state = np.asarray(x, dtype=np.float64)
     return bearing_range(state, landmarks, np.zeros(2)) if landmarks.shape[:1] != (0,) else np.empty((0, 2))
+
+
+def offset(x: Array, l: Array, z: Array) -> Array:  # noqa: E741
+    """Landmarks l (n, 2) in the axes of SE(2) poses x (n, 3), less where they were seen, z (n, 2): (n, 2) [m]."""
+    cosine, sine = np.cos(x[:, 2]), np.sin(x[:, 2])
+    dx, dy = l[:, 0] - x[:, 0], l[:, 1] - x[:, 1]
+    return np.stack([cosine * dx + sine * dy - z[:, 0], cosine * dy - sine * dx - z[:, 1]], axis=1)

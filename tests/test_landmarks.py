@@ -104,3 +104,8 @@ def test_what_is_not_a_number_stays_so() -> None:
     x = state((0.0, 0.0, 1.0))
     x[0] = np.nan
     assert np.isnan(landmarks.observe(x, MARKS)).all()
+
+
+def test_offsets_are_in_the_axes_of_the_pose() -> None:
+    x, place, seen = np.array([[1.0, 2.0, np.pi / 2]]), np.array([[1.0, 5.0]]), np.array([[2.5, -0.5]])
+    np.testing.assert_allclose(landmarks.offset(x, place, seen), [[0.5, 0.5]], atol=1e-12)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks import covariance_plans
+from benchmarks import covariance_plans, excluded_pasts, impossible_states
 
 
 def row(way: str, seed: int, found: list[tuple[float, float] | None]) -> dict[str, object]:
@@ -34,3 +34,48 @@ def test_settings_are_compared_at_equal_risk(monkeypatch: pytest.MonkeyPatch) ->
     np.testing.assert_array_equal(found.best("in the graph", 0.02), [10.5, 11.0])
     text = covariance_plans.render(found, 10)
     assert "| margin 0.5 m | 1 / 2 |" in text and "| 2% | in the graph | 2 / 2 | -1.5 (-1.5 .. -1.5), n=1 |" in text
+
+
+def test_orchards_leave_a_way() -> None:
+    for seed in range(2):
+        world = excluded_pasts.orchard(seed)
+        assert excluded_pasts.gaps(world.path, world.pillars).min() > 0.0
+    through = excluded_pasts.gaps(np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), np.array([[1.0, 0.0]]))
+    assert through.min() == pytest.approx(-excluded_pasts.PILLAR - excluded_pasts.ROBOT)  # also between the poses
+
+
+def test_bodies_exclude_a_wrong_association() -> None:
+    """A drive whose sightings are explained best by a path through a pillar."""
+    world, (chance, clutter) = excluded_pasts.orchard(5), excluded_pasts.CONDITIONS["half are missed, clutter"]
+    scans = excluded_pasts.scanned(world, chance, clutter, 5011)
+    found = excluded_pasts.explained(world, scans, chance, clutter)
+    error = {name: float(np.hypot(*(path - world.path)[-1, :2])) for name, path in found.items()}
+    assert error["sightings alone"] > 1.0
+    assert error["checked afterwards"] < 0.2 and error["in the graph"] < 0.2
+    through, kept = (excluded_pasts.gaps(found[name], world.pillars) for name in ("sightings alone", "in the graph"))
+    assert through.min() < -0.2 and kept[: excluded_pasts.STEPS + 1].min() > -2e-3
+
+
+def test_a_pillar_is_seen_once_in_a_scan() -> None:
+    """Two sightings near one pillar: the nearer one is its, and the other one clutter."""
+    world = excluded_pasts.Orchard(np.array([[1.0, 0.0]]), np.zeros((excluded_pasts.STEPS + 1, 3)))
+    sightings = np.array([[1.2, 0.0], [1.1, 0.0], [0.2, 1.0], [1.1, 0.0]])
+    still = np.zeros((excluded_pasts.STEPS, 3))
+    scans = excluded_pasts.Scans(sightings, np.array([0, 0, 0, 4]), still, np.zeros(3))
+    estimator = excluded_pasts.Estimator(world, scans, 0.5, 1.0)
+    _, matched, worth = estimator._associated(world.path)
+    np.testing.assert_array_equal(matched, [False, True, False, True])
+    assert worth == pytest.approx(2 * estimator._match + 2 * estimator._miss)  # due in four scans, seen in two
+
+
+def test_what_cannot_have_been_helps() -> None:
+    wall, drag = impossible_states.along_a_wall(0, 12), impossible_states.rolling(0, 12)
+    rms = [float(np.sqrt(np.mean(np.square(errors)))) for errors in (*wall.values(), *drag.values())]
+    assert rms[1] < rms[0] and rms[2] < 0.5 * rms[0] and rms[4] < rms[3]
+
+
+def test_errors_are_compared_layout_by_layout() -> None:
+    base, mine = [[0.1, 0.5], [0.3, 0.3]], [[0.1, 0.1], [0.3, 0.5]]
+    assert excluded_pasts.compared(base, base, "wrong") == "25"
+    assert excluded_pasts.compared(mine, base, "wrong") == "25 (-50 .. +50)"
+    assert excluded_pasts.compared(mine, base, "median").startswith("25 (-20")
