@@ -327,7 +327,7 @@ class Statement:
         active: Any,
         replaced: bool = False,
     ) -> Cost:
-        with placed(name, function, arguments):
+        with placed(name, arguments):
             if sigma is not None and information is not None:
                 raise GraphError(f"term '{name or title(function)}': give sigma or information, not both", term=name)
             wrapped = complete(function, arguments, name)
@@ -350,7 +350,7 @@ class Statement:
         active: Any,
         replaced: bool = False,
     ) -> ScalarCost:
-        with placed(name, function, arguments):
+        with placed(name, arguments):
             wrapped = complete(function, arguments, name)
             unique = self._unique(name, wrapped.name, replaced)
             normal, active, count = self._arguments(unique, arguments, active)
@@ -367,7 +367,7 @@ class Statement:
         active: Any,
         replaced: bool = False,
     ) -> Constraint:
-        with placed(name, function, arguments):
+        with placed(name, arguments):
             wrapped = complete(function, arguments, name)
             unique = self._unique(name, wrapped.name, replaced)
             normal, active, count = self._arguments(unique, arguments, active)
@@ -384,8 +384,8 @@ class Statement:
         upper: Parameter,
         replaced: bool = False,
     ) -> Constraint:
-        selection = _one_variable("a bound", stated)
-        with placed(name, itself, (selection,)):
+        selection = _one_variable("a bound", stated, name)
+        with placed(name, (selection,)):
             if not isinstance(selection.manifold, Rn):
                 raise GraphError(
                     f"bound on family '{selection.family.name}': {selection.manifold.name} is not Rn; bound a "
@@ -402,7 +402,7 @@ class Statement:
     def _fix(self, name: str | None, stated: tuple[Any, ...], replaced: Fix | None = None) -> Fix:
         if len(stated) != 2:
             raise GraphError(f"a fix is stated by a variable and its value, found {len(stated)} arguments", term=name)
-        selection, value = _one_variable("a fix", stated[:1]), stated[1]
+        selection, value = _one_variable("a fix", stated[:1], name), stated[1]
         unique = self._unique(name, f"{selection.family.name} fixed", replaced is not None)
         held = (
             value if isinstance(value, Data) else np.atleast_1d(doubles(f"fix '{unique}': value", value, term=unique))
@@ -546,10 +546,10 @@ def _require_name(what: str, name: Any) -> None:
         raise GraphError(f"the name of a {what} must be a text that is not empty, found {name!r}")
 
 
-def _one_variable(what: str, stated: tuple[Any, ...]) -> Selection:
+def _one_variable(what: str, stated: tuple[Any, ...], name: str | None) -> Selection:
     if len(stated) != 1 or not is_variable(stated[0]):
         found = ", ".join(f"{argument!r}"[:60] for argument in stated)
-        raise GraphError(f"{what} takes one family or selection, found {found or 'nothing'}")
+        raise GraphError(f"{what} takes one family or selection, found {found or 'nothing'}", term=name)
     return as_selection(stated[0])
 
 

@@ -17,7 +17,7 @@ from unifg.typing import Array
 
 
 @contextmanager
-def placed(name: str | None, function: Any, arguments: Sequence[Any]) -> Iterator[None]:
+def placed(name: str | None, arguments: Sequence[Any]) -> Iterator[None]:
     """Say of every refusal which families the term is about, where it does not say so itself."""
     try:
         yield
@@ -28,7 +28,7 @@ def placed(name: str | None, function: Any, arguments: Sequence[Any]) -> Iterato
             listed = ", ".join(f"'{family}'" for family in families)
             error.args = (f"{said} (family {listed})",)
         error.family = error.family or (families[0] if families else None)
-        error.term = error.term or name or getattr(function, "name", None)
+        error.term = error.term or name
         raise
 
 
