@@ -120,6 +120,22 @@ def test_pose_graph_with_a_hard_closure(run: Run) -> None:
     assert ran["slope"] == pytest.approx(-ran["pull"][0], rel=1e-2)
 
 
+def test_inertial_odometry(run: Run) -> None:
+    ran = run("inertial_odometry")
+    assert ran["solution"].converged
+    error, sigma = ran["error"], ran["sigma"]
+    away = np.linalg.norm(error[:, :3], axis=1)
+    assert re.fullmatch(
+        rf"off by {away.max():.3f} m at most, by sigma {sigma[:, :3].max():.3f} m an axis\n", ran.printed
+    )
+    assert away.max() < 0.3 and np.median(away) < 0.1  # fixes are off by 0.17 m
+    assert np.abs(error / sigma).max() < 3.5
+    spread = np.sqrt(np.diag(ran["solution"].covariance(ran["b"][-1])))
+    assert np.abs((ran["found"][-1] - ran["bias"]) / spread).max() < 3.5
+    assert spread[:3].max() < 0.01 and spread[3:].max() < 0.1  # they were unknown to 0.05 rad/s and 0.3 m/s^2
+    assert ran["receiver"].counts.placed == len(ran["stamps"]) and ran["imu"].counts.unknown == 0
+
+
 def test_joint_past_future(run: Run) -> None:
     ran = run("joint_past_future")
     assert list(ran["results"]) == ["sequential", "joint"]
