@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
 import unifg as fg
 from unifg.horizon import (
+    COUPLINGS,
     Choice,
     ControlCost,
     Dynamics,
@@ -269,6 +270,156 @@ def test_an_estimate_that_is_none_leaves_the_prediction() -> None:
         assert np.isfinite(window.present).all()
         assert (window.history.statics["mark"][0, 0] == 3.0) == (k < 6)
     assert window.history.statics["mark"][0, 0] == pytest.approx(0.5 + 0.6 + 1.0, abs=0.2)
+
+
+class Marks:
+    """Gaps to marks, each seen or not: what a landmark's slots are."""
+
+    records: ClassVar = {"gaps": (2, 2)}
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        gaps = graph.data("gaps", np.zeros((2 * len(x), 1)), each=True)
+        seen = graph.data("seen", np.zeros(2 * len(x), dtype=bool), each=True)
+        marks = graph.families["mark"][np.tile([0, 1], len(x))]
+        graph.minimize(
+            lambda x, m, z: m - x[:, :1] - z, x[np.repeat(np.arange(len(x)), 2)], marks, gaps, sigma=0.1, active=seen,
+            name="gaps",
+        )  # fmt: skip
+
+    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+        rows = now.past.recorded("gaps")[0].reshape(-1, 2)
+        return {"gaps": rows[:, :1], "seen": rows[:, 1] > 0.0}
+
+
+def test_a_slot_that_gets_another_landmark_forgets_the_first() -> None:
+    """Mark 0 is seen until it has left the window, then its slot holds another one: the batch has three marks."""
+    robot = replace(LINE, statics=(Static("mark", fg.Rn(1), [[0.0], [0.0]], 1e3),))
+    terms: list[Term] = [Dynamics(step, 0.1, sigma=NOISE), Marks()]
+    exact = GaussNewton(tolerance=1e-12)
+    window = Window(robot, 2, terms, start=START, sigma=0.8, solver=exact)
+    rng, ticks, change = np.random.default_rng(7), 12, 8
+    gaps = rng.normal(size=(ticks + 1, 2))
+    seen = np.array([[k < 4 or k >= change, True] for k in range(ticks + 1)])
+    for k in range(ticks + 1):
+        if k:
+            window.move([0.0])
+        if k == change:
+            window.forget("mark", 0)
+            window.admit("mark", 0, [1.0], 1e3)
+            assert window.history.statics["mark"][0, 0] == 1.0
+        window.record("gaps", np.column_stack([gaps[k], seen[k]]))
+        window.estimate(None)
+    graph = fg.Graph()
+    x, m = graph.variables("x", fg.Rn(2), ticks + 1), graph.variables("m", fg.Rn(1), 3)
+    graph.minimize(fg.prior, x[0], START, sigma=0.8)
+    graph.minimize(fg.prior, m, [[0.0], [0.0], [1.0]], sigma=1e3)
+    still = graph.data("u", np.zeros((ticks, 1)), each=True)
+    graph.minimize(step, x[:-1], still, x[1:], 0.1, sigma=NOISE)
+    at, j = np.nonzero(seen)
+    which = np.where((j == 0) & (at >= change), 2, j)
+    values = graph.data("z", gaps[at, j][:, None], each=True)
+    graph.minimize(lambda x, m, z: m - x[:, :1] - z, x[at], m[which], values, sigma=0.1)
+    whole = exact.solve(graph, {x: np.zeros((ticks + 1, 2)), m: np.zeros((3, 1))})
+    # What was believed of the first mark before it was seen, to a kilometre, goes with it.
+    np.testing.assert_allclose(window.present, whole[x][-1], atol=1e-6)
+    np.testing.assert_allclose(window.history.statics["mark"], whole[m][[2, 1]], atol=1e-6)
+    scale = np.sqrt(np.outer(*[np.diag(window.covariance)] * 2))
+    expected = whole.covariance(x[-1], m[2], m[1])
+    np.testing.assert_allclose(window.covariance / scale, expected / scale, atol=1e-6)
+    assert window.covariance[window.place("mark", 1), window.place("mark", 1)] == pytest.approx(
+        expected[3:, 3:], rel=1e-6
+    )
+    with pytest.raises(fg.GraphError, match="no static 'mark' with a member 2"):
+        window.admit("mark", 2, [0.0], 1.0)
+    with pytest.raises(fg.GraphError, match="is not on"):
+        window.admit("mark", 1, [0.0, 0.0], 1.0)
+
+
+def test_what_is_known_is_no_unknown() -> None:
+    """A bias that is known is the same in every graph, and no measurement or wish moves it."""
+    known = replace(LINE, statics=(Static("bias", fg.Rn(1), [BIAS], 0.0),))
+    for coupling in COUPLINGS:
+        loop = line_loop(known, coupling=coupling)
+        plans, _ = drive(loop, 12)
+        assert loop.statics["bias"][0, 0] == BIAS
+        before, after = plans[-1].states[:2]
+        np.testing.assert_allclose(after, T @ before + B @ (plans[-1].control + BIAS), atol=1e-6)
+        assert loop.window is not None
+        assert not loop.window.covariance[loop.window.place("bias")].any()
+        with pytest.raises(fg.GraphError, match="is known"):
+            loop.window.admit("bias", 0, [0.0], 1.0)
+
+
+class Timed:
+    """Exact motion with noise on the speed, over the time between nodes."""
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        noise, times = graph.families["noise"], graph.data("durations", np.zeros(len(x) - 1), each=True)
+        graph.minimize(fg.prior, noise, [0.0], sigma=0.4, name="noise")
+
+        def moved(x: Array, u: Array, w: Array, y: Array, h: Array) -> Array:
+            speed = x[:, 1:] + h[:, None] * (u + w)
+            return np.concatenate([y[:, :1] - x[:, :1] - h[:, None] * x[:, 1:], y[:, 1:] - speed], axis=1)
+
+        graph.constrain(moved, x[:-1], u, noise, x[1:], times, lower=0, upper=0, name="moved")
+
+    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+        return {"durations": np.diff(now.past.times)}
+
+
+def test_a_window_filled_by_steps_of_no_duration_is_one_that_fills_up() -> None:
+    robot = replace(LINE, steps={"noise": fg.Rn(1)})
+    terms: list[Term] = [Timed(), Measurement("gps", position, (1,), GPS)]
+    solver = SQP(tolerance=1e-11, qp="graph")
+    windows = [Window(robot, 5, terms, start=START, sigma=0.8, solver=solver, filled=f) for f in (False, True)]
+    drive = Drive(9, seed=8)
+    for k in range(10):
+        for window in windows:
+            if k:
+                window.move(drive.controls[k - 1], 0.1 * k)
+            window.record("gps", drive.positions[k])
+            window.estimate(None)
+        np.testing.assert_allclose(windows[0].present, windows[1].present, atol=1e-9)
+        # Covariances soften each constraint, those of steps of no duration too.
+        np.testing.assert_allclose(windows[0].state_covariance, windows[1].state_covariance, rtol=1e-5, atol=1e-9)
+    assert windows[1].history.empty == 0
+
+
+class Floor:
+    """A line on the floor that was seen, the first or the second: which one, depends on where the robot is believed."""
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        line = graph.data("line", np.zeros(1))
+        graph.minimize(lambda x, z: x[:, :1] - z, x[-1], line, sigma=0.01, name="line")
+
+    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+        return {"line": [1.0 if now.present[0] < 0.95 else 2.0]}
+
+
+@pytest.mark.parametrize(("rounds", "solves", "place"), [(1, 1, 1.0), (2, 2, 2.0), (9, 3, 2.0)])
+def test_data_that_depend_on_beliefs_are_asked_for_again(rounds: int, solves: int, place: float) -> None:
+    """One round believes what it has found; more of them go on until the present stays where it is."""
+    window = Window(LINE, 2, [Floor()], start=[0.9, 0.0], sigma=0.8, rounds=rounds, steady=1e-6)
+    window.estimate(None)
+    assert sum(window.statuses.values()) == solves
+    assert window.present[0] == pytest.approx(place, abs=0.05)
+
+
+def test_a_loop_made_on_a_window_leaves_what_it_knows() -> None:
+    window = line_window(4)
+    for k in range(6):
+        if k:
+            window.move([0.1])
+        window.record("gps", [0.1 * k])
+        window.estimate(None)
+    states = window.history.states.copy()
+    loop = line_loop(window=window, coupling="joint")
+    assert np.array_equal(window.history.states, states)
+    loop.plan(window.present, TARGET)
+    assert np.array_equal(window.history.states, states)  # the window carries on what the past alone says
+    assert np.abs(loop.estimate - window.present).max() > 1e-6
+    loop.tick(TARGET)
+    assert window.history.times[-1] == 6.0
 
 
 # ---------------------------------------------------------------- loops

@@ -181,7 +181,14 @@ class Window:
         self.history.statics[name][member] = array
 
     def forget(self, name: str, member: int) -> None:
-        """Marginalise a member of a static out of what has left; its measurements in the window are the caller's."""
+        """Marginalise a member of a static out of what has left.
+
+        What was believed of it before it was measured goes with it, unused; its measurements in the window are the
+        caller's to strike out.
+
+        Raises:
+            GraphError: when the robot has no such static.
+        """
         self.left.forget(self._arriving(name, member)[1])
 
     @property
