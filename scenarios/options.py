@@ -17,7 +17,18 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-__all__ = ["add_options", "count", "existing", "option", "pair", "pose", "positive", "settings_of", "share"]
+__all__ = [
+    "add_options",
+    "count",
+    "existing",
+    "not_negative",
+    "option",
+    "pair",
+    "pose",
+    "positive",
+    "settings_of",
+    "share",
+]
 
 S = TypeVar("S")
 Text = Callable[[str], Any]
@@ -153,6 +164,14 @@ def positive(text: str) -> float:
     value = _number(text)
     if not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
+    return value
+
+
+def not_negative(text: str) -> float:
+    """A number, zero or more."""
+    value = _number(text)
+    if not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of zero or more")
     return value
 
 

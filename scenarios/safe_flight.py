@@ -8,6 +8,7 @@ with their velocities; where they will be is guessed from that alone.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -20,18 +21,21 @@ from unifg.models import quadrotor
 from unifg.scenarios.episode import Progress, run_ticks, silent
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.safe_log import SafeLog
-from unifg.scenarios.options import count, option, positive
+from unifg.scenarios.options import count, not_negative, option, positive
 from unifg.scenarios.safety.flatness import TUNED, FlatnessController, Gains, flat_flight
-from unifg.scenarios.safety.keeper import Decision, Keeper, KeeperSettings, Obstacles
+from unifg.scenarios.safety.keeper import Decision, Keeper, KeeperSettings, Obstacles, Reading
+from unifg.scenarios.safety.one_step import FilterSettings, filtered
 from unifg.scenarios.safety.situations import Kind, Situation, situation
+from unifg.scenarios.safety.spline_planner import SplinePath, SplineSettings, around
 from unifg.scenarios.safety.weighing import Weighing, WeighingSettings
-from unifg.scenarios.worlds.body_rate import SUBSTEP, Airframe, BodyRatePlant
+from unifg.scenarios.ways.flat_path import Line
+from unifg.scenarios.worlds.body_rate import SUBSTEP, Airframe, BodyRatePlant, Loops
 from unifg.scenarios.worlds.disturbance import DisturbanceModel, Disturbances
 from unifg.typing import Array
 
 __all__ = ["CONTROLLERS", "Controller", "Knowledge", "SafeFlight", "SafeSettings", "flights", "run_safe_flights"]
 
-Controller = Literal["barrier", "flatness"]
+Controller = Literal["barrier", "flatness", "filter", "spline"]
 Knowledge = Literal["estimated", "books"]
 CONTROLLERS: tuple[Controller, ...] = get_args(Controller)
 
@@ -40,13 +44,14 @@ _TAG = 72  # keeps the noise apart from other numbers of the same seed
 
 class _Swept(NamedTuple):
     alpha: tuple[float, ...] = (1.2,)
+    gamma: tuple[float, ...] = (0.0,)
     speed: tuple[float, ...] = (2.0,)
     controller: tuple[Controller, ...] = ("barrier",)
 
 
 _SWEPT: dict[Kind, _Swept] = {
     "static": _Swept(alpha=(1.2, 0.3, 0.1, 3.0)),
-    "ellipse": _Swept(),
+    "ellipse": _Swept(gamma=(0.0, 0.1, 1.3)),
     "cluttered": _Swept(),
     "figure8": _Swept(speed=(1.0, 2.0, 3.0), controller=("barrier", "flatness")),
     "ball": _Swept(alpha=(3.0,), speed=(3.2,)),
@@ -66,8 +71,11 @@ class SafeSettings:
         case: static cylinder, obstacle on an ellipse, cluttered course, figure eight, or a ball thrown at a vehicle
             that hovers.
         alpha: rate at which a clearance may shrink [1/s]; may be repeated.
+        gamma: of the velocity in a second barrier [s], as published [s/m^2]; may be repeated.
+        reading: barriers that decay from node to node, or as they are published.
         speed: of the path at its fastest [m/s]; may be repeated.
-        controller: who decides, barrier or flatness; may be repeated.
+        controller: who decides: a plan with barriers, flatness, flatness with a filter of one step, or flatness along a
+            spline that was planned before; may be repeated.
         knowledge: "estimated" mass and drag with prediction of what is pending, or what is in the "books" without.
         seed: of sizes, places, phases and noise; without one, the case as it is described.
         solver: one of `unifg.solvers.names.CONSTRAINED`.
@@ -75,8 +83,11 @@ class SafeSettings:
         faster: speed limit along each axis over the speed of the path.
         dt: length of a tick [s].
         books: vehicle that everybody believes in at first.
-        truth: the vehicle.
+        truth: mass and drag of the vehicle.
+        true_loops: its loops.
         gains: of the controller by flatness.
+        filter: numbers of the filter of one step.
+        spline: numbers of the planner by splines.
         keeper: numbers of the controller by barriers.
         weighing: numbers of the estimate.
         seen: standard deviations of position, attitude and velocity as they are seen [m, rad, m/s].
@@ -85,6 +96,8 @@ class SafeSettings:
 
     case: Kind = option("static")
     alpha: tuple[float, ...] | None = option(None, text=positive, metavar="A", many=True)
+    gamma: tuple[float, ...] | None = option(None, text=not_negative, metavar="G", many=True)
+    reading: Reading = option("decay")
     speed: tuple[float, ...] | None = option(None, text=positive, metavar="V", many=True)
     controller: tuple[Controller, ...] | None = option(None, choices=CONTROLLERS, many=True)
     knowledge: Knowledge = option("estimated")
@@ -95,7 +108,10 @@ class SafeSettings:
     dt: float = 0.01
     books: Airframe = field(default_factory=Airframe)
     truth: quadrotor.Parameters = field(default_factory=_true_vehicle)
+    true_loops: Loops = field(default_factory=lambda: Loops(22.0, 0.025, 0.012))
     gains: Gains = TUNED
+    filter: FilterSettings = field(default_factory=FilterSettings)
+    spline: SplineSettings = field(default_factory=SplineSettings)
     keeper: KeeperSettings = field(default_factory=KeeperSettings)
     weighing: WeighingSettings = field(default_factory=WeighingSettings)
     seen: tuple[float, float, float] = (1e-3, 3e-3, 1e-2)
@@ -112,7 +128,13 @@ class SafeFlight:
     """
 
     def __init__(
-        self, settings: SafeSettings, about: Situation, controller: Controller, alpha: float, label: str, speed: float
+        self,
+        settings: SafeSettings,
+        about: Situation,
+        controller: Controller,
+        barriers: tuple[float, float],
+        label: str,
+        speed: float,
     ) -> None:
         """Prepare.
 
@@ -120,43 +142,61 @@ class SafeFlight:
             settings: of all flights.
             about: path and bodies.
             controller: who decides.
-            alpha: of the barriers [1/s].
+            barriers: alpha [1/s] and gamma of them.
             label: what tells it from those beside it.
             speed: of the path at its fastest [m/s].
         """
         s = self.settings = settings
         self.situation, self.label = about, label
-        self._known = {"case": about.kind, "controller": controller, "alpha_per_s": alpha, "speed_m_per_s": speed,
-                       "knowledge": s.knowledge, "seed": s.seed, "solver": s.solver}  # fmt: skip
+        self._known = {
+            "case": about.kind, "controller": controller, "alpha_per_s": barriers[0], "gamma": barriers[1],
+            "reading": s.reading, "speed_m_per_s": speed, "knowledge": s.knowledge, "seed": s.seed, "solver": s.solver,
+        }  # fmt: skip
         noise, shake = np.random.default_rng([_TAG, s.seed or 0]).spawn(2)
         self._noise, self._shake = noise, Disturbances(s.disturbance, shake)
-        truth = replace(s.books, parameters=s.truth)
+        truth = replace(s.books, parameters=s.truth, loops=s.true_loops)
         start = flat_flight(about.path.at(np.zeros(1)), s.truth)[0][0]
         self.plant, self.model = BodyRatePlant(truth, start, s.dt), BodyRatePlant(s.books, start, s.dt)
         estimating = s.knowledge == "estimated"
         self.weighing = Weighing(s.weighing, s.books.parameters, s.dt) if estimating else None
         lead = s.books.loops.delay + s.dt if estimating else 0.0
         self.lead = round(lead / SUBSTEP) * SUBSTEP
-        self._decide = self._deciders(controller, alpha, s.faster * speed)
+        self._decide = self._deciders(controller, barriers, s.faster * speed)
 
     def _deciders(
-        self, controller: Controller, alpha: float, limit: float
+        self, controller: Controller, barriers: tuple[float, float], limit: float
     ) -> Callable[[Array, float, Obstacles], Decision]:
         s, path = self.settings, self.situation.path
         if controller == "barrier":
-            bodies = len(self.situation.bodies)
-            numbers = replace(s.keeper, alpha=alpha, speed=limit, slots=min(s.keeper.slots, bodies))
+            slots, (alpha, gamma) = min(s.keeper.slots, len(self.situation.bodies)), barriers
+            numbers = replace(s.keeper, alpha=alpha, gamma=gamma, reading=s.reading, speed=limit, slots=slots)
             keeper = Keeper(numbers, s.books, path, s.dt, self.weighing, s.solver)
             return lambda state, now, seen: keeper.decide(state, now + self.lead, seen, now)
         flat = FlatnessController(s.gains, s.books.least, s.books.most)
+        if controller == "spline":
+            path = self._spline()
+        numbers_of_filter = replace(s.filter, alpha=barriers[0])
 
         def follow(state: Array, now: float, seen: Obstacles) -> Decision:
-            begin, p = time.thread_time(), self.believed
-            control = flat.control(state, path.at(np.array([now + self.lead])), p)
+            begin, p, slack = time.thread_time(), self.believed, 0.0
+            flown = path.at(np.array([now + self.lead]))
+            if controller == "filter":
+                acceleration, slack = filtered(flat.wanted(state, flown), state, seen, self.lead, numbers_of_filter)
+                control = flat.steer(state, acceleration, flown.jerk[0], p)
+            else:
+                control = flat.control(state, flown, p)
             elapsed = 1e3 * (time.thread_time() - begin)
-            return Decision(control, state[None, :3], "none", 0, 0.0, p.mass, np.array(p.drag), elapsed)
+            return Decision(control, state[None, :3], "none", 0, slack, p.mass, np.array(p.drag), elapsed)
 
         return follow
+
+    def _spline(self) -> SplinePath:
+        """A path around what stands in the way, planned before the flight."""
+        line, bodies = self.situation.path, self.situation.bodies
+        place, velocity = (part[0] for part in bodies.at(np.zeros(1)))
+        if not isinstance(line, Line) or self.situation.kind != "static":
+            raise fg.ScenarioError(f"splines are planned past things at rest, not in the case {self.situation.kind!r}")
+        return around(line, Obstacles(place, velocity, self._keep, bodies.upright, bodies.falls), self.settings.spline)
 
     @property
     def believed(self) -> quadrotor.Parameters:
@@ -170,8 +210,13 @@ class SafeFlight:
         state = quadrotor.STATE.retract(self.plant.state[None], sigma[None])[0]
         bodies = self.situation.bodies
         place, velocity = (part[0] for part in bodies.at(now))
-        keep = bodies.radii + s.books.radius + s.margin
-        return state, Obstacles(place, velocity, keep, bodies.upright, bodies.falls)
+        return state, Obstacles(place, velocity, self._keep, bodies.upright, bodies.falls)
+
+    @property
+    def _keep(self) -> Array:
+        """(M,) distance of the centre to be kept from each body [m]."""
+        found: Array = self.situation.bodies.radii + self.settings.books.radius + self.settings.margin
+        return found
 
     def run(self, progress: Progress = silent) -> SafeLog:
         """Fly to the end, or until the user stops it."""
@@ -219,7 +264,7 @@ def flights(settings: SafeSettings) -> list[SafeFlight]:
     if s.case not in _SWEPT:
         situation(s.case)
     swept = _SWEPT[s.case]
-    all_alphas, speeds = s.alpha or swept.alpha, s.speed or swept.speed
+    all_alphas, all_gammas, speeds = s.alpha or swept.alpha, s.gamma or swept.gamma, s.speed or swept.speed
     controllers = s.controller or swept.controller
     for name in controllers:
         if name not in CONTROLLERS:
@@ -228,13 +273,14 @@ def flights(settings: SafeSettings) -> list[SafeFlight]:
     for speed in speeds:
         about = situation(s.case, speed, s.seed)
         for controller in controllers:
-            barriers = controller != "flatness" and len(about.bodies) > 0
+            barriers = controller in ("barrier", "filter") and len(about.bodies) > 0
             alphas = all_alphas if barriers else all_alphas[:1]
-            for alpha in alphas:
+            gammas = all_gammas if barriers and controller == "barrier" else all_gammas[:1]
+            for alpha, gamma in itertools.product(alphas, gammas):
                 told = [f"{speed:g} m/s"] * (len(speeds) > 1) + [controller] * (len(controllers) > 1)
-                told += [f"alpha {alpha:g}"] * (len(alphas) > 1)
+                told += [f"alpha {alpha:g}"] * (len(alphas) > 1) + [f"gamma {gamma:g}"] * (len(gammas) > 1)
                 label = ", ".join(told) or (f"alpha {alpha:g}" if barriers else controller)
-                made.append(SafeFlight(s, about, controller, alpha, label, speed))
+                made.append(SafeFlight(s, about, controller, (alpha, gamma), label, speed))
     return made
 
 

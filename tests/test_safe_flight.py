@@ -16,8 +16,8 @@ from unifg.models import quadrotor
 from unifg.scenarios import command
 from unifg.scenarios.log.safe_log import SafeLog, safe_metrics
 from unifg.scenarios.safe_flight import SafeFlight, SafeSettings, flights, run_safe_flights
-from unifg.scenarios.safety.flatness import TUNED, FlatnessController, flat_flight
-from unifg.scenarios.safety.keeper import Keeper, KeeperSettings, Obstacles
+from unifg.scenarios.safety.flatness import TUNED, FlatnessController, Gains, flat_flight
+from unifg.scenarios.safety.keeper import Keeper, KeeperSettings, Obstacles, Reading
 from unifg.scenarios.safety.situations import SITUATIONS, situation
 from unifg.scenarios.safety.weighing import Weighing, WeighingSettings
 from unifg.scenarios.ways.flat_path import FigureEight, Hover, Line
@@ -78,10 +78,10 @@ def test_feedback_is_none_on_the_path_and_limited_far_away() -> None:
 )
 def test_errors_of_the_attitude_are_turned_back(axis: tuple[float, float, float], row: int) -> None:
     air, hover = Airframe(), Hover((0.0, 0.0, 1.0)).at(np.zeros(1))
-    controller = FlatnessController(TUNED, air.least, air.most)
+    controller = FlatnessController(Gains(), air.least, air.most)
     state = np.concatenate([[0.0, 0.0, 1.0], SO3.exp(0.1 * np.array(axis)), np.zeros(3)])
     rates = controller.control(state, hover, air.parameters)[:3]
-    gain = TUNED.heading if row == 2 else TUNED.tilt
+    gain = Gains().heading if row == 2 else Gains().tilt
     np.testing.assert_allclose(rates, -0.1 * gain * np.array(axis), rtol=3e-3, atol=1e-9)
 
 
@@ -216,8 +216,16 @@ def test_who_is_asked_for_flies() -> None:
     labels = [flight.label for flight in flights(SafeSettings(case="figure8", speed=(1.0, 2.0)))]
     assert labels == ["1 m/s, barrier", "1 m/s, flatness", "2 m/s, barrier", "2 m/s, flatness"]
     assert [flight.label for flight in flights(SafeSettings(alpha=(0.5,), controller=("flatness",)))] == ["flatness"]
-    with pytest.raises(ScenarioError, match="unknown controller 'pilot': choose one of barrier, flatness"):
+    with pytest.raises(ScenarioError, match="unknown controller 'pilot': choose one of barrier, flatness, filter"):
         flights(SafeSettings(controller=("pilot",)))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("reading", ["decay", "published"])
+def test_a_velocity_in_the_barrier_bends_the_plan(reading: Reading) -> None:
+    start, ahead = np.array([-2.2, 0.02, 1.5, 1.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0]), pillar(0.0, 0.0, (-1.0, 0.0, 0.0))
+    plans = [keeper(reading=reading, gamma=gamma, alpha=1.2).decide(start, 2.0, ahead, 2.0) for gamma in (0.0, 0.4)]
+    assert all(np.isfinite(plan.control).all() for plan in plans)
+    assert np.abs(plans[0].plan - plans[1].plan).max() > 0.01
 
 
 def test_an_interrupt_keeps_what_was_flown() -> None:

@@ -82,8 +82,8 @@ class Gains:
         return cls((a, b), (c, d), e, f)
 
 
-TUNED = Gains()
-"""What :func:`unifg.scenarios.safety.tuning.tuned` finds."""
+TUNED = Gains((157.0, 197.0), (8.0, 6.4), 84.0, 2.0)
+"""What ``python -m benchmarks.flight_tuning --controller flatness`` finds, from the gains of a new :class:`Gains`."""
 
 
 class FlatnessController:

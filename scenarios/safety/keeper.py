@@ -2,13 +2,14 @@
 
 The plan is a factor graph: states and controls of a quadrotor, N steps ahead; where the path is, as priors on the
 manifold; the dynamics and the limits of the controls as hard constraints. For every obstacle and every step the
-clearance h, measured from the distance that is to be kept, may shrink by no more than its share,
+clearance h, measured from the distance that is to be kept, may shrink by no more than its share
+(:func:`unifg.models.barriers.decay`, held by :func:`unifg.models.keeping.keep`),
 
-    h(x_{k+1}) >= exp(-alpha dt_k) h(x_k) - s_k,    s_k >= 0
+    h(x_{k+1}, t_{k+1}) >= exp(-alpha dt_k) h(x_k, t_k) - s_k
 
-and what a step takes beyond that, its slack, is dear. The obstacle's own motion is in h, for h is taken at the node's
-time. Ticks are shorter than steps: were the first step as long as the others, all it may lose could be lost in the
-first tick, and again in the next; so the first step is one tick long.
+and what a step takes beyond that, its slack, is dear. With gamma > 0 the velocity-extended barrier is held as well. As
+published, instead, a hinge asks at every node for h' + alpha h >= 0, h in 1/m, of an obstacle that rests in h' (eq. 19,
+and eq. 22 for gamma > 0).
 
 Slack that is used says which obstacle could not be kept off, and by how much.
 """
@@ -17,12 +18,14 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 import unifg as fg
 from unifg.models import quadrotor
+from unifg.models.barriers import Barrier, Flow, condition, decay, velocity_extended
+from unifg.models.keeping import Form, Kept, grid, keep
 from unifg.scenarios.safety.flatness import flat_flight
 from unifg.scenarios.safety.weighing import Weighing
 from unifg.scenarios.ways.flat_path import FlatPath
@@ -32,7 +35,7 @@ from unifg.typing import Array, BoolArray
 
 __all__ = ["Decision", "Keeper", "KeeperSettings", "Obstacles"]
 
-Price: TypeAlias = Literal["squared", "exact"]
+Reading: TypeAlias = Literal["decay", "published"]
 
 TOLERANCE = 1e-4  # of the KKT test, in a loop that goes on
 FAR = 1e3  # where obstacles are that are not there [m]
@@ -47,12 +50,15 @@ class KeeperSettings:
         step: length of all steps but the first [s].
         slots: obstacles that are looked at, the nearest first.
         alpha: rate at which a clearance may shrink [1/s].
+        gamma: of the velocity in a second barrier, none if zero [s]; as published [s/m^2].
+        reading: "decay" from node to node, or the hinge on h' + alpha h as it is "published".
+        form: of the barriers by decay.
         position, attitude, velocity: weights at each node [1/m^2, 1, s^2/m^2].
         rate, thrust: weights of the controls less those of the path in each step [s^2, 1/N^2].
         rate_change, thrust_change: weights of their changes from step to step.
         speed: greatest velocity along each axis of the world [m/s].
-        price: of slack: "squared", or "exact", which is a multiple of the slack itself.
-        slack: weight of its square [1/m^2], or the multiple [1/m].
+        slack: its weight; None for that of the form.
+        hinge: weight of the squared hinge [s^2 m^2], as published without one.
         iterations: most of a solve with a warm start.
         budget: wall-clock time of a solve [s]; a finite one makes a flight depend on the machine.
     """
@@ -61,6 +67,9 @@ class KeeperSettings:
     step: float = 0.05
     slots: int = 3
     alpha: float = 1.2
+    gamma: float = 0.0
+    reading: Reading = "decay"
+    form: Form = "slack"
     position: float = 20.0
     attitude: float = 2.0
     velocity: float = 2.0
@@ -69,8 +78,8 @@ class KeeperSettings:
     rate_change: float = 0.02
     thrust_change: float = 0.01
     speed: float = 4.0
-    price: Price = "squared"
-    slack: float = 1e6
+    slack: float | None = None
+    hinge: float = 1e4
     iterations: int = 10
     budget: float = np.inf
 
@@ -99,9 +108,9 @@ class Obstacles:
         found: Array = self.position + self.velocity * t + 0.5 * down * t * t
         return found
 
-    def nearest(self, place: Array, count: int) -> Obstacles:
-        """The ``count`` nearest to a place (3,), with others far away if there are fewer."""
-        away = self.position - place
+    def nearest(self, place: Array, count: int, later: float = 0.0) -> Obstacles:
+        """The ``count`` nearest to a place (3,) some seconds later, with others far away if there are fewer."""
+        away = self.at(np.array([later]))[0] - place
         away[self.upright, 2] = 0.0
         order = np.argsort(np.linalg.norm(away, axis=1) - self.keep, kind="stable")[:count]
         parts = self.position[order], self.velocity[order], self.keep[order], self.upright[order], self.falls[order]
@@ -137,28 +146,29 @@ class Decision:
     milliseconds: float
 
 
-def barrier(
-    p: Array, after: Array, slack: Array, here: Array, there: Array, keep: Array, flat: Array, left: Array
-) -> Array:
-    """(n, M) what is left of clearances after a step, less what must be, plus slack [m].
+def clearance(p: Array, t: Array, centre: Array, velocity: Array, fall: Array, keep: Array, flat: Array) -> Array:
+    """(n, M) distance beyond what is to be kept from what goes straight on, or falls [m].
 
     Args:
-        p: (n, 3) positions at the beginning [m].
-        after: (n, 3) at the end [m].
-        slack: (n, M) [m].
-        here: (n, M, 3) where the obstacles are at the beginning [m].
-        there: (n, M, 3) at the end [m].
+        p: (n, 3) positions [m].
+        t: (n,) when, counted from when the obstacles were seen [s].
+        centre: (M, 3) where they were then [m].
+        velocity: (M, 3) [m/s].
+        fall: (M, 3) acceleration of those that fall [m/s^2].
         keep: (M,) distance to be kept [m].
         flat: (M, 3) ones, with a zero at the height of upright cylinders.
-        left: (n,) share of the clearance that must be left.
     """
+    s = np.reshape(t, (-1, 1, 1))
+    away = (p[:, None, :] - centre - s * velocity - 0.5 * s * s * fall) * flat
+    distance: Array = np.sqrt((away * away).sum(axis=2)) - keep
+    return distance
 
-    def clearance(p: Array, c: Array) -> Array:
-        away = (p[:, None, :] - c) * flat
-        distance: Array = np.sqrt((away * away).sum(axis=2)) - keep
-        return distance
 
-    found: Array = clearance(after, there) - left[:, None] * clearance(p, here) + slack
+def inverse_clearance(
+    p: Array, t: Array, centre: Array, velocity: Array, fall: Array, keep: Array, flat: Array
+) -> Array:
+    """(n, M) ``1/keep - 1/distance`` of the same [1/m] (eq. 15)."""
+    found: Array = 1.0 / keep - 1.0 / (keep + clearance(p, t, centre, velocity, fall, keep, flat))
     return found
 
 
@@ -193,10 +203,9 @@ class Keeper:
         self.settings, self.airframe, self.path = settings, airframe, path
         s = settings
         self._weighing = weighing
-        n, m = s.horizon, s.slots
-        steps = np.full(n, s.step)
-        steps[0] = dt
-        self.nodes = np.concatenate([[0.0], np.cumsum(steps)])
+        n = s.horizon
+        begins, steps = grid(n, dt, s.step)
+        self.nodes = np.append(begins, begins[-1] + steps[-1])
         graph = fg.Graph()
         self.x = x = graph.variables("state", quadrotor.STATE, n + 1)
         self.u = u = graph.variables("control", quadrotor.CONTROL, n)
@@ -229,8 +238,8 @@ class Keeper:
         graph.constrain(quadrotor.disturbed_dynamics, *motion, lower=0.0, upper=0.0, name="dynamics")
         graph.bound(u, lower=airframe.least, upper=airframe.most, name="limits")
         graph.bound(ahead.v, lower=-s.speed, upper=s.speed, name="speed")
-        self.slack: fg.Family | None = None
-        if m:
+        self.kept: list[Kept] = []
+        if s.slots:
             self._state_barriers(graph, steps)
         self.graph = graph
         # One step of the interior point a tick, and more of them only while the plan violates the constraints.
@@ -242,20 +251,37 @@ class Keeper:
         self._applied = quadrotor.hover(airframe.parameters)
 
     def _state_barriers(self, graph: fg.Graph, steps: Array) -> None:
-        s, n, m = self.settings, self.settings.horizon, self.settings.slots
-        self.slack = slack = graph.variables("slack", fg.Rn(m), n)
-        far = np.full((n, m, 3), FAR)
-        self._here, self._there = graph.data("here", far, each=True), graph.data("there", far, each=True)
-        self._keep, self._flat = graph.data("keep", np.ones(m)), graph.data("flat", np.ones((m, 3)))
-        left = np.exp(-s.alpha * steps)
-        moved = self.x[:-1].p, self.x[1:].p, slack, self._here, self._there, self._keep, self._flat, left
-        graph.constrain(barrier, *moved, lower=0.0, name="barrier")
-        graph.bound(slack, lower=0.0, name="slack is positive")
-        if s.price == "squared":
-            graph.minimize(fg.prior, slack, np.zeros(m), sigma=s.slack**-0.5, name="slack")
-        else:
-            price = s.slack
-            graph.minimize_scalar(lambda given: price * given.sum(axis=1), slack, name="slack")
+        s, x, m = self.settings, self.x, self.settings.slots
+        self._since = graph.data("since", self.nodes[:-1], each=True)
+        blank = np.zeros((m, 3))
+        things = {
+            "centre": np.full((m, 3), FAR),
+            "velocity": blank,
+            "fall": blank,
+            "keep": np.ones(m),
+            "flat": blank + 1.0,
+        }
+        self._seen = {name: graph.data(name, value) for name, value in things.items()}
+        seen = tuple(self._seen.values())
+        if s.reading == "published":
+            h: Barrier = inverse_clearance
+            lost = _of_states(h)
+            held = velocity_extended(h, clearance, s.gamma) if s.gamma > 0.0 else lost
+            flow = _flow(self.airframe.parameters)
+            asked = condition(held, s.alpha, quadrotor.STATE, flow, as_published=True, lost=lost)
+            self.kept = [
+                keep(graph, asked, x[:-1], self.u, self._since, *seen, obstacles=m, form="hinge", weight=s.hinge)
+            ]
+            return
+        ends = x[:-1].p, x[1:].p, self._since, steps, *seen
+        self.kept = [keep(graph, decay(clearance, s.alpha), *ends, obstacles=m, form=s.form, weight=s.slack)]
+        if s.gamma > 0.0:
+            held = velocity_extended(clearance, clearance, s.gamma)
+            states = x[:-1], x[1:], self._since, steps, *seen
+            name = "velocity barrier"
+            self.kept.append(
+                keep(graph, decay(held, s.alpha), *states, obstacles=m, form=s.form, weight=s.slack, name=name)
+            )
 
     def decide(self, state: Array, now: float, obstacles: Obstacles, seen: float) -> Decision:
         """Plan.
@@ -275,24 +301,25 @@ class Keeper:
         if self._weighing is not None:
             data |= self._weighing.data()
         if s.slots:
-            near = obstacles.nearest(state[:3], s.slots)
-            places = near.at(now - seen + self.nodes)
+            near = obstacles.nearest(state[:3], s.slots, now - seen)
             flat = np.ones((s.slots, 3))
             flat[near.upright, 2] = 0.0
-            data |= {self._here: places[:-1], self._there: places[1:], self._keep: near.keep, self._flat: flat}
+            fall = np.array([0.0, 0.0, -quadrotor.GRAVITY]) * near.falls[:, None]
+            given = near.position, near.velocity, fall, near.keep, flat
+            data |= {self._since: now - seen + self.nodes[:-1], **dict(zip(self._seen.values(), given, strict=True))}
         guess, run = self._guess, self._warm
         if guess is None:
             states[0] = state
             values = {self.x: states, self.u: controls[:-1], **self._parameters()}
-            if self.slack is not None:
-                values[self.slack] = np.full((s.horizon, s.slots), 1e-3)
+            for kept in self.kept:
+                values |= kept.guess()
             guess, run = fg.Guess(values), self._cold
         solution = run.solve(guess, data=data)
         usable = bool(np.isfinite(solution[self.u]).all())
         self._guess = solution.shifted(self.x, self.u, by=0) if usable else None
         control = np.clip(solution[self.u][0] if usable else self._applied, self.airframe.least, self.airframe.most)
         self._applied = control
-        slack = float(solution[self.slack].max()) if self.slack is not None else 0.0
+        slack = max((use.amount for kept in self.kept for use in kept.used(solution)), default=0.0)
         spent = 1e3 * (time.thread_time() - begin)
         return Decision(
             control, solution[self.x][:, :3], solution.status.name.lower(), solution.iterations, slack,
@@ -309,3 +336,24 @@ class Keeper:
             return {}
         p = self.airframe.parameters
         return {self.mass: np.array([[p.mass]]), self.drag: np.array([p.drag])}
+
+
+def _of_states(h: Barrier) -> Barrier:
+    """A barrier on positions as one on states."""
+    place = quadrotor.STATE.component("p").storage
+
+    def of_states(x: Array, t: Any, *obstacle: Any) -> Array:
+        return h(x[:, place], t, *obstacle)
+
+    return of_states
+
+
+def _flow(parameters: quadrotor.Parameters) -> Flow:
+    """F of the vehicle without noise."""
+    mass, *rest = parameters.packed.tolist()
+    drag, wind, updraft = (np.array([part]) for part in (rest[:3], rest[3:5], rest[5:]))
+
+    def flow(x: Array, u: Array) -> Array:
+        return quadrotor.field(x, u, np.zeros((1, 6)), np.array([[mass]]), drag, wind, updraft)
+
+    return flow

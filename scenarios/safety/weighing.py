@@ -28,7 +28,7 @@ class WeighingSettings:
     """Numbers of the estimate.
 
     Attributes:
-        stretch: ticks that a stretch of the past has.
+        stretch: length of a stretch of the past, whole ticks [s].
         count: stretches that are remembered.
         velocity_sigma: standard deviation of a velocity seen [m/s].
         mass_sigma: of the mass before anything was seen, relative.
@@ -36,7 +36,7 @@ class WeighingSettings:
         least: least mass that is believed [kg].
     """
 
-    stretch: int = 5
+    stretch: float = 0.05
     count: int = 60
     velocity_sigma: float = 0.01
     mass_sigma: float = 0.1
@@ -87,7 +87,7 @@ class Weighing:
             graph.data("push", self._push, each=True), graph.data("hold", self._hold, each=True),
             graph.data("gained", self._gained, each=True), graph.data("weighed", self._known, each=True),
         )  # fmt: skip
-        sigma = 2.0**0.5 * s.velocity_sigma / (s.stretch * self._dt)
+        sigma = 2.0**0.5 * s.velocity_sigma / s.stretch
         every = np.zeros(n, dtype=np.intp)
         graph.minimize(balance, mass[every], drag[every], *given[:3], sigma=sigma, active=given[3], name="weighing")
         nominal = self._nominal
@@ -118,7 +118,7 @@ class Weighing:
             self._sums *= 0.5
             return
         self._count += 1
-        if self._count < self.settings.stretch:
+        if self._count < round(self.settings.stretch / self._dt):
             return
         half = 0.5 * np.column_stack([thrust * turn[:, 2], turn * (turn.T @ state[7:])])
         mean = (self._sums - half) / self._count

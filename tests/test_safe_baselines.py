@@ -1,0 +1,166 @@
+"""Those whom barriers in a plan are compared with, and the oracle that judges all of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from unifg.errors import ScenarioError
+from unifg.scenarios.safe_flight import SafeSettings, flights
+from unifg.scenarios.safety.keeper import Obstacles
+from unifg.scenarios.safety.one_step import FilterSettings, filtered
+from unifg.scenarios.safety.oracle import Authority, escape, exists
+from unifg.scenarios.safety.spline_planner import SplineSettings, around
+from unifg.scenarios.ways.flat_path import Line
+
+LINE = Line((-4.0, 0.0, 1.5), (4.0, 0.0, 1.5), 2.0, 1.5)
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def one(
+    place: tuple[float, float, float], *, upright: bool = True, falls: bool = False, speed: float = 0.0
+) -> Obstacles:
+    """An obstacle 0.75 m away from whose centre nobody may be, moving along x."""
+    return Obstacles(
+        np.array([place]), np.array([[speed, 0.0, 0.0]]), np.array([0.75]), np.array([upright]), np.array([falls])
+    )
+
+
+def state(x: float, y: float, vx: float, vy: float = 0.0) -> np.ndarray:
+    return np.concatenate([[x, y, 1.5], LEVEL, [vx, vy, 0.0]])
+
+
+# ---------------------------------------------------------------- one step
+
+
+def test_far_away_nothing_is_filtered() -> None:
+    wanted = np.array([1.0, -2.0, 0.5])
+    found, slack = filtered(wanted, state(-9.0, 0.0, 0.5), one((0.0, 0.0, 0.0)), 0.0, FilterSettings())
+    np.testing.assert_allclose(found, wanted, atol=1e-6)
+    assert slack < 1e-6
+
+
+@pytest.mark.parametrize(("upright", "falls", "speed"), [(True, False, 0.0), (False, False, -0.5), (False, True, 0.0)])
+def test_what_is_filtered_keeps_the_condition(upright: bool, falls: bool, speed: float) -> None:
+    s, later = FilterSettings(), 0.07
+    seen, now = (
+        one((0.0, 0.1, 0.0 if upright else 1.4), upright=upright, falls=falls, speed=speed),
+        state(-1.1, 0.0, 0.6),
+    )
+    found, slack = filtered(np.array([3.0, 0.0, 0.0]), now, seen, later, s)
+    assert slack < 1e-3 and found[0] < 2.9
+
+    def clearance(t: float) -> float:
+        """Of the vehicle under that acceleration, t seconds after it begins."""
+        place = now[:3] + now[7:] * t + 0.5 * found * t * t
+        away = place - seen.at(np.array([later + t]))[0, 0]
+        return float(np.linalg.norm(away[:2] if upright else away)) - 0.75
+
+    h = 1e-4
+    rate = (clearance(h) - clearance(-h)) / (2.0 * h)
+    bend = (clearance(h) - 2.0 * clearance(0.0) + clearance(-h)) / h**2
+    assert bend + (s.alpha + s.beta) * rate + s.alpha * s.beta * clearance(0.0) == pytest.approx(0.0, abs=2e-3)
+
+
+def test_where_nothing_helps_the_slack_says_so_and_the_box_is_kept() -> None:
+    s = FilterSettings()
+    found, slack = filtered(np.zeros(3), state(-0.8, 0.0, 4.0), one((0.0, 0.0, 0.0)), 0.0, s)
+    assert slack > 1.0
+    assert found[0] == pytest.approx(-s.level, abs=1e-4) and np.abs(found).max() < s.level + 1e-6
+    inside, _ = filtered(np.zeros(3), state(0.0, 0.0, 0.0), one((0.0, 0.0, 0.0)), 0.0, s)
+    assert np.isfinite(inside).all()
+
+
+# ---------------------------------------------------------------- splines
+
+
+def test_without_obstacles_a_spline_stays_near_its_line() -> None:
+    nothing = Obstacles(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, bool), np.zeros(0, bool))
+    times = np.linspace(-1.0, LINE.duration + 2.0, 200)
+    flown, wanted = around(LINE, nothing, SplineSettings()).at(times), LINE.at(times)
+    np.testing.assert_allclose(flown.position, wanted.position, atol=0.02)
+    np.testing.assert_array_equal(flown.velocity[times < 0.0], 0.0)
+    h = 1e-5
+    inner = times[(times > 0.1) & (times < LINE.duration)]
+    path = around(LINE, nothing, SplineSettings())
+    slope = (path.at(inner + h).position - path.at(inner - h).position) / (2.0 * h)
+    np.testing.assert_allclose(slope, path.at(inner).velocity, atol=1e-5)
+
+
+@pytest.mark.parametrize("beside", [-0.3, 0.02])
+def test_splines_leave_obstacles_on_the_nearer_side_and_a_margin_moves_them_away(beside: float) -> None:
+    near = []
+    for margin in (0.1, 0.4):
+        path = around(LINE, one((0.0, beside, 0.0)), SplineSettings(margin=margin))
+        places = path.at(np.linspace(0.0, path.duration, 2000)).position
+        near.append(np.hypot(places[:, 0], places[:, 1] - beside).min() - 0.75)
+        farthest = places[np.argmax(np.abs(places[:, 1])), 1]
+        assert np.sign(farthest) == -np.sign(beside)
+        np.testing.assert_allclose(places[[0, -1]], [LINE.start, LINE.end], atol=0.02)
+    assert near[0] > -0.05 and near[1] > near[0] + 0.15
+
+
+def test_splines_are_for_things_at_rest() -> None:
+    with pytest.raises(ScenarioError, match="past things at rest, not in the case 'ellipse'"):
+        flights(SafeSettings(case="ellipse", controller=("spline",)))
+
+
+@pytest.mark.parametrize("controller", ["filter", "spline"])
+def test_baselines_pass_the_cylinder(controller: str) -> None:
+    (flight,) = flights(SafeSettings(alpha=(3.0,), controller=(controller,)))  # type: ignore[arg-type]
+    flight.situation = replace(flight.situation, duration=3.2)
+    log = flight.run()
+    assert not log.touched and log.clearance.min() < 0.5
+
+
+# ---------------------------------------------------------------- the oracle
+
+
+def test_the_oracle_is_right_about_a_vehicle_that_flies_straight_at_a_point() -> None:
+    """Sideways it is half A (t - d)^2 away after t = distance / speed."""
+    authority = Authority(vehicle=4.0, mass_error=0.0, delay=0.1)
+    away, speed, keep = np.array([-2.0, 0.0]), np.array([4.0, 0.0]), 0.3
+    certain, best = escape(away, speed, keep, authority)
+    assert 0.5 * 4.0 * 0.4**2 - keep == pytest.approx(best, abs=2e-3)
+    assert -1e-3 < certain <= best + 1e-9
+    assert exists(away, speed, 0.25, authority) == "yes"
+    assert exists(away, speed, 0.33, authority) == "no"
+
+
+def test_more_to_give_never_makes_it_worse() -> None:
+    rng, base = np.random.default_rng(5), Authority(obstacle=1.0)
+    answers = []
+    for _ in range(60):
+        away, speed, keep = rng.uniform(-2.0, 2.0, 3), rng.uniform(-5.0, 5.0, 3), rng.uniform(0.2, 0.8)
+        certain, best = escape(away, speed, keep, base)
+        assert certain <= best + 1e-9
+        answers.append(exists(away, speed, keep, base))
+        for name, less in (("vehicle", 3.0), ("mass_error", 0.5), ("delay", 0.4), ("obstacle", 3.0)):
+            weaker = replace(base, **{name: less})
+            assert escape(away, speed, keep, weaker)[0] <= certain + 1e-9
+            assert escape(away, speed, keep, weaker)[1] <= best + 1e-9
+    assert {"yes", "no"} <= set(answers)
+
+
+def test_where_the_oracle_says_yes_an_acceleration_that_is_held_escapes_whatever_the_obstacle_does() -> None:
+    rng, authority = np.random.default_rng(6), Authority(obstacle=1.5, horizon=1.5)
+    times = np.linspace(0.0, 1.5, 301)
+    seen = 0
+    for _ in range(40):
+        away, speed = rng.uniform(-2.0, 2.0, 2), rng.uniform(-3.0, 3.0, 2)
+        if exists(away, speed, 0.4, authority) != "yes":
+            continue
+        seen += 1
+        angle = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
+        ways = authority.usable * np.column_stack([np.cos(angle), np.sin(angle)])
+        late = 0.5 * np.maximum(times - authority.delay, 0.0) ** 2
+        worst = np.full(72, np.inf)
+        for turn in np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False):  # pushes of the obstacle, each held
+            push = authority.obstacle * np.array([np.cos(turn), np.sin(turn)])
+            place = away + times[:, None] * speed - 0.5 * push * times[:, None] ** 2
+            place = place + ways[:, None, :] * late[:, None]
+            worst = np.minimum(worst, np.linalg.norm(place, axis=2).min(axis=1))
+        assert worst.max() >= 0.4 - 1e-9
+    assert seen > 5
