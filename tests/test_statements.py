@@ -73,6 +73,7 @@ HOSTILE: dict[str, tuple[States, str]] = {
     "information skew": (weighed(information=SKEW), r"symmetric, found 0.5 at \(0, 1\) and 0 at \(1, 0\)"),
     "information indefinite": (weighed(information=INDEFINITE), "factor 2 has a negative eigenvalue, -4"),
     "information nan": (weighed(information=np.full((3, 3), np.nan)), "finite and symmetric, found nan"),
+    "information data": (lambda g, x, u: weighed(information=g._data["s"])(g, x, u), r"information has shape \(3,\)"),
     "both": (weighed(sigma=1.0, information=np.eye(3)), "not both"),
     "loss is a class": (weighed(robust=fg.Huber), "must be a loss such as"),
     "loss is a number": (weighed(robust=1.0), "must be a loss such as"),
