@@ -54,6 +54,15 @@ def test_matplotlib_is_imported_when_something_is_drawn_and_pyplot_never(tmp_pat
     assert target.read_bytes()[:4] == b"\x89PNG"
 
 
+def test_without_matplotlib_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, x = line(1)
+    graph.minimize(fg.prior, x, [0.0, 0.0])
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ImportError, match=r'pip install "unifg\[view\]"'):
+        graph.draw()
+    assert "prior" in str(graph)
+
+
 def test_nothing_global_changes() -> None:
     before = dict(mpl.rcParams)
     graph, guess = short_drive()

@@ -64,10 +64,14 @@ def new_figure(size: tuple[float, float], ticks: int = 1) -> Iterator[Figure]:
 
     Raises:
         ViewError: there is no tick.
+        ImportError: matplotlib is not installed.
     """
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    try:
+        import matplotlib as mpl
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError('pictures need matplotlib: pip install "unifg[view]"') from error
 
     if ticks == 0:
         raise ViewError("there is no tick, and nothing to draw")
