@@ -81,6 +81,7 @@ PAGES = {
         Page("excluded-pasts", "Pasts that cannot have been", "benchmarks.excluded_pasts", hours=0.05),
         Page("quadrotor-joint", "One graph that estimates and flies", "benchmarks.quadrotor_pull", hours=0.15),
         Page("quadrotor-mpc", "Scenario: quadrotor-mpc", "benchmarks.quadrotor_flights", hours=1.5),
+        Page("barriers", "Control barrier functions", "benchmarks.guarded_flights", hours=0.15),
         Page("benchmarks", "Benchmarks", "benchmarks.elimination"),
     )
 }

@@ -38,6 +38,7 @@ __all__ = [
     "decay",
     "inverse",
     "moving",
+    "share",
     "still",
     "thrown",
     "uncertain",
@@ -203,6 +204,11 @@ def uncertain(h: Barrier, k: float) -> Barrier:
 # ---------------------------------------------------------------- h' >= -alpha h
 
 
+def share(alpha: float, t: Any) -> Any:
+    """``exp(-alpha t)``: how much of a barrier must be left after t seconds, same shape as t [s]."""
+    return np.exp(-alpha * t)
+
+
 def decay(h: Barrier, alpha: float) -> Callable[..., Array]:
     """``h(x_next, t + dt) - exp(-alpha dt) h(x, t)``, as ``(x, x_next, t, dt, *obstacle)``, (n, M).
 
@@ -222,7 +228,7 @@ def decay(h: Barrier, alpha: float) -> Callable[..., Array]:
     _not_negative("alpha", alpha)
 
     def barrier(x: Array, x_next: Array, t: Any, dt: Any, *obstacle: Any) -> Array:
-        kept = np.reshape(np.exp(-alpha * dt), (-1, 1))
+        kept = np.reshape(share(alpha, dt), (-1, 1))
         return h(x_next, t + dt, *obstacle) - kept * h(x, t, *obstacle)
 
     return barrier

@@ -11,6 +11,7 @@ import numpy as np
 import unifg as fg
 from unifg.horizon import Now
 from unifg.models import obstacles, unicycle
+from unifg.models.barriers import share
 from unifg.models.distance_map import SmoothField
 from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.seeing.tracks import Tracks, nearest
@@ -130,8 +131,8 @@ def predicted(s: ControllerSettings, pose: Array, tracks: Tracks) -> Array:
 def disc_limits(s: ControllerSettings, pose: Array, centres: Array, radii: Array, movers: BoolArray) -> Array:
     """(N, M) least distances to discs, as far as a robot at rest keeps them: resting is always feasible.
 
-    A disc that has ever moved is kept off by what it can travel in the meantime, up to a limit, and is not
-    approached by more than a share of the gap each step, as a control barrier function demands.
+    A disc that has ever moved is kept off by what it can travel in the meantime, up to a limit, and what is left of
+    the gap is a barrier that may shrink at the rate ``approach`` from now on.
     """
     stages = np.arange(1, s.horizon + 1)[:, None]
     at_rest = np.hypot(*np.moveaxis(pose[:2] - centres, 2, 0)) - radii
@@ -142,5 +143,5 @@ def disc_limits(s: ControllerSettings, pose: Array, centres: Array, radii: Array
     # that moves, for one that waits beside a robot at rest goes on as soon as the robot does.
     squeezed = np.minimum(at_rest, np.maximum(at_rest - s.squeeze, s.robot_radius + s.squeeze))
     kept = np.where(movers, at_rest, squeezed)
-    limits: Array = np.minimum(least + spare * (1.0 - s.approach) ** stages, kept)
+    limits: Array = np.minimum(least + spare * share(s.approach, s.dt * stages), kept)
     return limits

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +36,7 @@ class ControllerSettings:
         mover_speed: fastest walk of a mover [m/s].
         mover_allowance: most that is added to the clearance from discs that have ever moved [m].
         mover_margin: added to the soft margin around such discs [m].
-        approach: share of the gap to such a disc that one step may close.
+        approach: rate at which the gap to such a disc may close, alpha of its barrier [1/s].
         squeeze: how much nearer than at rest a plan may pass a standing disc where the clearance is violated [m].
         courtesy: gap at which movers wait for a robot at rest [m].
         yield_distance: gap to a mover that closes in at which the robot rests [m].
@@ -63,7 +64,7 @@ class ControllerSettings:
     mover_speed: float = 0.3
     mover_allowance: float = 0.15
     mover_margin: float = 0.3
-    approach: float = 0.12
+    approach: float = -math.log(0.88) / 0.1
     squeeze: float = 0.03
     courtesy: float = 0.1
     yield_distance: float = 0.3
