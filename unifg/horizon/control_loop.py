@@ -192,16 +192,20 @@ class Loop:
             time: of the present [s]; None for one more than at the last tick.
 
         Raises:
-            GraphError: without a window, or for data that do not fit; not for a hard problem.
+            GraphError: without a window; for a measurement, a control or a time that does not fit, which leaves
+                everything as it was; for data of a term that do not. Not for a hard problem.
         """
         if self.window is None:
             raise GraphError("a tick needs a window; without one, give the present to plan()")
         begin = self._clock()
+        seen = {name: value for name, value in (measured or {}).items() if value is not None}
+        for name, value in seen.items():
+            self.window.history.readable(name, value)
         if self.window.solution is not None:
             self.window.move(self.applied if applied is None else applied, time)
         elif time is not None:
             self.window.history.times[:] = time
-        for name, value in (measured or {}).items():
+        for name, value in seen.items():
             self.window.record(name, value)
         self.window.estimate(given)
         last = self.applied if applied is None else np.asarray(applied, dtype=np.float64)

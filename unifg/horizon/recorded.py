@@ -93,6 +93,17 @@ class History:
         state: Array = self.states[-1]
         return state
 
+    def later(self, time: float | None) -> float:
+        """The time of a new node; None for one more than that of the present one.
+
+        Raises:
+            GraphError: when time runs backwards.
+        """
+        new = float(self.times[-1]) + 1.0 if time is None else float(time)
+        if not new > self.times[-1]:
+            raise GraphError(f"the new node at {new} s is not later than the present one at {self.times[-1]} s")
+        return new
+
     def move(self, control: ArrayLike, state: ArrayLike, time: float, steps: Mapping[str, ArrayLike]) -> None:
         """Let the present become the past.
 
@@ -105,8 +116,7 @@ class History:
         Raises:
             GraphError: when time runs backwards.
         """
-        if not time > self.times[-1]:
-            raise GraphError(f"the new node at {time} s is not later than the present one at {self.times[-1]} s")
+        time = self.later(time)
         self.entered = min(self.entered + 1, self.length)
         rows = (self.states, self.controls, self.times, self.initial, *self.steps.values())
         for array in (*rows, *self._values.values(), *self._measured.values()):
@@ -120,22 +130,30 @@ class History:
     def record(self, name: str, value: ArrayLike, node: int = -1) -> None:
         """Attach a measurement to a node, the present one by default, an older one where it arrives late.
 
-        A value with an entry that is not a number was not measured.
+        A value with an entry that is not finite was not measured.
 
         Raises:
             GraphError: when nothing measures that, its shape differs, or the node has not entered or has left.
         """
-        if name not in self._values:
-            raise GraphError(f"nothing measures '{name}' (there are: {', '.join(self._values) or 'none'})")
-        values, array = self._values[name], np.asarray(value, dtype=np.float64)
-        if array.shape != values.shape[1:]:
-            raise GraphError(f"measurement '{name}' has shape {array.shape}, expected {values.shape[1:]}")
+        array = self.readable(name, value)
         place = node if node >= 0 else self.length + 1 + node
         if not self.empty <= place <= self.length:
             raise GraphError(f"measurement '{name}' of node {node}: the window holds nodes {self.empty}..{self.length}")
-        if np.isnan(array).any():
-            return
-        values[place], self._measured[name][place] = array, True
+        if np.isfinite(array).all():
+            self._values[name][place], self._measured[name][place] = array, True
+
+    def readable(self, name: str, value: ArrayLike) -> Array:
+        """A measured value as an array.
+
+        Raises:
+            GraphError: when nothing measures that, or its shape differs.
+        """
+        if name not in self._values:
+            raise GraphError(f"nothing measures '{name}' (there are: {', '.join(self._values) or 'none'})")
+        expected, array = self._values[name].shape[1:], np.asarray(value, dtype=np.float64)
+        if array.shape != expected:
+            raise GraphError(f"measurement '{name}' has shape {array.shape}, expected {expected}")
+        return array
 
     def recorded(self, name: str) -> tuple[Array, BoolArray]:
         """(L + 1, ...) what was measured at the nodes, and (L + 1,) whether it was."""

@@ -219,12 +219,13 @@ class Window:
         if applied.shape != (self.robot.control.storage,) or not np.isfinite(applied).all():
             raise GraphError(f"the control that was applied must be ({self.robot.control.storage},) finite: {applied}")
         history = self.history
+        entering = history.later(time)
         if history.full:
             if self.left.departure is None:
                 self.estimate_nothing()
             self.left.arrival, self.left.departure = self.left.departure, None
         expected = self.robot.predicted(history.present, applied) if state is None else state
-        history.move(applied, expected, history.times[-1] + 1.0 if time is None else time, steps or {})
+        history.move(applied, expected, entering, steps or {})
 
     def record(self, name: str, value: ArrayLike | None, node: int = -1) -> None:
         """Attach what was measured to a node, by default the present one; None where nothing was.
