@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import gzip
 from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.random import Generator
+from scipy.io import loadmat
 
 import unifg as fg
 from unifg.errors import ModelError
@@ -457,3 +461,52 @@ def test_untraceable_errors_still_work(solver: Callable[[], fg.Solver]) -> None:
     fixes.add(0.05, [0.1, 0.2])
     solution = solver().solve(graph, {x: np.zeros((3, 3))}, data=fixes.at(graph, [0.0, 0.1, 0.2]), check=True)
     assert solution[x][0, 0] > 0.04
+
+
+# ---------------------------------------------------------------- a log
+
+
+@pytest.mark.data
+def test_ranges_of_a_lawn_mower_between_sparse_nodes(shared_data: Path) -> None:
+    """Plaza 1: four beacons at 1.8 Hz, nodes every 4 s; ranges are too long by a factor that is estimated along.
+
+    Ranges taken at the nearest node instead are what one does without interpolation.
+    """
+    with gzip.open(shared_data / "landmarks" / "Plaza1_.mat.gz") as file:
+        log = loadmat(BytesIO(file.read()))
+    beacons = {int(row[0]): row[1:] for row in log["TL"]}
+    first, every, count = 600, 20, 60
+    places = slice(first, first + every * count + 1, every)
+    times, truth = log["GT"][places, 0], log["GT"][places, 1:]
+    moved = np.tile(fg.SE2.identity(), (count, 1))
+    steps = log["DR"][first : first + every * count, 1:].reshape(count, every, 2)
+    for k in range(every):
+        moved = fg.SE2.compose(moved, fg.SE2.exp(np.insert(steps[:, k], 1, 0.0, axis=1)))
+    ranges = log["TD"][(log["TD"][:, 0] > times[0]) & (log["TD"][:, 0] < times[-1])]
+    values = np.array([[*beacons[int(row[2])], row[3]] for row in ranges])
+
+    def error(x: Array, long: Array, z: Array) -> Array:
+        distance = np.linalg.norm(x[:, :2] - z[:, :2], axis=1, keepdims=True)
+        return np.asarray(distance * (1.0 + long[:, 1:]) + long[:, :1] - z[:, 2:])
+
+    graph = fg.Graph()
+    x, long = graph.variables("x", fg.SE2, count + 1), graph.variables("long", fg.Rn(2), 1)
+    graph.minimize(fg.between, x[:-1], x[1:], moved, sigma=np.sqrt(every) * np.array([0.03, 0.03, 0.01]))
+    graph.minimize(fg.prior, x[0], truth[0], sigma=[1.0, 1.0, 0.3])
+    graph.minimize(fg.prior, long, [0.0, 0.0], sigma=[5.0, 0.2])
+    guess = {x: truth[:1] + np.zeros((count + 1, 1)), long: np.zeros((1, 2))}
+    for k in range(count):
+        guess[x][k + 1] = fg.SE2.compose(guess[x][k], moved[k])
+    nearest = times[np.argmin(np.abs(times[:, None] - ranges[:, 0]), axis=0)]
+    off = {}
+    for name, stamps in (("interpolated", ranges[:, 0]), ("nearest", nearest)):
+        sensor = StampedMeasurements(
+            error, 3, capacity=20, sigma=0.7, statics=("long",), robust=fg.Huber(1.345), name=name
+        )
+        sensor.state(graph, x)
+        sensor.add(stamps, values)
+        solution = LevenbergMarquardt().solve(graph, guess, data=sensor.at(graph, times), check=True)
+        graph.remove(name)
+        assert sensor.counts == Counts(placed=len(ranges))
+        off[name] = float(np.sqrt(np.mean(np.sum((solution[x][:, :2] - truth[:, :2]) ** 2, axis=1))))
+    assert len(ranges) == 441 and off["interpolated"] < 0.2 < 0.35 < off["nearest"], off
