@@ -26,6 +26,13 @@ REFUSALS: list[tuple[str, Breaks, str]] = [
         "not both",
     ),
     ("lower above upper", lambda g, x: g.bound(x, lower=[0.0, 2.0], upper=1.0), "lower exceeds upper"),
+    ("bound without limits", lambda g, x: g.bound(x, name="a"), "term 'a': a bound without limits says nothing: give"),
+    ("constraint without limits", lambda g, x: g.constrain(fg.prior, x, [0, 0]), "a constraint without limits"),
+    (
+        "numbers that are no column",
+        lambda g, x: g.minimize(fg.prior, g.variables("n", fg.Rn(1), 4), np.zeros(4)),
+        r"expected \(1,\).*a number for each of 4 factors is a column, \(4, 1\): z\[:, None\]",
+    ),
     ("nan limit", lambda g, x: g.bound(x, upper=np.nan), "NaN"),
     ("fixed twice", lambda g, x: (g.fix(x[0], [0.0, 0.0]), g.fix(x[:2], [0.0, 0.0])), r"x\[0\] is fixed"),
     ("fix shape", lambda g, x: g.fix(x[0], [0.0, 0.0, 0.0]), "shape"),
@@ -200,3 +207,25 @@ def test_check_finds_dependent_constraints_and_bad_residuals() -> None:
     with np.errstate(all="ignore"):
         found = graph.check({x: np.array([[1.0, 1.0], [0.0, 1.0]])}).findings
     assert [(f.kind, f.term, f.index) for f in found] == [("not finite", "inverse", 1)]
+
+
+def test_names_do_not_take_the_place_of_families() -> None:
+    graph, x = line()
+    graph.minimize(fg.prior, x, [0.0, 0.0])
+    guess = np.zeros((len(x), 2))
+    with pytest.raises(fg.GraphError, match="contains 'x', which is no family of this graph: take the family itself"):
+        GaussNewton().solve(graph, {"x": guess})  # type: ignore[dict-item]
+    with pytest.raises(fg.GraphError, match=r"contains 'y', which is no family of this graph$"):
+        GaussNewton().solve(graph, {"y": guess})  # type: ignore[dict-item]
+    solution = GaussNewton().solve(graph, {x: guess})
+    with pytest.raises(fg.GraphError, match="expected a family of variables, or some of its members, found 'x'"):
+        solution["x"]  # type: ignore[index]
+    with pytest.raises(fg.GraphError, match=r"covariance\(\) of what"):
+        solution.covariance()
+
+
+def test_a_limit_may_be_infinite_if_it_is_given() -> None:
+    graph, x = line()
+    graph.minimize(fg.prior, x, [0.0, 0.0])
+    graph.bound(x, lower=-np.inf, upper=np.inf)
+    assert AugmentedLagrangian().solve(graph, {x: np.ones((len(x), 2))}).converged

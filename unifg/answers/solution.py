@@ -195,8 +195,10 @@ class Solution:
         What is fixed is known: its rows and columns are zero, as are directions that an active constraint forbids.
 
         Raises:
-            GraphError: when the system is singular.
+            GraphError: when the system is singular, or nothing is selected.
         """
+        if not variables:
+            raise GraphError("covariance() of what? Name families or members, as covariance(x[-1])")
         for variable in variables:
             self._require(as_selection(variable))
         columns = [self._program.columns.of(as_selection(variable)).ravel() for variable in variables]

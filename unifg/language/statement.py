@@ -40,7 +40,7 @@ from unifg.typing import Array, ArrayLike, IntArray
 AnyResidual: TypeAlias = Function | Residual | ManifoldResidual
 S = TypeVar("S", bound="Statement")
 SAME: Final[Any] = object()
-"""In the place of what :meth:`Statement.replace` leaves as it is."""
+"""In the place of what :meth:`Statement.replace` leaves as it is, and of a limit that is not given."""
 
 
 class Statement:
@@ -161,17 +161,18 @@ class Statement:
         self,
         function: AnyResidual,
         *arguments: Any,
-        lower: Parameter = -np.inf,
-        upper: Parameter = np.inf,
+        lower: Parameter = SAME,
+        upper: Parameter = SAME,
         active: Any = None,
         name: str | None = None,
     ) -> str:
-        """Require ``lower <= g <= upper``; equal limits make an equality.
+        """Require ``lower <= g <= upper``; equal limits make an equality, a limit that is not given is none.
 
         Multipliers are positive at an active upper limit and negative at an active lower one.
 
         Raises:
-            GraphError: when a lower limit exceeds its upper limit, or anything is malformed; the graph is as it was.
+            GraphError: when there is no limit, a lower limit exceeds its upper limit, or anything is malformed; the
+                graph is as it was.
         """
         return self._add(self._constraint(name, function, arguments, lower, upper, active))
 
@@ -179,14 +180,15 @@ class Statement:
         self,
         variable: Variable,
         *,
-        lower: Parameter = -np.inf,
-        upper: Parameter = np.inf,
+        lower: Parameter = SAME,
+        upper: Parameter = SAME,
         name: str | None = None,
     ) -> str:
-        """Limit Rn variables, or Rn components of a product, entry by entry.
+        """Limit Rn variables, or Rn components of a product, entry by entry; an infinite limit is none.
 
         Raises:
-            GraphError: when the variable does not live in Rn, or the limits do not fit; the graph is as it was.
+            GraphError: when the variable does not live in Rn, there is no limit, or the limits do not fit; the graph is
+                as it was.
         """
         return self._add(self._bound(name, (variable,), lower, upper))
 
@@ -372,6 +374,7 @@ class Statement:
             unique = self._unique(name, wrapped.name, replaced)
             normal, active, count = self._arguments(unique, arguments, active)
             size = rows_of(unique, wrapped, normal, count)
+            lower, upper = _given("a constraint", unique, lower, upper)
             lower, upper = check_limits(unique, lower, upper, count, size)
             self._own_data(unique, lower, upper)
             return Constraint(unique, wrapped, normal, active, count, size, lower, upper)
@@ -395,6 +398,7 @@ class Statement:
             unique = self._unique(name, f"{selection.family.name} bounds", replaced)
             normal, active, count = self._arguments(unique, (selection,), None)
             size = selection.manifold.dim
+            lower, upper = _given("a bound", unique, lower, upper)
             lower, upper = check_limits(unique, lower, upper, count, size)
             self._own_data(unique, lower, upper)
             return Constraint(unique, residual(itself), normal, active, count, size, lower, upper, is_bound=True)
@@ -544,6 +548,13 @@ def title(function: Any) -> str:
 def _require_name(what: str, name: Any) -> None:
     if not isinstance(name, str) or not name:
         raise GraphError(f"the name of a {what} must be a text that is not empty, found {name!r}")
+
+
+def _given(what: str, name: str, lower: Parameter, upper: Parameter) -> tuple[Parameter, Parameter]:
+    """Limits with infinity for the one that is not given; that neither is, is a mistake."""
+    if lower is SAME and upper is SAME:
+        raise GraphError(f"term '{name}': {what} without limits says nothing: give lower=, upper= or both", term=name)
+    return (-np.inf if lower is SAME else lower), (np.inf if upper is SAME else upper)
 
 
 def _one_variable(what: str, stated: tuple[Any, ...], name: str | None) -> Selection:

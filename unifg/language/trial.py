@@ -152,7 +152,11 @@ def _rows_of_kernel(name: str, kernel: Kernel, arguments: Sequence[Any], count: 
     try:
         _, parameters, _ = kernel.split(filled, count)
     except GraphError as error:
-        raise GraphError(f"term '{name}': {error}", term=name) from None
+        flat = any(
+            not isinstance(a, Selection) and np.shape(f) == (count,) for a, f in zip(arguments, filled, strict=True)
+        )
+        column = f"; a number for each of {count} factors is a column, ({count}, 1): z[:, None]" if flat else ""
+        raise GraphError(f"term '{name}': {error}{column}", term=name) from None
     return kernel.size([parameter.shape[1:] for parameter in parameters])
 
 

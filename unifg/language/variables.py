@@ -151,7 +151,13 @@ RESERVED = frozenset({"name", "manifold", "count", "family", "indices", "compone
 
 
 def as_selection(variable: Variable) -> Selection:
-    """View a whole family as a selection of all its members."""
+    """View a whole family as a selection of all its members.
+
+    Raises:
+        GraphError: it is neither.
+    """
+    if not isinstance(variable, Family | Selection):
+        raise GraphError(f"expected a family of variables, or some of its members, found {variable!r}")
     return variable if isinstance(variable, Selection) else variable[:]
 
 

@@ -51,7 +51,9 @@ class GuessReader:
         """A copy of values from anywhere."""
         for family in guess:
             if not isinstance(family, Family) or self._graph.families.get(family.name) is not family:
-                raise GraphError(f"the guess contains {family!r}, which is no family of this graph")
+                named = isinstance(family, str) and family in self._graph.families
+                hint = ": take the family itself, as graph.variables returned it, not its name" if named else ""
+                raise GraphError(f"the guess contains {family!r}, which is no family of this graph{hint}")
         values = Values(self._columns, np.empty(self._columns.stored))
         for family, own in values.items():
             given = guess.get(family)

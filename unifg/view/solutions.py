@@ -114,7 +114,7 @@ class Recipe:
         if len(ends) < 2:
             raise ViewError(
                 f"the factors of '{term}' touch {len(ends)} variable{'s' * (len(ends) != 1)} with a place: "
-                "a line needs two",
+                "a line needs two; for a term that takes whole products give position=",
                 term=term,
             )
         size, count = max(end.shape[1] for end in ends), max(len(end) for end in ends)
