@@ -45,7 +45,12 @@ class LeastSquares(Solver):
 
     def workspace(self, program: Program) -> Primal:
         """The factorisation of the normal equations."""
-        return Primal(program)
+        primal = Primal(program)
+        none = np.zeros(0)
+        primal.next_multipliers(
+            none, none, none
+        )  # steps that rounding swallows ask for it, the first perhaps in a loop
+        return primal
 
 
 @dataclass(kw_only=True)

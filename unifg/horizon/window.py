@@ -106,9 +106,19 @@ class Window:
         self._look = replace(solver, max_iterations=0).prepare(graph)
         self.spread = JointCovariance(self.run.program, x[-1], *self._past.statics)
         self.solution: Solution | None = None
+        self._rehearse()
         self.statuses: Counter[Status] = Counter()
+        self._given: Any = None
         self.iterations, self._rounds, self._steady = 0, rounds, steady
         self._covariance, self._due = self._prior_covariance(), False
+
+    def _rehearse(self) -> None:
+        """Call once what ticks call besides the solver: functions of manifolds are compiled when they are needed."""
+        kinds = [self.robot.state, *self.robot.steps.values(), *(static.manifold for static in self.robot.statics)]
+        for kind in kinds:
+            here = kind.identity()
+            kind.retract(here, kind.local(here, here))
+            kind.retract(here[None], kind.local(here[None], here[None]))
 
     def past_in(self, graph: Graph, x: Selection) -> Past:
         """State the past on the nodes x (L + 1) of a graph that holds the robot's statics."""
@@ -222,7 +232,7 @@ class Window:
         entering = history.later(time)
         if history.full:
             if self.left.departure is None:
-                self.estimate_nothing()
+                self._look_again()
             self.left.arrival, self.left.departure = self.left.departure, None
         expected = self.robot.predicted(history.present, applied) if state is None else state
         history.move(applied, expected, entering, steps or {})
@@ -253,8 +263,8 @@ class Window:
 
     def estimate(self, given: Any = None) -> Solution:
         """Solve the window and believe it, unless the answer is none; then the prediction is kept."""
-        past, self.iterations = self._past, 0
-        for _ in range(self._rounds):
+        past, self.iterations, self._given = self._past, 0, given
+        for left in reversed(range(self._rounds)):
             before, data = self.present, self.data(given)
             solution = self.run.solve(self.guess(), data=data)
             self.statuses[solution.status] += 1
@@ -263,14 +273,14 @@ class Window:
                 solution = self._look.solve(self.guess(), data=data)
                 break
             past.take(solution)
-            if np.abs(self.robot.state.local(before, self.history.present)).max() < self._steady:
+            if left and np.abs(self.robot.state.local(before, self.history.present)).max() < self._steady:
                 break
         self._conclude(solution)
         return solution
 
-    def estimate_nothing(self, given: Any = None) -> None:
-        """Look at the window where it is believed to be, without moving it."""
-        self._conclude(self._look.solve(self.guess(), data=self.data(given)))
+    def _look_again(self) -> None:
+        """Linearise the window where it is believed to be, without moving it."""
+        self._conclude(self._look.solve(self.guess(), data=self.data(self._given)))
 
     def _conclude(self, solution: Solution) -> None:
         self.solution, self._due = solution, True
