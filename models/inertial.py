@@ -77,7 +77,7 @@ class SampleCounts:
     """What became of the samples.
 
     Attributes:
-        kept: of the last :meth:`InertialMeasurements.data`.
+        kept: when data were asked for last.
         invalid: left out, because a number was not finite.
         repeated: left out, because there was a sample with that stamp.
         unknown: intervals of the last data without information: they begin before the first sample, or have a gap.

@@ -38,6 +38,7 @@ GRAVITY = (0.0, 0.0, -9.81)
 """In the world [m/s^2]."""
 NEAR = 1.0  # squared angle [rad^2] below which Gamma_2 is a power series
 TERMS = 10
+CLOSE = 1e-6  # of an interval: how much later than its node the first sample may be
 
 
 @dataclass(frozen=True)
@@ -222,7 +223,7 @@ def _integrate(
     w, a = np.empty(3), np.empty(3)
     first = 0
     for n in range(len(times) - 1):
-        if len(stamps) == 0 or stamps[0] > times[n]:
+        if len(stamps) == 0 or stamps[0] > times[n] + CLOSE * (times[n + 1] - times[n]):
             continue
         while first + 1 < len(stamps) and stamps[first + 1] <= times[n]:
             first += 1

@@ -55,7 +55,7 @@ class Counts:
     """What became of the measurements.
 
     Attributes:
-        placed: in the slots of the last :meth:`StampedMeasurements.data`.
+        placed: in slots, when data were asked for last.
         waiting: kept, because their stamps lie ahead of the newest node.
         late: refused, because their stamps lie before the oldest node.
         full: refused, because all slots of their interval were taken.

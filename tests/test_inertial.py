@@ -174,6 +174,8 @@ def test_what_is_not_covered_has_no_information(rng: Generator) -> None:
     assert found.held[0] == np.inf and np.array_equal(found.increment[0], SE23.identity())
     assert not found.information[0].any() and found.information[1:].any(axis=(1, 2)).all()
     assert abs(found.held[2] - 0.105) < 1e-12  # the last sample is held to the end
+    rounded = preintegrate(t + 1.0, w, a, [np.nextafter(1.0, 0.0), 1.05], NOISE, NONE)  # a node counted back from now
+    assert rounded.held[0] < 0.006 and rounded.information[0].any()
     empty = preintegrate(np.empty(0), np.empty((0, 3)), np.empty((0, 3)), [0.0, 1.0], NOISE, NONE)
     assert empty.held[0] == np.inf
 
