@@ -60,6 +60,9 @@ def test_is_short_tested_and_shown(path: Path) -> None:
     text, page = path.read_text(encoding="utf-8"), PAGE.read_text(encoding="utf-8")
     assert len(text.splitlines()) < LONGEST
     assert f"python examples/{path.name} [FOLDER]" in text
+    known = set(re.findall(r"^\s*(?:from|import) ([\w.]+)", text, re.MULTILINE))
+    inside = {path.stem for path in EXAMPLES} | {"benchmarks", "tests", "judge", "problems"}
+    assert not {name for name in known if name.split(".")[0] in inside or name.startswith("unifg.scenarios")}
     assert f"](../examples/{path.name})" in page
     assert f"](images/examples/{path.stem}.png)" in page
     assert (PICTURES / f"{path.stem}.png").stat().st_size < LARGEST
