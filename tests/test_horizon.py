@@ -719,6 +719,8 @@ def test_what_a_loop_refuses() -> None:
     loop: Loop = Loop(LINE, 5, [Dynamics(step, 0.1), Wrong()], solver=SQP(), window=line_window(3))
     with pytest.raises(fg.GraphError, match=r"Wrong gives data 'gaol'.*goal"):
         loop.tick(TARGET)
+    with pytest.raises(fg.GraphError, match=r"data 'goal' has shape \(3,\)"):
+        line_loop().tick(np.zeros(3))
 
 
 # ---------------------------------------------------------------- on groups, with functions nobody can trace

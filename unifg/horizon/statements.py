@@ -207,9 +207,15 @@ def values_of(terms: Sequence[Term], now: Now[Any], handles: Mapping[str, Data])
                 raise GraphError(f"{type(term).__name__} gives data '{name}', which its graph does not read ({known})")
             if handles[name] in found:
                 raise GraphError(f"{type(term).__name__} gives data '{name}', which another term has given")
-            handle, size = handles[name], handles[name].value.shape
-            found[handle] = np.broadcast_to(np.asarray(value), size) if np.ndim(value) < len(size) else value
+            found[handles[name]] = _spread_out(value, handles[name].value.shape)
     return found
+
+
+def _spread_out(value: ArrayLike, shape: tuple[int, ...]) -> ArrayLike:
+    """A value for all factors alike, once for each; what does not fit is refused by the graph, which knows its name."""
+    own = np.shape(value)
+    alike = len(own) < len(shape) and own == shape[len(shape) - len(own) :]
+    return np.broadcast_to(np.asarray(value), shape) if alike or not own else value
 
 
 def handles_of(graph: Graph) -> dict[str, Data]:
