@@ -36,7 +36,7 @@ scene.plot("solve", unit="ms", log=True)
 scene.view("robot", "follow", (-1.0, 0.0, 1.0), follows="robot", distance=4.0)
 run, pose = InteriorPoint(tolerance=1e-4).prepare(graph), np.zeros(3)
 guess = fg.Guess({x: np.linspace([0.0, 0.3, 0.0], goal, N + 1), u: np.zeros((N, 2))})
-watch = "--watch" in sys.argv
+watch, plans = "--watch" in sys.argv, []
 with scene.live() as live:
     print("open", live.url)
     while watch and not live.watching:
@@ -49,9 +49,10 @@ with scene.live() as live:
             frame.way("plan", plan[x][:, :2])
             frame.value("solve", 1e3 * plan.seconds)
             frame.readout("status", plan.status.name, alarm=not plan.converged)
+        plans.append(plan)
         pose, guess = unicycle.step(pose[None], plan[u[0]], dt)[0], plan.shifted(x, u)
         time.sleep(dt * watch)
 folder = Path(*[word for word in sys.argv[1:] if word != "--watch"] or ["out"])
 folder.mkdir(parents=True, exist_ok=True)
 print("saved", scene.save(folder / "live_view.html"), "; ends", pose.round(2))
-plan.plot(x, u).savefig(folder / "live_view.png", dpi=80)
+plans[10].plot(x, u).savefig(folder / "live_view.png", dpi=80)

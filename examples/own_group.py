@@ -49,7 +49,7 @@ guess = {x: S2.retract(sun, np.linspace(off[0], off[1], N + 1))}
 around = np.arccos(off[0] @ off[1] / np.prod(far)) - np.arccos(np.tan(away) / np.tan(far)).sum()
 shortest = np.degrees(np.arccos(np.cos(far) / np.cos(away)).sum() + np.sin(away) * around)
 print(fg.check_manifold(S2))
-figure, ax = plt.subplots(figsize=(4.6, 3.0), layout="constrained")
+figure, ax = plt.subplots(figsize=(3.0, 3.6), subplot_kw={"aspect": "equal"}, layout="constrained")
 for s in (solutions := [solver.solve(graph, guess) for solver in (SQP(), InteriorPoint(), AugmentedLagrangian())]):
     slew = np.degrees(np.sqrt(2.0 * N * s.cost))  # of N equal steps
     print(f"{s.solver:20} slews by {slew:.3f} deg, the shortest way has {shortest:.3f}, {s.status.name}")
