@@ -5,7 +5,8 @@ its limits), 1 if not, 2 for arguments that cannot be served, 130 after an inter
 written all the same).
 
 `SCENARIOS` is a table: to add one, write a module of `unifg.scenarios.commands` with its settings and a function that
-runs them. Options come from the settings (`unifg.scenarios.options`); only the scenario that is named is loaded.
+runs them and, where that is asked for, shows the run while it goes on. Options come from the settings
+(`unifg.scenarios.options`); only the scenario that is named is loaded.
 """
 
 from __future__ import annotations
@@ -42,16 +43,19 @@ class Scenario:
 
     Attributes:
         module: of `unifg.scenarios.commands`: its ``SETTINGS`` are a class whose fields are options, its ``run`` takes
-            them and a progress, and raises KeyboardInterrupt when stopped before there is anything to write.
+            them, a progress and, where it can be watched, whom to tell where; it raises KeyboardInterrupt when stopped
+            before there is anything to write.
         summary: one line for the help.
         solvers: the list of `unifg.solvers.names` to choose from.
         defaults: of options, where the command line has others than the settings.
+        live: whether it can be watched.
     """
 
     module: str
     summary: str
     solvers: str = "CONSTRAINED"
     defaults: Mapping[str, Any] = field(default_factory=dict)
+    live: bool = True
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
         """Load the scenario and add its options."""
@@ -65,6 +69,8 @@ class Scenario:
         parser.add_argument(
             "--out", type=Path, default=Path("out"), metavar="DIR", help="folder for results (default: %(default)s)"
         )
+        if self.live:
+            parser.add_argument("--live", action="store_true", help="show it in a browser while it runs; says where")
         parser.set_defaults(module=module)
 
 
@@ -147,7 +153,8 @@ def _run(chosen: argparse.Namespace) -> int:
         return _refuse(f"--out {folder}: cannot make this folder ({error.strerror})")
     settings = settings_of(chosen.module.SETTINGS, chosen, solver=chosen.solver)
     with _progress_bar(chosen.name) as progress:
-        outcome: Outcome = chosen.module.run(settings, progress)
+        watched = {"announce": _announce} if getattr(chosen, "live", False) else {}
+        outcome: Outcome = chosen.module.run(settings, progress, **watched)
     try:
         files = outcome.write(folder)
     except OSError as error:
@@ -194,6 +201,11 @@ def _progress_bar(name: str) -> Iterator[Progress]:
             yield progress
         finally:
             signal.signal(signal.SIGINT, before)
+
+
+def _announce(url: str) -> None:
+    """Say where a run can be watched."""
+    print(f"\nlive: {url}", file=sys.stderr, flush=True)
 
 
 def _refuse(message: str) -> int:
@@ -243,7 +255,7 @@ SCENARIOS = {
 }
 """Everything ``unifg run`` can run."""
 
-SOLVE = Scenario("graphs", "Solve a pose graph from a file (g2o or TORO, gzipped or not).", "LEAST_SQUARES")
+SOLVE = Scenario("graphs", "Solve a pose graph from a file (g2o or TORO, gzipped or not).", "LEAST_SQUARES", live=False)
 """``unifg solve``."""
 
 

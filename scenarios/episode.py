@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, TypeAlias
 
+from unifg.scenarios.log.columns import watched
+
 __all__ = ["Progress", "rehearse", "run_ticks", "silent"]
 
 Progress: TypeAlias = Callable[[float, str], None]
@@ -67,4 +69,5 @@ def rehearse(kind: object, twin: Callable[[], Any]) -> None:
         if ticks == GOOD_TICKS + BAD_TICKS:
             raise KeyboardInterrupt
 
-    other.run(after)
+    with watched(None):  # nobody wants to see it
+        other.run(after)

@@ -255,3 +255,48 @@ def test_an_origin_far_away_is_where_the_picture_is() -> None:
     plain = [umsgpack.unpackb(base64.b64decode(text)) for text in message["commands"]]
     (matrix,) = [c["matrix"] for c in plain if c["type"] == "set_transform" and c["path"] == "/meshcat/car"]
     assert np.abs(matrix).max() < 10.0
+
+
+def test_a_run_is_watched_tick_by_tick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every tick that is recorded is a frame; the log in the making answers as the log does."""
+    from episodes import episode
+    from unifg.scenarios.commands.watching import watching_ticks
+    from unifg.scenarios.log.columns import Recorder, columns, watched
+    from unifg.scenarios.log.drive_log import EpisodeLog
+    from unifg.scenarios.show.drive_scene import drive_frame, drive_stage
+
+    done = episode(ticks=6, obstacles=4)
+    names = columns(EpisodeLog)
+    known = {name: value for name, value in vars(done).items() if name not in names}
+    known["obstacle_moving"] = done.obstacle_moves
+    told: list[str] = []
+    scenes: list[Scene] = []
+
+    def begin(log: Any) -> Scene:
+        scenes.append(drive_stage(log))
+        return scenes[-1]
+
+    with watching_ticks(told.append, begin, lambda scene, frame, log, tick: drive_frame(frame, log, tick)):
+        recorder = Recorder(EpisodeLog, **{k: v for k, v in known.items() if k not in ("collisions", "reached")})
+        with watched(None):  # a rehearsal
+            Recorder(EpisodeLog, **known).add(**{name: getattr(done, name)[0] for name in names})
+        for tick in range(done.ticks):
+            recorder.add(**{name: getattr(done, name)[tick] for name in names})
+    assert len(told) == 1 and told[0].startswith("http://127.0.0.1:")
+    (scene,) = scenes
+    assert [shot.number for shot in scene.shots] == list(range(6))
+    np.testing.assert_allclose(scene.shots[-1].placed["robot"].position[:2], done.true_pose[-1, :2])
+    assert {"obstacle 0", "obstacle 3"} <= scene.shots[0].placed.keys()
+    assert "unifg live view" not in [thread.name for thread in threading.enumerate()]
+    with watching_ticks(None, begin, lambda *given: None):
+        Recorder(EpisodeLog, **known).add(**{name: getattr(done, name)[0] for name in names})
+    assert len(scenes) == 1  # nobody wants to see it
+
+
+def test_the_command_says_where_a_run_can_be_watched(
+    tmp_path: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from unifg.scenarios import command
+
+    assert command.main(["run", "manoeuvres", "--case", "obstacle", "--live", "--out", str(tmp_path)]) == 0
+    assert "live: http://127.0.0.1:" in capsys.readouterr().err

@@ -13,6 +13,7 @@ from matplotlib.patches import Circle
 
 import unifg as fg
 from judge import judge
+from scenes import check_offline, commands_of, data_of, tracks_of
 from unifg.models import unicycle
 from unifg.scenarios import command
 from unifg.scenarios.manoeuvres import (
@@ -25,6 +26,7 @@ from unifg.scenarios.manoeuvres import (
     table,
 )
 from unifg.scenarios.show import manoeuvre_plot as manoeuvre_plots
+from unifg.scenarios.show.manoeuvre_scene import manoeuvre_scene
 from unifg.solvers import SQP, names
 from unifg.style.colours import css
 
@@ -222,13 +224,29 @@ def test_shades_go_from_green_through_whitening_pink_to_blue() -> None:
         assert manoeuvre_plots.shades(count).shape == (count, 3)
 
 
+@pytest.mark.parametrize("name", sorted(CASES))
+def test_the_scene_drives_what_was_found(name: str) -> None:
+    manoeuvre = solved(name, "sqp")
+    page = manoeuvre_scene(manoeuvre).html()
+    check_offline(page)
+    data, tracks = data_of(page), tracks_of(commands_of(page))
+    places = np.array([place for _, place in tracks["robot"][".position"]])
+    np.testing.assert_allclose(places[:, :2], manoeuvre.states[:, :2])
+    assert data["good"] is True and data["dt"] == manoeuvre.settings.dt
+    plots = {plot["name"]: plot["values"] for plot in data["plots"]}
+    np.testing.assert_allclose(plots["forward speed"][:-1], manoeuvre.controls[:, 0])
+    assert ("clearance" in plots) == bool(manoeuvre.case.discs)
+    assert data["readouts"][0]["texts"][0] == ("backward" if name == "behind" else "forward")
+
+
 @both
 def test_command_writes_its_files(solver: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main(["run", "manoeuvres", "--solver", solver, "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr()
-    for name in ("behind.png", "obstacle.png", "metrics.json"):
+    for name in ("behind.png", "obstacle.png", "metrics.json", "behind.html", "obstacle.html"):
         assert str(tmp_path / "out" / name) in said.out.splitlines()
-        assert 0 < (tmp_path / "out" / name).stat().st_size < 250_000
+        largest = 2_000_000 if name.endswith("html") else 250_000  # a scene carries its viewer
+        assert 0 < (tmp_path / "out" / name).stat().st_size < largest
     assert "all limits kept" in said.out and "1, at 1.0 s" in said.out
     assert "100%" in said.err and "100%" not in said.out
     found = json.loads((tmp_path / "out" / "metrics.json").read_text())
@@ -243,7 +261,7 @@ def test_command_writes_its_files(solver: str, tmp_path: Path, capsys: pytest.Ca
 
 def test_command_runs_one_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main(["run", "manoeuvres", "--case", "behind", "--out", str(tmp_path)]) == 0
-    assert {file.name for file in tmp_path.iterdir()} == {"behind.png", "metrics.json"}
+    assert {file.name for file in tmp_path.iterdir()} == {"behind.html", "behind.png", "metrics.json"}
     assert command.main(["run", "manoeuvres", "--help"]) == 0
     assert "{" + ",".join([*CASES, "both"]) + "}" in capsys.readouterr().out
 
@@ -264,7 +282,7 @@ def test_an_interrupt_ends_the_run_and_writes_what_there_is(tmp_path: Path, monk
 
     monkeypatch.setattr(manoeuvres, "run_manoeuvre", stopped)
     assert command.main(["run", "manoeuvres", "--out", str(tmp_path)]) == command.INTERRUPTED
-    assert {file.name for file in tmp_path.iterdir()} == {"behind.png", "metrics.json"}
+    assert {file.name for file in tmp_path.iterdir()} == {"behind.html", "behind.png", "metrics.json"}
 
 
 def test_command_refuses_other_cases_and_seeds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

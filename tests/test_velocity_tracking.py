@@ -13,10 +13,12 @@ import pytest
 
 import unifg as fg
 from judge import judge
+from scenes import check_offline, commands_of, data_of, tracks_of
 from unifg.models import vehicle
 from unifg.models.vehicle import Vehicle
 from unifg.scenarios import command, velocity_tracking
 from unifg.scenarios.show import velocity_plot as velocity_tracking_plots
+from unifg.scenarios.show.velocity_scene import velocity_scene
 from unifg.scenarios.velocity_tracking import (
     Drive,
     TrackingSettings,
@@ -229,6 +231,19 @@ def test_picture_shows_the_drive() -> None:
     }
 
 
+def test_the_scene_drives_as_far_as_the_speeds_say() -> None:
+    drive = solved("kkt")
+    page = velocity_scene(drive).html()
+    check_offline(page)
+    data, tracks = data_of(page), tracks_of(commands_of(page))
+    times, places = zip(*tracks["car"][".position"], strict=True)
+    steps = np.diff(np.array(places)[:, 0]) / (drive.profile.dt * np.diff(times))
+    middle = 0.5 * (drive.speed[:-1] + drive.speed[1:])
+    np.testing.assert_allclose(steps[5:20], middle[np.array(times[:-1])][5:20], atol=1e-9)
+    assert {plot["name"] for plot in data["plots"]} == {"speed", "profile", "deviation", "force"}
+    assert data["views"][0]["follows"] == "car" and data["good"] is True
+
+
 def run(folder: Path, *words: str) -> int:
     return command.main(["run", "velocity-tracking", *words, "--out", str(folder)])
 
@@ -236,9 +251,10 @@ def run(folder: Path, *words: str) -> int:
 def test_command_writes_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(tmp_path, "--length", "60") == 0
     said = capsys.readouterr()
-    for name in ("velocity_tracking.png", "metrics.json"):
+    for name in ("velocity_tracking.png", "metrics.json", "scene.html"):
         assert str(tmp_path / name) in said.out.splitlines()
-        assert 0 < (tmp_path / name).stat().st_size < 250_000
+        largest = 2_000_000 if name.endswith("html") else 250_000  # a scene carries its viewer
+        assert 0 < (tmp_path / name).stat().st_size < largest
     assert "cost J (without 1/2)" in said.out and "100%" in said.err and "100%" not in said.out
     found = json.loads((tmp_path / "metrics.json").read_text())
     assert {**found, "solve_ms": 0.0} == {**metrics(solved("kkt")), "solve_ms": 0.0}
@@ -285,7 +301,7 @@ def test_an_interrupt_writes_what_there_is(tmp_path: Path, monkeypatch: pytest.M
     assert stopped.solution.status is fg.Status.INTERRUPTED
     monkeypatch.setattr(velocity_tracking, "run_tracking", lambda settings, progress: stopped)
     assert run(tmp_path) == command.INTERRUPTED
-    assert {file.name for file in tmp_path.iterdir()} == {"velocity_tracking.png", "metrics.json"}
+    assert {file.name for file in tmp_path.iterdir()} == {"scene.html", "velocity_tracking.png", "metrics.json"}
 
 
 def test_wrong_settings_are_refused() -> None:

@@ -7,11 +7,12 @@ from pathlib import Path
 from unifg.files.tum import write_tum
 from unifg.scenarios import navigation
 from unifg.scenarios.commands.outcome import Outcome, Progress
+from unifg.scenarios.commands.watching import Announce, watching_ticks
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.log.metrics import table, write_metrics
 from unifg.scenarios.show.drive_plot import overview
-from unifg.scenarios.show.drive_scene import drive_scene
+from unifg.scenarios.show.drive_scene import drive_frame, drive_scene, drive_stage
 from unifg.style.figures import write_figure
 
 __all__ = ["SETTINGS", "run", "summary", "write_results"]
@@ -19,14 +20,15 @@ __all__ = ["SETTINGS", "run", "summary", "write_results"]
 SETTINGS = navigation.NavigationSettings
 
 
-def run(settings: navigation.NavigationSettings, progress: Progress) -> Outcome:
+def run(settings: navigation.NavigationSettings, progress: Progress, announce: Announce | None = None) -> Outcome:
     """Drive.
 
     Raises:
         KeyboardInterrupt: when stopped before the first tick.
         ScenarioError: when start, goals or obstacles do not fit the map.
     """
-    log = navigation.run_navigation(settings, progress=progress)
+    with watching_ticks(announce, drive_stage, lambda scene, frame, log, tick: drive_frame(frame, log, tick)):
+        log = navigation.run_navigation(settings, progress=progress)
     if log.ticks == 0:
         raise KeyboardInterrupt
     return Outcome(log.succeeded, log.interrupted, summary(log), lambda folder: write_results(folder, log))

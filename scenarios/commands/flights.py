@@ -7,11 +7,12 @@ from pathlib import Path
 
 from unifg.scenarios import flight
 from unifg.scenarios.commands.outcome import Outcome, Progress
+from unifg.scenarios.commands.watching import Announce, watching_ticks
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics, has_estimate
 from unifg.scenarios.log.metrics import table, write_metrics
 from unifg.scenarios.show.flight_plot import control, estimates, overview
-from unifg.scenarios.show.flight_scene import flight_scene
+from unifg.scenarios.show.flight_scene import flight_frame, flight_scene, flight_stage
 from unifg.style.figures import write_figure
 
 __all__ = ["SETTINGS", "run", "summary", "write_results"]
@@ -19,14 +20,15 @@ __all__ = ["SETTINGS", "run", "summary", "write_results"]
 SETTINGS = flight.FlightSettings
 
 
-def run(settings: flight.FlightSettings, progress: Progress) -> Outcome:
+def run(settings: flight.FlightSettings, progress: Progress, announce: Announce | None = None) -> Outcome:
     """Fly.
 
     Raises:
         KeyboardInterrupt: when stopped before the first tick.
         ScenarioError: when the movers do not fit into the corridor.
     """
-    log = flight.run_flight(settings, progress)
+    with watching_ticks(announce, flight_stage, flight_frame):
+        log = flight.run_flight(settings, progress)
     if log.ticks == 0:
         raise KeyboardInterrupt
     return Outcome(log.succeeded, log.interrupted, summary(log), lambda folder: write_results(folder, log))

@@ -1,4 +1,4 @@
-"""``unifg run manoeuvres``: the cases that were asked for, their pictures and one file of numbers."""
+"""``unifg run manoeuvres``: the cases that were asked for, their scenes and pictures, and one file of numbers."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from pathlib import Path
 
 from unifg.answers.status import Status
 from unifg.scenarios import manoeuvres
-from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations
+from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations, in_turn
+from unifg.scenarios.commands.watching import Announce, watching_iterates
 from unifg.scenarios.options import option
 from unifg.scenarios.show.manoeuvre_plot import picture
+from unifg.scenarios.show.manoeuvre_scene import manoeuvre_iterate, manoeuvre_scene, manoeuvre_stage
 from unifg.style.figures import write_figure
 
 __all__ = ["SETTINGS", "run"]
@@ -31,7 +33,7 @@ class CaseSettings:
 SETTINGS = CaseSettings
 
 
-def run(settings: CaseSettings, progress: Progress) -> Outcome:
+def run(settings: CaseSettings, progress: Progress, announce: Announce | None = None) -> Outcome:
     """Solve one case after the other."""
     names = tuple(manoeuvres.CASES) if settings.case == "both" else (settings.case,)
     solved: list[manoeuvres.Manoeuvre] = []
@@ -42,7 +44,9 @@ def run(settings: CaseSettings, progress: Progress) -> Outcome:
             progress((number + done) / len(names), f"{name}: {text}")
 
         tell = by_iterations(part, 0.9, lambda row: f"iteration {row.number}, cost {row.cost:.5g}")
-        solved.append(manoeuvres.run_manoeuvre(manoeuvres.CASES[name], settings.solver, progress=tell))
+        case = manoeuvres.CASES[name]
+        with watching_iterates(announce, manoeuvre_stage(case), manoeuvre_iterate) as watch:
+            solved.append(manoeuvres.run_manoeuvre(case, settings.solver, progress=in_turn(tell, watch)))
         interrupted = solved[-1].solution.status is Status.INTERRUPTED
         if interrupted:
             break
@@ -50,6 +54,7 @@ def run(settings: CaseSettings, progress: Progress) -> Outcome:
 
     def write(folder: Path) -> list[Path]:
         numbers = manoeuvres.write_metrics(folder / "metrics.json", solved)
-        return [*(write_figure(folder / f"{m.case.name}.png", picture(m), 105) for m in solved), numbers]
+        scenes = [manoeuvre_scene(m).save(folder / f"{m.case.name}.html") for m in solved]
+        return [*scenes, *(write_figure(folder / f"{m.case.name}.png", picture(m), 105) for m in solved), numbers]
 
     return Outcome(all(m.succeeded for m in solved), interrupted, manoeuvres.table(solved), write)

@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 from unifg.answers.history import Iteration
 
-__all__ = ["Outcome", "Progress", "by_iterations"]
+__all__ = ["Outcome", "Progress", "by_iterations", "in_turn"]
 
 Progress: TypeAlias = Callable[[float, str], None]
 """Takes the share that is done, and a word about it; raises KeyboardInterrupt when the user wants to stop."""
@@ -45,3 +45,13 @@ def by_iterations(progress: Progress, pace: float, say: Callable[[Iteration], st
         progress(1.0 - pace**row.number, say(row))
 
     return tell
+
+
+def in_turn(*callbacks: Callable[[Iteration], None]) -> Callable[[Iteration], None]:
+    """A callback of a solver that calls others, one after the other."""
+
+    def each(row: Iteration) -> None:
+        for callback in callbacks:
+            callback(row)
+
+    return each

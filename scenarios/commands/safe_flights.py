@@ -7,10 +7,11 @@ from pathlib import Path
 
 from unifg.scenarios import safe_flight
 from unifg.scenarios.commands.outcome import Outcome, Progress
+from unifg.scenarios.commands.watching import Announce, watching_ticks
 from unifg.scenarios.log.metrics import write_metrics
 from unifg.scenarios.log.safe_log import SafeLog, safe_metrics
 from unifg.scenarios.show.safe_plot import picture
-from unifg.scenarios.show.safe_scene import safe_scene
+from unifg.scenarios.show.safe_scene import safe_frame, safe_scene, safe_stage
 from unifg.style.figures import write_figure
 
 __all__ = ["SETTINGS", "run", "summary", "write_results"]
@@ -18,14 +19,15 @@ __all__ = ["SETTINGS", "run", "summary", "write_results"]
 SETTINGS = safe_flight.SafeSettings
 
 
-def run(settings: safe_flight.SafeSettings, progress: Progress) -> Outcome:
+def run(settings: safe_flight.SafeSettings, progress: Progress, announce: Announce | None = None) -> Outcome:
     """Fly all that is asked for.
 
     Raises:
         KeyboardInterrupt: when stopped before the first tick.
         ScenarioError: for a case or a controller that is unknown.
     """
-    logs = [log for log in safe_flight.run_safe_flights(settings, progress) if log.ticks]
+    with watching_ticks(announce, safe_stage, lambda scene, frame, log, tick: safe_frame(frame, log, tick)):
+        logs = [log for log in safe_flight.run_safe_flights(settings, progress) if log.ticks]
     if not logs:
         raise KeyboardInterrupt
     succeeded = all(log.succeeded for log in logs)

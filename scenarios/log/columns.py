@@ -7,7 +7,9 @@ scenes only read it, so a picture never needs the solver that made it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import Field, dataclass, field, fields
 from typing import Any, Generic, TypeVar
 
@@ -15,7 +17,7 @@ import numpy as np
 
 from unifg.errors import ScenarioError
 
-__all__ = ["Column", "Recorder", "column", "columns", "ragged", "words"]
+__all__ = ["Column", "Recorder", "SoFar", "column", "columns", "ragged", "watched", "words"]
 
 L = TypeVar("L")
 
@@ -70,6 +72,46 @@ def columns(log: Any) -> dict[str, Column]:
     return {f.name: f.metadata["column"] for f in declared if "column" in f.metadata}
 
 
+class SoFar:
+    """A log in the making, to be read like the log: its columns are lists, one entry per tick recorded."""
+
+    def __init__(self, log: type, known: dict[str, Any], entries: dict[str, list[Any]]) -> None:
+        """Look at a recorder's parts."""
+        self._log, self._known, self._entries = log, known, entries
+
+    @property
+    def ticks(self) -> int:
+        """Number of ticks recorded."""
+        return len(next(iter(self._entries.values())))
+
+    def follows(self, other: SoFar | None) -> bool:
+        """Whether both look at the same recorder."""
+        return other is not None and self._entries is other._entries
+
+    def __getattr__(self, name: str) -> Any:
+        """A column, something known, a default, or what the log works out of them."""
+        for place in (self.__dict__.get("_entries", {}), self.__dict__.get("_known", {})):
+            if name in place:
+                return place[name]
+        if name.startswith("_"):
+            raise AttributeError(name)
+        found = getattr(self._log, name)
+        return found.fget(self) if isinstance(found, property) and found.fget is not None else found
+
+
+_watch: ContextVar[Callable[[SoFar], None] | None] = ContextVar("watch", default=None)
+
+
+@contextmanager
+def watched(watch: Callable[[SoFar], None] | None) -> Iterator[None]:
+    """Have every tick that is recorded meanwhile, in this thread, looked at; None for by nobody."""
+    token = _watch.set(watch)
+    try:
+        yield
+    finally:
+        _watch.reset(token)
+
+
 class Recorder(Generic[L]):
     """A log in the making: one :meth:`add` per tick, then :meth:`finish`."""
 
@@ -97,6 +139,9 @@ class Recorder(Generic[L]):
             raise ScenarioError(f"a tick of {self._log.__name__} needs every column once, look at: {', '.join(wrong)}")
         for name, value in row.items():
             self._entries[name].append(self._columns[name].entry(value))
+        watch = _watch.get()
+        if watch is not None:
+            watch(SoFar(self._log, self._known, self._entries))
 
     def finish(self, **known: Any) -> L:
         """The finished record, also one without ticks.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +13,7 @@ from unifg.scenarios.log.safe_log import SafeLog
 from unifg.typing import Array
 from unifg.view import Frame, Part, Scene, shapes
 
-__all__ = ["safe_scene"]
+__all__ = ["safe_frame", "safe_scene", "safe_stage"]
 
 _HEIGHT = 3.0  # of cylinders, which have no end [m]
 _FLOOR = -0.02
@@ -28,18 +30,35 @@ def safe_scene(log: SafeLog) -> Scene:
     """
     if log.ticks == 0:
         raise ViewError("there is no tick, and nothing to show")
-    scene = Scene(f"unifg: quadrotor-cbf, {log.settings['case']}", dt=log.dt)
+    scene = safe_stage(log, [_rests(log.bodies[:, index]) for index in range(len(log.radii))])
     low, high = _extent(log)
     corners = [[x, y, z] for z in (0.0, _HEIGHT) for x in (low[0], high[0]) for y in (low[1], high[1])]
-    scene.around, scene.ground, scene.speeds = np.array(corners), False, (0.1, 0.25, 0.5, 1, 2)
+    scene.around, scene.ground = np.array(corners), False
+    _floor(scene, low, high)
+    if not _rests(log.wanted[:, :3]):
+        scene.way("path", shapes.thin(log.wanted[:, :3], 200))
+    for tick in range(log.ticks):
+        safe_frame(scene.frame(), log, tick)
+    _words(scene, log)
+    return scene
+
+
+def safe_stage(log: Any, still: Sequence[bool] = ()) -> Scene:
+    """The bodies of a flight, and words for what changes.
+
+    Args:
+        log: a `SafeLog`, or one in the making: what is known before the first tick is asked of it.
+        still: which bodies rest, as far as that is known.
+    """
+    scene = Scene(f"unifg: quadrotor-cbf, {log.settings['case']}", dt=log.dt)
+    scene.speeds = (0.1, 0.25, 0.5, 1, 2)
     scene.layer("flown", "line", "trail", "way flown", width=0.05)
     scene.layer("path", "line", "plan", "path to follow", width=0.024)
     scene.layer("plan", "line", "horizon", "plan", width=0.07)
-    _floor(scene, low, high)
-    _vehicle(scene, log)
-    still = _bodies(scene, log)
-    if not _rests(log.wanted[:, :3]):
-        scene.way("path", shapes.thin(log.wanted[:, :3], 200))
+    scene.body("drone", "quadrotor", size=log.hull, colour="robot", legend="")
+    shadow = shapes.ring(np.zeros(2), 0.0, log.hull, 0.016, corners=24)
+    scene.body("shadow", [Part("disc", shadow, "start", False, 0.4)], legend="")
+    _bodies(scene, log, list(still) or [False] * len(log.radii))
     scene.label("drone", follows="drone", above=True)
     scene.view("overview", "Overview", [-0.55, -0.75, 0.8], 24.0)
     scene.view("follow", "Follow drone", [-1.0, -0.45, 0.7], 30.0, follows="drone", distance=9.0)
@@ -48,9 +67,6 @@ def safe_scene(log: SafeLog) -> Scene:
         scene.plot("boundary distance", unit="m", limit=0.0, colour="horizon")
     scene.plot("from the path", unit="cm", colour="estimate")
     scene.plot("decided in", unit="ms", log=True)
-    for tick in range(log.ticks):
-        _frame(scene.frame(), log, tick, still)
-    _words(scene, log)
     return scene
 
 
@@ -71,16 +87,8 @@ def _floor(scene: Scene, low: Array, high: Array) -> None:
     scene.mesh("metres", lines, colour="metres", legend="")
 
 
-def _vehicle(scene: Scene, log: SafeLog) -> None:
-    """The vehicle and its shadow."""
-    scene.body("drone", "quadrotor", size=log.hull, colour="robot", legend="")
-    shadow = shapes.ring(np.zeros(2), 0.0, log.hull, 0.016, corners=24)
-    scene.body("shadow", [Part("disc", shadow, "start", False, 0.4)], legend="")
-
-
-def _bodies(scene: Scene, log: SafeLog) -> list[bool]:
-    """What is to be kept clear of, with its margin on the ground; returns which of them rest."""
-    still = [_rests(log.bodies[:, index]) for index in range(len(log.radii))]
+def _bodies(scene: Scene, log: Any, still: list[bool]) -> None:
+    """What is to be kept clear of, with its margin on the ground."""
     first: dict[str, str] = {}
     for index, (radius, upright) in enumerate(zip(log.radii.tolist(), log.upright.tolist(), strict=True)):
         colour = "fixed" if still[index] else "moving"
@@ -94,24 +102,23 @@ def _bodies(scene: Scene, log: SafeLog) -> list[bool]:
         else:
             scene.body(name, "ball", size=radius, colour=colour, legend=words, like=like)
         first.setdefault(colour, name)
-    return still
 
 
-def _frame(frame: Frame, log: SafeLog, tick: int, still: list[bool]) -> None:
-    """What a tick shows."""
+def safe_frame(frame: Frame, log: Any, tick: int) -> None:
+    """What a tick of a `SafeLog`, or of one in the making, shows."""
     state, plan = log.states[tick], log.plans[tick]
     frame.place("drone", state[:7])
     frame.place("shadow", [state[0], state[1], 0.0])
-    for index, place in enumerate(log.bodies[0 if all(still) else tick]):
+    for index, place in enumerate(log.bodies[tick]):
         z = 0.0 if log.upright[index] else place[2]
         frame.place(f"body {index}", [place[0], place[1], z, 1.0, 0.0, 0.0, 0.0])
     frame.trail("flown", state[:3])
     if len(plan) > 1 and np.isfinite(plan).all() and not _rests(plan):
         frame.way("plan", shapes.thin(plan, _NODES))
-    error = 100.0 * float(np.linalg.norm(log.error[tick]))
+    error = 100.0 * float(np.linalg.norm(state[:3] - log.wanted[tick][:3]))
     frame.readout("speed", f"{np.linalg.norm(state[7:]):.2f} m/s")
     if len(log.radii):
-        near = float(log.boundary[tick])
+        near = float(log.near[tick].min()) - log.hull - log.margin
         frame.readout("boundary distance", f"{near:.3f} m", alarm=near < 0.0)
         frame.value("boundary distance", near)
     frame.readout("from the path", f"{error:.1f} cm")

@@ -1,0 +1,86 @@
+"""``unifg run SCENARIO --live``: a run in a browser while it goes on, tick by tick or iterate by iterate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeAlias
+
+from unifg.answers.history import Iteration
+from unifg.scenarios.log.columns import SoFar, watched
+from unifg.view import Frame, Live, Scene
+
+__all__ = ["Announce", "watching_iterates", "watching_ticks"]
+
+Announce: TypeAlias = Callable[[str], None]
+"""Is told where the browser finds the scene; None where nobody wants to see it."""
+
+
+@contextmanager
+def watching_ticks(
+    announce: Announce | None, begin: Callable[[Any], Scene], draw: Callable[[Scene, Frame, Any, int], None]
+) -> Iterator[None]:
+    """Show every tick that is recorded meanwhile.
+
+    Args:
+        announce: see `Announce`.
+        begin: makes the scene of a record in the making; called for each record.
+        draw: what a tick of it shows.
+    """
+    if announce is None:
+        yield
+        return
+    scene: Scene | None = None
+    live: Live | None = None
+    shown: SoFar | None = None
+
+    def watch(log: SoFar) -> None:
+        nonlocal scene, live, shown
+        if scene is None or not log.follows(shown):
+            if live is not None:
+                live.close()
+            scene = begin(log)
+            live = scene.live()
+            announce(live.url)
+        shown = log
+        with scene.frame() as frame:
+            draw(scene, frame, log, log.ticks - 1)
+
+    try:
+        with watched(watch):
+            yield
+    finally:
+        if live is not None:
+            live.close()
+
+
+@contextmanager
+def watching_iterates(
+    announce: Announce | None, scene: Scene, draw: Callable[[Frame, Iteration], None]
+) -> Iterator[Callable[[Iteration], None]]:
+    """A callback of a solver that shows every iterate; one that does nothing where nobody wants to see it.
+
+    Args:
+        announce: see `Announce`.
+        scene: with what stays.
+        draw: what an iterate shows, besides its numbers.
+    """
+    if announce is None:
+        yield lambda row: None
+        return
+    scene.plot("cost")
+    scene.plot("stationarity", log=True)
+    scene.plot("violation", log=True, colour="moving")
+
+    def watch(row: Iteration) -> None:
+        with scene.frame() as frame:
+            draw(frame, row)
+            frame.readout("iteration", str(row.number))
+            frame.readout("cost", f"{row.cost:.6g}")
+            frame.readout("violation", f"{row.violation:.1e}")
+            for name in ("cost", "stationarity", "violation"):
+                frame.value(name, getattr(row, name))
+
+    with scene.live() as live:
+        announce(live.url)
+        yield watch

@@ -1,0 +1,83 @@
+"""A manoeuvre as a scene: the robot drives what was found, beside the guess it was found from."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from unifg.answers.history import Iteration
+from unifg.scenarios.manoeuvres import Case, Manoeuvre, ManoeuvreSettings
+from unifg.view import Frame, Scene
+
+__all__ = ["manoeuvre_iterate", "manoeuvre_scene", "manoeuvre_stage"]
+
+
+def manoeuvre_scene(manoeuvre: Manoeuvre) -> Scene:
+    """The scene of one solved case, over the time of its plan."""
+    m, s = manoeuvre, manoeuvre.settings
+    scene = Scene(f"unifg: manoeuvre '{m.case.name}'", dt=s.dt)
+    scene.speeds = (0.25, 0.5, 1, 2)
+    reference = m.case.reference(s)
+    width = 0.012 * float(np.ptp(np.concatenate([m.states, reference])[:, :2], axis=0).max())
+    scene.way("path", reference[:, :2], width=width, colour="goal", legend="path it is asked to follow")
+    scene.layer("trail", "line", "trail", "driven so far", width=1.6 * width)
+    scene.way("plan", m.states[:, :2], width=0.6 * width, colour="horizon", legend="plan that was found")
+    cusps = m.states[m.cusps, :2]
+    scene.points("cusps", cusps, pixels=9.0, colour="ink", legend="cusp: it passes from backward to forward")
+    if m.case.discs:
+        discs = np.array(m.case.discs)
+        scene.discs("discs", discs, colour="fixed", legend="disc that nobody had foreseen")
+    scene.body("robot", "disc", size=s.robot_radius, colour="robot")
+    scene.body("wanted", "arrow", size=1.5 * s.robot_radius, colour="goal", legend="where the path would have it now")
+    scene.label("robot", follows="robot", above=True)
+    scene.view("above", "From above", (0.0, -1e-4, 1.0))
+    scene.view("follow", "Follow robot", (0.0, -0.5, 0.9), follows="robot", distance=20.0 * s.robot_radius)
+    scene.plot("forward speed", unit="m/s", limit=0.0)
+    scene.plot("turning speed", unit="rad/s", limit=0.0, colour="estimate")
+    scene.plot("from the path", unit="m", colour="goal")
+    if m.case.discs:
+        scene.plot("clearance", unit="m", limit=s.clearance, colour="horizon")
+    last = len(m.controls) - 1
+    for tick, (pose, asked) in enumerate(zip(m.states, reference, strict=True)):
+        frame, (speed, turn) = scene.frame(), m.controls[min(tick, last)].tolist()
+        frame.place("robot", pose)
+        frame.place("wanted", asked)
+        frame.trail("trail", pose[:2])
+        away = float(np.hypot(*(pose - asked)[:2]))
+        frame.readout("drives", "backward" if speed < 0.0 else "forward")
+        frame.readout("speed", f"{speed:.2f} m/s")
+        frame.readout("turn", f"{turn:.2f} rad/s")
+        frame.readout("from the path", f"{away:.2f} m")
+        frame.value("forward speed", speed)
+        frame.value("turning speed", turn)
+        frame.value("from the path", away)
+        if m.case.discs:
+            frame.readout("clearance", f"{m.clearance[tick]:.3f} m")
+            frame.value("clearance", float(m.clearance[tick]))
+    scene.outcome, scene.good = m.solution.status.value, m.succeeded
+    scene.facts |= {
+        "asked": m.case.title,
+        "solver": m.solver,
+        "iterations": f"{m.solution.iterations}, from a guess that cannot be driven",
+        "cost": f"{m.solution.cost:.5g}",
+        "limits": "kept" if m.within_limits else "BROKEN",
+    }
+    return scene
+
+
+def manoeuvre_stage(case: Case) -> Scene:
+    """What is asked of the robot, for a scene of the iterates of a solve."""
+    scene = Scene(f"unifg: manoeuvre '{case.name}', as it is solved", counts="iteration")
+    scene.way("path", case.reference(ManoeuvreSettings())[:, :2], colour="goal", legend="path it is asked to follow")
+    if case.discs:
+        scene.discs("discs", np.array(case.discs), colour="fixed", legend="disc that nobody had foreseen")
+    scene.layer("plan", "line", "horizon", "plan of this iterate")
+    scene.layer("poses", "arrow", "horizon", "", like="plan")
+    return scene
+
+
+def manoeuvre_iterate(frame: Frame, row: Iteration) -> None:
+    """The plan of an iterate that keeps its values."""
+    for family, values in (row.values or {}).items():
+        if family.name == "pose":
+            frame.way("plan", values[:, :2])
+            frame.poses("poses", values)
