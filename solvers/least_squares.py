@@ -45,12 +45,7 @@ class LeastSquares(Solver):
 
     def workspace(self, program: Program) -> Primal:
         """The factorisation of the normal equations."""
-        primal = Primal(program)
-        none = np.zeros(0)
-        primal.next_multipliers(
-            none, none, none
-        )  # steps that rounding swallows ask for it, the first perhaps in a loop
-        return primal
+        return Primal(program)
 
 
 @dataclass(kw_only=True)
@@ -99,6 +94,12 @@ class LevenbergMarquardt(LeastSquares):
     """
 
     damping: float = 1e-4
+
+    def workspace(self, program: Program) -> Primal:
+        """As of all; steps that rounding swallows, of which the first may be one in a loop, ask for multipliers."""
+        primal, none = super().workspace(program), np.zeros(0)
+        primal.next_multipliers(none, none, none)
+        return primal
 
     def search_step(self, run: SolveState, workspace: Primal, lin: Linearization) -> Array | None:
         """The step at the initial damping."""
