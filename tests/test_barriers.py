@@ -13,7 +13,10 @@ import unifg as fg
 from judge import judge
 from problems.guarded_flight import NAMES, SPHERES, START, GuardedFlight
 from unifg.errors import GraphError, ModelError
+from unifg.kernels.derive.expression import traced
+from unifg.kernels.derive.operations import Op
 from unifg.kernels.derive.rates import rate
+from unifg.kernels.derive.stated import StatedKernel
 from unifg.models import (
     avoidance,
     barriers,
@@ -68,6 +71,20 @@ def test_rates_of_rates_are_second_derivatives() -> None:
     np.testing.assert_allclose(rate(faster, p), ((v**2).sum(axis=1)[:, None] - along**2) / length, atol=1e-12)
 
 
+def test_nothing_is_left_of_the_parameter_of_a_path() -> None:
+    """It would be taken for one more tangent coordinate by whoever differentiates again."""
+
+    def speed(p: Array) -> Array:
+        found: Array = rate(lambda s, p: avoidance.sphere_clearance(p + s * 2.0, CENTRE, RADIUS), p)
+        return found
+
+    expression = traced(speed, (fg.Rn(3),))
+    tape = expression.tape
+    moving = {tape.a[i] for i in tape.live(expression.rows) if tape.op[i] == Op.TANGENT}
+    assert moving == {0, 1, 2}
+    assert all(0 <= j <= k < 3 for j, k in expression.curvature)
+
+
 def test_a_rate_at_the_centre_is_a_number() -> None:
     still = rate(lambda s, p: avoidance.sphere_clearance(p + s * 1.0, CENTRE[:1], RADIUS[:1]), np.zeros((1, 3)))
     assert still.tolist() == [[0.0]]
@@ -110,6 +127,28 @@ def test_residuals_may_be_called_in_a_trace() -> None:
     assert found and {found.routes[name] for name in ("both", "shifted", "corners")} == {EXACT}, str(found)
     lin = graph.compile().linearize(guess).residual
     np.testing.assert_allclose(lin[:18].reshape(3, 6), both(guess[x][:-1], guess[u], guess[x][1:]), atol=1e-12)
+
+
+def test_the_same_function_of_another_residual_is_another() -> None:
+    """One closure over two clearances of the same shapes: neither is taken for the other."""
+
+    def near(p: Array, centre: Array, radius: Array) -> Array:
+        found: Array = np.abs(p[:, None] - centre).sum(axis=2) - radius
+        return found
+
+    manhattan = fg.residual(StatedKernel(near, (fg.Rn(3), (2, 3), (2,)), 2))
+    graph = fg.Graph()
+    p = graph.variables("p", fg.Rn(3), 3)
+    both = [avoidance.sphere_clearance, manhattan]
+    for number, clearance in enumerate(both):
+        kept = barriers.decay(barriers.still(clearance), 1.0)
+        graph.minimize(kept, p[:-1], p[1:], 0.0, 0.1, CENTRE, RADIUS, name=f"{number}")
+    guess = {p: RNG.normal(size=(3, 3))}
+    assert {graph.check(guess).routes[name] for name in "01"} == {EXACT}
+    found = graph.compile().linearize(guess).residual.reshape(2, 2, 2)
+    for rows, clearance in zip(found, both, strict=True):
+        h = clearance(guess[p], CENTRE, RADIUS)
+        np.testing.assert_allclose(rows, h[1:] - np.exp(-0.1) * h[:-1], atol=1e-12)
 
 
 WALL = np.zeros((20, 30), dtype=bool)
@@ -376,6 +415,17 @@ def test_the_slack_names_the_obstacle() -> None:
     hard = keeping.keep(graph, barrier, *arguments, obstacles=2, form="hard", name="hard")
     assert not InteriorPoint().solve(graph, {p: np.tile(start, (6, 1)), **kept.guess()}).converged
     assert hard.used(found) == [] and hard.guess() == {} and hard.obstacles == ("hard 0", "hard 1")
+
+
+def test_uses_are_told_the_most_first_from_where_they_begin() -> None:
+    graph = fg.Graph()
+    p = graph.variables("p", fg.Rn(3), 3)
+    kept = keeping.keep(graph, avoidance.sphere_clearance, p, CENTRE, RADIUS, obstacles=("near", "far"))
+    assert kept.slack is not None
+    amounts = {kept.slack: np.array([[0.0, 0.1], [0.2, 0.0], [0.3, 1e-4]])}
+    assert kept.used(amounts) == [keeping.Use("near", 1, 0.3), keeping.Use("far", 0, 0.1)]
+    assert kept.used(amounts, beyond=0.25) == [keeping.Use("near", 2, 0.3)]
+    assert kept.used({kept.slack: np.zeros((3, 2))}) == []
 
 
 def test_a_slack_that_is_not_needed_costs_a_millimetre_or_nothing() -> None:
