@@ -94,6 +94,17 @@ def test_unicycle_mpc_loop(run: Run) -> None:
     assert np.linalg.norm(lane[:, :2] - disc, axis=1).min() < ran["radius"] - 0.1
 
 
+def test_covariance_aware_plan(run: Run) -> None:
+    ran = run("covariance_aware_plan")
+    x, P, light = ran["x"], ran["P"], []
+    for k, plan in ran["plans"].items():
+        assert plan.converged
+        assert ran["kept"](plan[x][1:-1], plan[P][1:-1], k).min() > -1e-6
+        np.testing.assert_allclose(plan[P][1:], ran["step"](plan[P][:-1], plan[x][1:]), atol=1e-6)
+        light.append(plan[x][:, 1].max())
+    assert abs(light[0]) < 1e-3 and 0.2 < light[1] < light[2]  # the more it wants to be sure, the farther it goes
+
+
 def test_own_robot(run: Run) -> None:
     ran = run("own_robot")
     interior, augmented = ran["solutions"].values()

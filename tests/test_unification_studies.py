@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks import covariance_plans, excluded_pasts, impossible_states
+from benchmarks import covariance_plans, excluded_pasts, impossible_states, potential_weights
 
 
 def row(way: str, seed: int, found: list[tuple[float, float] | None]) -> dict[str, object]:
@@ -79,3 +79,16 @@ def test_errors_are_compared_layout_by_layout() -> None:
     assert excluded_pasts.compared(base, base, "wrong") == "25"
     assert excluded_pasts.compared(mine, base, "wrong") == "25 (-50 .. +50)"
     assert excluded_pasts.compared(mine, base, "median").startswith("25 (-20")
+
+
+def test_weights_are_compared_with_the_constraint() -> None:
+    def flight(seed: int, weight: float, reached: bool, clearance: float) -> dict[str, object]:
+        numbers = {"collisions": int(clearance <= 0.0), "time": 15.0, "emergencies": 1}
+        return {"seed": seed, "weight": weight, "reached": reached, "clearance": clearance, **numbers}
+
+    rows = [
+        flight(seed, weight, weight < 3.0 or seed == 0, 0.3 - weight / 10) for seed in (0, 1) for weight in (0.0, 3.0)
+    ]
+    text = potential_weights.render(rows)
+    assert "| hard clearance | 2 of 2 | 0 |" in text
+    assert "| 3 | 1 of 2 | 2 | 15 (+0 .. +0), n=1 | 0 (-30 .. -30) | 0 | 2 |" in text
