@@ -192,6 +192,29 @@ def test_horizon_ends_where_the_plan_ends(page: str, log: EpisodeLog) -> None:
     pytest.fail("no horizon at tick 5")
 
 
+def test_covariance_route_and_contacts_are_shown(page: str, log: EpisodeLog) -> None:
+    """The ellipse is that of the estimate in the world; a repaired route takes the place of the first from then on."""
+    data, tracks = data_of(page), tracks_of(commands_of(page))
+    half = log.ticks // 2
+    routes = {c["path"] for c in commands_of(page) if c["type"] == "set_object" and "/route/" in c["path"]}
+    assert routes == {"/meshcat/route/0", f"/meshcat/route/{half}"}
+    shown = dict(tracks[f"route/{half}"][".visible"])
+    assert shown[0] is False and shown[half] is True
+    scale = dict(tracks["sigma/parts"][".scale"])[0]
+    np.testing.assert_allclose(scale[:2], 30.0 * np.sqrt([4e-4, 1e-4]))  # 3 sigma, 10 times enlarged
+    readouts = {readout["name"]: readout for readout in data["readouts"]}
+    assert readouts["believed \u03c3"]["texts"][0] == "2.0 and 1.0 cm" and readouts["contacts"]["texts"][-1] == "0"
+    assert not any(key["text"] == "contact" for key in data["legend"])
+    assert [plot["name"] for plot in data["plots"]] == ["localise + plan", "localisation error", "clearance"]
+    touched = replace(log, contacts=(np.arange(log.ticks) >= 4).astype(np.intp))
+    text = drive_scene(touched).html()
+    drawn = {c["path"] for c in commands_of(text) if c["type"] == "set_object" and "/contact/" in c["path"]}
+    assert drawn == {"/meshcat/contact/4"}  # from then on, and in one piece
+    alarms = {readout["name"]: readout["alarms"] for readout in data_of(text)["readouts"]}["contacts"]
+    assert alarms == [tick >= 4 for tick in range(log.ticks)]
+    assert any(key["text"] == "contact" for key in data_of(text)["legend"])
+
+
 def test_scan_points_skip_dropouts_and_misses(log: EpisodeLog) -> None:
     beams = np.arange(len(log.scan_angles))
     points = scan_points(log, 4, beams)

@@ -36,12 +36,12 @@ def velocity_scene(drive: Drive) -> Scene:
     scene.body("ghost", "car", size=_CAR, colour="goal", legend="a car that kept to the profile exactly")
     scene.label("car", follows="car", above=True)
     scene.view(
-        "follow", "Follow the car", (-0.55, -0.9, 0.45), 30.0, follows="car", distance=55.0, ahead=(8.0, 0.0, 0.0)
+        "follow", "Follow the car", (-0.55, -0.9, 0.45), 30.0, follows="car", distance=55.0, ahead=(2.0, 0.0, 0.0)
     )
     scene.view("overview", "Whole road", (-0.15, -0.85, 0.5), 20.0)
     scene.plot("speed", unit="m/s")
-    scene.plot("profile", unit="m/s", colour="goal")
     scene.plot("deviation", unit="m/s", limit=0.0, colour="moving")
+    scene.plot("profile", unit="m/s", colour="goal")
     scene.plot("force", unit="N", limit=0.0, colour="horizon")
     last = len(drive.force) - 1
     for k, speed in enumerate(drive.speed.tolist()):
