@@ -115,7 +115,7 @@ def test_same_seed_same_drive(solver: str) -> None:
         if isinstance(value, np.ndarray):
             assert np.array_equal(value, other, equal_nan=value.dtype.kind == "f"), name
         elif name == "detected":
-            assert all(np.array_equal(a, b) for a, b in zip(value, other, strict=True))
+        elif isinstance(value, list) and value and isinstance(value[0], np.ndarray):  # rows of different lengths
         else:
             assert value == other, name
 
