@@ -164,6 +164,13 @@ def test_solutions_one_after_the_other(solved: tuple[fg.Solution, fg.Family, fg.
     assert "x" in objects(page)  # the same in all frames: sent once, and never hidden
 
 
+def test_a_solution_of_another_graph_is_refused(solved: tuple[fg.Solution, fg.Family, fg.Family]) -> None:
+    solution, x, _ = solved
+    scene = Scene.of(solution, x)
+    with pytest.raises(GraphError, match="family 'x' is not part of this solution"):
+        scene.add(chain(3)[0])
+
+
 def test_what_changes_is_shown_in_its_turn_and_what_stays_is_sent_once() -> None:
     scene = Scene("turns", dt=1.0)
     for k in range(4):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unifg.answers.solution import Solution
-from unifg.errors import ViewError
+from unifg.errors import GraphError, ViewError
 from unifg.language.variables import Family, Selection, Variable, as_selection
 from unifg.typing import Array, IntArray
 from unifg.view.canvas import Canvas, Frame
@@ -39,7 +39,14 @@ class Shown:
         return self.reading.kind != "points" or self.reading.position is not None or bool(self.selection.component)
 
     def of(self, values: Values) -> Array:
-        """(n, storage) values of the members shown."""
+        """(n, storage) values of the members shown.
+
+        Raises:
+            GraphError: they are those of another graph.
+        """
+        family = self.selection.family
+        if family not in values:
+            raise GraphError(f"family '{family.name}' is not part of this solution", family=family.name)
         return values[self.selection.family][self.selection.indices][:, self.selection.storage]
 
 
