@@ -23,7 +23,7 @@ from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.safe_log import SafeLog
 from unifg.scenarios.options import count, not_negative, option, positive
 from unifg.scenarios.safety.flatness import TUNED, FlatnessController, Gains, flat_flight
-from unifg.scenarios.safety.keeper import Decision, Keeper, KeeperSettings, Obstacles, Reading
+from unifg.scenarios.safety.keeper import TRACKING, Decision, Keeper, KeeperSettings, Obstacles, Reading
 from unifg.scenarios.safety.one_step import FilterSettings, filtered
 from unifg.scenarios.safety.situations import Kind, Situation, situation
 from unifg.scenarios.safety.spline_planner import SplinePath, SplineSettings, around
@@ -89,6 +89,7 @@ class SafeSettings:
         filter: numbers of the filter of one step.
         spline: numbers of the planner by splines.
         keeper: numbers of the controller by barriers.
+        tracking: the same where nothing is in the way.
         weighing: numbers of the estimate.
         seen: standard deviations of position, attitude and velocity as they are seen [m, rad, m/s].
         disturbance: of rates and accelerations.
@@ -113,6 +114,7 @@ class SafeSettings:
     filter: FilterSettings = field(default_factory=FilterSettings)
     spline: SplineSettings = field(default_factory=SplineSettings)
     keeper: KeeperSettings = field(default_factory=KeeperSettings)
+    tracking: KeeperSettings = TRACKING
     weighing: WeighingSettings = field(default_factory=WeighingSettings)
     seen: tuple[float, float, float] = (1e-3, 3e-3, 1e-2)
     disturbance: DisturbanceModel = field(default_factory=DisturbanceModel)
@@ -169,7 +171,8 @@ class SafeFlight:
         s, path = self.settings, self.situation.path
         if controller == "barrier":
             slots, (alpha, gamma) = min(s.keeper.slots, len(self.situation.bodies)), barriers
-            numbers = replace(s.keeper, alpha=alpha, gamma=gamma, reading=s.reading, speed=limit, slots=slots)
+            weights = s.keeper if slots else s.tracking
+            numbers = replace(weights, alpha=alpha, gamma=gamma, reading=s.reading, speed=limit, slots=slots)
             keeper = Keeper(numbers, s.books, path, s.dt, self.weighing, s.solver)
             return lambda state, now, seen: keeper.decide(state, now + self.lead, seen, now)
         flat = FlatnessController(s.gains, s.books.least, s.books.most)

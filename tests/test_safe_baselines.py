@@ -129,6 +129,16 @@ def test_the_oracle_is_right_about_a_vehicle_that_flies_straight_at_a_point() ->
     assert exists(away, speed, 0.33, authority) == "no"
 
 
+def test_what_is_known_of_an_obstacle_is_no_threat() -> None:
+    """A ball that will fall short of the vehicle, seen while it still rises towards it."""
+    away, speed, authority = np.array([-1.0, 0.0, 0.5]), np.array([2.0, 0.0, -1.0]), Authority(vehicle=0.1, horizon=0.6)
+    falling = escape(away, speed, 0.3, authority, np.array([0.0, 0.0, -9.81]))
+    assert escape(away, speed, 0.3, authority)[1] < 0.0 < falling[0]
+    later = np.linspace(0.0, 0.6, 301)[:, None]
+    exact = np.linalg.norm(away + speed * later + 0.5 * 9.81 * later**2 * [0.0, 0.0, 1.0], axis=1).min() - 0.3
+    assert falling[0] == pytest.approx(exact, abs=0.02)
+
+
 def test_more_to_give_never_makes_it_worse() -> None:
     rng, base = np.random.default_rng(5), Authority(obstacle=1.0)
     answers = []

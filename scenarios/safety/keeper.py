@@ -33,7 +33,7 @@ from unifg.scenarios.worlds.body_rate import Airframe
 from unifg.solvers.names import backend
 from unifg.typing import Array, BoolArray
 
-__all__ = ["Decision", "Keeper", "KeeperSettings", "Obstacles"]
+__all__ = ["TRACKING", "Decision", "Keeper", "KeeperSettings", "Obstacles"]
 
 Reading: TypeAlias = Literal["decay", "published"]
 
@@ -82,6 +82,16 @@ class KeeperSettings:
     hinge: float = 1e4
     iterations: int = 10
     budget: float = np.inf
+
+
+TRACKING = KeeperSettings(
+    position=60.0, attitude=5.4e-3, velocity=0.12, rate=2.5e-6, thrust=1.1e-5, rate_change=4e-5, thrust_change=2e-5
+)
+"""Weights for flights with nothing in the way; ``python -m benchmarks.flight_tuning --controller barrier`` finds them.
+
+They make controls cheap, which is what following a path closely takes; among obstacles, where the path may lie inside
+of things, they do harm.
+"""
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,9 @@ class Authority:
         return self.vehicle / (1.0 + self.mass_error)
 
 
-def escape(away: Array, speed: Array, keep: float, authority: Authority) -> tuple[float, float]:
+def escape(
+    away: Array, speed: Array, keep: float, authority: Authority, pull: Array | None = None
+) -> tuple[float, float]:
     """Clearances that can be had for certain, and at best.
 
     Args:
@@ -63,6 +65,7 @@ def escape(away: Array, speed: Array, keep: float, authority: Authority) -> tupl
         speed: its rate, relative to what is known of the obstacle's motion [m/s].
         keep: distance to be kept [m].
         authority: what both can do.
+        pull: acceleration of the obstacle that is known, as of one that falls [m/s^2]; None for none.
 
     Returns:
         The least distance less ``keep`` over time, of the best acceleration that is held, against any motion of the
@@ -72,15 +75,17 @@ def escape(away: Array, speed: Array, keep: float, authority: Authority) -> tupl
     times = np.linspace(0.0, a.horizon, 301)
     late = 0.5 * np.maximum(times - a.delay, 0.0) ** 2
     straight = away + times[:, None] * speed
+    if pull is not None:
+        straight = straight - 0.5 * times[:, None] ** 2 * pull
     bound = np.linalg.norm(straight, axis=1) + a.usable * late - keep
     ways = straight + a.usable * _directions(len(away))[:, None, :] * late[:, None]
     certain = np.linalg.norm(ways, axis=2) - 0.5 * a.obstacle * times**2 - keep
     return float(certain.min(axis=1).max()), float(bound.min())
 
 
-def exists(away: Array, speed: Array, keep: float, authority: Authority) -> Answer:
+def exists(away: Array, speed: Array, keep: float, authority: Authority, pull: Array | None = None) -> Answer:
     """Whether a safe control exists; arguments as those of :func:`escape`."""
-    certain, best = escape(away, speed, keep, authority)
+    certain, best = escape(away, speed, keep, authority, pull)
     return "yes" if certain >= 0.0 else "no" if best < 0.0 else "unknown"
 
 
