@@ -238,6 +238,7 @@ def test_a_failed_frame_is_not_shown() -> None:
             return await hear()
 
         assert browser(live, watch)["page"]["now"] == [["tick", "0", False]]
+    assert len(scene.shots) == 1
 
 
 def test_an_origin_far_away_is_where_the_picture_is() -> None:

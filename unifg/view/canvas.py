@@ -380,7 +380,9 @@ class Frame(Shot, Canvas):
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
-        """Show it, where somebody watches; a frame that was given up is not shown."""
+        """Show it, where somebody watches; a frame that was given up is none."""
         if kind is None:
             for watcher in list(self._content.watchers):
                 watcher(self)
+        elif self in self._content.shots:
+            self._content.shots.remove(self)
