@@ -78,6 +78,7 @@ PAGES = {
         Page("joint-drives", "Drives, joint coupling", "benchmarks.navigation", ("--coupling", "joint"), hours=0.06),
         Page("joint", "What the joint graph buys", "benchmarks.coupling", hours=0.8),
         Page("covariance-plans", "Covariance in the plan", "benchmarks.covariance_plans"),
+        Page("active-perception", "Plans that go where they learn", "benchmarks.active_perception"),
         Page("potential-weights", "The weight of Ta's cost", "benchmarks.potential_weights"),
         Page("excluded-pasts", "Pasts that cannot have been", "benchmarks.excluded_pasts", hours=0.05),
         Page("quadrotor-joint", "One graph that estimates and flies", "benchmarks.quadrotor_pull", hours=0.15),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks import covariance_plans, excluded_pasts, impossible_states, potential_weights
+from benchmarks import active_perception, covariance_plans, excluded_pasts, impossible_states, potential_weights
 
 
 def row(way: str, seed: int, found: list[tuple[float, float] | None]) -> dict[str, object]:
@@ -92,3 +92,24 @@ def test_weights_are_compared_with_the_constraint() -> None:
     text = potential_weights.render(rows)
     assert "| hard clearance | 2 of 2 | 0 |" in text
     assert "| 3 | 1 of 2 | 2 | 15 (+0 .. +0), n=1 | 0 (-30 .. -30) | 0 | 2 |" in text
+
+
+def test_ways_are_compared_at_equal_error_and_at_equal_time() -> None:
+    def met(way: str, seed: int, *plans: tuple[str, float, float]) -> dict[str, object]:
+        numbers = {"foreseen": 0.1, "miss": 0.2, "collisions": 0.0}
+        found = [{"setting": s, "time": time, "error": error, **numbers} for s, time, error in plans]
+        return {"way": way, "seed": seed, "drives": 5, "found": found}
+
+    rows = [
+        met("rule", 1, ("2", 10.0, 0.8), ("2", 10.5, 0.6), ("0.6", 12.0, 0.3)), met("rule", 2, ("2", 11.0, 0.9)),
+        met("in the cost", 1, ("3", 10.2, 0.6), ("10", 11.0, 0.3)), met("in the cost", 2, ("3", 10.0, 0.8)),
+        met("cautious", 1), met("cautious", 2), met("cautious", 3),
+    ]  # fmt: skip
+    found = active_perception.Campaign(rows, 5)
+    assert found.seeds == [1, 2]
+    np.testing.assert_array_equal(found.of("rule", "2", "error"), [0.8, 0.9])  # the fastest with that setting
+    np.testing.assert_array_equal(found.fastest("rule", 0.35), [12.0, np.nan])
+    np.testing.assert_array_equal(found.fastest("in the cost", 0.35), [11.0, np.nan])
+    np.testing.assert_array_equal(found.surest("rule", 0.3), [0.8, np.nan])  # 10.0 is the fastest of any way
+    text = active_perception.render(found, 5)
+    assert "| 35 cm | 1 / 2 | 1 / 2 | 0 / 2 | -1 (-1 .. -1), n=1 | - |" in text

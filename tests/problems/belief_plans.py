@@ -89,11 +89,13 @@ class Planner:
         world: discs and beacons.
         graph: stated once.
         foresees: whether covariance and spread are variables; without them only margins can be chosen.
+        via: whether a node can be told to be near a place.
+        sensor: which sightings the plan counts on.
     """
 
-    def __init__(self, world: Layout, foresees: bool = True) -> None:
+    def __init__(self, world: Layout, foresees: bool = True, via: bool = False, sensor: BeaconSensor = SENSOR) -> None:
         """State the graph."""
-        self.world, self.foresees = world, foresees
+        self.world, self.foresees, self.sensor = world, foresees, sensor
         graph = self.graph = fg.Graph()
         x = self.x = graph.variables("x", SE2, STEPS + 1)
         u = self.u = graph.variables("u", fg.Rn(2), STEPS)
@@ -111,25 +113,41 @@ class Planner:
             b = self.b = graph.variables("b", fg.Rn(12), STEPS + 1)
             self.k, self.arrival = graph.data("k", 0.0), graph.data("arrival", 0.0)
             graph.fix(b[0], BEGIN)
-            known = (DENSITY, GAIN, world.beacons)
-            graph.constrain(filtering, b[:-1], x[:-1], u, x[1:], b[1:], h, *known, lower=0, upper=0, name="filter")
+            known, defect = (DENSITY, GAIN, world.beacons), filtering(sensor)
+            graph.constrain(defect, b[:-1], x[:-1], u, x[1:], b[1:], h, *known, lower=0, upper=0, name="filter")
             graph.constrain(scaled, x[1:], b[1:], *discs, self.k, self.margin, lower=0, name="clearance")
             graph.minimize_scalar(unsure, b[-1], self.arrival, name="arrival")
         else:
             graph.constrain(clear, x[1:], *discs, self.margin, lower=0, name="clearance")
+        if via:
+            self.place = graph.data("place", np.zeros(2))
+            self.within = graph.data("within", np.full(STEPS, np.hypot(LENGTH, LENGTH)), each=True)
+            graph.constrain(beyond, x[1:], self.place, self.within, upper=0, name="via")
         self.run = SQP(tolerance=TOLERANCE, max_iterations=50).prepare(graph)
 
     def guess(self, aside: float) -> Guess:
         """Around one side: ``aside`` is the greatest distance from the straight line [m]."""
         along = np.linspace(0.0, 1.0, STEPS + 1)
-        xy = np.stack([LENGTH * along, aside * np.sin(np.pi * along)], axis=1)
+        return self.following(np.stack([LENGTH * along, aside * np.sin(np.pi * along)], axis=1))
+
+    def past(self, place: Array) -> tuple[Guess, int]:
+        """Straight to a place (2,) and on to the goal, and which node (from one on) is there."""
+        corners = np.array([[0.0, 0.0], place, [LENGTH, 0.0]])
+        length = np.append(0.0, np.cumsum(np.hypot(*np.diff(corners, axis=0).T)))
+        node = int(np.clip(round(STEPS * length[1] / length[2]), 1, STEPS - 1))
+        at = np.interp(np.arange(STEPS + 1), [0, node, STEPS], length)
+        xy = np.stack([np.interp(at, length, corners[:, i]) for i in range(2)], axis=1)
+        return self.following(xy), node
+
+    def following(self, xy: Array) -> Guess:
+        """Along a way (n + 1, 2) [m]."""
         step = np.diff(xy, axis=0)
         heading = np.arctan2(step[:, 1], step[:, 0])
         poses = np.column_stack([xy, np.append(heading, heading[-1])])
         poses[0] = 0.0
         h = 1.1 * float(np.hypot(*step.T).sum()) / STEPS / SPEED
         u = np.stack([np.hypot(*step.T) / h, np.diff(poses[:, 2]) / h], axis=1)
-        return self.stated(Plan(poses, u, foreseen(self.world, poses, u, h), h))
+        return self.stated(Plan(poses, u, foreseen(self.world, poses, u, h, self.sensor), h))
 
     def stated(self, plan: Plan) -> Guess:
         """A plan as a guess."""
@@ -137,7 +155,7 @@ class Planner:
         return guess | ({self.b: plan.beliefs / UNIT} if self.foresees else {})
 
     def solve(
-        self, guess: Guess | fg.Solution, margin: float | Array, **chosen: float
+        self, guess: Guess | fg.Solution, margin: float | Array, **chosen: float | Array
     ) -> tuple[fg.Solution, Plan | None]:
         """From one guess, with margins for all, or for each node and disc; no plan where constraints are not kept."""
         data: dict[Any, Any] = {getattr(self, name): value for name, value in chosen.items()}
@@ -146,13 +164,20 @@ class Planner:
         if solution.violation > TOLERANCE:
             return solution, None
         x, u, h = solution[self.x].copy(), solution[self.u].copy(), float(solution[self.h][0, 0])
-        return solution, Plan(x, u, foreseen(self.world, x, u, h), h)
+        return solution, Plan(x, u, foreseen(self.world, x, u, h, self.sensor), h)
 
 
 def clear(x: Array, centre: Array, radius: Array, margin: Array) -> Array:
     """Clearance less a margin: (n, m) [m]."""
     distance: Array = np.linalg.norm(x[:, None, :2] - centre, axis=2)
     return distance - radius - margin
+
+
+def beyond(x: Array, place: Array, within: Array) -> Array:
+    """By how much poses are farther from a place than they may be: (n, 1) [m]."""
+    offset = x[:, :2] - place
+    distance: Array = np.sqrt(np.sum(offset * offset, axis=1) + uncertainty.NEAR**2)
+    return distance[:, None] - within[:, None]
 
 
 def confident(x: Array, b: Array, centre: Array, radius: Array, k: Array | float, margin: Array | float) -> Array:
@@ -165,12 +190,14 @@ def scaled(x: Array, b: Array, centre: Array, radius: Array, k: Array, margin: A
     return confident(x, UNIT * b, centre, radius, k, margin)
 
 
-recursion = uncertainty.pose_recursion(SENSOR)
-
-
-def filtering(b: Array, x: Array, u: Array, after: Array, b_after: Array, *known: Array) -> Array:
+def filtering(sensor: BeaconSensor) -> Callable[..., Array]:
     """Defect of the recursion, (n, 12), in the unit of beliefs."""
-    return recursion(UNIT * b, x, u, after, UNIT * b_after, *known) / UNIT
+    recursion = uncertainty.pose_recursion(sensor)
+
+    def defect(b: Array, x: Array, u: Array, after: Array, b_after: Array, *known: Array) -> Array:
+        return recursion(UNIT * b, x, u, after, UNIT * b_after, *known) / UNIT
+
+    return defect
 
 
 def unsure(b: Array, weight: Array) -> Array:
@@ -178,9 +205,9 @@ def unsure(b: Array, weight: Array) -> Array:
     return weight * np.sqrt(UNIT * (b[:, 0] + b[:, 2]))
 
 
-def foreseen(world: Layout, poses: Array, u: Array, h: float) -> Array:
+def foreseen(world: Layout, poses: Array, u: Array, h: float, sensor: BeaconSensor = SENSOR) -> Array:
     """(n + 1, 12) packed beliefs along poses (n + 1, 3) under controls (n, 2), step by step."""
-    ahead = uncertainty.pose_forecast(SENSOR)
+    ahead = uncertainty.pose_forecast(sensor)
     found, duration = [Forecast(START[None], 0.0 * START[None])], np.array([[h]])
     for here, control, there in zip(poses[:-1, None], u[:, None], poses[1:, None], strict=True):
         found.append(ahead(found[-1], here, control, there, duration, DENSITY, GAIN, world.beacons))
@@ -191,9 +218,14 @@ Solve: TypeAlias = Callable[[Guess | fg.Solution, float], tuple[fg.Solution, Pla
 """A plan from a guess and a value that is swept."""
 
 
-def sweep(planner: Planner, solve: Solve, values: Sequence[float]) -> list[Plan | None]:
-    """The best plan for each value, rising, over guesses around both sides and the plans of the value before."""
-    starts: list[Guess] = [planner.guess(side) for side in SIDES]
+def sweep(
+    planner: Planner, solve: Solve, values: Sequence[float], starts: Sequence[Guess] | None = None
+) -> list[Plan | None]:
+    """The best plan for each value, rising, over guesses and the plans of the value before.
+
+    Without guesses, these are around both sides.
+    """
+    starts = starts or [planner.guess(side) for side in SIDES]
     chains: list[Guess | fg.Solution] = [*starts]
     found = list[Plan | None]()
     for value in values:
