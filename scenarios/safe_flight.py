@@ -85,11 +85,12 @@ class SafeSettings:
         books: vehicle that everybody believes in at first.
         truth: mass and drag of the vehicle.
         true_loops: its loops.
-        gains: of the controller by flatness.
+        gains: of the controller by flatness where it predicts; where it does not it has those of a new `Gains`, for
+            these need the prediction.
         filter: numbers of the filter of one step.
         spline: numbers of the planner by splines.
         keeper: numbers of the controller by barriers.
-        tracking: the same where nothing is in the way.
+        tracking: the same where nothing is in the way and it predicts.
         weighing: numbers of the estimate.
         seen: standard deviations of position, attitude and velocity as they are seen [m, rad, m/s].
         disturbance: of rates and accelerations.
@@ -171,11 +172,12 @@ class SafeFlight:
         s, path = self.settings, self.situation.path
         if controller == "barrier":
             slots, (alpha, gamma) = min(s.keeper.slots, len(self.situation.bodies)), barriers
-            weights = s.keeper if slots else s.tracking
+            weights = s.tracking if self.weighing is not None and not slots else s.keeper
             numbers = replace(weights, alpha=alpha, gamma=gamma, reading=s.reading, speed=limit, slots=slots)
             keeper = Keeper(numbers, s.books, path, s.dt, self.weighing, s.solver)
             return lambda state, now, seen: keeper.decide(state, now + self.lead, seen, now)
-        flat = FlatnessController(s.gains, s.books.least, s.books.most)
+        gains = Gains() if self.weighing is None else s.gains
+        flat = FlatnessController(gains, s.books.least, s.books.most)
         if controller == "spline":
             path = self._spline()
         numbers_of_filter = replace(s.filter, alpha=barriers[0])
