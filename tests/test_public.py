@@ -21,6 +21,7 @@ OPEN = (
     "unifg.pose_graphs",
     "unifg.files",
     "unifg.view",
+    "unifg.horizon",
 )
 OPEN_MODULES = {
     "unifg",

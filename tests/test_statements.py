@@ -216,7 +216,7 @@ def test_data_and_guesses_that_are_no_numbers_are_refused(wrong: Any) -> None:
         with pytest.raises(fg.GraphError, match="guess for family 'x'"):
             run.solve({x: wrong})
     with pytest.raises(fg.GraphError, match="data 'on'"):
-        run.solve({x: [[0.0, 0.0]]}, data={on: [1] if isinstance(wrong, list) else wrong})
+        run.solve({x: [[0.0, 0.0]]}, data={on: [2] if isinstance(wrong, list) else wrong})
     given: dict[fg.Data, Any] = {goal: [3, np.float32(4.0)], on: np.array([True])}
     assert run.solve({x: [[0, 0]]}, data=given)[x].tolist() == [[3.0, 4.0]]
 
@@ -476,3 +476,15 @@ def test_check_takes_every_form_of_a_guess() -> None:
             graph.check(wrong)  # type: ignore[arg-type]
         with pytest.raises(fg.GraphError, match=r"a guess is {family: array"):
             SQP().solve(graph, wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("given", [[1, 0, 1], [1.0, 0.0, 1.0], np.array([True, False, True])])
+def test_zeros_and_ones_stand_for_booleans_in_data(given: object) -> None:
+    graph = fg.Graph()
+    on = graph.data("on", np.ones(3, dtype=bool), each=True)
+    found = on.check(given)  # type: ignore[arg-type]
+    assert found.dtype == bool
+    np.testing.assert_array_equal(found, [True, False, True])
+    for wrong in ([0, 1, 2], [0.5, 1.0, 0.0]):
+        with pytest.raises(fg.GraphError, match=r"'on'.*0 and 1"):
+            on.check(wrong)

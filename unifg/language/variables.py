@@ -120,13 +120,16 @@ class Data:
         """Return ``value`` as an array of the declared shape.
 
         Raises:
-            GraphError: when shape or kind differ - numbers, or booleans - or an entry is NaN.
+            GraphError: when shape or kind differ - numbers, or booleans, for which 0 and 1 may stand - or one is NaN.
         """
         array = doubles(f"data '{self.name}'", value, flags=self.value.dtype == bool)
         if array.dtype != self.value.dtype:
-            raise GraphError(
-                f"data '{self.name}' was declared with booleans, found numbers: compare them, as in v != 0"
-            )
+            if not np.isin(array, (0.0, 1.0)).all():
+                raise GraphError(
+                    f"data '{self.name}' was declared with booleans, found numbers besides 0 and 1: compare them, "
+                    "as in v != 0"
+                )
+            array = array == 1.0
         if array.shape != self.value.shape:
             raise GraphError(
                 f"data '{self.name}' has shape {array.shape}, but was declared with {self.value.shape}: "

@@ -343,7 +343,7 @@ def _socket(port: int) -> socket.socket:
     """A socket that listens on this machine, on that port or one near it, or on any.
 
     Raises:
-        OSError: no port is free.
+        ViewError: no port is free.
     """
     for tried in [*range(port, port + _PORTS), 0]:
         made = socket.socket()
@@ -357,7 +357,7 @@ def _socket(port: int) -> socket.socket:
             refused = error
         else:
             return made
-    raise OSError(f"no port is free: {refused}")
+    raise ViewError(f"no port is free: {refused}")
 
 
 def _matrix(placed: Placement, origin: Array) -> Array:
