@@ -70,7 +70,7 @@ HOSTILE: dict[str, tuple[States, str]] = {
     "sigma a function": (weighed(sigma=np.ones), "must be real numbers"),
     "sigma data": (lambda g, x, u: weighed(sigma=g._data["s"])(g, x, u), "found -1 at"),
     "information shape": (weighed(information=np.eye(2)), r"information has shape \(2, 2\)"),
-    "information skew": (weighed(information=SKEW), r"symmetric, found 0.5 at \(0, 1\) and 0 at \(1, 0\)"),
+    "information skew": (weighed(information=SKEW), r"symmetric, found 0.5 at \(0, 1\) and 0.0 at \(1, 0\)"),
     "information indefinite": (weighed(information=INDEFINITE), "factor 2 has a negative eigenvalue, -4"),
     "information nan": (weighed(information=np.full((3, 3), np.nan)), "finite and symmetric, found nan"),
     "information data": (lambda g, x, u: weighed(information=g._data["s"])(g, x, u), r"information has shape \(3,\)"),
@@ -81,7 +81,7 @@ HOSTILE: dict[str, tuple[States, str]] = {
     "active length": (weighed(active=[True, False]), "number of factors is unclear"),
     "active axes": (weighed(active=np.ones((4, 1), dtype=bool)), "active= must be"),
     "active scalar data": (lambda g, x, u: weighed(active=g._data["flag"])(g, x, u), "active= must be"),
-    "crossed": (limited(lower=[0.0, 2.0], upper=1.0), "lower exceeds upper in factor 0, row 1: 2 > 1"),
+    "crossed": (limited(lower=[0.0, 2.0], upper=1.0), "lower exceeds upper in factor 0, row 1: 2.0 > 1.0"),
     "limit nan": (limited(upper=[1.0, np.nan]), r"upper is NaN at \(1,\)"),
     "limit shape": (limited(upper=np.ones(4)), r"upper has shape \(4,\), expected"),
     "limit of each factor": (limited(upper=np.ones(3)), r"upper\[:, None\]"),
@@ -488,3 +488,13 @@ def test_zeros_and_ones_stand_for_booleans_in_data(given: object) -> None:
     for wrong in ([0, 1, 2], [0.5, 1.0, 0.0]):
         with pytest.raises(fg.GraphError, match=r"'on'.*0 and 1"):
             on.check(wrong)
+
+
+def test_numbers_that_differ_by_rounding_are_told_as_they_are() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    with pytest.raises(fg.GraphError, match=r"0\.30000000000000004 > 0\.3"):
+        graph.bound(x, lower=0.1 + 0.2, upper=0.3)
+    information = np.array([[1e7, 3e6 + 1.0], [3e6, 1e7]])
+    with pytest.raises(fg.GraphError, match=r"3000001\.0 at .* 3000000\.0 at .*S\.T"):
+        graph.minimize(fg.prior, x, np.zeros(2), information=information)

@@ -431,3 +431,14 @@ def test_shapes_look_outwards() -> None:
         sphere(), np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]]), np.stack([np.eye(3), 2.0 * np.eye(3)])
     )
     assert twice[:, 0].max() == pytest.approx(7.0) and faces.max() == len(twice) - 1
+
+
+def test_what_is_no_covariance_and_no_rotation_is_refused() -> None:
+    scene = Scene()
+    with pytest.raises(ViewError, match="covariance 1 has a negative variance"):
+        scene.covariances("c", np.zeros((2, 2)), [np.eye(2), [[1.0, 2.0], [2.0, 1.0]]])
+    for quaternion in ([0.0, 0.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0]):
+        with pytest.raises(ViewError, match="quaternion of pose 0"):
+            scene.poses("p", [[0.0, 0.0, 0.0, *quaternion]])
+    scene.covariances("c", np.zeros((1, 2)), [[[1.0, 1.0], [1.0, 1.0 - 1e-12]]])  # but for rounding
+    scene.poses("p", [[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])

@@ -92,9 +92,10 @@ def square_roots(name: str, information: Array, count: int, size: int) -> Array:
         unequal = ~np.isfinite(stack) | ~np.isclose(stack, transposed, rtol=1e-9, atol=0.0)
         index, row, column = (int(k) for k in np.argwhere(unequal)[0])
         raise GraphError(
-            f"term '{name}': information must be finite and symmetric, found {stack[index, row, column]:g} at "
-            f"{(row, column)} and {stack[index, column, row]:g} at {(column, row)}"
-            f"{f' of factor {index}' if len(stack) > 1 else ''}",
+            f"term '{name}': information must be finite and symmetric, found {stack[index, row, column]!s} at "
+            f"{(row, column)} and {stack[index, column, row]!s} at {(column, row)}"
+            f"{f' of factor {index}' if len(stack) > 1 else ''}; of an inverse, which rounding leaves unsymmetric, "
+            "give (S + S.T) / 2",
             term=name,
             index=index,
         )

@@ -70,8 +70,8 @@ def check_limits(name: str, lower: Parameter, upper: Parameter, count: int, size
         crossed = np.argwhere(low > high)
         factor, row = (int(i) for i in crossed[0])
         raise GraphError(
-            f"term '{name}': lower exceeds upper in factor {factor}, row {row}: {low[factor, row]:g} > "
-            f"{high[factor, row]:g}",
+            f"term '{name}': lower exceeds upper in factor {factor}, row {row}: {low[factor, row]!s} > "
+            f"{high[factor, row]!s}",
             term=name,
             index=factor,
         )

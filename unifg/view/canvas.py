@@ -113,7 +113,7 @@ class Canvas:
             legend: words of the legend.
 
         Raises:
-            ViewError: the shape is another, or a number is not finite.
+            ViewError: the shape is another, a number is not finite, or a quaternion has not unit length.
         """
         rows = np.atleast_2d(np.array(poses, dtype=np.float64))
         if rows.ndim != 2 or rows.shape[1] not in (3, 7):
@@ -121,6 +121,14 @@ class Canvas:
                 f"'{name}': poses are (n, 3) x, y, theta or (n, 7) position and quaternion, found {rows.shape}"
             )
         finite(name, rows, "pose")
+        off = (
+            np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1.0) > 1e-6 if rows.shape[1] == 7 else np.zeros(0, dtype=bool)
+        )
+        if off.any():
+            k = int(np.argmax(off))
+            raise ViewError(
+                f"'{name}': the quaternion of pose {k}, {rows[k, 3:].tolist()}, has not unit length", index=k
+            )
         layer = self._content.layer(name, "arrow" if rows.shape[1] == 3 else "axes", colour, legend)
         if rows.shape[1] == 3:
             given = {"poses": rows, "length": length, "colour": layer.colour, "level": layer.level}
@@ -144,7 +152,7 @@ class Canvas:
             legend: words of the legend.
 
         Raises:
-            ViewError: shapes do not fit, or a number is not finite.
+            ViewError: shapes do not fit, a number is not finite, or a variance is negative beyond rounding.
         """
         places, flat = self._places(name, centres)
         size = 2 if flat else 3
@@ -156,6 +164,10 @@ class Canvas:
             )
         finite(name, given_covariances, "covariance")
         variances, vectors = np.linalg.eigh(0.5 * (given_covariances + given_covariances.transpose(0, 2, 1)))
+        wrong = variances.min(axis=1, initial=0.0) < -1e-9 * np.abs(variances).max(axis=1, initial=0.0)
+        if wrong.any():
+            k = int(np.argmax(wrong))
+            raise ViewError(f"'{name}': covariance {k} has a negative variance, {variances[k].min():g} m^2", index=k)
         half = sigmas * np.sqrt(np.maximum(variances, 0.0))
         axes = np.einsum("nij,nj,nkj->nik", vectors, half, vectors)  # symmetric: it turns as little as can be
         layer = self._content.layer(name, "ghost", colour, legend)
