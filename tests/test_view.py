@@ -436,7 +436,7 @@ def test_shapes_look_outwards() -> None:
 def test_what_is_no_covariance_and_no_rotation_is_refused() -> None:
     scene = Scene()
     with pytest.raises(ViewError, match="covariance 1 has a negative variance"):
-        scene.covariances("c", np.zeros((2, 2)), [np.eye(2), [[1.0, 2.0], [2.0, 1.0]]])
+        scene.covariances("c", np.zeros((2, 2)), np.array([np.eye(2), [[1.0, 2.0], [2.0, 1.0]]]))
     for quaternion in ([0.0, 0.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0]):
         with pytest.raises(ViewError, match="quaternion of pose 0"):
             scene.poses("p", [[0.0, 0.0, 0.0, *quaternion]])
