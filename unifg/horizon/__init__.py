@@ -15,7 +15,7 @@ from unifg.horizon.decision import Choice, Judge, KeepThenBrake, Kept, Plan
 from unifg.horizon.past import Arrival
 from unifg.horizon.recorded import History
 from unifg.horizon.robot import Robot, Static
-from unifg.horizon.statements import ControlCost, Dynamics, Measurement, Now, Term
+from unifg.horizon.statements import ControlCost, Dynamics, Measurement, Now, Resetting, Term
 from unifg.horizon.window import Window
 
 __all__ = [
@@ -33,6 +33,7 @@ __all__ = [
     "Measurement",
     "Now",
     "Plan",
+    "Resetting",
     "Robot",
     "Starts",
     "Static",

@@ -18,7 +18,7 @@ from unifg.errors import GraphError
 from unifg.horizon.coupled import COUPLINGS, Coupling, Given, Joined, Tie, weigh
 from unifg.horizon.decision import Choice, Judge, KeepThenBrake, Kept, Plan
 from unifg.horizon.robot import Robot
-from unifg.horizon.statements import Now, Term, handles_of, values_of
+from unifg.horizon.statements import Now, Term, handles_of, reset_all, values_of
 from unifg.horizon.window import Window
 from unifg.language.variables import Data
 from unifg.typing import Array, ArrayLike
@@ -107,7 +107,8 @@ class Loop:
             coupling: "separate", "sequential" or "joint".
             pull: see :class:`unifg.horizon.coupled.Joined`.
             control_weight: factor on all costs of the future; matters where they meet those of the past.
-            limits: least and greatest controls (m,), to which plans are clipped; None for none.
+            limits: least and greatest controls (m,), to which plans are clipped, infinite where there are none; one
+                number holds for all, None for no limits.
             judge: decides what is applied; by default :class:`unifg.horizon.KeepThenBrake`.
             starts: where solves begin that have no last answer to go on from.
             believable: whether what a joint solve says of the present is believed; by default when its plan is
@@ -120,8 +121,8 @@ class Loop:
             clock: seconds of the wall.
 
         Raises:
-            GraphError: for an unknown coupling, a joint one without a window, sizes that do not fit, a term that
-                cannot be stated, or a delay of a joint coupling or of a robot without a model.
+            GraphError: for an unknown coupling, a joint one without a window, sizes and limits that do not fit, a term
+                that cannot be stated, or a delay of a joint coupling or of a robot without a model.
         """
         if coupling not in COUPLINGS:
             raise GraphError(f"unknown coupling '{coupling}': choose {', '.join(COUPLINGS)}")
@@ -138,6 +139,7 @@ class Loop:
             )
         self.robot, self.steps, self.coupling, self.window, self.delay = robot, steps, coupling, window, delay
         self._terms, self._deadline, self._clock, self._patience = tuple(terms), deadline, clock, patience
+        between = _looked_at((-np.inf, np.inf) if limits is None else limits, robot.control.storage)
         graph = Graph()
         self.tie: Tie = self._tied(graph, pull)
         self.x, self.u = self.tie.ahead, graph.variables("u", robot.control, steps)
@@ -149,9 +151,7 @@ class Loop:
         timed = [replace(own, time_limit=min(own.time_limit, deadline)) for own in (solver, cold or solver)]
         self._limits = [own.time_limit for own in timed]
         self.warm, self.cold = (own.prepare(graph) for own in timed)
-        size = robot.control.storage
-        least, most = limits if limits is not None else (np.full(size, -np.inf), np.full(size, np.inf))
-        self.kept = Kept(steps, robot, (np.asarray(least, dtype=np.float64), np.asarray(most, dtype=np.float64)))
+        self.kept = Kept(steps, robot, between)
         self.judge: Judge = judge or KeepThenBrake(robot)
         self.starts: Starts = starts or Starts()
         self._believable = believable or _close
@@ -160,7 +160,7 @@ class Loop:
         self.milliseconds: deque[float] = deque(maxlen=TIMES)
         self.guess: Guess | None = None
         self.solution: Solution | None = None
-        self.sent: Array = np.zeros((delay, size))
+        self.sent: Array = np.zeros((delay, robot.control.storage))
         self.lagging, self.failed = 0, False
         self._believe_nothing()
 
@@ -336,15 +336,17 @@ class Loop:
         self.lagging = 0
 
     def reset(self, start: ArrayLike | None = None, sigma: ArrayLike | None = None) -> None:
-        """Forget the plan that is kept and the past, too; counts of statuses and times stay.
+        """Forget the plan that is kept, the past, and what terms keep; counts of statuses and times stay.
 
         Args:
             start: (storage,) believed state; None for that of the beginning.
             sigma: (d,) its standard deviations, or its covariance; None for those of the beginning.
         """
-        self.abandon()
         if self.window is not None:
             self.window.reset(start, sigma)
+        behind = () if self.window is None else self.window.terms
+        reset_all(term for term in self._terms if not any(term is other for other in behind))
+        self.abandon()
         self._believe_nothing()
 
     def _believe_nothing(self) -> None:
@@ -354,6 +356,19 @@ class Loop:
         self.solution = None
         self.estimate = self.robot.state.identity() if self.window is None else self.window.present
         self.statics, self.believed = {static.name: static.values for static in self.robot.statics}, False
+
+
+def _looked_at(limits: tuple[ArrayLike, ArrayLike], size: int) -> tuple[Array, Array]:
+    """Least and greatest controls (m,), between which there are some."""
+    try:
+        least, most = (np.broadcast_to(np.array(limit, dtype=np.float64), (size,)) for limit in limits)
+    except (TypeError, ValueError) as error:
+        raise GraphError(
+            f"the limits must be two, ({size},) each: least and greatest controls; got {limits}"
+        ) from error
+    if not (np.all(least <= most) and np.all(least < np.inf) and np.all(most > -np.inf)):
+        raise GraphError(f"the limits leave no control: the least ({size},) is {least}, the greatest {most}")
+    return least, most
 
 
 def _close(solution: Solution, choice: Choice) -> bool:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
+from math import sqrt
 from typing import Any, Literal, Protocol, TypeAlias, get_args
 
 import numpy as np
@@ -15,6 +17,7 @@ from unifg.horizon.past import Past
 from unifg.horizon.robot import Robot
 from unifg.horizon.statements import Now
 from unifg.horizon.window import Window
+from unifg.kernels.robust import DCS, Cauchy, GemanMcClure, Huber, Loss, Reweighted, TruncatedLeastSquares, Tukey
 from unifg.language.factors import prior
 from unifg.language.terms import Cost, ScalarCost
 from unifg.language.terms import Term as Stated
@@ -182,11 +185,33 @@ class Joined:
         return solution[self._present][0], {family.name: solution[family] for family in self.past.statics}
 
 
+def weighed(loss: Loss, weight: float) -> Loss | None:
+    """The loss of s that is ``weight`` times a loss of s / weight; None where only its author knows.
+
+    All shipped ones are homogeneous: it is the same formula, which bends at another place.
+    """
+    if type(loss) is DCS:
+        return replace(loss, phi=loss.phi * weight)
+    if type(loss) is Huber or type(loss) is Tukey or type(loss) is TruncatedLeastSquares:
+        return replace(loss, threshold=loss.threshold * sqrt(weight))
+    if type(loss) is Cauchy or type(loss) is GemanMcClure:
+        return replace(loss, scale=loss.scale * sqrt(weight))
+    if type(loss) is Reweighted:
+        return Reweighted(partial(_stretched, loss.rule, weight))
+    return None
+
+
+def _stretched(rule: Callable[[Array], Array], weight: float, squared: Array) -> Array:
+    """A rule of s applied to s / weight."""
+    return rule(squared / weight)
+
+
 def weigh(terms: Sequence[Stated], weight: float) -> None:
-    """Multiply costs, as they have been stated, by a common weight.
+    """Multiply costs, as they have been stated, by a common weight; losses bend where they did.
 
     Raises:
-        GraphError: for a cost that is not a square, or whose standard deviations are data, when the weight is not one.
+        GraphError: when the weight is not one: for a cost that is not a square, whose standard deviations are data, or
+            whose loss is not one of the library's.
     """
     if weight == 1.0:
         return
@@ -197,6 +222,15 @@ def weigh(terms: Sequence[Stated], weight: float) -> None:
             raise GraphError(
                 f"term '{term.name}' cannot be weighed by control_weight: state its weight in the term", term=term.name
             )
+        if isinstance(term, Cost) and term.robust is not None:
+            loss = weighed(term.robust, weight)
+            if loss is None:
+                raise GraphError(
+                    f"term '{term.name}': its loss {type(term.robust).__name__} cannot be weighed by control_weight: "
+                    "state its weight in the loss",
+                    term=term.name,
+                )
+            term.robust = loss
         if isinstance(term, Cost) and term.information is not None:
             term.information = np.asarray(term.information, dtype=np.float64) * weight
         elif isinstance(term, Cost):

@@ -2,12 +2,14 @@
 
 A term is an object with two methods. ``state(graph, x, u)`` adds costs and constraints on the nodes it is given, of the
 past or of the future; ``data(now)`` gives the values of the data that it declared, by their names. The same object may
-stand in several graphs, the one of the past alone and the one of past and future, so it keeps nothing of them.
+stand in several graphs, the one of the past alone and the one of past and future, so it keeps nothing of them. What it
+keeps between ticks, as measurements that have arrived, it forgets when a window or a loop is reset, if it has a method
+``reset()``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
@@ -79,6 +81,15 @@ class Recording(Protocol):
     @property
     def records(self) -> Mapping[str, tuple[int, ...]]:
         """Shape of a measurement at one node, by name."""
+        ...
+
+
+@runtime_checkable
+class Resetting(Protocol):
+    """A term that keeps something between ticks, as measurements that have arrived, which a new episode forgets."""
+
+    def reset(self) -> None:
+        """Forget it: the window or the loop begins anew."""
         ...
 
 
@@ -216,6 +227,13 @@ def _spread_out(value: ArrayLike, shape: tuple[int, ...]) -> ArrayLike:
     own = np.shape(value)
     alike = len(own) < len(shape) and own == shape[len(shape) - len(own) :]
     return np.broadcast_to(np.asarray(value), shape) if alike or not own else value
+
+
+def reset_all(terms: Iterable[Term]) -> None:
+    """Let those terms that keep something forget it."""
+    for term in terms:
+        if isinstance(term, Resetting):
+            term.reset()
 
 
 def handles_of(graph: Graph) -> dict[str, Data]:

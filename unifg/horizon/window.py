@@ -19,7 +19,7 @@ from unifg.horizon.past import Arrival, Left, Past, Tangent
 from unifg.horizon.recorded import History
 from unifg.horizon.robot import Robot, information_of
 from unifg.horizon.spread import JointCovariance
-from unifg.horizon.statements import Now, Recording, Term
+from unifg.horizon.statements import Now, Recording, Term, reset_all
 from unifg.language.terms import Constraint
 from unifg.language.variables import Data, Family, Selection
 from unifg.solvers.interior_point.method import InteriorPoint
@@ -245,6 +245,7 @@ class Window:
         """
         if value is not None:
             self.history.record(name, value, node)
+            self.left.departure = None  # it was found without this measurement
 
     def now(self, given: Any, last: Array | None = None) -> Now[Any]:
         """What terms may ask for now; ``last`` (m,) is the control applied last."""
@@ -287,7 +288,7 @@ class Window:
         self._past.depart(solution)
 
     def reset(self, start: ArrayLike | None = None, sigma: ArrayLike | None = None) -> None:
-        """Forget everything, and begin anew.
+        """Forget everything, and begin anew; terms that keep something forget it, too.
 
         Args:
             start: (storage,) believed state; None for that of the beginning.
@@ -298,6 +299,7 @@ class Window:
         self.history.begin(begin)
         self.left.begin(begin, spread)
         self.solution, self._covariance, self._due = None, self._prior_covariance(), False
+        reset_all(self.terms)
 
     def _prior_covariance(self) -> Array:
         blocks = [np.linalg.inv(self.left.initial[1])]

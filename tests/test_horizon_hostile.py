@@ -1,0 +1,190 @@
+"""Windows and loops that are handed what nobody should hand them, and episodes that follow one another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.horizon import ControlCost, Dynamics, Loop, Measurement, Now, Robot, Term, Window
+from unifg.solvers import SQP, GaussNewton, InteriorPoint
+from unifg.typing import Array, ArrayLike
+
+H, A, B = 0.5, np.array([[1.0, 0.5], [0.0, 1.0]]), np.array([[0.125], [0.5]])
+POINT = Robot(fg.Rn(2), fg.Rn(1), predict=lambda x, u: A @ x + B @ u)
+
+
+def moved(x: Array, u: Array, y: Array, h: float) -> Array:
+    return np.asarray(y - x @ A.T - u @ B.T)
+
+
+def position(x: Array, z: Array) -> Array:
+    return x[:, :1] - z
+
+
+def window_of(*terms: Term, length: int = 3, robot: Robot = POINT, **options: Any) -> Window:
+    usual: dict[str, Any] = {"start": [0.0, 0.0], "sigma": [1.0, 0.5], "solver": GaussNewton(tolerance=1e-12)}
+    motion = Dynamics(moved, H, sigma=[0.05, 0.1])
+    return Window(robot, length, [motion, *(terms or (Measurement("p", position, (1,), 0.3),))], **usual | options)
+
+
+@dataclass
+class Wish:
+    """To be somewhere with some control, of which more than a little does not count more."""
+
+    loss: Any = None
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        goal = graph.data("goal", np.zeros(2))
+        graph.minimize(fg.prior, x[1:], goal, sigma=1.0, name="goal")
+        graph.minimize(fg.prior, u, [5.0], sigma=1.0, robust=self.loss, name="wish")
+
+    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+        return {} if now.given is None else {"goal": now.given}
+
+
+def loop_of(*terms: Term, solver: fg.Solver | None = None, **options: Any) -> Loop:
+    usual: dict[str, Any] = {"window": window_of()}
+    ahead: list[Term] = [Dynamics(moved, H), *(terms or (Wish(), ControlCost([1.0])))]
+    return Loop(POINT, 4, ahead, solver=solver or InteriorPoint(tolerance=1e-9), **usual | options)
+
+
+# ---------------------------------------------------------------- one episode after another
+
+
+@dataclass
+class Buffer:
+    """A sensor that keeps what has come in until it is asked."""
+
+    name: str
+    waiting: list[float] = field(default_factory=list)
+    begun: int = 0
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        graph.minimize(position, x[-1], graph.data(self.name, np.zeros(1)), sigma=0.3, name=f"{self.name} here")
+
+    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+        return {self.name: [np.mean(self.waiting or [0.0])]}
+
+    def reset(self) -> None:
+        self.waiting.clear()
+        self.begun += 1
+
+
+@pytest.mark.parametrize("given", [None, [0.0, 0.0]])
+def test_terms_forget_the_last_episode_with_the_window(given: Any) -> None:
+    behind, ahead, found = Buffer("seen"), Buffer("told"), []
+    loop = loop_of(Wish(), ahead, window=window_of(behind))
+    for value in (100.0, 0.0):
+        behind.waiting.append(value)
+        ahead.waiting.append(value)
+        found.append(loop.tick().controls)
+        loop.reset(given)
+    assert (behind.begun, ahead.begun) == (2, 2)
+    fresh = loop_of(Wish(), Buffer("told"), window=window_of(Buffer("seen"))).tick().controls
+    np.testing.assert_allclose(found[1], fresh, atol=1e-9)
+    window = window_of(both := Buffer("seen"))
+    window.reset()
+    assert both.begun == 1
+    shared = Buffer("seen")
+    loop_of(Wish(), shared, window=window_of(shared)).reset()
+    assert shared.begun == 1  # once, though it is a term of both
+
+
+@pytest.mark.parametrize("late", [False, True], ids=["before the estimate", "after it"])
+@pytest.mark.parametrize("place", [0, 2, 3])
+def test_what_is_recorded_after_the_estimate_leaves_with_its_node(place: int, late: bool) -> None:
+    found = []
+    for after in (late, False):
+        window = window_of(length=3)
+        for k in range(5):
+            if k:
+                window.move([0.1])
+            if k == 4 and not after:
+                window.record("p", [10.0], place)
+            window.estimate()
+        if after:
+            window.record("p", [10.0], place)
+        for _ in range(3):
+            window.move([0.0])
+            window.estimate()
+        found.append((window.present, window.covariance))
+    np.testing.assert_allclose(found[0][0], found[1][0], atol=1e-9)
+    np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-9)
+
+
+# ---------------------------------------------------------------- weights
+
+
+@pytest.mark.parametrize(
+    "loss",
+    [
+        None,
+        fg.Huber(1.0),
+        fg.Cauchy(1.5),
+        fg.Tukey(6.0),
+        fg.DCS(2.0),
+        fg.GemanMcClure(3.0),
+        fg.TruncatedLeastSquares(2.0),
+        fg.Reweighted(lambda s: 1.0 / (1.0 + s)),
+    ],
+    ids=lambda loss: type(loss).__name__,
+)
+def test_a_common_factor_changes_no_plan(loss: Any) -> None:
+    """Every cost is multiplied by it, beyond the bend of its loss, too."""
+    found, costs = [], []
+    for weight in (1.0, 16.0):
+        solver = SQP(tolerance=1e-10, hessian="gauss-newton", max_iterations=200)
+        loop = loop_of(Wish(loss), ControlCost([0.7]), control_weight=weight, solver=solver, window=None)
+        found.append(loop.plan([1.0, 0.5]).controls)
+        assert loop.solution is not None
+        costs.append(loop.solution.cost)
+    np.testing.assert_allclose(found[0], found[1], atol=1e-6)
+    assert costs[1] == pytest.approx(16.0 * costs[0], rel=1e-6)
+
+
+class Own(fg.Huber):
+    """A loss of somebody's own."""
+
+    def value(self, squared: Array) -> Array:
+        return squared
+
+
+def test_a_loss_that_nobody_knows_is_not_weighed() -> None:
+    loop_of(Wish(Own(1.0)), control_weight=1.0)
+    with pytest.raises(fg.GraphError, match=r"'wish'.*loss Own.*control_weight"):
+        loop_of(Wish(Own(1.0)), control_weight=2.0)
+
+
+# ---------------------------------------------------------------- limits
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        ([np.nan], [1.0]),
+        ([-1.0], [np.nan]),
+        ([1.0], [-1.0]),
+        ([-1.0, -1.0], [1.0, 1.0]),
+        ([np.inf], [np.inf]),
+        ([-np.inf], [-np.inf]),
+        ([-1.0],),
+        ("low", "high"),
+        5.0,
+    ],
+    ids=str,
+)
+def test_limits_are_looked_at_where_they_are_given(limits: Any) -> None:
+    with pytest.raises(fg.GraphError, match=r"limits.*\(1,\)"):
+        loop_of(limits=limits)
+
+
+@pytest.mark.parametrize("limits", [(-0.1, 0.1), ([-0.1], np.inf), ([-np.inf], [0.1])], ids=str)
+def test_limits_of_one_number_hold_for_all(limits: Any) -> None:
+    plan = loop_of(limits=limits).tick()
+    assert plan.controls.max() <= limits[1] and plan.controls.min() >= limits[0]
+    assert plan.controls.shape == (4, 1)
