@@ -139,7 +139,7 @@ class InertialMeasurements:
         """Add factors between all neighbours of x, and of the biases where there is one for each node.
 
         Raises:
-            ModelError: when there are fewer than two nodes, or the biases do not fit.
+            ModelError: when there are fewer than two nodes, the biases do not fit, or they are to walk without noise.
         """
         nodes = as_selection(x)
         body = nodes if self._body is None else getattr(nodes, self._body)
@@ -152,6 +152,12 @@ class InertialMeasurements:
         n = len(nodes) - 1
         nothing = preintegrate([], np.empty((0, 3)), np.empty((0, 3)), np.arange(n + 1.0), self.noise, np.zeros(6))
         walking = len(biases) > 1
+        if walking and not min(self.noise.gyro_walk, self.noise.accelerometer_walk) > 0.0:
+            walks = f"gyro_walk {self.noise.gyro_walk!r} and accelerometer_walk {self.noise.accelerometer_walk!r}"
+            raise ModelError(
+                f"'{self.name}': biases for each node walk by {walks}, which must be positive; one bias that stays is "
+                "a family of one member"
+            )
         data = {
             name: graph.data(name, value, each=True)
             for name, value in self._named(nothing).items()

@@ -17,8 +17,9 @@ import numpy as np
 from unifg.errors import ModelError
 from unifg.kernels.residuals import Residual
 from unifg.language.factors import prior
-from unifg.language.statement import Statement
+from unifg.language.statement import Statement, complete
 from unifg.language.terms import prepare_arguments
+from unifg.language.trial import rows_of
 from unifg.language.variables import Family
 from unifg.lie import Rn
 from unifg.typing import Array
@@ -110,7 +111,9 @@ def keep(
         name: of the term; the slack's family and its cost are called after it.
 
     Raises:
-        ModelError: on a form that is none, no obstacle, or a weight that is not positive.
+        ModelError: on a form that is none, no obstacle, another number of obstacles than the barrier has, or a weight
+            that is not positive.
+        GraphError: as the statements of the graph raise it; the graph is as it was.
     """
     names = tuple(f"{name} {k}" for k in range(obstacles)) if isinstance(obstacles, int) else tuple(obstacles)
     price = weight if weight is not None else EXACT if form == "exact slack" else WEIGHT
@@ -120,20 +123,32 @@ def keep(
         raise ModelError(f"'{name}' has no obstacle")
     if not (price > 0.0 and np.isfinite(price)):
         raise ModelError(f"'{name}': the weight of a slack or a hinge must be positive, found {price!r}")
+    normal, _, count = prepare_arguments(name, arguments, active)
+    rows = rows_of(name, complete(barrier, normal), normal, count)
+    if rows != len(names):
+        raise ModelError(f"'{name}': the barrier says something of {rows} obstacles, found {len(names)}: {names}")
+    for at in (graph.snapshot(), graph):  # what is refused is refused where nothing remains of it
+        kept = _hold(at, barrier, arguments, count, names, form, float(price), active, name)
+    return kept
+
+
+def _hold(
+    graph: Statement, barrier: Callable[..., Array] | Residual, arguments: tuple[Any, ...], count: int,
+    names: tuple[str, ...], form: Form, price: float, active: Any, name: str,
+) -> Kept:  # fmt: skip
     if form == "hinge":
         graph.minimize(hinge(barrier), *arguments, sigma=price**-0.5, active=active, name=name)
         return Kept(name, form, names, None)
     if form == "hard":
         graph.constrain(barrier, *arguments, lower=0.0, active=active, name=name)
         return Kept(name, form, names, None)
-    count = prepare_arguments(name, arguments, active)[2]
     slack = graph.variables(f"{name} slack", Rn(len(names)), count)
     graph.constrain(_loosened(barrier), slack, *arguments, lower=0.0, active=active, name=name)
     if form == "slack":
         graph.minimize(prior, slack, np.zeros(len(names)), sigma=price**-0.5, name=f"{name} slack")
     else:
         graph.bound(slack, lower=0.0, name=f"{name} slack limits")
-        graph.minimize_scalar(_priced(float(price)), slack, name=f"{name} slack")
+        graph.minimize_scalar(_priced(price), slack, name=f"{name} slack")
     return Kept(name, form, names, slack)
 
 

@@ -39,6 +39,8 @@ GRAVITY = (0.0, 0.0, -9.81)
 NEAR = 1.0  # squared angle [rad^2] below which Gamma_2 is a power series
 TERMS = 10
 CLOSE = 1e-6  # of an interval: how much later than its node the first sample may be
+DENSITIES = 1e-9, 1e3  # between which noise is: the best gyros have 1e-7 rad/s/sqrt(Hz)
+INVERTED = 1e-3  # by how much a covariance times its inverse, both without units, may differ from the identity
 
 
 @dataclass(frozen=True)
@@ -46,16 +48,32 @@ class ImuNoise:
     """Densities of noise that is white in continuous time, as data sheets have them; defaults of a small MEMS sensor.
 
     Attributes:
-        gyro: of rates [rad/s/sqrt(Hz)].
-        accelerometer: of specific forces [m/s^2/sqrt(Hz)].
-        gyro_walk: of the random walk of the gyro's bias [rad/s^2/sqrt(Hz)].
-        accelerometer_walk: of that of the accelerometer's [m/s^3/sqrt(Hz)].
+        gyro: of rates [rad/s/sqrt(Hz)], from 1e-9 to 1e3.
+        accelerometer: of specific forces [m/s^2/sqrt(Hz)], from 1e-9 to 1e3.
+        gyro_walk: of the random walk of the gyro's bias [rad/s^2/sqrt(Hz)]; zero where one bias stays.
+        accelerometer_walk: of that of the accelerometer's [m/s^3/sqrt(Hz)]; zero where one bias stays.
+
+    Raises:
+        ModelError: when a density is none; of rates and forces zero is none: without noise there is no information.
     """
 
     gyro: float = 1.7e-4
     accelerometer: float = 2e-3
     gyro_walk: float = 2e-5
     accelerometer_walk: float = 3e-3
+
+    def __post_init__(self) -> None:
+        """Look at the densities."""
+        least, most = DENSITIES
+        for name in ("gyro", "accelerometer"):
+            if not least <= getattr(self, name) <= most:
+                raise ModelError(
+                    f"ImuNoise: {name} {getattr(self, name)!r} must be a density from {least:g} to {most:g}; give that "
+                    "of the data sheet, or of a simulation without noise a small one, as 1e-6"
+                )
+        for name in ("gyro_walk", "accelerometer_walk"):
+            if not 0.0 <= getattr(self, name) <= most:
+                raise ModelError(f"ImuNoise: {name} {getattr(self, name)!r} must be a density from 0 to {most:g}")
 
     def walk(self, duration: ArrayLike) -> Array:
         """(n, 6) standard deviations of the change of biases over (n,) durations [s]."""
@@ -85,13 +103,28 @@ class Preintegrated(NamedTuple):
 
     @property
     def information(self) -> Array:
-        """(n, 9, 9) inverses of the covariances; zero where nothing was measured."""
+        """(n, 9, 9) inverses of the covariances; zero where nothing was measured.
+
+        Raises:
+            ModelError: when a covariance has no inverse in double precision: densities lie too far apart.
+        """
         found = np.zeros_like(self.covariance)
         scale = np.sqrt(np.einsum("nii->ni", self.covariance))
         known = (scale > 0.0).all(axis=1)
         per = 1.0 / scale[known]  # entries differ by powers of the sampling time
         both = per[:, :, None] * per[:, None, :]
-        inverse = both * np.linalg.inv(both * self.covariance[known])
+        alike = both * self.covariance[known]
+        try:
+            inverse = np.linalg.inv(alike)
+        except np.linalg.LinAlgError:
+            inverse = np.full_like(alike, np.nan)
+        off = np.abs(inverse @ alike - np.eye(9)).max(axis=(1, 2))
+        if not (off < INVERTED).all():
+            raise ModelError(
+                "a covariance has no inverse in double precision: the noise densities of gyro and accelerometer lie "
+                "too far apart"
+            )
+        inverse = both * inverse
         found[known] = 0.5 * (inverse + np.swapaxes(inverse, 1, 2))
         return found
 

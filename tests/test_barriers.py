@@ -463,6 +463,27 @@ def test_what_cannot_be_held_is_refused_by_name() -> None:
         run.solve({p: np.ones((2, 3))}, data={centres: np.full((2, 3), np.nan)})
 
 
+@pytest.mark.parametrize("form", ["hinge", "hard", "slack", "exact slack"])
+def test_as_many_obstacles_are_named_as_the_barrier_has(form: keeping.Form) -> None:
+    """One slack for two obstacles is another problem than it says; a refused barrier leaves nothing behind."""
+    graph = fg.Graph()
+    p = graph.variables("p", fg.Rn(3), 2)
+    for named in (1, 3, ("lorry",), ("lorry", "tree", "ball")):
+        with pytest.raises(ModelError, match="'spheres': the barrier says something of 2 obstacles, found"):
+            keeping.keep(
+                graph, avoidance.sphere_clearance, p, CENTRE, RADIUS, obstacles=named, form=form, name="spheres"
+            )
+    graph.minimize(fg.prior, p, np.zeros(3), name="spheres")  # the name is taken
+    before = str(graph)
+    with pytest.raises(GraphError, match="'spheres'"):
+        keeping.keep(graph, avoidance.sphere_clearance, p, CENTRE, RADIUS, obstacles=2, form=form, name="spheres")
+    assert str(graph) == before
+    graph.remove("spheres")
+    assert keeping.keep(
+        graph, avoidance.sphere_clearance, p, CENTRE, RADIUS, obstacles=2, form=form, name="spheres"
+    ).obstacles == ("spheres 0", "spheres 1")
+
+
 def test_inactive_intervals_are_not_held() -> None:
     graph = fg.Graph()
     p = graph.variables("p", fg.Rn(3), 2)

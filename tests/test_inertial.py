@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from numpy.random import Generator
@@ -196,6 +198,50 @@ def test_bad_logs_are_refused(rng: Generator) -> None:
             preintegrate(*arguments, NOISE, NONE)
     with pytest.raises(ModelError, match="must be finite"):
         preintegrate(t, w, a, [0.0, 1.0], NOISE, np.full(6, np.nan))
+
+
+@pytest.mark.parametrize("density", [0.0, -1e-3, np.nan, np.inf, 1e-200, 1e200])
+@pytest.mark.parametrize("name", ["gyro", "accelerometer", "gyro_walk", "accelerometer_walk"])
+def test_densities_that_are_none_are_refused_by_name(name: str, density: float) -> None:
+    """A zero on the diagonal took the information of all nine rows away, and nothing was said."""
+    if name.endswith("walk") and 0.0 <= density < 1.0:
+        assert not ImuNoise(**{name: density}).walk([1.0]).min() > density
+        return
+    with pytest.raises(ModelError, match=re.escape(f"{name} {density!r} must be a density from")):
+        ImuNoise(**{name: density})
+
+
+@pytest.mark.parametrize("gyro", [1e-9, 1e-6, 1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("accelerometer", [1e-9, 1e-6, 1e-2, 1e3])
+def test_an_information_is_positive_however_far_apart_densities_are(
+    gyro: float, accelerometer: float, rng: Generator
+) -> None:
+    t, w, a = log_of(40, rng)
+    found = preintegrate(t, w, a, [0.0, 0.1, 0.2], ImuNoise(gyro, accelerometer), NONE)
+    scale = np.sqrt(np.einsum("nii->ni", found.covariance))
+    both = found.information * scale[:, :, None] * scale[:, None, :]
+    assert np.linalg.eigvalsh(both).min() > 0.0
+
+
+def test_a_covariance_without_an_inverse_is_refused(rng: Generator) -> None:
+    t, w, a = log_of(40, rng)
+    found = preintegrate(t, w, a, [-1.0, 0.0, 0.1, 0.2], NOISE, NONE)
+    for broken in (np.ones((9, 9)), np.full((9, 9), np.inf)):
+        covariance = found.covariance.copy()
+        covariance[2] = broken
+        with pytest.raises(ModelError, match="lie too far apart"):
+            assert found._replace(covariance=covariance).information is None
+
+
+def test_biases_without_a_walk_are_one() -> None:
+    for noise in (ImuNoise(gyro_walk=0.0), ImuNoise(accelerometer_walk=0.0)):
+        graph = fg.Graph()
+        x = graph.variables("x", SE23, 3)
+        graph.variables("bias", BIAS, 3)
+        with pytest.raises(ModelError, match="which must be positive; one bias that stays"):
+            InertialMeasurements(noise).state(graph, x)
+        graph.variables("one", BIAS, 1)
+        InertialMeasurements(noise, bias="one").state(graph, x)
 
 
 # ---------------------------------------------------------------- the factor
