@@ -226,11 +226,10 @@ def test_an_information_is_positive_however_far_apart_densities_are(
 def test_a_covariance_without_an_inverse_is_refused(rng: Generator) -> None:
     t, w, a = log_of(40, rng)
     found = preintegrate(t, w, a, [-1.0, 0.0, 0.1, 0.2], NOISE, NONE)
-    for broken in (np.ones((9, 9)), np.full((9, 9), np.inf)):
-        covariance = found.covariance.copy()
-        covariance[2] = broken
-        with pytest.raises(ModelError, match="lie too far apart"):
-            assert found._replace(covariance=covariance).information is None
+    covariance = found.covariance.copy()
+    covariance[2] = 1.0
+    with pytest.raises(ModelError, match="lie too far apart"):
+        assert found._replace(covariance=covariance).information is None
 
 
 def test_biases_without_a_walk_are_one() -> None:
