@@ -188,3 +188,140 @@ def test_limits_of_one_number_hold_for_all(limits: Any) -> None:
     plan = loop_of(limits=limits).tick()
     assert plan.controls.max() <= limits[1] and plan.controls.min() >= limits[0]
     assert plan.controls.shape == (4, 1)
+
+
+# ---------------------------------------------------------------- what does not fit
+
+
+@pytest.mark.parametrize(
+    ("statics", "message"),
+    [
+        ({"gian": [[0.1]]}, r"no static 'gian' \(there are: gain\)"),
+        ({"gain": [[0.1], [0.2]]}, r"'gain' must be \(1, 1\)"),
+        ({"gain": [[np.nan]]}, r"'gain' must be \(1, 1\)"),
+    ],
+)
+def test_a_plan_is_given_statics_that_there_are(statics: Any, message: str) -> None:
+    robot = Robot(fg.Rn(2), fg.Rn(1), (fg.horizon.Static("gain", fg.Rn(1), [0.0], 1.0),), predict=POINT.predict)
+    loop: Loop = Loop(robot, 3, [Dynamics(moved, H), Wish()], solver=SQP())
+    loop.plan([0.0, 0.0], statics={"gain": np.array([[0.1]])})
+    with pytest.raises(fg.GraphError, match=message):
+        loop.plan([0.0, 0.0], statics=statics)
+
+
+BAD_SIGMAS: list[Any] = [-1.0, [1.0, -1.0], 0.0, np.nan, np.inf, [1.0, 1.0, 1.0], [[1.0, 0.5], [0.0, 1.0]], np.eye(3)]
+
+
+@pytest.mark.parametrize("sigma", BAD_SIGMAS, ids=str)
+def test_a_belief_has_positive_deviations(sigma: Any) -> None:
+    with pytest.raises(fg.GraphError, match="at the start must be"):
+        window_of(sigma=sigma)
+    window = window_of()
+    window.record("p", [1.0])
+    window.estimate()
+    before = window.present
+    with pytest.raises(fg.GraphError, match="at the start must be"):
+        window.reset([2.0, 0.0], sigma)
+    np.testing.assert_array_equal(window.present, before)
+
+
+@pytest.mark.parametrize("start", [[np.nan, 0.0], [0.0], "here", [[0.0, 0.0]]], ids=str)
+def test_a_new_beginning_is_looked_at(start: Any) -> None:
+    sensor = Buffer("seen", [1.0])
+    loop = loop_of(window=window_of(sensor))
+    plan = loop.tick()
+    with pytest.raises(fg.GraphError, match="the start"):
+        loop.reset(start)
+    assert sensor.waiting and np.array_equal(loop.applied, plan.control) and loop.kept.age == 0
+    circle = Robot(fg.SO3, fg.Rn(1))
+    prior: Measurement = Measurement("p", fg.prior, (4,), 0.1)
+    window: Window = Window(circle, 2, [prior], start=[0.0, 0.0, 0.0, 1.0], sigma=0.1)
+    with pytest.raises(fg.GraphError, match="the start"):
+        window.reset(np.zeros(4))
+    with pytest.raises(fg.GraphError, match=r"the new node.*SO3"):
+        window.move([0.0], state=np.zeros(4))
+
+
+@pytest.mark.parametrize(
+    "guess",
+    [{"state": np.zeros(7)}, {"state": [np.nan, 0.0]}, {"steps": {"w": [1.0]}}, {"control": ["fast"]}],
+    ids=str,
+)
+def test_a_node_that_does_not_fit_does_not_enter(guess: Any) -> None:
+    window = window_of()
+    window.estimate()
+    with pytest.raises(fg.GraphError):
+        window.move(**{"control": [0.0]} | guess)
+    assert window.history.entered == 0
+
+
+@pytest.mark.parametrize("wrong", [[np.nan, 0.0], [0.0, 0.0, 0.0]], ids=str)
+def test_a_model_that_leads_nowhere_is_named(wrong: Any) -> None:
+    window = window_of(robot=Robot(fg.Rn(2), fg.Rn(1), predict=lambda x, u: np.array(wrong)))
+    window.estimate()
+    with pytest.raises(fg.GraphError, match=r"predict.*\(2,\)"):
+        window.move([0.0])
+    assert window.history.entered == 0
+
+
+def test_a_measurement_that_is_taken_back_was_none() -> None:
+    found = []
+    for taken in (False, True):
+        window = window_of()
+        for k in range(6):
+            if k:
+                window.move([0.0])
+            if taken and k == 4:
+                window.record("p", [10.0])
+            window.estimate()
+            if taken and k == 5:
+                window.record("p", [np.nan], -2)
+                window.estimate()
+        found.append(window.present)
+    np.testing.assert_allclose(found[1], found[0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"time": np.nan}, {"time": np.inf}, {"time": "now"}, {"applied": [0.0, 0.0]}, {"applied": [np.nan]}],
+    ids=str,
+)
+@pytest.mark.parametrize("before", [0, 2])
+def test_a_first_tick_refuses_what_later_ones_refuse(before: int, wrong: dict[str, Any]) -> None:
+    loop, fresh = loop_of(), loop_of()
+    for k in range(before):
+        loop.tick(time=float(k))
+        fresh.tick(time=float(k))
+    with pytest.raises(fg.GraphError):
+        loop.tick(measured={"p": [1.0]}, **wrong)
+    plan, again = (own.tick(measured={"p": [1.0]}, time=5.0) for own in (loop, fresh))
+    np.testing.assert_array_equal(plan.controls, again.controls)
+
+
+@pytest.mark.parametrize("pull", [[1.0, 2.0, 3.0], [1.0], [[1.0, 2.0]], "far"], ids=str)
+def test_a_pull_fits_the_state(pull: Any) -> None:
+    with pytest.raises(fg.GraphError, match=r"pull.*\(2,\)"):
+        loop_of(coupling="joint", pull=pull)
+
+
+class Mute:
+    """A term that forgot to give its data."""
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        graph.minimize(fg.prior, x, [0.0, 0.0], name="rest")
+
+
+def test_terms_are_looked_at_before_they_are_stated() -> None:
+    for term in (
+        Dynamics(moved, H, sigma=1.0, statics=("b",)),
+        Measurement("p", position, (1,), 0.3, statics=("b",)),
+    ):
+        with pytest.raises(fg.GraphError, match=rf"'{term.name}'.*'b'"):
+            window_of(term)
+    for shape in (2, "ab", (1.5,), (-1,)):
+        with pytest.raises(fg.GraphError, match=r"'p'.*shape.*\(2,\)"):
+            Measurement("p", position, shape, 0.3)  # type: ignore[arg-type]
+    mute: Any = Mute()
+    for make in (lambda: window_of(mute), lambda: loop_of(mute), lambda: window_of(Wish)):  # type: ignore[arg-type]
+        with pytest.raises(fg.GraphError, match=r"(Mute|Wish).*state.*data"):
+            make()

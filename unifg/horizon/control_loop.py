@@ -17,8 +17,9 @@ from unifg.answers.status import Status
 from unifg.errors import GraphError
 from unifg.horizon.coupled import COUPLINGS, Coupling, Given, Joined, Tie, weigh
 from unifg.horizon.decision import Choice, Judge, KeepThenBrake, Kept, Plan
+from unifg.horizon.recorded import instant
 from unifg.horizon.robot import Robot
-from unifg.horizon.statements import Now, Term, handles_of, reset_all, values_of
+from unifg.horizon.statements import Now, Term, handles_of, looked_at, reset_all, values_of
 from unifg.horizon.window import Window
 from unifg.language.variables import Data
 from unifg.typing import Array, ArrayLike
@@ -138,7 +139,7 @@ class Loop:
                 "'joint', where the future begins at the present"
             )
         self.robot, self.steps, self.coupling, self.window, self.delay = robot, steps, coupling, window, delay
-        self._terms, self._deadline, self._clock, self._patience = tuple(terms), deadline, clock, patience
+        self._terms, self._deadline, self._clock, self._patience = looked_at(terms), deadline, clock, patience
         between = _looked_at((-np.inf, np.inf) if limits is None else limits, robot.control.storage)
         graph = Graph()
         self.tie: Tie = self._tied(graph, pull)
@@ -201,14 +202,14 @@ class Loop:
         seen = {name: value for name, value in (measured or {}).items() if value is not None}
         for name, value in seen.items():
             self.window.history.readable(name, value)
+        last = self.applied if applied is None else self.robot.applicable(applied)
         if self.window.solution is not None:
-            self.window.move(self.applied if applied is None else applied, time)
+            self.window.move(last, time)
         elif time is not None:
-            self.window.history.times[:] = time
+            self.window.history.times[:] = instant(time)
         for name, value in seen.items():
             self.window.record(name, value)
         self.window.estimate(given)
-        last = self.applied if applied is None else np.asarray(applied, dtype=np.float64)
         return self._plan(self.window.now(given, last), begin)
 
     def plan(self, present: ArrayLike, given: Any = None, statics: Mapping[str, Array] | None = None) -> Plan:
@@ -218,6 +219,9 @@ class Loop:
             present: state.
             given: what terms ask for in ``now.given``.
             statics: (count, storage) by name; by default those of the window, without one those at the start.
+
+        Raises:
+            GraphError: for statics that there are not, and data of a term that do not fit.
         """
         begin = self._clock()
         return self._plan(self.now(present, given, statics), begin)
@@ -226,8 +230,18 @@ class Loop:
         """What terms are asked with; arguments as of :meth:`plan`."""
         history = None if self.window is None else self.window.history
         known = {static.name: static.values for static in self.robot.statics} if history is None else history.statics
-        known = {name: values.copy() for name, values in known.items()} | dict(statics or {})
+        given_statics = {name: self._static(name, value, known) for name, value in (statics or {}).items()}
+        known = {name: values.copy() for name, values in known.items()} | given_statics
         return Now(given, np.array(present, dtype=np.float64), self.applied.copy(), known, history)
+
+    def _static(self, name: str, value: ArrayLike, known: Mapping[str, Array]) -> Array:
+        """A value (count, storage) of a static."""
+        if name not in known:
+            raise GraphError(f"the robot has no static '{name}' (there are: {', '.join(known) or 'none'})", family=name)
+        found, shape = np.asarray(value, dtype=np.float64), known[name].shape
+        if found.shape != shape or not np.isfinite(found).all():
+            raise GraphError(f"static '{name}' must be {shape} finite numbers, got {found}", family=name)
+        return found
 
     def data(self, now: Now[Any]) -> dict[Data, ArrayLike]:
         """Data of the whole graph."""

@@ -124,9 +124,15 @@ class Joined:
                 in the units of its tangent space, and nothing for the statics. Infinite for no bound.
 
         Raises:
-            GraphError: unless the pull is positive; without any, the coupling is the sequential one.
+            GraphError: unless the pull is positive and fits; without any, the coupling is the sequential one.
         """
-        bound = np.asarray(pull, dtype=np.float64)
+        dim = window.robot.state.dim
+        try:
+            bound = np.array(pull, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise GraphError(f"the pull must be a number or ({dim},), got {pull}") from error
+        if bound.shape not in ((), (dim,)):
+            raise GraphError(f"the pull must be a number or ({dim},), got {bound.shape}")
         if not np.all(bound > 0.0):
             raise GraphError(f"the pull must be positive, got {pull}: without any, the coupling is 'sequential'")
         robot, length = window.robot, window.length

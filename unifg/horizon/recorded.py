@@ -51,9 +51,7 @@ class History:
         """
         if length < 1:
             raise GraphError(f"a window needs at least one step, found length={length}")
-        present = np.asarray(start, dtype=np.float64)
-        if present.shape != (robot.state.storage,) or not np.all(robot.state.is_valid(present)):
-            raise GraphError(f"the start {present} is not a point of {robot.state.name}")
+        present = robot.point(start, "the start")
         self.length, self.filled = length, filled
         self.states = np.tile(present, (length + 1, 1))
         self.controls = np.zeros((length, robot.control.storage))
@@ -97,9 +95,9 @@ class History:
         """The time of a new node; None for one more than that of the present one.
 
         Raises:
-            GraphError: when time runs backwards.
+            GraphError: when time is not finite or runs backwards.
         """
-        new = float(self.times[-1]) + 1.0 if time is None else float(time)
+        new = float(self.times[-1]) + 1.0 if time is None else instant(time)
         if not new > self.times[-1]:
             raise GraphError(f"the new node at {new} s is not later than the present one at {self.times[-1]} s")
         return new
@@ -130,7 +128,7 @@ class History:
     def record(self, name: str, value: ArrayLike, node: int = -1) -> None:
         """Attach a measurement to a node, the present one by default, an older one where it arrives late.
 
-        A value with an entry that is not finite was not measured.
+        A value with an entry that is not finite was not measured, also where one was recorded before.
 
         Raises:
             GraphError: when nothing measures that, its shape differs, or the node has not entered or has left.
@@ -139,8 +137,8 @@ class History:
         place = node if node >= 0 else self.length + 1 + node
         if not self.empty <= place <= self.length:
             raise GraphError(f"measurement '{name}' of node {node}: the window holds nodes {self.empty}..{self.length}")
-        if np.isfinite(array).all():
-            self._values[name][place], self._measured[name][place] = array, True
+        measured = bool(np.isfinite(array).all())
+        self._values[name][place], self._measured[name][place] = array if measured else 0.0, measured
 
     def readable(self, name: str, value: ArrayLike) -> Array:
         """A measured value as an array.
@@ -158,3 +156,18 @@ class History:
     def recorded(self, name: str) -> tuple[Array, BoolArray]:
         """(L + 1, ...) what was measured at the nodes, and (L + 1,) whether it was."""
         return self._values[name], self._measured[name]
+
+
+def instant(time: float) -> float:
+    """A time [s].
+
+    Raises:
+        GraphError: when it is none.
+    """
+    try:
+        found = float(time)
+    except (TypeError, ValueError) as error:
+        raise GraphError(f"a time must be a finite number of seconds, got {time!r}") from error
+    if not np.isfinite(found):
+        raise GraphError(f"a time must be a finite number of seconds, got {found}")
+    return found

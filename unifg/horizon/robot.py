@@ -98,10 +98,46 @@ class Robot:
     predict: Callable[[Array, Array], Array] | None = None
 
     def predicted(self, state: Array, control: Array) -> Array:
-        """(storage,) where one step leads."""
+        """(storage,) where one step leads.
+
+        Raises:
+            GraphError: when ``predict`` gives something else.
+        """
         if self.predict is None:
             return state.copy()
-        return np.asarray(self.predict(state, control), dtype=np.float64).reshape(self.state.storage)
+        found = np.asarray(self.predict(state, control), dtype=np.float64)
+        if found.size != self.state.storage:
+            raise GraphError(f"predict must give a state ({self.state.storage},), found {found.shape}")
+        return found.reshape(self.state.storage)
+
+    def applicable(self, control: ArrayLike) -> Array:
+        """A control (m,) that was applied.
+
+        Raises:
+            GraphError: when it is none.
+        """
+        size = self.control.storage
+        try:
+            applied = np.asarray(control, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise GraphError(f"the control that was applied must be ({size},) finite: {control!r}") from error
+        if applied.shape != (size,) or not np.isfinite(applied).all():
+            raise GraphError(f"the control that was applied must be ({size},) finite: {applied}")
+        return applied
+
+    def point(self, state: ArrayLike, what: str) -> Array:
+        """A point (storage,) of the robot's manifold.
+
+        Raises:
+            GraphError: when it is none.
+        """
+        try:
+            found = np.array(state, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise GraphError(f"{what} {state!r} is not a point of {self.state.name}") from error
+        if found.shape != (self.state.storage,) or not np.all(self.state.is_valid(found)):
+            raise GraphError(f"{what} {found} is not a point of {self.state.name}")
+        return found
 
     def rollout(self, state: Array, controls: Array) -> Array:
         """(k + 1, storage) states that controls (k, m) lead to from a state (storage,)."""

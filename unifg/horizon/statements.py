@@ -20,7 +20,7 @@ from unifg.errors import GraphError
 from unifg.horizon.recorded import History
 from unifg.language.factors import difference, prior
 from unifg.language.statement import AnyResidual
-from unifg.language.variables import Data, Selection
+from unifg.language.variables import Data, Family, Selection
 from unifg.typing import Array, ArrayLike
 
 G = TypeVar("G")
@@ -115,6 +115,12 @@ class Measurement:
     robust: Any = None
     component: str | None = None
 
+    def __post_init__(self) -> None:
+        """Refuse a shape that is none."""
+        sizes = self.shape if isinstance(self.shape, tuple) else (None,)
+        if not all(isinstance(size, int | np.integer) and size >= 0 for size in sizes):
+            raise GraphError(f"measurement '{self.name}': its shape is a tuple, as (2,); found {self.shape!r}")
+
     @property
     def records(self) -> Mapping[str, tuple[int, ...]]:
         """One value per node."""
@@ -124,7 +130,7 @@ class Measurement:
         """Add a cost at every node, active where something was measured."""
         values = graph.data(self.name, np.zeros((len(x), *self.shape)), each=True)
         measured = graph.data(f"{self.name}: measured", np.zeros(len(x), dtype=bool), each=True)
-        shared = [graph.families[name] for name in self.statics]
+        shared = _shared(graph, self.statics, self.name)
         where = x if self.component is None else getattr(x, self.component)
         graph.minimize(
             self.residual, where, *shared, values, sigma=self.sigma, robust=self.robust, active=measured, name=self.name
@@ -156,7 +162,7 @@ class Dynamics:
 
     def state(self, graph: Graph, x: Selection, u: Any) -> None:
         """Add a cost or an equality for every step."""
-        shared = [graph.families[name] for name in self.statics]
+        shared = _shared(graph, self.statics, self.name)
         arguments, name = (x[:-1], u, *shared, x[1:], self.step), self.name
         if isinstance(u, Data):
             name = f"past {name}"
@@ -227,6 +233,30 @@ def _spread_out(value: ArrayLike, shape: tuple[int, ...]) -> ArrayLike:
     own = np.shape(value)
     alike = len(own) < len(shape) and own == shape[len(shape) - len(own) :]
     return np.broadcast_to(np.asarray(value), shape) if alike or not own else value
+
+
+def _shared(graph: Graph, statics: Sequence[str], term: str) -> list[Family]:
+    """Families of statics that a term takes."""
+    for name in statics:
+        if name not in graph.families:
+            known = ", ".join(graph.families)
+            raise GraphError(f"term '{term}' takes static '{name}', which the robot does not have ({known})", term=term)
+    return [graph.families[name] for name in statics]
+
+
+def looked_at(terms: Iterable[Term]) -> tuple[Term, ...]:
+    """Terms that are some.
+
+    Raises:
+        GraphError: for an object without the methods of a term, or a class that has not been called.
+    """
+    found = tuple(terms)
+    for term in found:
+        lacking = [name for name in ("state", "data") if not callable(getattr(term, name, None))]
+        if lacking or isinstance(term, type):
+            name = term.__name__ if isinstance(term, type) else type(term).__name__
+            raise GraphError(f"{name} is no term: a term is an object with methods state(graph, x, u) and data(now)")
+    return found
 
 
 def reset_all(terms: Iterable[Term]) -> None:

@@ -19,7 +19,7 @@ from unifg.horizon.past import Arrival, Left, Past, Tangent
 from unifg.horizon.recorded import History
 from unifg.horizon.robot import Robot, information_of
 from unifg.horizon.spread import JointCovariance
-from unifg.horizon.statements import Now, Recording, Term, reset_all
+from unifg.horizon.statements import Now, Recording, Term, looked_at, reset_all
 from unifg.language.terms import Constraint
 from unifg.language.variables import Data, Family, Selection
 from unifg.solvers.interior_point.method import InteriorPoint
@@ -84,13 +84,13 @@ class Window:
         Raises:
             GraphError: when sizes do not fit, or a term cannot stand in a window.
         """
-        self.robot, self.terms, self.length = robot, tuple(terms), length
+        self.robot, self.terms, self.length = robot, looked_at(terms), length
         self._arrival = arrival or Tangent()
         self._records: dict[str, tuple[int, ...]] = {}
-        for term in terms:
+        for term in self.terms:
             if isinstance(term, Recording):
                 self._records.update(term.records)
-        self._start = np.array(start, dtype=np.float64)
+        self._start = robot.point(start, "the start")
         self._sigma = _covariance(sigma, robot.state.dim)
         self.history = History(robot, length, self._start, self._records, filled)
         self.left = Left(robot, self._start, self._sigma)
@@ -223,19 +223,27 @@ class Window:
             steps: (storage,) guesses of the new step's unknowns, by name.
 
         Raises:
-            GraphError: when the control is not finite or time runs backwards.
+            GraphError: when the control is not finite, time runs backwards, or there is no such step or state; the
+                window is as it was.
         """
-        applied = np.asarray(control, dtype=np.float64)
-        if applied.shape != (self.robot.control.storage,) or not np.isfinite(applied).all():
-            raise GraphError(f"the control that was applied must be ({self.robot.control.storage},) finite: {applied}")
-        history = self.history
-        entering = history.later(time)
+        robot, history = self.robot, self.history
+        applied, entering = robot.applicable(control), history.later(time)
+        expected = self._expected(applied) if state is None else robot.point(state, "the new node")
+        for name, value in (steps or {}).items():
+            if name not in robot.steps or np.shape(value) != (robot.steps[name].storage,):
+                known = ", ".join(f"{name} ({kind.storage},)" for name, kind in robot.steps.items()) or "none"
+                raise GraphError(f"the guess of '{name}' is none of the robot's steps: {known}", family=name)
         if history.full:
             if self.left.departure is None:
                 self._look_again()
             self.left.arrival, self.left.departure = self.left.departure, None
-        expected = self.robot.predicted(history.present, applied) if state is None else state
         history.move(applied, expected, entering, steps or {})
+
+    def _expected(self, applied: Array) -> Array:
+        found = self.robot.predicted(self.history.present, applied)
+        if not np.isfinite(found).all():
+            raise GraphError(f"predict must give a finite state {found.shape}, found {found} at {self.history.present}")
+        return found
 
     def record(self, name: str, value: ArrayLike | None, node: int = -1) -> None:
         """Attach what was measured to a node, by default the present one; None where nothing was.
@@ -293,8 +301,11 @@ class Window:
         Args:
             start: (storage,) believed state; None for that of the beginning.
             sigma: (d,) or (d, d); None for that of the beginning.
+
+        Raises:
+            GraphError: when they do not fit; the window is as it was.
         """
-        begin = self._start if start is None else np.asarray(start, dtype=np.float64)
+        begin = self._start if start is None else self.robot.point(start, "the start")
         spread = self._sigma if sigma is None else _covariance(sigma, self.robot.state.dim)
         self.history.begin(begin)
         self.left.begin(begin, spread)
@@ -318,11 +329,16 @@ class Window:
 
 def _covariance(sigma: ArrayLike, dim: int) -> Array:
     """(d, d) covariance of standard deviations (d,), or as it is."""
-    array = np.asarray(sigma, dtype=np.float64)
+    array = np.array(sigma, dtype=np.float64)
+    positive = bool(np.isfinite(array).all())
     if array.ndim < 2:
-        array = np.diag(np.broadcast_to(array, (dim,)) ** 2)
-    covariance: Array = array.copy()
-    if covariance.shape != (dim, dim) or not np.all(np.linalg.eigvalsh(covariance) > 0.0):
+        positive = positive and array.shape in ((), (1,), (dim,)) and bool(np.all(array > 0.0))
+        covariance = np.diag(np.broadcast_to(array, (dim,)) ** 2) if positive else array
+    else:
+        covariance = array
+        positive = positive and array.shape == (dim, dim) and np.allclose(array, array.T, rtol=1e-9, atol=0.0)
+        positive = positive and bool(np.all(np.linalg.eigvalsh(array) > 0.0))
+    if not positive:
         raise GraphError(
             f"the standard deviations at the start must be ({dim},) positive, or a covariance; got {array}"
         )
