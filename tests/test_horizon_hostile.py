@@ -325,3 +325,34 @@ def test_terms_are_looked_at_before_they_are_stated() -> None:
     for make in (lambda: window_of(mute), lambda: loop_of(mute), lambda: window_of(Wish)):  # type: ignore[arg-type]
         with pytest.raises(fg.GraphError, match=r"(Mute|Wish).*state.*data"):
             make()
+
+
+class Speed:
+    """A speed that was measured over the last step but one, by its duration."""
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        duration = graph.data("duration", np.ones(1), each=True)
+        graph.minimize(lambda x, y, h: (y[:, :1] - x[:, :1]) / h[:, None], x[-3], x[-2], duration, name="speed")
+
+    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+        return {"duration": np.diff(now.past.times)[-2:-1]}
+
+
+def test_a_term_that_divides_by_durations_is_told_of_those_that_are_none() -> None:
+    with pytest.raises(fg.GraphError, match=r"filled=False"):
+        window_of(Speed(), filled=True).estimate()
+    window = window_of(Speed())
+    for k in range(6):
+        if k:
+            window.move([0.1])
+        window.estimate()
+    with pytest.raises(fg.GraphError) as error:
+        window_of(Wrong(), filled=False).estimate()
+    assert "filled" not in str(error.value)
+
+
+class Wrong(Speed):
+    """The same, with data that nobody reads."""
+
+    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+        return {"durations": [1.0]}

@@ -14,7 +14,7 @@ from unifg.answers.graph import Graph
 from unifg.answers.solution import Solution
 from unifg.answers.solver import Solver
 from unifg.answers.status import Status
-from unifg.errors import GraphError
+from unifg.errors import GraphError, UnifgError
 from unifg.horizon.past import Arrival, Left, Past, Tangent
 from unifg.horizon.recorded import History
 from unifg.horizon.robot import Robot, information_of
@@ -76,7 +76,8 @@ class Window:
             arrival: coordinates of the prior of what has left; by default the variables' own tangent spaces.
             filled: whether the places before the start are nodes, too, that steps of no duration have led away from:
                 for dynamics that take the duration of a step from ``now.past.times``, and then say that nothing moved.
-                The structure of the problem is that of a full window from the first tick on.
+                The structure of the problem is that of a full window from the first tick on. Measurements with time
+                stamps and inertial ones are not defined on such steps.
             rounds: how often at most, in one estimate, terms are asked for their data at what is believed and the
                 window is solved: more than once where data depend on beliefs, as associations do.
             steady: a round that moves the present state by less, in every coordinate of its tangent space, is the last.
@@ -271,7 +272,24 @@ class Window:
         return {self._past.x.family: self._past.nodes(), **self._past.guess()}
 
     def estimate(self, given: Any = None) -> Solution:
-        """Solve the window and believe it, unless the answer is none; then the prediction is kept."""
+        """Solve the window and believe it, unless the answer is none; then the prediction is kept.
+
+        Raises:
+            UnifgError: for data of a term that do not fit, and a term that cannot stand on steps of no duration in a
+                window that is filled.
+        """
+        try:
+            return self._estimate(given)
+        except UnifgError as error:
+            if not (self.history.filled and np.any(np.diff(self.history.times) == 0.0)):
+                raise
+            raise GraphError(
+                f"{error}; the window is filled, so steps of no duration lead to its start: terms that divide by a "
+                "duration or integrate over it, as measurements with time stamps, need filled=False",
+                term=error.term,
+            ) from error
+
+    def _estimate(self, given: Any) -> Solution:
         past, self.iterations, self._given = self._past, 0, given
         for left in reversed(range(self._rounds)):
             before, data = self.present, self.data(given)
