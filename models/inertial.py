@@ -26,10 +26,12 @@ from unifg.language.factors import difference
 from unifg.language.statement import Statement
 from unifg.language.variables import Data, Selection, Variable, as_selection
 from unifg.lie import SE23, SO3, Manifold, Product
-from unifg.models.preintegration import BIAS, GRAVITY, ImuNoise, Preintegrated, preintegrate
+from unifg.models.preintegration import BIAS, CLOSE, GRAVITY, ImuNoise, Preintegrated, preintegrate
 from unifg.models.rigid import motion_parts
-from unifg.models.stamped import Present, by_handle
+from unifg.models.stamped import Alone, Present, by_handle, state_whole
 from unifg.typing import Array, ArrayLike
+
+STILL = 1e-6  # standard deviation of each row, and of biases, over a step of no duration
 
 
 def motion(state: Manifold = SE23, gravity: tuple[float, float, float] = GRAVITY) -> Residual:
@@ -95,7 +97,8 @@ class InertialMeasurements:
     ``add`` takes samples as they arrive. As a term of a window (:class:`unifg.horizon.Window`) it is asked for the
     rest; in a graph by hand, ``state`` adds the factors once and ``at`` integrates what lies between nodes at given
     times, at given biases: a window of some thousand samples in some milliseconds. Nothing is compiled or laid out
-    again in between. The body is the sensor: its place and axes are those of the states.
+    again in between. The body is the sensor: its place and axes are those of the states. Samples before the oldest node
+    are forgotten, so one sensor serves one window. Threads may add while others ask.
 
     Attributes:
         noise: of the sensor.
@@ -129,17 +132,26 @@ class InertialMeasurements:
         """
         if not gap > 0.0:
             raise ModelError(f"'{name}': gap {gap} must be positive")
-        self.noise, self.gap, self.name, self.counts = noise, gap, name, SampleCounts()
+        self.noise, self.gap, self.name = noise, gap, name
         self._body, self._bias, self._gravity = body, bias, gravity
         self._walk = f"{name}: walk"
         self._place: slice | None = None  # of biases in states
-        self._samples: Array = np.empty((0, 7))  # stamp, rates, forces
+        self._alone = Alone()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all samples, and what has become of them."""
+        with self._alone:
+            self._samples: Array = np.empty((0, 7))  # stamp, rates, forces
+            self._left = -np.inf  # the last stamp that has left
+            self.counts = SampleCounts()
 
     def state(self, graph: Statement, x: Variable, u: Any = None) -> None:
         """Add factors between all neighbours of x, and of the biases where there is one for each node.
 
         Raises:
             ModelError: when there are fewer than two nodes, the biases do not fit, or they are to walk without noise.
+            GraphError: as the graph raises it. Either way the graph is as it was.
         """
         nodes = as_selection(x)
         body = nodes if self._body is None else getattr(nodes, self._body)
@@ -158,22 +170,27 @@ class InertialMeasurements:
                 f"'{self.name}': biases for each node walk by {walks}, which must be positive; one bias that stays is "
                 "a family of one member"
             )
-        data = {
-            name: graph.data(name, value, each=True)
-            for name, value in self._named(nothing).items()
-            if walking or name != self._walk
-        }
-        *given, information, known = (handle for name, handle in data.items() if name != self._walk)
+        moved = motion(body.manifold, self._gravity)
+
+        def stated(graph: Statement) -> None:
+            data = {
+                name: graph.data(name, value, each=True)
+                for name, value in self._named(nothing).items()
+                if walking or name != self._walk
+            }
+            *given, information, known = (handle for name, handle in data.items() if name != self._walk)
+            graph.minimize(
+                moved,
+                *(body[:-1], body[1:], biases[:-1] if walking else biases, *given),
+                information=information,
+                active=known,
+                name=self.name,
+            )
+            if walking:
+                graph.minimize(difference, biases[:-1], biases[1:], sigma=data[self._walk], name=f"{self.name}: biases")
+
+        state_whole(graph, stated)
         self._place = biases.storage if biases.family is nodes.family else None
-        graph.minimize(
-            motion(body.manifold, self._gravity),
-            *(body[:-1], body[1:], biases[:-1] if walking else biases, *given),
-            information=information,
-            active=known,
-            name=self.name,
-        )
-        if walking:
-            graph.minimize(difference, biases[:-1], biases[1:], sigma=data[self._walk], name=f"{self.name}: biases")
 
     def _biases(self, graph: Statement, nodes: Selection) -> Variable:
         if isinstance(nodes.manifold, Product) and self._bias in nodes.manifold.components:
@@ -209,21 +226,25 @@ class InertialMeasurements:
             )
         rows = np.concatenate([t.reshape(-1, 1), w.reshape(-1, 3), a.reshape(-1, 3)], axis=1)
         good = np.isfinite(rows).all(axis=1)
-        rows = np.concatenate([self._samples, rows[good]])
-        rows = rows[np.argsort(rows[:, 0], kind="stable")]
-        first = np.diff(rows[:, 0], prepend=-np.inf) > 0.0
-        self._samples = rows[first]
-        self.counts = replace(
-            self.counts,
-            invalid=self.counts.invalid + int((~good).sum()),
-            repeated=self.counts.repeated + int((~first).sum()),
-        )
+        with self._alone:
+            rows = np.concatenate([self._samples, rows[good]])
+            rows = rows[np.argsort(rows[:, 0], kind="stable")]
+            first = np.diff(rows[:, 0], prepend=-np.inf) > 0.0
+            self._samples = rows[first]
+            self.counts = replace(
+                self.counts,
+                invalid=self.counts.invalid + int((~good).sum()),
+                repeated=self.counts.repeated + int((~first).sum()),
+            )
 
     def data(self, now: Present) -> dict[str, Array]:
-        """Values of the data, by name, for the nodes of a window; biases are those it believes in."""
+        """Values of the data, by name, for the nodes of a window; biases are those it believes in.
+
+        Raises:
+            ModelError: when samples between them have been forgotten for another window.
+        """
         history = now.past
         times, first = np.array(history.times), int(history.empty)
-        times[:first] = times[first] - np.arange(first, 0, -1.0)  # places that no node has entered yet
         if self._place is not None:
             return self._given(times, first, history.states[:-1, self._place])
         found = self._given(times, first, now.statics[self._bias][0])
@@ -239,7 +260,7 @@ class InertialMeasurements:
             bias: (6,) or (n - 1, 6), as they are believed to be.
 
         Raises:
-            ModelError: when times or biases are not what they should be.
+            ModelError: when times or biases are not what they should be, or samples between them have been forgotten.
             GraphError: when the factors have not been added.
         """
         term: Any = graph.term(self.name)
@@ -251,15 +272,36 @@ class InertialMeasurements:
 
     def _given(self, times: Array, first: int, bias: ArrayLike) -> dict[str, Array]:
         """Values of the data, by name, for nodes of which those before the first are not there yet."""
-        old = int(np.searchsorted(self._samples[:, 0], times[first], side="right")) - 1
-        self._samples = self._samples[max(old, 0) :]  # the one before the oldest node is held into its interval
-        found = self.integrated(times, bias)
+        empty, first = first, int(np.searchsorted(times, times[first], side="right")) - 1
+        times = np.concatenate([times[first] - np.arange(first, 0, -1.0), times[first:]])
+        since = float(times[first])
+        with self._alone:
+            begin = float(self._samples[0, 0]) if len(self._samples) else np.inf
+            if since < begin - CLOSE and self._left >= since - self.gap:
+                raise ModelError(
+                    f"'{self.name}': nodes from {since:g} s on are asked for, but the samples before {begin:g} s have "
+                    "been forgotten: give every window a sensor of its own, and call reset() where time begins anew"
+                )
+            old = int(np.searchsorted(self._samples[:, 0], since, side="right")) - 1
+            if old > 0:
+                self._left = max(self._left, float(self._samples[old - 1, 0]))
+                self._samples = self._samples[old:]  # the one before the oldest node is held into its interval
+            samples = self._samples
+        found = self._integrated(samples, times, bias)
         found.held[:first] = np.inf
         unknown = int((found.held[first:] > self.gap).sum())
-        self.counts = replace(self.counts, kept=len(self._samples), unknown=unknown)
-        return self._named(found)
+        with self._alone:
+            self.counts = replace(self.counts, kept=len(samples), unknown=unknown)
+        still = slice(empty, first)  # steps of no duration, in which nothing moves
+        found.increment[still], found.by_bias[still], found.duration[still] = SE23.identity(), 0.0, 0.0
+        found.covariance[still], found.held[still] = STILL**2 * np.eye(9), 0.0
+        named = self._named(found)
+        named[self._walk][still] = STILL
+        return named
 
     def integrated(self, times: ArrayLike, bias: ArrayLike) -> Preintegrated:
         """The samples integrated between any times, as for a guess by :func:`unifg.models.preintegration.predict`."""
-        s = self._samples
+        return self._integrated(self._samples, times, bias)
+
+    def _integrated(self, s: Array, times: ArrayLike, bias: ArrayLike) -> Preintegrated:
         return preintegrate(s[:, 0], s[:, 1:4], s[:, 4:], times, self.noise, bias)

@@ -7,8 +7,9 @@ two nodes gets a fixed number of slots; what is in them are data, and empty slot
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from threading import RLock
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,7 +19,7 @@ from unifg.kernels.derive.stated import StatedKernel
 from unifg.kernels.residuals import Function, Residual
 from unifg.kernels.robust import Loss
 from unifg.language.statement import Statement
-from unifg.language.variables import Data, Variable, as_selection
+from unifg.language.variables import Data, Family, Variable, as_selection
 from unifg.models.interpolation import Interpolation, geodesic
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
@@ -80,6 +81,8 @@ class StampedMeasurements:
 
     A stamp on a node falls on it; equal stamps take a slot each. The oldest nodes leave, and with them the measurements
     before what is the oldest then. What arrives after that is refused and counted, as is all else that finds no slot.
+    So one sensor serves one window: nodes that need what has left with those of another are refused. Threads may add
+    while others ask.
 
     Attributes:
         counts: what has become of the measurements so far.
@@ -124,36 +127,57 @@ class StampedMeasurements:
         self.name, self.size, self.capacity = name, size, capacity
         self.statics, self.offset, self.component = tuple(statics), offset, component
         self._error, self._sigma, self._between, self._robust = _batched(error, name), sigma, between, robust
-        self._stamps: Array = np.empty(0)
-        self._values: Array = np.empty((0, size))
-        self._known: BoolArray = np.empty(0, dtype=bool)  # whether they have been placed before
-        self.counts = Counts()
+        self._alone = Alone()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all measurements, and what has become of them."""
+        with self._alone:
+            self._stamps: Array = np.empty(0)
+            self._values: Array = np.empty((0, self.size))
+            self._known: BoolArray = np.empty(0, dtype=bool)  # whether they have been placed before
+            self._left = self._since = -np.inf  # the last stamp that has left, and the oldest node at that time
+            self.counts = Counts()
 
     def state(self, graph: Statement, x: Variable, u: Any = None) -> None:
         """Add the factors, all inactive, between the nodes x, two or more in the order of time.
 
         Raises:
-            ModelError: when there are fewer than two nodes, or the offset is no number.
+            ModelError: when there are fewer than two nodes, a static or the offset is not in the graph, or the offset
+                is no number.
+            GraphError: as the graph raises it. Either way the graph is as it was.
         """
         nodes = as_selection(x) if self.component is None else getattr(as_selection(x), self.component)
         if len(nodes) < 2:
             raise ModelError(f"'{self.name}' needs two nodes or more to stand between, found {len(nodes)}")
-        clock = [] if self.offset is None else [graph.families[self.offset]]
+        shared = [self._family(graph, "statics", name) for name in self.statics]
+        clock = [] if self.offset is None else [self._family(graph, "offset", self.offset)]
         if any((len(family), family.manifold.dim) != (1, 1) for family in clock):
             raise ModelError(f"'{self.name}': the offset of a clock is one variable on Rn(1)")
         empty = self._filled(np.arange(float(len(nodes))), np.empty(0, dtype=np.intp), 0.0)
-        into, step, values, measured = (graph.data(name, value, each=True) for name, value in empty.items())
         before = np.repeat(np.arange(len(nodes) - 1), self.capacity)
-        graph.minimize(
-            _at_stamp(self._error, self._between or geodesic(nodes.manifold), bool(clock)),
-            *(nodes[before], nodes[before + 1], *clock, into, step),
-            *(graph.families[name] for name in self.statics),
-            values,
-            sigma=self._sigma,
-            robust=self._robust,
-            active=measured,
-            name=self.name,
-        )
+        error = _at_stamp(self._error, self._between or geodesic(nodes.manifold), bool(clock))
+
+        def stated(graph: Statement) -> None:
+            into, step, values, measured = (graph.data(name, value, each=True) for name, value in empty.items())
+            graph.minimize(
+                error,
+                *(nodes[before], nodes[before + 1], *clock, into, step, *shared, values),
+                sigma=self._sigma,
+                robust=self._robust,
+                active=measured,
+                name=self.name,
+            )
+
+        state_whole(graph, stated)
+
+    def _family(self, graph: Statement, role: str, name: str) -> Family:
+        if name not in graph.families:
+            there = ", ".join(f"'{other}'" for other in graph.families)
+            raise ModelError(
+                f"'{self.name}': {role}= names '{name}', which the graph does not have (there are: {there})"
+            )
+        return graph.families[name]
 
     def add(self, stamp: ArrayLike, value: ArrayLike) -> None:
         """Take measurements: one stamp [s] and (size,) value, or (k,) stamps and (k, size) values, in any order.
@@ -169,13 +193,18 @@ class StampedMeasurements:
             raise ModelError(f"'{self.name}': stamps {stamps.shape} need values {wanted}, found {values.shape}")
         stamps, values = np.atleast_1d(stamps), values.reshape(-1, self.size)
         good = np.isfinite(stamps) & np.isfinite(values).all(axis=1)
-        self._count(invalid=int((~good).sum()))
-        self._stamps = np.concatenate([self._stamps, stamps[good]])
-        self._values = np.concatenate([self._values, values[good]])
-        self._known = np.concatenate([self._known, np.zeros(int(good.sum()), dtype=bool)])
+        with self._alone:
+            self._count(invalid=int((~good).sum()))
+            self._stamps = np.concatenate([self._stamps, stamps[good]])
+            self._values = np.concatenate([self._values, values[good]])
+            self._known = np.concatenate([self._known, np.zeros(int(good.sum()), dtype=bool)])
 
     def data(self, now: Present) -> dict[str, Array]:
-        """Values of the data, by name, for the nodes of a window."""
+        """Values of the data, by name, for the nodes of a window.
+
+        Raises:
+            ModelError: when measurements of theirs have left with the nodes of another window.
+        """
         history: Nodes = now.past
         offset = 0.0 if self.offset is None else float(np.ravel(now.statics[self.offset])[0])
         return self._given(np.array(history.times), history.empty, offset)
@@ -189,7 +218,8 @@ class StampedMeasurements:
             offset: of the sensor's clock, as it is believed to be: it says between which nodes a measurement lies.
 
         Raises:
-            ModelError: when times are not one for each node, finite and increasing, or the offset is not finite.
+            ModelError: when times are not one for each node, finite and increasing, the offset is not finite, or
+                measurements between them have left for later nodes.
             GraphError: when they have not been added.
         """
         term: Any = graph.term(self.name)
@@ -202,12 +232,14 @@ class StampedMeasurements:
 
     def _given(self, times: Array, first: int, offset: float) -> dict[str, Array]:
         """Values of the data, by name, for nodes of which those before the first are not there yet."""
-        if first < len(times) - 1:
-            interval, place = self._place(times[first:], offset)
-            slot = (interval + first) * self.capacity + place
-        else:
-            slot = np.empty(0, dtype=np.intp)
-        return self._filled(times, slot, 0.0 if self.offset else offset)
+        oldest = int(np.searchsorted(times, times[first], side="right")) - 1  # steps before it have no duration
+        with self._alone:
+            if oldest < len(times) - 1:
+                interval, place = self._place(times[oldest:], offset)
+                slot = (interval + oldest) * self.capacity + place
+            else:
+                slot = np.empty(0, dtype=np.intp)
+            return self._filled(times, slot, 0.0 if self.offset else offset)
 
     def _filled(self, times: Array, slot: IntArray, offset: float) -> dict[str, Array]:
         """The same, the first measurements being in these slots."""
@@ -225,6 +257,11 @@ class StampedMeasurements:
         """Keep what has a slot, first, and what waits; returns intervals and places in them of the former."""
         taken = self._stamps + offset
         slack = CLOSE * float(np.diff(at).min()) + 4.0 * float(np.spacing(np.abs(at).max()))
+        if at[0] < self._since - slack and self._left + offset >= at[0] - slack:
+            raise ModelError(
+                f"'{self.name}': nodes from {at[0]:g} s on are asked for, but what was measured before {self._since:g} "
+                "s has left: give every window a sensor of its own, and call reset() where time begins anew"
+            )
         late, ahead = taken < at[0] - slack, taken > at[-1] + slack
         inside = np.flatnonzero(~late & ~ahead)
         interval = np.clip(np.searchsorted(at, taken[inside], side="right") - 1, 0, len(at) - 2)
@@ -240,6 +277,8 @@ class StampedMeasurements:
             full=int((~kept).sum()),
             ahead=int(ahead.sum()) - len(waiting),
         )
+        if late.any():
+            self._left, self._since = max(self._left, float(self._stamps[late].max())), float(at[0])
         stay = np.concatenate([chosen, waiting])
         self._stamps, self._values = self._stamps[stay], self._values[stay]
         self._known = np.arange(len(stay)) < len(chosen)
@@ -249,6 +288,32 @@ class StampedMeasurements:
     def _count(self, **more: int) -> None:
         """Add to the counts."""
         self.counts = replace(self.counts, **{name: getattr(self.counts, name) + n for name, n in more.items()})
+
+
+class Alone:
+    """A lock, for one thread at a time; copies have one of their own."""
+
+    def __init__(self) -> None:
+        """Open."""
+        self._lock = RLock()
+
+    def __enter__(self) -> None:
+        """Wait for the others."""
+        self._lock.acquire()
+
+    def __exit__(self, *raised: object) -> None:
+        """Let the next one in."""
+        self._lock.release()
+
+    def __reduce__(self) -> tuple[type[Alone], tuple[()]]:
+        """Locks are not copied."""
+        return Alone, ()
+
+
+def state_whole(graph: Statement, stated: Callable[[Statement], None]) -> None:
+    """State several things that belong together, or nothing: what is refused is refused on a snapshot first."""
+    stated(graph.snapshot())
+    stated(graph)
 
 
 def _ranks(groups: IntArray) -> IntArray:

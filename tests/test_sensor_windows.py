@@ -177,3 +177,98 @@ def test_inertial_navigation_in_a_window(static: bool, rng: Generator) -> None:
     assert imu.counts.unknown == 0 and fixes.counts.late == 0
     sigmas = np.sqrt(np.diag(window.state_covariance))[:9]
     assert np.all(np.abs(errors[-1]) < 5.0 * sigmas)
+
+
+# ---------------------------------------------------------------- windows that begin anew, are shared, or full at once
+
+
+def resting(filled: bool = False) -> tuple[Window, InertialMeasurements]:
+    """A body that stands still, with biases in its states."""
+    imu, state = InertialMeasurements(ImuNoise(1e-3, 1e-2, 1e-4, 1e-3), body="body"), fg.Product(body=SE23, bias=BIAS)
+    sigma = [0.02] * 9 + [0.01] * 6
+    return Window(Robot(state, fg.Rn(1)), 4, [imu], start=state.identity(), sigma=sigma, filled=filled), imu
+
+
+def test_nothing_of_the_last_episode_comes_back() -> None:
+    sensor = fixes_of()
+    window, _ = resting()
+    imu = InertialMeasurements(ImuNoise(), body="body")
+    sensor.add([0.1, 0.2, np.nan], np.full((3, 2), 100.0))
+    imu.add([0.0, 0.01, 0.01], np.full((3, 3), 5.0), np.full((3, 3), 50.0))
+    for term in (sensor, imu):
+        assert term.counts != type(term.counts)()
+        term.reset()
+        assert term.counts == type(term.counts)()
+    place_of = Window(POINT, 3, [Dynamics(drift, H, sigma=0.01), sensor], start=np.zeros(2), sigma=0.2)
+    place_of.move(np.zeros(2), H)
+    place_of.estimate()
+    assert not place_of.present.any() and sensor.counts == Counts()
+    assert len(imu.integrated([0.0, 0.1], np.zeros(6)).held) == 1
+    assert imu.integrated([0.0, 0.1], np.zeros(6)).held[0] == np.inf
+    window.estimate()
+
+
+def test_a_sensor_serves_one_window_or_says_so() -> None:
+    """What has left with the nodes of one is gone for the other; windows that keep step may share."""
+    sensor = fixes_of()
+    ahead, behind, same = (
+        Window(POINT, 3, [Dynamics(drift, H, sigma=0.01), sensor], start=np.zeros(2), sigma=0.2) for _ in range(3)
+    )
+    for k in range(1, 9):
+        ahead.move(np.zeros(2), H * k)
+        same.move(np.zeros(2), H * k)
+        sensor.add(H * k, [1.0, 0.0])
+        ahead.estimate()
+        same.estimate()
+        assert np.array_equal(ahead.present, same.present)
+    behind.move(np.zeros(2), H)
+    with pytest.raises(fg.ModelError, match=r"'fixes': nodes from 0 s on .* before 0\.5 s has left.*reset\(\)"):
+        behind.estimate()
+    sensor.reset()
+    sensor.add(H, [1.0, 0.0])
+    behind.estimate()
+    assert sensor.counts == Counts(placed=1)
+
+
+def test_an_inertial_sensor_serves_one_window_or_says_so() -> None:
+    imu, state = InertialMeasurements(ImuNoise(), body="body"), fg.Product(body=SE23, bias=BIAS)
+    ahead, behind = (Window(Robot(state, fg.Rn(1)), 2, [imu], start=state.identity(), sigma=0.1) for _ in range(2))
+    t = 0.01 * np.arange(60)
+    imu.add(t, np.zeros((60, 3)), np.tile([0.0, 0.0, 9.81], (60, 1)))
+    for k in range(1, 6):
+        ahead.move(np.zeros(1), 0.1 * k)
+        ahead.estimate()
+    behind.move(np.zeros(1), 0.1)
+    with pytest.raises(fg.ModelError, match=r"'imu': nodes from 0 s on .* samples before 0\.3 s have been forgotten"):
+        behind.estimate()
+    imu.reset()
+    behind.estimate()
+    assert imu.counts.unknown == 1
+
+
+def test_sensors_stand_in_a_window_that_is_full_at_once() -> None:
+    """Steps of no duration: nothing is measured in them, and nothing moves."""
+    answers = []
+    for filled in (False, True):
+        sensor = fixes_of()
+        move = Dynamics(drift, H, sigma=0.01)
+        window = Window(POINT, 4, [move, sensor], start=np.zeros(2), sigma=0.2, filled=filled)
+        sensor.add([0.0, np.nextafter(0.0, -1.0)], [[0.1, 0.0], [0.2, 0.0]])
+        window.estimate()
+        assert sensor.counts == Counts()
+        for k in range(1, 8):
+            window.move(np.zeros(2), H * k)
+            sensor.add(H * (k - 0.5), [0.1, 0.0])
+            assert window.estimate().converged
+        assert sensor.counts.late == 0
+        inertial, imu = resting(filled=filled)
+        t = 0.01 * np.arange(101)
+        imu.add(t, np.full((101, 3), 0.01), np.tile([0.1, 0.0, 9.81], (101, 1)))
+        inertial.estimate()
+        for k in range(1, 8):
+            inertial.move(np.zeros(1), H * k)
+            assert inertial.estimate().converged
+            assert imu.counts.unknown == 0
+        answers.append((inertial.present, np.sqrt(np.diag(inertial.state_covariance))))
+    np.testing.assert_allclose(answers[0][0], answers[1][0], atol=1e-6)
+    np.testing.assert_allclose(answers[0][1], answers[1][1], rtol=1e-3)

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import gzip
+import pickle
+import sys
 from collections.abc import Callable
+from copy import deepcopy
 from io import BytesIO
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -15,10 +19,13 @@ from scipy.io import loadmat
 import unifg as fg
 from unifg.errors import ModelError
 from unifg.kernels.differences import jacobian
+from unifg.lie import SE23
 from unifg.machine.jit import compiled
 from unifg.machine.tally import counting
 from unifg.models import landmarks
+from unifg.models.inertial import InertialMeasurements
 from unifg.models.interpolation import Interpolation, cubic, geodesic
+from unifg.models.preintegration import BIAS, ImuNoise
 from unifg.models.quadrotor import STATE
 from unifg.models.stamped import Counts, StampedMeasurements
 from unifg.solvers import GaussNewton, LevenbergMarquardt
@@ -435,6 +442,71 @@ def test_errors_may_be_shipped_residuals_with_landmarks(rng: Generator) -> None:
     solution = LevenbergMarquardt().solve(graph, {x: truth, mark: [[1.0, 1.0]]}, data=data, check=True)
     np.testing.assert_allclose(solution[mark][0], place, atol=1e-9)
     assert graph.check({x: truth, mark: [[1.0, 1.0]]}).routes["seen"] == "traced, its derivatives exact"
+
+
+def test_threads_add_while_others_ask() -> None:
+    """Nothing is lost, and stamps and values stay together; copies and pickles have locks of their own."""
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        graph = fg.Graph()
+        x = graph.variables("x", SE23, 5)
+        graph.variables("bias", BIAS, 1)
+        y = graph.variables("y", fg.Rn(1), 5)
+        count, fixes = 600, StampedMeasurements(lambda x, z: x - z, 1, capacity=2000, sigma=1.0, name="fixes")
+        imu = InertialMeasurements(ImuNoise())
+        fixes.state(graph, y)
+        imu.state(graph, x)
+
+        def feed(share: int) -> None:
+            for k in range(share, count, 2):
+                stamp = 0.4 * k / count
+                fixes.add(stamp, [stamp])
+                imu.add(stamp, np.zeros(3), np.zeros(3))
+
+        threads = [Thread(target=feed, args=(share,)) for share in (0, 1)]
+        for thread in threads:
+            thread.start()
+        while any(thread.is_alive() for thread in threads):
+            fixes.at(graph, TIMES)
+            imu.at(graph, TIMES, np.zeros(6))
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(interval)
+    given = {data.name: value for data, value in fixes.at(graph, TIMES).items()}
+    assert fixes.counts == Counts(placed=count)
+    on = given["fixes: measured"]
+    stamps = (np.repeat(TIMES[:-1], 2000) + given["fixes: time into step"])[on]
+    np.testing.assert_allclose(stamps, given["fixes"][on, 0], atol=1e-12)
+    imu.at(graph, TIMES, np.zeros(6))
+    assert imu.counts.kept == count
+    for other in (deepcopy(imu), pickle.loads(pickle.dumps(imu))):
+        other.add(9.0, np.zeros(3), np.zeros(3))
+        assert other.counts.kept == count
+
+
+def test_a_refused_sensor_leaves_the_graph_as_it_was() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", SE23, 3)
+    bias = graph.variables("bias", BIAS, 3)
+    before = str(graph)
+    with pytest.raises(fg.GraphError, match="sigma"):
+        StampedMeasurements(lambda x, z: x[:, :2] - z, 2, capacity=1, sigma=-1.0, name="fixes").state(graph, x)
+    for wrong in ({"offset": "clock"}, {"statics": ("x", "mark")}):
+        role, name = next((key, value if isinstance(value, str) else value[1]) for key, value in wrong.items())
+        fixes = StampedMeasurements(place, 2, capacity=1, sigma=1.0, name="fixes", **wrong)
+        with pytest.raises(ModelError, match=f"'fixes': {role}= names '{name}', .*there are: 'x', 'bias'"):
+            fixes.state(graph, x)
+    assert str(graph) == before
+    graph.minimize(fg.prior, bias, np.zeros(6), name="imu: biases")  # a name that is taken
+    before = str(graph)
+    with pytest.raises(fg.GraphError, match="imu: biases"):
+        InertialMeasurements(ImuNoise()).state(graph, x)
+    assert str(graph) == before
+    graph.remove("imu: biases")
+    InertialMeasurements(ImuNoise()).state(graph, x)
+    StampedMeasurements(lambda x, z: x[:, :2] - z, 2, capacity=1, sigma=1.0, name="fixes").state(graph, x)
 
 
 def test_functions_of_one_factor_are_refused() -> None:
