@@ -7,7 +7,9 @@ sensor that is kept level :mod:`unifg.models.landmarks` has bearing and range in
 
 The sensor stands on the body, at ``body_T_sensor``. Noise is alike in both directions across the bearing; the axes of
 the plane are those of Duff et al. 2017, *Building an orthonormal basis, revisited*. At zero range there is no
-direction, and the residual is not finite; a landmark straight behind the measured direction is half a turn off.
+direction, and the residual is not finite, nor is it where the measured direction has no length: a solve refuses such a
+factor by its term and number, unless it is inactive. A landmark straight behind the measured direction is half a turn
+off.
 """
 
 from __future__ import annotations
@@ -95,7 +97,7 @@ def _sensor(p: Array, R: Array, l: Array, mount: tuple[float, ...] | None) -> Ar
 
 def _off(seen: Array, measured: Array) -> Array:
     """(n, 2) the step on the sphere from a measured direction to the one in which something is seen."""
-    length = np.maximum(np.linalg.norm(measured, axis=1), 1e-150)
+    length = np.linalg.norm(measured, axis=1)
     x, y, z = (measured[:, k] / length for k in range(3))
     distance = np.linalg.norm(seen, axis=1)
     u, v, w = (seen[:, k] / distance for k in range(3))

@@ -12,7 +12,7 @@ from unifg.lie import SE3, SE23, SO3
 from unifg.models.quadrotor import STATE
 from unifg.models.space_landmarks import bearing_3d, bearing_range_3d, observe_3d
 from unifg.models.stamped import StampedMeasurements
-from unifg.solvers import LevenbergMarquardt
+from unifg.solvers import InteriorPoint, LevenbergMarquardt
 from unifg.typing import Array
 
 MOUNT = SE3.from_parts([0.3, -0.2, 0.1], SO3.from_rpy(0.4, -1.2, 2.0))
@@ -108,6 +108,29 @@ def test_what_is_no_pose_is_refused() -> None:
         with pytest.raises(ModelError, match="must be an element of SE3"):
             bearing_3d(SE3, place)
     assert bearing_3d().kernel is bearing_3d().kernel  # derived once
+
+
+@pytest.mark.parametrize("data", [False, True], ids=["constant", "data"])
+@pytest.mark.parametrize("solver", [LevenbergMarquardt, InteriorPoint])
+def test_a_direction_without_length_is_refused(
+    solver: type[LevenbergMarquardt] | type[InteriorPoint], data: bool, rng: Generator
+) -> None:
+    """It led to a pose that nothing had measured; where it is inactive, as an empty slot, it does not matter."""
+    marks = 4.0 * rng.standard_normal((4, 3))
+    z = observe_3d(SE3.identity(), marks)
+    z[3, :3] = 0.0
+    for active in (None, np.arange(4) < 3):
+        graph = fg.Graph()
+        x = graph.variables("x", SE3, 1)
+        given = graph.data("z", z, each=True) if data else z
+        graph.minimize(bearing_range_3d(), x[[0] * 4], marks, given, sigma=0.1, active=active, name="seen")
+        start = {x: SE3.exp(np.full(6, 0.1))[None]}
+        if active is None:
+            with pytest.raises(fg.GraphError, match="'seen': the residual of factor 3 is not finite"):
+                solver().solve(graph, start)
+        else:
+            found = solver().solve(graph, start, check=True)
+            assert np.abs(SE3.local(SE3.identity(), found[x][0])).max() < 1e-6
 
 
 def test_poses_and_landmarks_are_found_together(rng: Generator) -> None:
