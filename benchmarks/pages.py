@@ -80,6 +80,7 @@ PAGES = {
         Page("covariance-plans", "Covariance in the plan", "benchmarks.covariance_plans"),
         Page("active-perception", "Plans that go where they learn", "benchmarks.active_perception"),
         Page("potential-weights", "The weight of Ta's cost", "benchmarks.potential_weights"),
+        Page("shared-dynamics", "Dynamics in the past, parameters in the plan", "benchmarks.shared_dynamics"),
         Page("excluded-pasts", "Pasts that cannot have been", "benchmarks.excluded_pasts", hours=0.05),
         Page("quadrotor-joint", "One graph that estimates and flies", "benchmarks.quadrotor_pull", hours=0.15),
         Page("quadrotor-mpc", "Scenario: quadrotor-mpc", "benchmarks.quadrotor_flights", hours=1.5),

@@ -8,6 +8,9 @@ tangent of SE_2(3):
 
 (Forster et al. 2017, section VI-D, with one logarithm for all nine rows as in Brossard et al. 2021). Units of the rows
 are m, m/s and rad. Biases are held over an interval; from one to the next they walk.
+
+Where turns between nodes are known by other means, one mean force for each interval is a factor by itself
+(:func:`specific_force`).
 """
 
 from __future__ import annotations
@@ -47,10 +50,15 @@ def motion(state: Manifold = SE23, gravity: tuple[float, float, float] = GRAVITY
     Raises:
         ModelError: for another manifold.
     """
+    return residual(_kernel(cast(Hashable, state), _down(gravity)))
+
+
+def _down(gravity: tuple[float, float, float]) -> tuple[float, ...]:
+    """Gravity as three numbers."""
     down = np.asarray(gravity, dtype=np.float64)
     if down.shape != (3,) or not np.isfinite(down).all():
         raise ModelError(f"gravity must be three finite numbers, found {gravity}")
-    return residual(_kernel(cast(Hashable, state), tuple(down.tolist())))
+    return tuple(down.tolist())
 
 
 @cache
@@ -72,6 +80,36 @@ def _kernel(manifold: Hashable, gravity: tuple[float, ...]) -> StatedKernel:
 
     shapes = (state, state, BIAS, (10,), (9, 6), (6,), ())
     return StatedKernel(inertial, shapes, 9, name="inertial motion")
+
+
+def specific_force(state: Manifold = SE23, gravity: tuple[float, float, float] = GRAVITY) -> Residual:
+    """``specific_force()(x, y, force, per_second)``: (n, 3) [m/s^2], in the world.
+
+    (v_y - v_x) / h - g - (R_x f + R_y f) / 2 with force f (3,), the mean of what an accelerometer felt in its axes over
+    the h seconds between x and y, and ``per_second`` 1/h. The mean turn is off by a twelfth of the square of the angle
+    between the nodes. Noise of the sensor that is alike in all axes is so in the world.
+
+    Args:
+        state: as of :func:`motion`.
+        gravity: in the world [m/s^2].
+
+    Raises:
+        ModelError: for another manifold.
+    """
+    return residual(_felt(cast(Hashable, state), _down(gravity)))
+
+
+@cache
+def _felt(manifold: Hashable, gravity: tuple[float, ...]) -> StatedKernel:
+    state = cast(Manifold, manifold)
+    _, v, R = motion_parts(state, "specific force")
+
+    def felt(x: Array, y: Array, force: Array, per_second: Array) -> Array:
+        pushed = 0.5 * (SO3.act(x[:, R], force) + SO3.act(y[:, R], force))
+        left: Array = np.reshape(per_second, (-1, 1)) * (y[:, v] - x[:, v]) - np.array([gravity]) - pushed
+        return left
+
+    return StatedKernel(felt, (state, state, (3,), ()), 3, name="specific force")
 
 
 @dataclass(frozen=True)

@@ -220,6 +220,13 @@ def swung(w: Array, p: Array) -> Any:
     return p + (1.0 - np.cos(angle)) / angle**2 * once + (angle - np.sin(angle)) / angle**3 * crossed(w, once)
 
 
+def felt(x: Array, y: Array, force: Array, per_second: Array) -> Array:
+    """Acceleration less gravity's and the mean of the forces, seen in the world."""
+    turned = [SO3.act(part[:, 3:7], force) for part in (x, y)]
+    speed = (y[:, 7:10] - x[:, 7:10]) * per_second[:, None]
+    return np.concatenate([speed[:, :2], speed[:, 2:] + 9.81], axis=1) - (turned[0] + turned[1]) / 2.0
+
+
 def inertial_motion(at: tuple[slice, slice, slice]) -> Function:
     """Of states whose position, velocity and orientation stand there."""
     p, v, q = at
@@ -397,6 +404,7 @@ DEFINED: dict[str, Function] = {
     "vehicle.dynamics": vehicle, "quadrotor.dynamics": undisturbed, "quadrotor.disturbed_dynamics": disturbed,
     "inertial.motion": inertial_motion((slice(0, 3), slice(3, 6), slice(6, 10))),
     "inertial.motion, in parts": inertial_motion((slice(0, 3), slice(7, 10), slice(3, 7))),
+    "inertial.specific_force": felt,
     "space_landmarks.bearing_range_3d": bearing_in_space(slice(0, 3), slice(3, 7), MOUNT),
     "space_landmarks.bearing_3d": bearing_in_space(slice(0, 3), slice(3, 7)),
     "landmarks.bearing_range": bearing_range, "landmarks.height": height, "landmarks.tilt": tilt,

@@ -297,13 +297,28 @@ def test_free_fall_and_rest() -> None:
     assert abs(turned(start[None], end[None], NONE[None], *falling[:4])[0]).max() > 1.0
 
 
+def test_a_mean_force_is_felt_between_two_nodes() -> None:
+    """Nothing is left of rest and of free fall, nor of a held force but for a twelfth of the square of the turn."""
+    felt, q, h = inertial.specific_force(), SO3.from_rpy(0.3, -0.2, 1.0), 0.1
+    start = SE23.from_parts([1.0, 2.0, 3.0], [1.0, 0.0, 0.5], q)
+    np.testing.assert_allclose(felt(start[None], start[None], at_rest(q)[None], 1.0 / h), 0.0, atol=1e-14)
+    turn, force = np.array([0.4, -1.0, 2.0]), np.array([1.0, -2.0, 12.0])
+    for rates, pushed in ((np.zeros(3), np.zeros(3)), (np.zeros(3), force), (turn, force)):
+        end = predict(start, preintegrate([0.0], [rates], [pushed], [0.0, h], NOISE, NONE))[1]
+        left = felt(start[None], end[None], pushed[None], 1.0 / h)[0]
+        angle = h * float(np.linalg.norm(rates))
+        np.testing.assert_allclose(left, 0.0, atol=1e-12 + 1.05 * angle**2 / 12.0 * float(np.linalg.norm(pushed)))
+    assert abs(inertial.specific_force(gravity=(0.0, 0.0, -3.71))(start[None], end[None], force[None], 10.0)).max() > 5
+
+
 def test_manifolds_and_gravity_are_checked() -> None:
-    for manifold in (fg.SE3, fg.Product(p=fg.Rn(3), v=fg.Rn(3)), fg.Product(p=fg.Rn(2), v=fg.Rn(3), R=SO3)):
-        with pytest.raises(ModelError, match="needs a position, a velocity and an orientation"):
-            inertial.motion(manifold)
-    for gravity in ((0.0, 0.0), (0.0, 0.0, np.nan)):
-        with pytest.raises(ModelError, match="three finite numbers"):
-            inertial.motion(gravity=gravity)  # type: ignore[arg-type]
+    for made in (inertial.motion, inertial.specific_force):
+        for manifold in (fg.SE3, fg.Product(p=fg.Rn(3), v=fg.Rn(3)), fg.Product(p=fg.Rn(2), v=fg.Rn(3), R=SO3)):
+            with pytest.raises(ModelError, match="needs a position, a velocity and an orientation"):
+                made(manifold)
+        for gravity in ((0.0, 0.0), (0.0, 0.0, np.nan)):
+            with pytest.raises(ModelError, match="three finite numbers"):
+                made(gravity=gravity)  # type: ignore[arg-type]
     assert inertial.motion().kernel is inertial.motion().kernel  # derived once
 
 

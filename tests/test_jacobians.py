@@ -211,6 +211,10 @@ for inertial_case, states in (("inertial.motion", fg.SE23), ("inertial.motion, i
         inertial.motion(states), [states.random(RNG, (COUNT,)), states.random(RNG, (COUNT,)), vectors(6)],
         [states, states, preintegration.BIAS], INCREMENTS,
     )  # fmt: skip
+CASES["inertial.specific_force"] = (
+    inertial.specific_force(quadrotor.STATE), [quadrotor.STATE.random(RNG, (COUNT,)) for _ in range(2)],
+    [quadrotor.STATE, quadrotor.STATE], [vectors(3), np.linspace(5.0, 50.0, COUNT)],
+)  # fmt: skip
 MOUNT = fg.SE3.from_parts([0.3, -0.2, 0.1], fg.SO3.from_rpy(0.4, -1.2, 2.0))
 SEEN = np.concatenate([vectors(3), RNG.uniform(1.0, 5.0, (COUNT, 1))], axis=1)
 CASES["space_landmarks.bearing_range_3d"] = (

@@ -227,6 +227,8 @@ def test_without_dynamics_nothing_is_learnt() -> None:
         return float(np.sqrt(np.mean(square)))
 
     assert rms(informed) < 0.6 * rms(found) < 0.3
+    felt = begin(2, DeadReckoningEstimator, EstimatorSettings(window=WindowSettings(force_sigma=0.15)))
+    assert rms(beliefs(felt, log)) < 0.5 * rms(found)  # what is felt takes the place of dynamics
 
 
 def test_what_is_not_estimated_stays() -> None:

@@ -284,7 +284,7 @@ def sighting(time: float, places: Array, ids: list[int], state: Array) -> Readin
     count = len(ids)
     return Reading(
         time, np.array(ids), bearings, np.hypot(*offset.T), np.full(count, 0.4), np.zeros(count, dtype=np.intp),
-        np.ones(count, dtype=bool), 1.5, np.array([0.0, 0.0, 1.0]), np.zeros(3),
+        np.ones(count, dtype=bool), 1.5, np.array([0.0, 0.0, 1.0]), np.zeros(3), np.array([0.0, 0.0, 9.81]),
     )  # fmt: skip
 
 

@@ -204,8 +204,27 @@ def test_an_exact_sensor_reports_the_truth() -> None:
     assert reading.height == 1.7
     np.testing.assert_allclose(reading.tilt, matrix.T @ [0.0, 0.0, 1.0], atol=1e-15)
     np.testing.assert_array_equal(reading.rates, np.zeros(3))
+    np.testing.assert_allclose(reading.force, matrix.T @ [0.0, 0.0, 9.81], atol=1e-14)
     world.step([0.3, -0.2, 0.5, 9.0])
     np.testing.assert_allclose(world.sense().rates, [0.3, -0.2, 0.5], atol=1e-15)
+    np.testing.assert_allclose(world.sense().force, [0.0, 0.0, 9.0], atol=1e-5)  # thrust by mass, whatever the way
+
+
+def test_what_is_felt_is_the_acceleration_without_gravity() -> None:
+    """Drag and wind are felt, and the floor that carries a vehicle."""
+    turned = SO3.exp(np.array([0.2, -0.3, 2.5]))
+    start = np.array([0.0, 0.0, 1.7, *turned, 1.5, -0.5, 0.2])
+    drag, wind, u = np.array([0.3, 0.2, 0.1]), np.array([0.4, -0.2, 0.0]), np.array([0.0, 0.0, 0.0, 11.0])
+    parameters = quadrotor.Parameters(1.2, (0.3, 0.2, 0.1), (0.4, -0.2))
+    world = QuadrotorWorld(field([]), 0, parameters, start=start, sensor=SensorModel.exact(), disturbance=CALM)
+    world.step(u, 0.005)
+    back = SO3.matrix(turned[None])[0].T
+    force = (np.array([0.0, 0.0, 11.0]) - drag * (back @ start[7:])) / 1.2 + back @ wind
+    np.testing.assert_allclose(world.sense().force, force, atol=0.01)
+    on = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    parked = QuadrotorWorld(field([]), 0, start=on, sensor=SensorModel.exact(), disturbance=CALM)
+    parked.step([0.0, 0.0, 0.0, 3.0])
+    np.testing.assert_allclose(parked.sense().force, [0.0, 0.0, 9.81], atol=1e-12)
 
 
 def seen(
@@ -243,13 +262,17 @@ def test_noise_is_as_large_as_promised() -> None:
     height = np.array([r.height for r in readings]) - 2.0
     tilt = np.array([r.tilt for r in readings]) - [0.0, 0.0, 1.0]
     rates = np.array([r.rates for r in readings])
+    force = np.array([r.force for r in readings]) - [0.0, 0.0, 9.81]
+    bias = force.mean(axis=0)  # the same throughout
+    assert (np.abs(bias) < 4.0 * model.sigma_force_bias).all() and np.abs(bias).max() > 0.1 * model.sigma_force_bias
+    force -= bias
     for sample, sigma in [
         (ranges, model.sigma_range), (bearings, model.sigma_bearing), (height, model.sigma_height),
-        (tilt, model.sigma_tilt), (rates, model.sigma_gyro),
+        (tilt, model.sigma_tilt), (rates, model.sigma_gyro), (force, model.sigma_force),
     ]:  # fmt: skip
         assert sample.std() == pytest.approx(sigma, rel=0.05)
         assert abs(sample.mean()) < 5.0 * sigma / math.sqrt(sample.size)
-    columns = np.column_stack([ranges, bearings, height, tilt, rates])
+    columns = np.column_stack([ranges, bearings, height, tilt, rates, force])
     correlation = np.corrcoef(columns.T) - np.eye(columns.shape[1])
     assert np.abs(correlation).max() < 0.1
 
@@ -281,6 +304,7 @@ def test_one_seed_is_one_noise_whatever_is_flown_and_seen() -> None:
                         [noisy.height - clean.height],
                         noisy.tilt - clean.tilt,
                         noisy.rates - clean.rates,
+                        noisy.force - clean.force,
                         clean.rates - control[:3],
                     ]
                 )

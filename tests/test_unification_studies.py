@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 
-from benchmarks import active_perception, covariance_plans, excluded_pasts, impossible_states, potential_weights
+from benchmarks import (
+    active_perception,
+    covariance_plans,
+    excluded_pasts,
+    impossible_states,
+    potential_weights,
+    shared_dynamics,
+)
 
 
 def row(way: str, seed: int, found: list[tuple[float, float] | None]) -> dict[str, object]:
@@ -113,3 +123,45 @@ def test_ways_are_compared_at_equal_error_and_at_equal_time() -> None:
     np.testing.assert_array_equal(found.surest("rule", 0.3), [0.8, np.nan])  # 10.0 is the fastest of any way
     text = active_perception.render(found, 5)
     assert "| 35 cm | 1 / 2 | 1 / 2 | 0 / 2 | -1 (-1 .. -1), n=1 | - |" in text
+
+
+@pytest.mark.parametrize("past", ["nominal", "unknown"])
+@pytest.mark.parametrize("plan", ["nominal", "estimated"])
+def test_past_and_plan_are_chosen_apart(past: str, plan: str) -> None:
+    flight = shared_dynamics.prepared(shared_dynamics.Job(1000, past, plan, accelerometer=plan == "nominal"))
+    pilot, nominal, control = cast(Any, flight.pilot), flight.conditions.nominal, None
+    for _ in range(4):
+        control = pilot.tick(flight.world.sense(), control).control
+        flight.world.step(control)
+    own = pilot.estimator.own
+    assert own.estimated == (("mass", "drag", "wind") if past == "unknown" else ())
+    assert (own.noise_sigma[5] > 1.0) == (past == "nominal")
+    assert own.force_sigma == (shared_dynamics.FORCE_SIGMA if plan == "nominal" else None)
+    assert pilot.controller.belief is pilot.belief
+    np.testing.assert_array_equal(pilot.belief.state, pilot.estimator.window.present)
+    assert (pilot.belief.parameters == nominal) == (plan == "nominal")
+    if plan == "estimated":
+        assert pilot.adviser.own.estimated == ("mass", "drag", "wind")
+        np.testing.assert_array_equal(pilot.belief.parameters.packed[:1], pilot.adviser.parameters[:1])
+        assert (pilot.adviser is pilot.estimator) == (past == "unknown")
+
+
+def test_changes_are_compared_corridor_by_corridor() -> None:
+    rows = [
+        {
+            "seed": seed, "past": past, "plan": plan, "accelerometer": False, "reached": True, "collisions": seed,
+            "velocity": 100.0 + seed - (30.0 + seed) * (past == "unknown"), "position": 30.0, "clearance": 25.0,
+            "tracking": 50.0 - 20.0 * (plan == "estimated"), "time": 15.0,
+        }
+        for seed in (0, 1) for past in ("nominal", "unknown") for plan in ("nominal", "estimated")
+    ]  # fmt: skip
+    text = shared_dynamics.render(rows)
+    assert "| no | nominal | estimated | 100 | 30 | 30 | 25 | 15 | 1 of 2 |" in text
+    assert "| no | unknowns in the dynamics of the past | estimated plan | -30 (-31 .. -30) | +0 (+0 .. +0) |" in text
+    none = "+0 (+0 .. +0)"
+    assert f"| no | estimates in the plan | past with unknowns | {none} | {none} | -20 (-20 .. -20) |" in text
+    ahead, ticks = shared_dynamics.AHEAD, 30
+    truth, plans = np.zeros((ticks, 10)), np.zeros((ticks, ahead + 1, 3))
+    truth[:, 0] = 0.05 * np.arange(ticks)  # 1 m/s; planned to be 1.1, from where it was not
+    plans[:, :, 0] = 7.0 + 0.055 * np.arange(ahead + 1)
+    assert shared_dynamics.tracking(cast(Any, SimpleNamespace(truth=truth, plans=plans))) == pytest.approx(0.05)

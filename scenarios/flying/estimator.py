@@ -223,6 +223,8 @@ class Estimator:
             self._propagate(state, control, noise, dt)
             self.window.move(control, self.window.history.times[-1] + dt, state, {"noise": noise})
             self.window.record("turned", turned)
+            if self.own.force_sigma is not None:
+                self.window.record("force", reading.force)
         self._time = reading.time
 
     def see(self, reading: Reading) -> None:

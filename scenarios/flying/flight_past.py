@@ -19,6 +19,7 @@ from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import Residual
 from unifg.machine.jit import compiled
 from unifg.models import landmarks, quadrotor
+from unifg.models.inertial import specific_force
 from unifg.scenarios.flying.arrival import arrival, seen_from_the_vehicle
 from unifg.scenarios.worlds.disturbance import DisturbanceModel
 from unifg.typing import Array, ArrayLike, BoolArray
@@ -46,6 +47,7 @@ class WindowSettings:
         height_sigma: [m].
         tilt_sigma: of each component of the measured R' e3.
         gyro_sigma: [rad/s]; None when the gyro's rates take the place of the commanded ones.
+        force_sigma: of the specific force felt over a tick [m/s^2]; None without an accelerometer.
         survey_sigma: of each coordinate of a landmark that is on the map from the start [m].
 
     Raises:
@@ -61,6 +63,7 @@ class WindowSettings:
     height_sigma: float = 0.03
     tilt_sigma: float = 0.01
     gyro_sigma: float | None = 0.01
+    force_sigma: float | None = None
     survey_sigma: float = 0.02
 
     def __post_init__(self) -> None:
@@ -79,6 +82,9 @@ class WindowSettings:
         for name in self.estimated:
             mask[PLACES[name]] = True
         return mask
+
+
+FORCE = specific_force(quadrotor.STATE)
 
 
 @compiled
@@ -139,6 +145,34 @@ class Motion:
         if self.settings.gyro_sigma is not None:
             found["turned"] = now.past.recorded("turned")[0][1:]
         return found
+
+
+@dataclass(frozen=True)
+class Accelerometer:
+    """What was felt between neighbours; it ties their velocities to each other, whatever moves the vehicle."""
+
+    sigma: float
+
+    @property
+    def records(self) -> Mapping[str, tuple[int, ...]]:
+        """Mean specific force since the last node [m/s^2]."""
+        return {"force": (3,)}
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add a cost for every step."""
+        steps = len(x) - 1
+        force = graph.data("force", np.zeros((steps, 3)), each=True)
+        per_second = graph.data("per second", np.ones(steps), each=True)
+        felt = graph.data("felt", np.zeros(steps, dtype=bool), each=True)
+        sides = x[:-1], x[1:], force, per_second
+        graph.minimize(FORCE, *sides, sigma=self.sigma, active=felt, name="accelerometer")
+
+    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+        """What was felt in steps that took time."""
+        durations = np.diff(now.past.times)
+        felt = durations > 0.0
+        per_second = 1.0 / np.where(felt, durations, 1.0)
+        return {"force": now.past.recorded("force")[0][1:], "per second": per_second, "felt": felt}
 
 
 @dataclass(frozen=True)
@@ -228,6 +262,8 @@ def window(
         Measurement("height", landmarks.height, (), settings.height_sigma, component="p"),
         Measurement("tilt", landmarks.tilt, (3,), settings.tilt_sigma, component="R"),
     ]
+    if settings.force_sigma is not None:
+        terms.append(Accelerometer(settings.force_sigma))
     return Window(
         robot, settings.length, terms, start=state, sigma=sigma, solver=solver,
         arrival=SeenFromTheVehicle(settings.landmarks), filled=True,

@@ -51,6 +51,7 @@ class Reading:
         height: above the floor [m].
         tilt: (3,) R' e3, the world's vertical in the body; not normalised.
         rates: (3,) mean body rates over the last step [rad/s]; of a vehicle at rest before the first.
+        force: (3,) mean specific force in the body over the last step [m/s^2]: acceleration without gravity's.
     """
 
     time: float
@@ -63,3 +64,4 @@ class Reading:
     height: float
     tilt: Array
     rates: Array
+    force: Array

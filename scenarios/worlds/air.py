@@ -19,6 +19,7 @@ import numpy as np
 import pymunk
 
 from unifg.errors import ScenarioError
+from unifg.lie import SO3
 from unifg.models import quadrotor
 from unifg.scenarios.seeing.readings import Reading
 from unifg.scenarios.ways.passage import obstacle_distance
@@ -33,6 +34,9 @@ __all__ = ["VEHICLE_RADIUS", "QuadrotorWorld"]
 
 VEHICLE_RADIUS = 0.25
 """Radius of the vehicle's disc on the ground plane [m]; it has no height, and its tilt is not looked at."""
+
+UP = np.array([0.0, 0.0, quadrotor.GRAVITY])
+"""Specific force at rest, in the world [m/s^2]."""
 
 _ARRIVED = 1e-9  # [m]
 _WORLD_TAG = 53  # keeps the noise apart from the layouts of the same seed
@@ -86,7 +90,7 @@ class QuadrotorWorld:
         self.movers = random_movers(layout, movers, mover_rng) if isinstance(movers, int) else tuple(movers)
         self._disturbances = Disturbances(self.disturbance_model, disturbance_rng)
         self._state = _start_state(layout, start)
-        self._rates = np.zeros(3)
+        self._rates, self._force = np.zeros(3), SO3.act(SO3.inverse(self._state[3:7]), UP)
         self._space = space = Space(self._state[:2], VEHICLE_RADIUS)
         if self._state[2] <= 0.0:
             space.begin(_FLOOR, counts=False)  # a start on the ground is no collision
@@ -133,14 +137,15 @@ class QuadrotorWorld:
                 f"a control is four finite numbers, body rates and thrust; got {control!r}. Fly a stored plan or hover "
                 "rather than a plan that failed"
             )
-        rates, pauses = np.zeros(3), 0
+        rates, path = list[Array](), [self._state]
         for pause in self._space.substeps(dt):
             noise = self._disturbances.draw(pause)
-            rates += u[:3] + noise[:3]
+            rates.append(u[:3] + noise[:3])
             flown = quadrotor.fly(self._state, u, pause, self.parameters, noise, substeps=1)
             self._state = self._land(self._collide(flown, pause))
-            pauses += 1
-        self._rates = rates / pauses
+            path.append(self._state)
+        self._rates = sum(rates, np.zeros(3)) / len(rates)
+        self._force = felt_force(np.array(path), np.array(rates), dt / len(rates))
 
     def _collide(self, flown: Array, pause: float) -> Array:
         """Let the disc follow the integrator as far as it can; the state (10,) that is left."""
@@ -167,7 +172,7 @@ class QuadrotorWorld:
 
     def sense(self) -> Reading:
         """Measure once at the present state; every call draws new noise."""
-        return self._sensor.read(self.time, self._state, self.things(), self._rates)
+        return self._sensor.read(self.time, self._state, self.things(), self._rates, self._force)
 
     # ------------------------------------------------------------ ground truth
 
@@ -202,6 +207,20 @@ class QuadrotorWorld:
         discs = np.concatenate([self.layout.cylinders, self.mover_states()])
         beside = float(obstacle_distance(self._state[None, :2], discs, self.layout.walls)[0]) - VEHICLE_RADIUS
         return min(beside, float(self._state[2]))
+
+
+def felt_force(states: Array, rates: Array, pause: float) -> Array:
+    """Mean (3,) of what an accelerometer in the body feels along a path, of contacts too [m/s^2].
+
+    Args:
+        states: (n + 1, 10).
+        rates: (n, 3) of the body between them [rad/s].
+        pause: time between them [s].
+    """
+    halfway = SO3.retract(states[:-1, 3:7], 0.5 * pause * rates)
+    pushed = np.diff(states[:, 7:], axis=0) / pause + UP
+    mean: Array = SO3.act(SO3.inverse(halfway), pushed).mean(axis=0)
+    return mean
 
 
 def _start_state(layout: Layout, start: ArrayLike | None) -> Array:

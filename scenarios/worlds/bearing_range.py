@@ -1,4 +1,4 @@
-"""What the vehicle measures: bearing and range of cylinders and corners, height, tilt and body rates."""
+"""What the vehicle measures: bearing and range of cylinders and corners, height, tilt, body rates, specific force."""
 
 from __future__ import annotations
 
@@ -33,6 +33,8 @@ class SensorModel:
         sigma_height: [m].
         sigma_tilt: of each component of R' e3.
         sigma_gyro: of each body rate [rad/s].
+        sigma_force: of each component of the specific force [m/s^2].
+        sigma_force_bias: of what its sensor shows too much, throughout [m/s^2].
     """
 
     range_max: float = 8.0
@@ -42,11 +44,13 @@ class SensorModel:
     sigma_height: float = 0.03
     sigma_tilt: float = 0.01
     sigma_gyro: float = 0.01
+    sigma_force: float = 0.1
+    sigma_force_bias: float = 0.05
 
     @staticmethod
     def exact(range_max: float = 8.0) -> SensorModel:
         """A sensor without noise."""
-        return SensorModel(range_max, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return SensorModel(range_max, *[0.0] * 8)
 
 
 class Sensor:
@@ -79,9 +83,10 @@ class Sensor:
         self._kinds = np.array(
             [Landmarks.CORNER if shape is None else Landmarks.CYLINDER for shape in shapes], dtype=np.intp
         )
-        self._streams = rng.spawn(5)
+        *self._streams, self._felt = rng.spawn(6)
+        self._bias = model.sigma_force_bias * self._felt.standard_normal(3)
 
-    def read(self, time: float, state: Array, things: Array, rates: Array) -> Reading:
+    def read(self, time: float, state: Array, things: Array, rates: Array, force: Array) -> Reading:
         """Measure once; every call draws new noise.
 
         Args:
@@ -89,6 +94,7 @@ class Sensor:
             state: (10,) true state.
             things: (n, 3) x, y, radius of everything by id [m].
             rates: (3,) true mean body rates [rad/s].
+            force: (3,) true mean specific force [m/s^2].
         """
         model = self.model
         standing, moving, height, tilt, gyro = self._streams
@@ -124,6 +130,7 @@ class Sensor:
             height=float(state[2] + model.sigma_height * height_noise),
             tilt=rotation[2] + model.sigma_tilt * tilt_noise,
             rates=rates + model.sigma_gyro * gyro_noise,
+            force=force + self._bias + model.sigma_force * self._felt.standard_normal(3),
         )
 
     def _visible(self, index: int, state: Array, things: Array) -> bool:

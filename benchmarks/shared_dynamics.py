@@ -1,0 +1,222 @@
+"""What the past gains from the vehicle's dynamics, and the plan from estimated parameters, each by itself.
+
+    python -m benchmarks.shared_dynamics [--seeds 0:12] [--workers K] [--fresh] [--report]
+
+A quadrotor flies through unknown corridors (:mod:`benchmarks.quadrotor_flights`). Its past knows no dynamics, those
+with the parameters believed at the start, or those with mass, drag and wind as unknowns; its plan is made with the
+parameters believed at the start, or with estimates; an accelerometer is there or not, for everybody. Where a past
+without unknowns meets a plan with estimates, a second past beside it hands on its parameters and nothing else. All
+flights of a seed meet the same corridor, parameters, disturbances and noise; intervals are bootstrapped over corridors.
+Writes docs/shared-dynamics.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from benchmarks import campaign
+from benchmarks.campaign import Row, digits, interval, paired, where
+from benchmarks.report import command, listing, machine, publish
+from unifg.horizon import Plan
+from unifg.models import quadrotor
+from unifg.scenarios.episode import silent
+from unifg.scenarios.flight import Flight, FlightSettings
+from unifg.scenarios.flying.estimator import DeadReckoning, Dynamics, Estimator, EstimatorSettings
+from unifg.scenarios.flying.flight_control import Controller
+from unifg.scenarios.flying.flight_past import WindowSettings
+from unifg.scenarios.flying.flight_pilot import Pilot
+from unifg.scenarios.log.flight_log import FlightLog
+from unifg.scenarios.log.flight_metrics import flight_metrics
+from unifg.scenarios.seeing.readings import Reading
+from unifg.scenarios.seeing.tracks import Tracks
+from unifg.typing import Array
+
+FORCE_SIGMA = 0.15  # [m/s^2] of an accelerometer with noise of 0.1 and an unknown bias of 0.05
+MISTRUST = {False: 1.0, True: 2.0}
+"""Process noise of an acceleration whose parameters are wrong, without and with an accelerometer [m/s^2]: that of 0.3,
+0.6, 1 and 2 which gave the smallest errors of velocity in corridors 1000 to 1002, which are open to tuning."""
+FLIGHT = 25.0  # [s]; who has not arrived by then hangs
+AHEAD = 10  # ticks: where a plan is compared with what came of it
+PASTS = ("none", "nominal", "unknown")
+PLANS = ("nominal", "estimated")
+
+
+@dataclass(frozen=True)
+class NominalDynamics(Dynamics):
+    """The vehicle's dynamics with the parameters believed at the start; what these have wrong is noise.
+
+    Attributes:
+        mistrust: standard deviation of that noise [m/s^2].
+    """
+
+    mistrust: float
+
+    def window(self, settings: EstimatorSettings) -> WindowSettings:
+        """Nothing is estimated, and the acceleration is not trusted as far."""
+        own = settings.window
+        sigma = (*own.noise_sigma[:3], *np.hypot(own.noise_sigma[3:], self.mistrust).tolist())
+        return replace(own, estimated=(), noise_sigma=sigma)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One flight: dynamics of the past, parameters of the plan, and whether there is an accelerometer."""
+
+    seed: int
+    past: str
+    plan: str
+    accelerometer: bool
+
+
+class Divided(Pilot):
+    """Estimates the state by one past, and plans with parameters that need not be its own.
+
+    Attributes:
+        adviser: whose parameters the plan takes; None for those believed at the start.
+    """
+
+    def __init__(
+        self, estimator: Estimator, controller: Controller, nominal: quadrotor.Parameters, adviser: Estimator | None
+    ) -> None:
+        """Join them; the adviser may be the estimator itself."""
+        super().__init__(estimator, controller)
+        self.adviser, self._nominal = adviser, nominal
+
+    def tick(self, reading: Reading, control: Array | None) -> Plan:
+        """Decide."""
+        self.alone = self.estimator.update(reading, control)
+        parameters = self._nominal
+        if self.adviser is not None:
+            told = self.alone if self.adviser is self.estimator else self.adviser.update(reading, control)
+            parameters = told.parameters
+        self.belief = replace(self.alone, parameters=parameters)
+        return self.controller.plan(self.belief, Tracks.none())
+
+
+def prepared(job: Job) -> Flight:
+    """The flight of a job, ready to be flown."""
+    window = WindowSettings(force_sigma=FORCE_SIGMA if job.accelerometer else None)
+    settings = EstimatorSettings(window=window)
+    flight = Flight(FlightSettings("ipm", "sequential", job.seed, time_limit=FLIGHT, estimator=settings))
+    found, known = flight.conditions, flight.pilot.estimator
+    estimator = known
+    if job.past != "unknown":
+        nominal = NominalDynamics(found.nominal, MISTRUST[job.accelerometer])
+        model = nominal if job.past == "nominal" else DeadReckoning(found.nominal)
+        estimator = Estimator(known.window.present, found.nominal, settings, found.layout.corners, model)
+    adviser = known if job.plan == "estimated" else None
+    flight.pilot = Divided(estimator, flight.pilot.controller, found.nominal, adviser)
+    return flight
+
+
+def fly(job: Job) -> Row:
+    """Fly once."""
+    log = prepared(job).run(silent)
+    metrics = dict(flight_metrics(log))
+    return {
+        "reached": bool(log.reached),
+        "collisions": int(log.collisions),
+        "velocity": 1e3 * metrics["velocity_error_m_per_s"]["rms"],
+        "position": 1e3 * metrics["position_error_m"]["rms"],
+        "tracking": 1e3 * tracking(log),
+        "clearance": 100.0 * float(np.min(log.clearance)),
+        "time": float(log.time[-1]),
+    }
+
+
+def tracking(log: FlightLog) -> float:
+    """Root mean square of how far the vehicle is from where a plan of half a second ago had it go [m].
+
+    Both are counted from where the vehicle was, or believed to be, when the plan was made.
+    """
+    gone = log.truth[AHEAD:, :3] - log.truth[:-AHEAD, :3]
+    planned = log.plans[:-AHEAD, AHEAD] - log.plans[:-AHEAD, 0]
+    return float(np.sqrt(np.square(gone - planned).sum(axis=1).mean()))
+
+
+WORDS = {"none": "none", "nominal": "nominal", "unknown": "with unknowns"}
+MEASURES = {
+    "velocity error [mm/s]": "velocity",
+    "position error [mm]": "position",
+    "off the plan after 0.5 s [mm]": "tracking",
+    "least clearance [cm]": "clearance",
+}
+CHANGES = {
+    ("dynamics in the past, nominal ones", "nominal plan"): (("none", "nominal"), ("nominal", "nominal")),
+    ("unknowns in the dynamics of the past", "nominal plan"): (("nominal", "nominal"), ("unknown", "nominal")),
+    ("unknowns in the dynamics of the past", "estimated plan"): (("nominal", "estimated"), ("unknown", "estimated")),
+    ("estimates in the plan", "nominal past"): (("nominal", "nominal"), ("nominal", "estimated")),
+    ("estimates in the plan", "past with unknowns"): (("unknown", "nominal"), ("unknown", "estimated")),
+}
+"""What is changed and what is not: dynamics of the past and parameters of the plan, before and after."""
+
+
+def mean(name: str, some: Sequence[Row]) -> str:
+    """Mean of a measure over flights."""
+    return f"{np.mean([row[name] for row in some]):.3g}"
+
+
+def change(name: str, pair: tuple[Sequence[Row], Sequence[Row]]) -> str:
+    """Mean of the paired differences of a measure, and its interval."""
+    old, new = paired(*pair, lambda row: float(row[name]))
+    low, high = interval(new - old)
+    return f"{digits(float(np.mean(new - old)), '+')} ({digits(low, '+')} .. {digits(high, '+')})"
+
+
+def render(rows: Sequence[Row]) -> str:
+    """Markdown: the combinations, and what each change does."""
+    levels: dict[tuple[str, str, str], list[Row]] = {}
+    changes: dict[tuple[str, str, str], tuple[list[Row], list[Row]]] = {}
+    for there, sensor in ((False, "no"), (True, "yes")):
+        flown = {
+            (past, plan): where(rows, accelerometer=there, past=past, plan=plan) for past in PASTS for plan in PLANS
+        }
+        levels |= {(sensor, WORDS[past], plan): some for (past, plan), some in flown.items() if some}
+        for words, (before, after) in CHANGES.items():
+            if flown[before] and flown[after]:
+                changes[sensor, *words] = flown[before], flown[after]
+    told: Mapping[str, Callable[[list[Row]], str]] = {
+        **{head: partial(mean, name) for head, name in MEASURES.items()},
+        "time of those who arrive [s]": lambda some: mean("time", [row for row in some if row["reached"]]),
+        "arrived, untouched": lambda some: (
+            f"{sum(row['reached'] and not row['collisions'] for row in some)} of {len(some)}"
+        ),
+    }
+    differences: Mapping[str, Callable[[tuple[list[Row], list[Row]]], str]] = {
+        head: partial(change, name) for head, name in MEASURES.items()
+    }
+    parts = [
+        machine("numpy", "scipy", "numba", "pymunk"),
+        "### The combinations",
+        "Errors are root mean squares over a flight; everything is the mean over flights.",
+        listing(["accelerometer", "dynamics of the past", "parameters of the plan"], levels, told),
+        "### What each change does",
+        "Mean of the paired differences, with its 95 % interval over corridors.",
+        listing(["accelerometer", "what is added", "beside"], changes, differences),
+    ]
+    return "\n\n".join(parts)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Fly what is missing and rewrite docs/shared-dynamics.md."""
+    parser = command(__doc__)
+    campaign.options(parser)
+    parser.add_argument("--seeds", type=campaign.seeds, default=range(12), metavar="FIRST:END")
+    options = parser.parse_args(arguments)
+    jobs = [
+        Job(seed, past, plan, accelerometer)
+        for seed in options.seeds for accelerometer in (False, True) for past in PASTS for plan in PLANS
+        if past != "none" or plan == "nominal"
+    ]  # fmt: skip
+    rows = campaign.episodes("shared_dynamics", fly, jobs, options)
+    asked = [row for row in rows if row["seed"] in options.seeds]
+    publish("shared-dynamics", render(asked), {row["code"] for row in asked})
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
