@@ -317,7 +317,7 @@ def shipped() -> set[str]:
                 names.add(f"{module.name}.{name}")
             if callable(value) and getattr(value, "__annotations__", {}).get("return") == "Residual":
                 names.add(f"{module.name}.{name}")  # a function that makes residuals
-    general = (".residual", ".of_distance")  # make a residual of any function, or of any function of a distance
+    general = (".residual", ".complete", ".of_distance")  # of any function, or of any function of a distance
     return {name for name in names if not name.endswith(general)}
 
 
