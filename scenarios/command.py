@@ -4,9 +4,7 @@ Exit status: 0 if the robot did what it was asked (every goal reached without a 
 its limits), 1 if not, 2 for arguments that cannot be served, 130 after an interrupt (what was done until then is
 written all the same).
 
-`SCENARIOS` is a table: to add one, write a module of `unifg.scenarios.commands` with its settings and a function that
-runs them and, where that is asked for, shows the run while it goes on. Options come from the settings
-(`unifg.scenarios.options`); only the scenario that is named is loaded.
+What can be run stands in `unifg.scenarios.commands.catalogue`; only the scenario that is named is loaded.
 """
 
 from __future__ import annotations
@@ -16,62 +14,24 @@ import re
 import signal
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 from unifg import __version__
 from unifg.errors import UnifgError
+from unifg.scenarios.commands.catalogue import SCENARIOS, SOLVE
 from unifg.scenarios.commands.outcome import Outcome, Progress
-from unifg.scenarios.options import add_options, settings_of
+from unifg.scenarios.options import settings_of
 
-__all__ = ["SCENARIOS", "SOLVE", "Outcome", "Scenario", "main"]
+__all__ = ["main"]
 
 SUCCEEDED, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
 
 _PAIRED_OPTIONS = ("--start", "--goal", "--force-bounds")
 _NEGATIVE = re.compile(r"-[\d.]")
-
-
-@dataclass(frozen=True)
-class Scenario:
-    """One entry of `SCENARIOS`.
-
-    Attributes:
-        module: of `unifg.scenarios.commands`: its ``SETTINGS`` are a class whose fields are options, its ``run`` takes
-            them, a progress and, where it can be watched, whom to tell where; it raises KeyboardInterrupt when stopped
-            before there is anything to write.
-        summary: one line for the help.
-        solvers: the list of `unifg.solvers.names` to choose from.
-        defaults: of options, where the command line has others than the settings.
-        live: whether it can be watched.
-    """
-
-    module: str
-    summary: str
-    solvers: str = "CONSTRAINED"
-    defaults: Mapping[str, Any] = field(default_factory=dict)
-    live: bool = True
-
-    def add_options(self, parser: argparse.ArgumentParser) -> None:
-        """Load the scenario and add its options."""
-        from unifg.solvers import names
-
-        module, solvers = import_module(f"unifg.scenarios.commands.{self.module}"), getattr(names, self.solvers)
-        add_options(parser, module.SETTINGS, **self.defaults)
-        solver = next(f.default for f in fields(module.SETTINGS) if f.name == "solver")
-        about = f"{names.choices(solvers)} (default: %(default)s)"
-        parser.add_argument("--solver", choices=solvers, default=solver, help=about)
-        parser.add_argument(
-            "--out", type=Path, default=Path("out"), metavar="DIR", help="folder for results (default: %(default)s)"
-        )
-        if self.live:
-            parser.add_argument("--live", action="store_true", help="show it in a browser while it runs; says where")
-        parser.set_defaults(module=module)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -222,41 +182,6 @@ def _join_negative(arguments: list[str]) -> list[str]:
         else:
             joined.append(argument)
     return joined
-
-
-SCENARIOS = {
-    "navigation": Scenario(
-        "drives",
-        "A robot localises itself by lidar and drives through a building under MPC.",
-        defaults={"obstacles": 3},
-    ),
-    "manoeuvres": Scenario(
-        "manoeuvre_cases",
-        "Two control graphs solved once: backing out of a wrong heading, and deflecting around an unforeseen disc.",
-    ),
-    "velocity-tracking": Scenario(
-        "speed_tracking",
-        "Forces that make a car follow a speed profile: one optimal control problem over the whole drive.",
-        "EQUALITIES",
-    ),
-    "quadrotor-mpc": Scenario(
-        "flights",
-        "A quadrotor flies through a corridor of unknown cylinders, estimating and planning on factor graphs.",
-    ),
-    "quadrotor-obstacles": Scenario(
-        "courses",
-        "A quadrotor's flight past three walls and a cylinder, optimised as a whole.",
-        "SECOND_ORDER",
-    ),
-    "quadrotor-cbf": Scenario(
-        "safe_flights",
-        "A quadrotor keeps its distance by control barriers: a cylinder, things that move, clutter, a thrown ball.",
-    ),
-}
-"""Everything ``unifg run`` can run."""
-
-SOLVE = Scenario("graphs", "Solve a pose graph from a file (g2o or TORO, gzipped or not).", "LEAST_SQUARES", live=False)
-"""``unifg solve``."""
 
 
 if __name__ == "__main__":

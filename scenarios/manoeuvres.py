@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -286,14 +286,18 @@ def case_metrics(manoeuvre: Manoeuvre) -> CaseMetrics:
     }
 
 
-def write_metrics(path: Path, manoeuvres: Sequence[Manoeuvre]) -> Path:
-    """Write the numbers of all cases as JSON and return the path."""
-    content = {
+def metrics_of(manoeuvres: Sequence[Manoeuvre]) -> dict[str, Any]:
+    """The numbers of all cases."""
+    return {
         "scenario": "manoeuvres",
         "solver": manoeuvres[0].solver,
         "cases": {m.case.name: case_metrics(m) for m in manoeuvres},
     }
-    return metrics.write_metrics(path, content, sort_keys=False)
+
+
+def write_metrics(path: Path, manoeuvres: Sequence[Manoeuvre]) -> Path:
+    """Write them as JSON and return the path."""
+    return metrics.write_metrics(path, metrics_of(manoeuvres), sort_keys=False)
 
 
 def table(manoeuvres: Sequence[Manoeuvre]) -> str:

@@ -7,6 +7,7 @@ import pytest
 import unifg as fg
 from unifg import solvers
 from unifg.scenarios import command as shell
+from unifg.scenarios.commands.catalogue import SCENARIOS, SOLVE
 from unifg.solvers import names
 
 CLASSES = {getattr(solvers, name) for name in solvers.__all__ if name != "LinearGraphs"}
@@ -59,11 +60,11 @@ def test_options_arrive_and_wrong_ones_are_named() -> None:
         names.backend("penalty", hessian="exact")
 
 
-@pytest.mark.parametrize("command", [("run", name) for name in shell.SCENARIOS] + [("solve",)])
+@pytest.mark.parametrize("command", [("run", name) for name in SCENARIOS] + [("solve",)])
 def test_commands_offer_names_with_titles(command: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
     assert shell.main([*command, "--help"]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    scenario = shell.SOLVE if command == ("solve",) else shell.SCENARIOS[command[1]]
+    scenario = SOLVE if command == ("solve",) else SCENARIOS[command[1]]
     assert names.choices(getattr(names, scenario.solvers)).replace("-", "") in said.replace("- ", "").replace("-", "")
 
 

@@ -17,6 +17,7 @@ from unifg.lie import SO3
 from unifg.scenarios import command
 from unifg.scenarios import flight as episode
 from unifg.scenarios.commands import flights as results
+from unifg.scenarios.commands.catalogue import SCENARIOS
 from unifg.scenarios.episode import Progress
 from unifg.scenarios.flight import Flight, FlightSettings, run_flight
 from unifg.scenarios.flying.flight_pilot import COUPLINGS
@@ -327,7 +328,7 @@ def test_arguments_arrive() -> None:
     assert settings.estimator.association == "unknown"
     assert settings.controller.avoidance == "potential"
     parser = argparse.ArgumentParser()
-    command.SCENARIOS["quadrotor-mpc"].add_options(parser)
+    SCENARIOS["quadrotor-mpc"].add_options(parser)
     assert parser.parse_args([]).solver == FlightSettings().solver
 
 

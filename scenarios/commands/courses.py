@@ -33,7 +33,10 @@ def run(settings: courses.CourseSettings, progress: Progress, announce: Announce
         course = courses.run_course(settings, progress=in_turn(tell, watch))
     progress(1.0, "solved")
     interrupted = course.solution.status is Status.INTERRUPTED
-    return Outcome(course.succeeded, interrupted, summary(course), lambda folder: write_results(folder, course))
+    numbers = course_metrics(course)
+    return Outcome(
+        course.succeeded, interrupted, summary(course), numbers, lambda folder: write_results(folder, course)
+    )
 
 
 def course_metrics(course: Course) -> dict[str, Any]:

@@ -31,7 +31,8 @@ def run(settings: navigation.NavigationSettings, progress: Progress, announce: A
         log = navigation.run_navigation(settings, progress=progress)
     if log.ticks == 0:
         raise KeyboardInterrupt
-    return Outcome(log.succeeded, log.interrupted, summary(log), lambda folder: write_results(folder, log))
+    numbers = episode_metrics(log)
+    return Outcome(log.succeeded, log.interrupted, summary(log), numbers, lambda folder: write_results(folder, log))
 
 
 def write_results(folder: Path, log: EpisodeLog) -> list[Path]:

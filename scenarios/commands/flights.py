@@ -31,7 +31,8 @@ def run(settings: flight.FlightSettings, progress: Progress, announce: Announce 
         log = flight.run_flight(settings, progress)
     if log.ticks == 0:
         raise KeyboardInterrupt
-    return Outcome(log.succeeded, log.interrupted, summary(log), lambda folder: write_results(folder, log))
+    numbers = flight_metrics(log)
+    return Outcome(log.succeeded, log.interrupted, summary(log), numbers, lambda folder: write_results(folder, log))
 
 
 def write_results(folder: str | Path, log: FlightLog, metrics: Mapping[str, object] | None = None) -> list[Path]:

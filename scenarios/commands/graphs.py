@@ -26,7 +26,10 @@ def run(settings: pose_graph.SolveSettings, progress: Progress) -> Outcome:
     """Solve the graph of a file."""
     solved = pose_graph.solve_file(settings, progress)
     converged = solved.solution.converged
-    return Outcome(converged, solved.interrupted, summary(solved), lambda folder: write_results(folder, solved))
+    numbers = metrics(solved)
+    return Outcome(
+        converged, solved.interrupted, summary(solved), numbers, lambda folder: write_results(folder, solved)
+    )
 
 
 def write_results(folder: Path, solved: SolvedGraph) -> list[Path]:

@@ -57,4 +57,5 @@ def run(settings: CaseSettings, progress: Progress, announce: Announce | None = 
         scenes = [manoeuvre_scene(m).save(folder / f"{m.case.name}.html") for m in solved]
         return [*scenes, *(write_figure(folder / f"{m.case.name}.png", picture(m), 105) for m in solved), numbers]
 
-    return Outcome(all(m.succeeded for m in solved), interrupted, manoeuvres.table(solved), write)
+    succeeded, numbers = all(m.succeeded for m in solved), manoeuvres.metrics_of(solved)
+    return Outcome(succeeded, interrupted, manoeuvres.table(solved), numbers, write)

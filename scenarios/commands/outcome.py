@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from unifg.answers.history import Iteration
 
@@ -23,12 +23,14 @@ class Outcome:
         succeeded: whether the robot did what it was asked.
         interrupted: whether the user stopped it.
         summary: table for people.
+        metrics: numbers and words for programs, as ``metrics.json`` holds them.
         write: writes the results into an existing folder and returns the files.
     """
 
     succeeded: bool
     interrupted: bool
     summary: str
+    metrics: Mapping[str, Any]
     write: Callable[[Path], list[Path]]
 
 

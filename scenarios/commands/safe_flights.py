@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from unifg.scenarios import safe_flight
 from unifg.scenarios.commands.outcome import Outcome, Progress
@@ -14,7 +15,7 @@ from unifg.scenarios.show.safe_plot import picture
 from unifg.scenarios.show.safe_scene import safe_frame, safe_scene, safe_stage
 from unifg.style.figures import write_figure
 
-__all__ = ["SETTINGS", "run", "summary", "write_results"]
+__all__ = ["SETTINGS", "run", "safe_numbers", "summary", "write_results"]
 
 SETTINGS = safe_flight.SafeSettings
 
@@ -31,7 +32,19 @@ def run(settings: safe_flight.SafeSettings, progress: Progress, announce: Announ
     if not logs:
         raise KeyboardInterrupt
     succeeded = all(log.succeeded for log in logs)
-    return Outcome(succeeded, logs[-1].interrupted, summary(logs), lambda folder: write_results(folder, logs))
+    return Outcome(
+        succeeded, logs[-1].interrupted, summary(logs), safe_numbers(logs), lambda folder: write_results(folder, logs)
+    )
+
+
+def safe_numbers(logs: Sequence[SafeLog]) -> dict[str, Any]:
+    """The numbers of flights of one case."""
+    return {
+        "scenario": "quadrotor-cbf",
+        "case": logs[0].settings["case"],
+        "succeeded": all(log.succeeded for log in logs),
+        "flights": [safe_metrics(log) for log in logs],
+    }
 
 
 def write_results(folder: str | Path, logs: Sequence[SafeLog]) -> list[Path]:
@@ -45,13 +58,7 @@ def write_results(folder: str | Path, logs: Sequence[SafeLog]) -> list[Path]:
         The files written: ``scene.html``, ``flights.png`` and ``metrics.json``.
     """
     folder = Path(folder)
-    scenario = {"scenario": "quadrotor-cbf", "case": logs[0].settings["case"]}
-    found = {
-        **scenario,
-        "succeeded": all(log.succeeded for log in logs),
-        "flights": [safe_metrics(log) for log in logs],
-    }
-    numbers = write_metrics(folder / "metrics.json", found)
+    numbers = write_metrics(folder / "metrics.json", safe_numbers(logs))
     shown = write_figure(folder / "flights.png", picture(logs), 110)
     return [safe_scene(logs[0]).save(folder / "scene.html"), shown, numbers]
 

@@ -30,4 +30,6 @@ def run(settings: velocity_tracking.TrackingSettings, progress: Progress, announ
         return [scene, shown, velocity_tracking.write_metrics(folder / "metrics.json", drive)]
 
     interrupted = drive.solution.status is Status.INTERRUPTED
-    return Outcome(drive.succeeded, interrupted, velocity_tracking.table(drive), write)
+    return Outcome(
+        drive.succeeded, interrupted, velocity_tracking.table(drive), dict(velocity_tracking.metrics(drive)), write
+    )

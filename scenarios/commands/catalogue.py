@@ -1,0 +1,90 @@
+"""What ``unifg run``, ``unifg solve`` and campaigns can run: names, and the modules that know how.
+
+To add one, write a module of `unifg.scenarios.commands` with ``SETTINGS``, a class whose fields are options
+(`unifg.scenarios.options`), and ``run``, which takes them and returns an outcome; then give it a line here.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from unifg.scenarios.options import add_options
+
+__all__ = ["SCENARIOS", "SOLVE", "Scenario"]
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One entry of `SCENARIOS`.
+
+    Attributes:
+        module: of `unifg.scenarios.commands`: its ``SETTINGS`` are a class whose fields are options, its ``run`` takes
+            them, a progress and, where it can be watched, whom to tell where; it raises KeyboardInterrupt when stopped
+            before there is anything to write.
+        summary: one line for the help.
+        solvers: the list of `unifg.solvers.names` to choose from.
+        defaults: of options, where the command line has others than the settings.
+        live: whether it can be watched.
+    """
+
+    module: str
+    summary: str
+    solvers: str = "CONSTRAINED"
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    live: bool = True
+
+    def add_options(self, parser: argparse.ArgumentParser) -> None:
+        """Load the scenario and add its options."""
+        from unifg.solvers import names
+
+        module, solvers = import_module(f"unifg.scenarios.commands.{self.module}"), getattr(names, self.solvers)
+        add_options(parser, module.SETTINGS, **self.defaults)
+        solver = next(f.default for f in fields(module.SETTINGS) if f.name == "solver")
+        about = f"{names.choices(solvers)} (default: %(default)s)"
+        parser.add_argument("--solver", choices=solvers, default=solver, help=about)
+        parser.add_argument(
+            "--out", type=Path, default=Path("out"), metavar="DIR", help="folder for results (default: %(default)s)"
+        )
+        if self.live:
+            parser.add_argument("--live", action="store_true", help="show it in a browser while it runs; says where")
+        parser.set_defaults(module=module)
+
+
+SCENARIOS = {
+    "navigation": Scenario(
+        "drives",
+        "A robot localises itself by lidar and drives through a building under MPC.",
+        defaults={"obstacles": 3},
+    ),
+    "manoeuvres": Scenario(
+        "manoeuvre_cases",
+        "Two control graphs solved once: backing out of a wrong heading, and deflecting around an unforeseen disc.",
+    ),
+    "velocity-tracking": Scenario(
+        "speed_tracking",
+        "Forces that make a car follow a speed profile: one optimal control problem over the whole drive.",
+        "EQUALITIES",
+    ),
+    "quadrotor-mpc": Scenario(
+        "flights",
+        "A quadrotor flies through a corridor of unknown cylinders, estimating and planning on factor graphs.",
+    ),
+    "quadrotor-obstacles": Scenario(
+        "courses",
+        "A quadrotor's flight past three walls and a cylinder, optimised as a whole.",
+        "SECOND_ORDER",
+    ),
+    "quadrotor-cbf": Scenario(
+        "safe_flights",
+        "A quadrotor keeps its distance by control barriers: a cylinder, things that move, clutter, a thrown ball.",
+    ),
+}
+"""Everything ``unifg run`` can run."""
+
+SOLVE = Scenario("graphs", "Solve a pose graph from a file (g2o or TORO, gzipped or not).", "LEAST_SQUARES", live=False)
+"""``unifg solve``."""
