@@ -47,7 +47,7 @@ UNSOLVED: dict[str, set[str]] = {
     # Convexified costs without curvature send the first steps far away; where they land decides, to the last digit.
     "SQP": {"HS93", "Powell's singular function"},
     "SQP, exact": {"HS93", "Powell's singular function"},
-    "InteriorPoint": {"HS13", "HS56", "discs that touch"},  # HS13, discs: no multipliers
+    "InteriorPoint": {"HS56"},
 }
 # Solved or not, by the version of the QP solver: with PIQP 0.7 the first ends 4e-5 short of stationarity, with 0.6 it
 # converges. What is claimed must be true all the same.

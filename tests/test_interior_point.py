@@ -359,3 +359,17 @@ def test_control_c_while_a_term_runs_in_python() -> None:
     assert solution.cost == pytest.approx(run.program.evaluate(solution.values).cost, rel=1e-12)
     batched.residual = evaluate  # type: ignore[method-assign]
     assert run.solve(guess).cost == whole.cost
+
+
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-8])
+@pytest.mark.parametrize("force", [900.0, 940.0, 990.0, 1000.0, 1010.0])
+def test_a_multiplier_near_its_price_is_no_end(force: float, tolerance: float) -> None:
+    """With a price of 1000 the row gives way by mu / (1000 - force), which is too much for complementarity alone."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 30)
+    graph.minimize_scalar(lambda x: force * x[:, 0], x[0], name="push")
+    graph.minimize(fg.prior, x, np.ones(1), name="stay")
+    graph.bound(x, lower=0.0, name="wall")
+    solution = InteriorPoint(tolerance=tolerance).solve(graph, {x: np.ones((30, 1))})
+    assert solution.converged and solution.iterations < 40
+    assert -tolerance < solution[x][0, 0] < 1e-3

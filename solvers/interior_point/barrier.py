@@ -399,6 +399,17 @@ def test(address: int) -> None:
                 prices[row] *= 10.0
             now.paid *= 10.0
             run(links[0].relax, (address,))
+    if now.violation <= tolerance and now.mu <= smallest and _error(now) <= now.mu:
+        # All is done that can be done at these prices. A multiplier near its own lets a row give way by mu / (price -
+        # multiplier): no violation that counts, but times the multiplier more than complementarity may be.
+        near = False
+        for k in range(now.sides):
+            near = near or sides[k].y * sides[k].e > tolerance * now.scale
+        if near:
+            if now.raises >= MOST_RAISES:
+                now.answer = STALLED
+                return
+            run(links[0].dearer, (address,))
     while not bound and _error(now) <= KAPPA * now.mu and now.mu > smallest:
         less = min(0.2 * now.mu, now.mu**1.5)
         now.mu = less if less > tolerance else smallest
@@ -407,6 +418,29 @@ def test(address: int) -> None:
     phi, theta = merit(now, sides, pairs, prices, row_units, rows, lower, cost, constraints, 0.0)
     now.phi, now.theta = phi, theta
     now.trials, now.corrected, now.answer = 0, 0, TRY
+
+
+@linked
+def dearer(address: int) -> None:
+    """Raise all prices where the iterate stands, with what is elastic on its central path."""
+    multipliers, pairs, prices, links = parts(address, "multipliers pairs prices links")
+    rows, scalars, sides = parts(address, "rows scalars sides")
+    now = scalars[0]
+    now.raises += 1
+    now.rho *= 10.0
+    now.filtered = now.failures = 0
+    for row in range(len(prices)):
+        prices[row] *= 10.0
+    for k in range(now.sides):
+        sides[k].e = now.mu / (prices[sides[k].row] - sides[k].y)
+    if now.elastic == 1:
+        for k in range(len(rows)):
+            row = rows[k]
+            pairs[k].p, pairs[k].n = (
+                now.mu / (prices[row] - multipliers[row]),
+                now.mu / (prices[row] + multipliers[row]),
+            )
+    run(links[0].measure, (address,))
 
 
 @linked

@@ -233,6 +233,7 @@ def addresses() -> Records:
         "judge": filter_search.judge,
         "correct": filter_search.correct,
         "relax": barrier.relax,
+        "dearer": barrier.dearer,
         "restore": filter_search.restore,
         "accept": filter_search.accept,
         "direct": direction.direct,

@@ -105,7 +105,7 @@ PAIR = np.dtype(
 )
 # Addresses of compiled functions.
 FUNCTIONS = "factor solve linearize evaluate curve weigh add_scalars evaluate_scalars retract"
-FUNCTIONS += " begin measure test bend direct steer advance judge correct restore accept relax renew loop"
+FUNCTIONS += " begin measure test bend direct steer advance judge correct restore accept relax dearer renew loop"
 LINKS = np.dtype([(name, np.int64) for name in FUNCTIONS.split()])
 
 # What a call answers.
