@@ -29,6 +29,7 @@ from unifg.scenarios.options import existing, option, pose
 from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.ways.polyline import path_length
 from unifg.scenarios.worlds.building import DEMO_GOALS, DEMO_START, building_map
+from unifg.scenarios.worlds.drivetrain import Drivetrain, draw_patches
 from unifg.scenarios.worlds.placement import place_obstacles
 from unifg.scenarios.worlds.plane import World
 from unifg.typing import Array
@@ -54,6 +55,7 @@ class NavigationSettings:
         obstacles: number of obstacles that are not on the map.
         seed: of everything random.
         controller: weights and limits.
+        drivetrain: of the base.
     """
 
     map: Path | None = option(None, text=existing("the YAML file of a ROS map"), metavar="F.yaml")
@@ -66,6 +68,7 @@ class NavigationSettings:
     obstacles: int = option(0, metavar="K")
     seed: int = option(0, metavar="S")
     controller: ControllerSettings = field(default_factory=ControllerSettings)
+    drivetrain: Drivetrain = field(default_factory=Drivetrain)
 
 
 def run_navigation(settings: NavigationSettings, progress: Progress | None = None) -> EpisodeLog:
@@ -102,7 +105,7 @@ class Episode:
         legs = zip([self.start, *self.goals[:-1]], self.goals, strict=True)
         self.legs = [self._route(begin, end) for begin, end in legs]
         self.path = np.concatenate([leg.path for leg in self.legs])
-        placement, sensors, belief = np.random.default_rng(settings.seed).spawn(3)
+        placement, sensors, belief, floor = np.random.default_rng(settings.seed).spawn(4)
         discs = place_obstacles(
             self.occupancy,
             self.distance_map,
@@ -112,7 +115,10 @@ class Episode:
             start=self.start,
             goals=self.goals,
         )
-        self.world = World(self.occupancy, self.start, discs, sensors, robot_radius=control.robot_radius)
+        self.world = World(
+            self.occupancy, self.start, discs, sensors, robot_radius=control.robot_radius,
+            drivetrain=settings.drivetrain, patches=draw_patches(settings.drivetrain, self.path, floor),
+        )  # fmt: skip
         sigma = np.array(INITIAL_SIGMA)
         believed = self.start + sigma * belief.standard_normal(3)
         self.pilot = make_pilot(

@@ -21,6 +21,7 @@ import pymunk
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
 from unifg.scenarios.seeing.readings import Scan
+from unifg.scenarios.worlds.drivetrain import Drivetrain, Wheels, slip_at
 from unifg.scenarios.worlds.rectangles import wall_rectangles
 from unifg.scenarios.worlds.space import OTHERS, Obstacle, Space
 from unifg.typing import Array, ArrayLike
@@ -87,6 +88,8 @@ class World:
         robot_radius: float = ROBOT_RADIUS,
         lidar: LidarModel | None = None,
         odometry: OdometryModel | None = None,
+        drivetrain: Drivetrain | None = None,
+        patches: Array | None = None,
     ) -> None:
         """Build the walls, place the obstacles and the robot.
 
@@ -98,6 +101,8 @@ class World:
             robot_radius: [m].
             lidar: lidar to simulate; None for 360 beams, 12 m, 0.02 m, 1 % dropouts.
             odometry: wheel odometry to simulate; None for 5 % scale error and 2 % noise.
+            drivetrain: what the base makes of its commands; None for a base that follows them at once.
+            patches: (K, 3) x, y, radius [m] of slippery patches on the floor.
 
         Raises:
             ScenarioError: if the start is not a finite pose, or the robot would stand in a wall or an
@@ -116,7 +121,11 @@ class World:
         self._scale = 1.0 + self._odometry_model.scale_sigma * odometry_rng.standard_normal(2)
         self._measured = np.zeros(2)
         self._angles = self.lidar.angles
+        self._drivetrain = drivetrain or Drivetrain.ideal()
+        self.patches: Array = np.zeros((0, 3)) if patches is None else np.array(patches, dtype=np.float64)
+        self._wheels = Wheels(self._drivetrain)
         self._command = (0.0, 0.0)
+        self._left, self._spun, self._gripped = 0, 0.0, 0.0
         self._space = Space(pose, robot_radius)
         self._add_walls()
         for index, obstacle in enumerate(self.obstacles):
@@ -150,7 +159,7 @@ class World:
     # ------------------------------------------------------------------ motion
 
     def step(self, v: float, omega: float, dt: float = 0.1) -> None:
-        """Drive with constant body velocities for a while; walls and obstacles stop the robot.
+        """Tell the wheels a forward velocity and a turning rate for a while; walls and obstacles stop the robot.
 
         Args:
             v: forward velocity [m/s].
@@ -164,19 +173,33 @@ class World:
             raise ScenarioError(
                 f"the control (v, omega) = ({v}, {omega}) is not finite; stop the robot, do not drive on it"
             )
-        self._command = (float(v), float(omega))
+        self._wheels.tell((float(v), float(omega)))
         before, heading_before = self._robot.position, self._robot.angle
+        self._spun = self._gripped = 0.0
         for count, pause in enumerate(self._space.substeps(dt)):
             if not count:
+                self._left = round(dt / pause)
                 self._start_tick(pause)
             self._space.step(pause, resting=self._robot.velocity.length < _REST_SPEED)
-        self._measure(before, heading_before, dt)
+        self._measure(before, heading_before, dt, self._gripped / self._spun if self._spun > 0.0 else 1.0)
+
+    def _grip(self, body: pymunk.Body) -> float:
+        """Share of the wheels' motion that the floor gives the base where it is."""
+        return 1.0 - slip_at(self._drivetrain, self.patches, body.position)
 
     def _drive(self, body: pymunk.Body, gravity: tuple[float, float], damping: float, dt: float) -> None:
         """Velocity for the coming substep, along its midpoint heading: the chord of the arc."""
-        v, omega = self._command
+        grip = self._grip(body)
+        if self._left:  # the engine asks once more after the last substep of a tick
+            self._left -= 1
+            self._command = self._wheels.advance(dt)
+            moved = abs(self._command[0]) + abs(self._command[1])
+            self._spun, self._gripped = self._spun + moved, self._gripped + moved * grip
+        v, omega = grip * self._command[0], grip * self._command[1]
         heading = body.angle + 0.5 * omega * dt
-        body.velocity = (v * math.cos(heading), v * math.sin(heading))
+        aside = -self._drivetrain.skid * v * omega
+        cosine, sine = math.cos(heading), math.sin(heading)
+        body.velocity = (v * cosine - aside * sine, v * sine + aside * cosine)
         body.angular_velocity = omega
 
     def _start_tick(self, pause: float) -> None:
@@ -188,15 +211,15 @@ class World:
         self._drive(self._robot, (0.0, 0.0), 1.0, pause)
         self._robot.velocity = self._space.without_contacts(self._robot.velocity, relative=False)
 
-    def _measure(self, before: pymunk.Vec2d, heading_before: float, dt: float) -> None:
-        """Read the wheels: forward and turning part of the SE(2) logarithm of the motion really made."""
+    def _measure(self, before: pymunk.Vec2d, heading_before: float, dt: float, grip: float) -> None:
+        """Read the wheels: forward and turning part of the SE(2) logarithm of the motion made, and what was slipped."""
         turn = self._robot.angle - heading_before
         body_motion = (self._robot.position - before).rotated(-heading_before)
         half = 0.5 * turn
         stretch = half / math.tan(half) if abs(half) > 1e-9 else 1.0
         forward = stretch * body_motion.x + half * body_motion.y
         noise = self._odometry_model.noise_sigma * self._odometry_rng.standard_normal(2)
-        self._measured = np.array([forward, turn]) / dt * (self._scale + noise)
+        self._measured = np.array([forward, turn]) / (dt * grip) * (self._scale + noise)
 
     # ----------------------------------------------------------------- sensors
 
@@ -220,8 +243,8 @@ class World:
     def odometry(self) -> tuple[float, float]:
         """Mean body velocities (v [m/s], omega [rad/s]) over the last step, as the wheels report them.
 
-        They are proportional to the motion really made: wheels that a wall holds back do not spin, and
-        sliding sideways along a wall is not felt. (0, 0) before the first step.
+        They are proportional to the motion really made and to what the wheels slipped: wheels that a wall holds back
+        do not spin, and sliding sideways, along a wall or in a turn, is not felt. (0, 0) before the first step.
         """
         return float(self._measured[0]), float(self._measured[1])
 

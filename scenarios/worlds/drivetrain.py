@@ -1,0 +1,138 @@
+"""What a base makes of its commands: how soon, how briskly, and how much of it the floor takes.
+
+A command acts after the latency. The motors follow it with a lag of first order, dv/dt = (command - v) / lag, but they
+change the wheels' velocities no faster than their accelerations allow, divided by what the base carries besides itself.
+The floor takes a share of what the wheels do (longitudinal slip, more of it on patches), and lets a base that turns
+drift outwards in proportion to its lateral acceleration. Wheels feel neither.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from unifg.errors import ScenarioError
+from unifg.scenarios.options import not_negative, option, positive, share
+from unifg.scenarios.ways.polyline import arc_lengths, at_stations
+from unifg.typing import Array
+
+__all__ = ["Drivetrain", "Wheels", "draw_patches", "slip_at"]
+
+PATCH_RADIUS = (0.3, 0.6)
+"""Least and greatest radius of a slippery patch [m]."""
+
+
+@dataclass(frozen=True)
+class Drivetrain:
+    """Of a base, as it is; the robot knows of it what its data sheet says, the accelerations unloaded.
+
+    2.5 m/s^2 and 3.2 rad/s^2 are the accelerations that the example of Nav2's DWB controller gives a light base; the
+    driver of PAL's PMB-2, which goes 1 m/s like the robot here and carries an arm, allows 1.0 m/s^2 and 2.1 rad/s^2.
+
+    Attributes:
+        acceleration: greatest change of the forward velocity, speeding up or braking [m/s^2].
+        turning: greatest change of the turning rate [rad/s^2].
+        load: mass carried, as a share of the base's own: forces stay what they are, so accelerations shrink.
+        lag: time constant of the motors [s].
+        latency: from a command, or from what it was computed of, to its effect [s].
+        slip: share of the wheels' motion that the floor takes.
+        skid: outward drift of a base that turns, per lateral acceleration [(m/s)/(m/s^2)].
+        patches: number of slippery patches on the planned path.
+        patch_slip: share of the wheels' motion that a patch takes.
+    """
+
+    acceleration: float = option(math.inf, text=positive, metavar="M/S2")
+    turning: float = option(math.inf, text=positive, metavar="RAD/S2")
+    load: float = option(0.0, text=not_negative, metavar="SHARE")
+    lag: float = option(0.0, text=not_negative, metavar="S")
+    latency: float = option(0.0, text=not_negative, metavar="S")
+    slip: float = option(0.0, text=share, metavar="SHARE")
+    skid: float = option(0.0, text=not_negative, metavar="S")
+    patches: int = option(0, metavar="K")
+    patch_slip: float = option(0.5, text=share, metavar="SHARE")
+
+    def __post_init__(self) -> None:
+        """Refuse what is no base.
+
+        Raises:
+            ScenarioError: naming the field.
+        """
+        for field in fields(self):
+            value = getattr(self, field.name)
+            least_excluded = field.name in ("acceleration", "turning")
+            most = 1.0 if field.name in ("slip", "patch_slip") else math.inf
+            inside = (0.0 < value <= most) if least_excluded else (0.0 <= value < most)
+            if not inside:
+                bounds = f"{'above zero' if least_excluded else 'zero or more'}{' and below 1' if most == 1.0 else ''}"
+                raise ScenarioError(f"{field.name} of a drivetrain must be {bounds}, got {value}")
+
+    @staticmethod
+    def ideal() -> Drivetrain:
+        """A base that does what it is told, at once."""
+        return Drivetrain(acceleration=math.inf, turning=math.inf)
+
+    @property
+    def sheet(self) -> tuple[float, float]:
+        """Accelerations [m/s^2, rad/s^2] as the data sheet has them: without a load."""
+        return self.acceleration, self.turning
+
+
+class Wheels:
+    """The velocities of a base's wheels over time.
+
+    Attributes:
+        velocity: (2,) forward and turning, of the wheels now [m/s, rad/s].
+    """
+
+    def __init__(self, drivetrain: Drivetrain) -> None:
+        """Stand still, told to stand still."""
+        self._drivetrain = drivetrain
+        self._most = np.array(drivetrain.sheet) / (1.0 + drivetrain.load)
+        self._coming: deque[tuple[float, Array]] = deque()
+        self._told = np.zeros(2)
+        self._now = 0.0
+        self.velocity = np.zeros(2)
+
+    def tell(self, command: tuple[float, float]) -> None:
+        """Send a command (v, omega) [m/s, rad/s] now; it acts after the latency, until another does."""
+        self._coming.append((self._now + self._drivetrain.latency, np.array(command)))
+
+    def advance(self, dt: float) -> tuple[float, float]:
+        """Let time pass; mean velocities (v [m/s], omega [rad/s]) over ``dt`` [s].
+
+        A command takes effect at the beginning of the interval in which its time comes, half an interval early or late.
+        """
+        while self._coming and self._coming[0][0] <= self._now + 0.5 * dt:
+            self._told = self._coming.popleft()[1]
+        self._now += dt
+        lag, before = self._drivetrain.lag, self.velocity
+        follow = 1.0 if lag == 0.0 else -math.expm1(-dt / lag)
+        wanted = follow * (self._told - before)
+        change = np.clip(wanted, -self._most * dt, self._most * dt)
+        self.velocity = before + change
+        if lag == 0.0:  # a ramp that ends within the interval, or a step
+            spent = np.abs(change) / (self._most * dt)
+            mean = self.velocity - 0.5 * spent * change
+        else:  # the exponential where it is not cut
+            easy = np.abs(wanted) <= self._most * dt
+            mean = np.where(easy, self._told - wanted * lag / dt, 0.5 * (before + self.velocity))
+        return float(mean[0]), float(mean[1])
+
+
+def slip_at(drivetrain: Drivetrain, patches: Array, place: tuple[float, float]) -> float:
+    """Share of the wheels' motion that the floor takes at a place (x, y) [m], patches (K, 3) x, y, radius [m]."""
+    if len(patches) and (np.hypot(patches[:, 0] - place[0], patches[:, 1] - place[1]) < patches[:, 2]).any():
+        return max(drivetrain.slip, drivetrain.patch_slip)
+    return drivetrain.slip
+
+
+def draw_patches(drivetrain: Drivetrain, path: Array, rng: np.random.Generator) -> Array:
+    """(K, 3) x, y, radius [m] of the slippery patches, their middles uniform along a path (P, 2) or (P, 3)."""
+    drawn = rng.uniform(size=(drivetrain.patches, 2))
+    arc = arc_lengths(path[:, :2])
+    places = at_stations(path[:, :2], arc, drawn[:, 0] * arc[-1])
+    low, high = PATCH_RADIUS
+    return np.column_stack([places, low + (high - low) * drawn[:, 1]])
