@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import unifg as fg
-from benchmarks import campaign
-from benchmarks.campaign import Row, where
+from benchmarks import runs
 from benchmarks.covariance_plans import difference, mean
 from benchmarks.report import command, machine, publish, table
 from problems import belief_plans
 from problems.belief_plans import SENSOR, Guess, Layout, Plan, Planner
+from unifg.scenarios.campaigns.comparison import Row, where
 
 MARGIN = 0.3  # from discs, of all plans [m]
 WEIGHTS = (3.0, 10.0, 30.0)  # of the deviation at the goal [s/m]
@@ -185,12 +185,12 @@ def render(found: Campaign, drives: int) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Run what is missing and rewrite docs/active-perception.md."""
     parser = command(__doc__)
-    campaign.options(parser)
-    parser.add_argument("--seeds", type=campaign.seeds, default=range(100, 110), metavar="FIRST:END")
+    runs.options(parser)
+    parser.add_argument("--seeds", type=runs.seeds, default=range(100, 110), metavar="FIRST:END")
     parser.add_argument("--drives", type=int, default=300, help="of each plan")
     options = parser.parse_args(arguments)
     jobs = [Job(seed, way, options.drives) for seed in options.seeds for way in WAYS]
-    rows = campaign.episodes("active_perception", attempt, jobs, options)
+    rows = runs.episodes("active_perception", attempt, jobs, options)
     asked = [row for row in rows if row["seed"] in options.seeds]
     publish(
         "active-perception", render(Campaign(asked, options.drives), options.drives), {row["code"] for row in asked}

@@ -12,10 +12,10 @@ from __future__ import annotations
 from functools import partial
 from itertools import product
 
-from benchmarks import campaign
-from benchmarks.campaign import Read, Row, comparison, digits, interval, paired, where
+from benchmarks import runs
 from benchmarks.navigation import DEPARTMENT, Case, Drive, drive
 from benchmarks.report import command, machine, publish
+from unifg.scenarios.campaigns.comparison import Read, Row, comparison, digits, interval, paired, where
 
 VARIANTS = {
     "sequential": ("sequential", 1.0),
@@ -92,14 +92,14 @@ def sayings(rows: list[Row]) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Run what is missing and rewrite docs/joint.md."""
     parser = command(__doc__)
-    campaign.options(parser)
-    parser.add_argument("--seeds", type=campaign.seeds, default=range(50), metavar="FIRST:END")
+    runs.options(parser)
+    parser.add_argument("--seeds", type=runs.seeds, default=range(50), metavar="FIRST:END")
     parser.add_argument("--solvers", nargs="+", choices=SOLVERS, default=SOLVERS)
     options = parser.parse_args(arguments)
     routes = [name for name, case in ROUTES.items() if case.available]
     variants = product(options.seeds, options.solvers, routes, VARIANTS.values())
     jobs = [Drive(route, solver, coupling, seed, weight) for seed, solver, route, (coupling, weight) in variants]
-    rows = campaign.episodes("coupling", partial(drive, cases=ROUTES), jobs, options)
+    rows = runs.episodes("coupling", partial(drive, cases=ROUTES), jobs, options)
     publish("joint", render(rows), {row["code"] for row in rows})
     return 0
 

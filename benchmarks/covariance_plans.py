@@ -18,11 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 
 import unifg as fg
-from benchmarks import campaign
-from benchmarks.campaign import Row, digits, interval, where
+from benchmarks import runs
 from benchmarks.report import command, machine, publish, table
 from problems import belief_plans
 from problems.belief_plans import Guess, Plan
+from unifg.scenarios.campaigns.comparison import Row, digits, interval, where
 
 RESERVE = 0.05  # margin of those plans that keep standard deviations [m]: the robot cuts corners between nodes
 DEVIATIONS = (1.0, 2.0, 2.5, 3.0, 3.5)
@@ -184,12 +184,12 @@ def render(found: Campaign, drives: int) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Run what is missing and rewrite docs/covariance-plans.md."""
     parser = command(__doc__)
-    campaign.options(parser)
-    parser.add_argument("--seeds", type=campaign.seeds, default=range(12), metavar="FIRST:END")
+    runs.options(parser)
+    parser.add_argument("--seeds", type=runs.seeds, default=range(12), metavar="FIRST:END")
     parser.add_argument("--drives", type=int, default=400, help="of each plan")
     options = parser.parse_args(arguments)
     jobs = [Job(seed, way, options.drives) for seed in options.seeds for way in WAYS]
-    rows = campaign.episodes("covariance_plans", attempt, jobs, options)
+    rows = runs.episodes("covariance_plans", attempt, jobs, options)
     asked = [row for row in rows if row["seed"] in options.seeds]
     found = Campaign(asked, options.drives)
     publish("covariance-plans", render(found, options.drives), {row["code"] for row in asked})

@@ -17,11 +17,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import unifg as fg
-from benchmarks import campaign, impossible_states
-from benchmarks.campaign import Row, digits, interval, where
+from benchmarks import impossible_states, runs
 from benchmarks.report import command, machine, publish, table
 from unifg.lie import SE2
 from unifg.models import landmarks, obstacles
+from unifg.scenarios.campaigns.comparison import Row, digits, interval, where
 from unifg.solvers import GaussNewton, InteriorPoint
 from unifg.typing import Array, IntArray
 
@@ -302,13 +302,13 @@ def render(rows: list[Row], drives: int) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Run what is missing and rewrite docs/excluded-pasts.md."""
     parser = command(__doc__)
-    campaign.options(parser)
-    parser.add_argument("--seeds", type=campaign.seeds, default=range(12), metavar="FIRST:END")
+    runs.options(parser)
+    parser.add_argument("--seeds", type=runs.seeds, default=range(12), metavar="FIRST:END")
     parser.add_argument("--drives", type=int, default=20, help="in each layout")
     options = parser.parse_args(arguments)
     studies = [*CONDITIONS, *impossible_states.STUDIES]
     jobs = [Job(seed, study, options.drives) for seed in options.seeds for study in studies]
-    rows = campaign.episodes("excluded_pasts", attempt, jobs, options)
+    rows = runs.episodes("excluded_pasts", attempt, jobs, options)
     asked = [row for row in rows if row["seed"] in options.seeds]
     publish("excluded-pasts", render(asked, options.drives), {row["code"] for row in asked})
     return 0

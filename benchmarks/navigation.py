@@ -19,9 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import campaign
-from benchmarks.campaign import Row
+from benchmarks import runs
 from benchmarks.report import command, machine, publish, shared, table
+from unifg.scenarios.campaigns.comparison import Row, where
 from unifg.scenarios.driving.drive_pilot import COUPLINGS
 from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.log.drive_metrics import episode_metrics
@@ -190,7 +190,7 @@ def verdicts(rows: list[Row]) -> str:
         ticks = _pool(rows, solver, "solve_ms")
         if not len(ticks):
             continue
-        horizon = min(row["horizon"] for row in campaign.where(rows, solver=solver))
+        horizon = min(row["horizon"] for row in where(rows, solver=solver))
         median, p99 = np.percentile(ticks, [50.0, 99.0])
         ready = len(ticks) >= LEAST_TICKS and horizon >= LEAST_HORIZON
         for name, value, most in (("median", median, MEDIAN_MS), ("99th percentile", p99, P99_MS)):
@@ -202,7 +202,7 @@ def verdicts(rows: list[Row]) -> str:
 
 def _pool(rows: list[Row], solver: str, name: str) -> Array:
     """All ticks of a backend [ms]."""
-    return np.concatenate([np.zeros(0), *(row["ticks"][name] for row in campaign.where(rows, solver=solver))])
+    return np.concatenate([np.zeros(0), *(row["ticks"][name] for row in where(rows, solver=solver))])
 
 
 def times(rows: list[Row]) -> str:
@@ -218,7 +218,7 @@ def times(rows: list[Row]) -> str:
 
 def statuses(rows: list[Row]) -> str:
     """How the control solves ended."""
-    words = {s: Counter(w for row in campaign.where(rows, solver=s) for w in row["status"]) for s in SOLVERS}
+    words = {s: Counter(w for row in where(rows, solver=s) for w in row["status"]) for s in SOLVERS}
     names = sorted({name for counts in words.values() for name in counts})
     lines = [
         (solver, *(f"{100.0 * counts[name] / counts.total():.2f} %" for name in names))
@@ -231,9 +231,9 @@ def statuses(rows: list[Row]) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Drive what is missing, then write the tables; 0 only if every drive keeps its limits."""
     parser = command(__doc__)
-    campaign.options(parser)
+    runs.options(parser)
     parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES), metavar="CASE", help="some cases")
-    parser.add_argument("--seeds", type=campaign.seeds, default=SEEDS, metavar="FIRST:END", help="fewer are no page")
+    parser.add_argument("--seeds", type=runs.seeds, default=SEEDS, metavar="FIRST:END", help="fewer are no page")
     parser.add_argument("--coupling", choices=COUPLINGS, default=COUPLINGS[0])
     options = parser.parse_args(arguments)
     page = "navigation" if options.coupling == COUPLINGS[0] else f"{options.coupling}-drives"
@@ -243,7 +243,7 @@ def main(arguments: list[str] | None = None) -> int:
     chosen = [name for name in options.only if name not in missing]
     variants = product(chosen, options.seeds, SOLVERS)
     jobs = [Drive(case, solver, options.coupling, seed) for case, seed, solver in variants]
-    found = campaign.episodes("navigation", drive, jobs, options)
+    found = runs.episodes("navigation", drive, jobs, options)
     rows = [row for row in found if row["coupling"] == options.coupling and row["seed"] in options.seeds]
     complete = set(product(CASES, SOLVERS, SEEDS)) <= {(row["case"], row["solver"], row["seed"]) for row in rows}
     publish(page, render(rows), {row["code"] for row in rows}, docs=complete)

@@ -21,10 +21,10 @@ from itertools import pairwise, product
 import numpy as np
 from scipy.stats import binomtest
 
-from benchmarks import campaign
-from benchmarks.campaign import Row, share
+from benchmarks import runs
 from benchmarks.report import command, listing, machine, publish, table, words
 from benchmarks.timing import pin
+from unifg.scenarios.campaigns.comparison import Row, crossed, share
 from unifg.scenarios.course import (
     AVOIDANCES,
     HESSIANS,
@@ -163,7 +163,7 @@ def _compiled(method: Method) -> None:
 def results_of(rows: Iterable[Row]) -> Results:
     """Outcomes of every method, on the layouts that all have tried."""
     names = [field.name for field in fields(Outcome)]
-    groups = campaign.crossed(rows, *(field.name for field in fields(Method)))
+    groups = crossed(rows, *(field.name for field in fields(Method)))
     found = {Method(*key): [Outcome(*(row[name] for name in names)) for row in some] for key, some in groups.items()}
     return {method: found[method] for method in METHODS}
 
@@ -315,7 +315,7 @@ def _middle(values: Sequence[float]) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Solve every layout by every method and write the tables."""
     parser = command(__doc__)
-    campaign.options(parser)
+    runs.options(parser)
     parser.add_argument("--layouts", type=int, default=len(COURSE_SEEDS), help="number of layouts")
     parser.add_argument("--tuning", action="store_true", help="the layouts settings were chosen on; writes no page")
     options = parser.parse_args(arguments)
@@ -325,7 +325,7 @@ def main(arguments: list[str] | None = None) -> int:
         pin()
     seeds = (TUNING_SEEDS if options.tuning else COURSE_SEEDS)[: options.layouts]
     jobs = [Attempt(**vars(method), seed=seed) for seed in seeds for method in METHODS]
-    rows = [row for row in campaign.episodes("obstacle_courses", attempted, jobs, options) if row["seed"] in seeds]
+    rows = [row for row in runs.episodes("obstacle_courses", attempted, jobs, options) if row["seed"] in seeds]
     flown = sorted({row["seed"] for row in rows})
     text = render(results_of(rows), [obstacle_course(seed) for seed in flown])
     name = "obstacle-courses-tuning" if options.tuning else "quadrotor-obstacles"

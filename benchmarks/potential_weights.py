@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks import campaign
-from benchmarks.campaign import Row, against, where
+from benchmarks import runs
 from benchmarks.report import command, listing, machine, publish
+from unifg.scenarios.campaigns.comparison import Row, against, where
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.log.flight_metrics import flight_metrics
 
@@ -75,11 +75,11 @@ def render(rows: Sequence[Row]) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Fly what is missing and rewrite docs/potential-weights.md."""
     parser = command(__doc__)
-    campaign.options(parser)
-    parser.add_argument("--seeds", type=campaign.seeds, default=range(1000, 1010), metavar="FIRST:END")
+    runs.options(parser)
+    parser.add_argument("--seeds", type=runs.seeds, default=range(1000, 1010), metavar="FIRST:END")
     options = parser.parse_args(arguments)
     jobs = [Job(seed, weight) for seed in options.seeds for weight in WEIGHTS]
-    rows = campaign.episodes("potential_weights", fly, jobs, options)
+    rows = runs.episodes("potential_weights", fly, jobs, options)
     asked = [row for row in rows if row["seed"] in options.seeds]
     publish("potential-weights", render(asked), {row["code"] for row in asked})
     return 0

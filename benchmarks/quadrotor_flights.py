@@ -16,10 +16,10 @@ from itertools import product
 
 import numpy as np
 
-from benchmarks import campaign
-from benchmarks.campaign import Row
+from benchmarks import runs
 from benchmarks.quadrotor_tables import HEADLINE, render
 from benchmarks.report import command, machine, publish
+from unifg.scenarios.campaigns.comparison import Row
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.flying.flight_pilot import COUPLINGS
 from unifg.scenarios.flying.flight_settings import Avoidance
@@ -124,14 +124,14 @@ def _contact(log: FlightLog) -> Row | None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Fly what is missing and rewrite the results in docs/quadrotor-mpc.md."""
     parser = command(__doc__)
-    campaign.options(parser)
+    runs.options(parser)
     parser.add_argument("--studies", nargs="+", choices=STUDIES, default=STUDIES)
-    parser.add_argument("--seeds", type=campaign.seeds, default=CORRIDOR_SEEDS, metavar="FIRST:END")
+    parser.add_argument("--seeds", type=runs.seeds, default=CORRIDOR_SEEDS, metavar="FIRST:END")
     parser.add_argument("--solvers", nargs="+", choices=SOLVERS, default=SOLVERS)
     parser.add_argument("--couplings", nargs="+", choices=COUPLINGS, default=COUPLINGS)
     options = parser.parse_args(arguments)
     jobs = jobs_of(options.studies, options.solvers, options.couplings, options.seeds)
-    found = campaign.episodes("quadrotor_flights", fly, jobs, options, alone=lambda job: job.study == "timing")
+    found = runs.episodes("quadrotor_flights", fly, jobs, options, alone=lambda job: job.study == "timing")
     # Flights on other seeds, such as those for tuning, are no results.
     rows = [row for row in found if row["seed"] in options.seeds]
     text = f"{machine('numpy', 'scipy', 'numba', 'osqp', 'piqp', 'pymunk')}\n\n{render(rows)}"

@@ -17,11 +17,11 @@ from itertools import product
 
 import numpy as np
 
-from benchmarks import campaign
-from benchmarks.campaign import Row, against, digits, where
+from benchmarks import runs
 from benchmarks.quadrotor_flights import SOLVERS
 from benchmarks.report import command, listing, machine, publish
 from unifg.models import quadrotor
+from unifg.scenarios.campaigns.comparison import Row, against, digits, where
 from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.flying.flight_joint import JointSettings
 from unifg.scenarios.flying.flight_pilot import make_pilot
@@ -238,11 +238,11 @@ def render(rows: list[Row], seeds: Sequence[int], seconds: float) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Fly what is missing and rewrite docs/quadrotor-joint.md."""
     parser = command(__doc__)
-    campaign.options(parser)
-    parser.add_argument("--seeds", type=campaign.seeds, default=TUNING_SEEDS[:8], metavar="FIRST:END")
+    runs.options(parser)
+    parser.add_argument("--seeds", type=runs.seeds, default=TUNING_SEEDS[:8], metavar="FIRST:END")
     parser.add_argument("--seconds", type=float, default=6.0)
     options = parser.parse_args(arguments)
-    found = campaign.episodes("quadrotor_pull", fly, jobs_of(options.seeds, options.seconds), options)
+    found = runs.episodes("quadrotor_pull", fly, jobs_of(options.seeds, options.seconds), options)
     rows = [row for row in found if row["seed"] in options.seeds and row["seconds"] == options.seconds]
     publish("quadrotor-joint", render(rows, options.seeds, options.seconds), {row["code"] for row in rows})
     return 0

@@ -15,6 +15,7 @@ import unifg
 from benchmarks.pages import DIGEST_LINE, PAGES
 from benchmarks.sources import CHECKOUT as CHECKOUT
 from benchmarks.sources import digest
+from unifg.scenarios.campaigns.markdown import table as table
 
 T = TypeVar("T")
 Words = TypeVar("Words", bound=tuple[str, ...])
@@ -39,12 +40,6 @@ def shared(folder: str) -> Path | None:
 def words(status: unifg.Status) -> str:
     """A status as tables name it."""
     return status.name.lower().replace("_", " ")
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]], text: int = 1) -> str:
-    """A Markdown table whose first ``text`` columns are words and the others numbers."""
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * text + "---:|" * (len(head) - text)]
-    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 
 
 def listing(head: Sequence[str], groups: Mapping[Words, T], columns: Mapping[str, Callable[[T], str]]) -> str:

@@ -18,11 +18,11 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks import campaign
-from benchmarks.campaign import Row, digits, interval, paired, where
+from benchmarks import runs
 from benchmarks.report import command, listing, machine, publish
 from unifg.horizon import Plan
 from unifg.models import quadrotor
+from unifg.scenarios.campaigns.comparison import Row, digits, interval, paired, where
 from unifg.scenarios.episode import silent
 from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.flying.estimator import DeadReckoning, Dynamics, Estimator, EstimatorSettings
@@ -204,15 +204,15 @@ def render(rows: Sequence[Row]) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Fly what is missing and rewrite docs/shared-dynamics.md."""
     parser = command(__doc__)
-    campaign.options(parser)
-    parser.add_argument("--seeds", type=campaign.seeds, default=range(12), metavar="FIRST:END")
+    runs.options(parser)
+    parser.add_argument("--seeds", type=runs.seeds, default=range(12), metavar="FIRST:END")
     options = parser.parse_args(arguments)
     jobs = [
         Job(seed, past, plan, accelerometer)
         for seed in options.seeds for accelerometer in (False, True) for past in PASTS for plan in PLANS
         if past != "none" or plan == "nominal"
     ]  # fmt: skip
-    rows = campaign.episodes("shared_dynamics", fly, jobs, options)
+    rows = runs.episodes("shared_dynamics", fly, jobs, options)
     asked = [row for row in rows if row["seed"] in options.seeds]
     publish("shared-dynamics", render(asked), {row["code"] for row in asked})
     return 0

@@ -19,14 +19,14 @@ from typing import NamedTuple
 import numpy as np
 
 import unifg as fg
-from benchmarks import campaign
-from benchmarks.campaign import Row
+from benchmarks import runs
 from benchmarks.gtsam_peer import Peer, as_array, available
 from benchmarks.report import command, listing, publish, shared
 from problems.closures import Claim, with_wrong_closures
 from unifg.files.g2o import read_g2o
 from unifg.lie import SE2
 from unifg.pose_graphs import PoseGraph
+from unifg.scenarios.campaigns.comparison import Row
 from unifg.solvers import GaussNewton, GraduatedNonConvexity
 from unifg.typing import Array
 
@@ -153,8 +153,8 @@ def named(row: Row) -> tuple[str, ...]:
 def main(arguments: list[str] | None = None) -> int:
     """Print one row per graph, share, claim, seed and method."""
     parser = command(__doc__)
-    campaign.options(parser)
-    parser.add_argument("--seeds", type=campaign.seeds, metavar="FIRST:END", help="instead of three or six from 10 on")
+    runs.options(parser)
+    parser.add_argument("--seeds", type=runs.seeds, metavar="FIRST:END", help="instead of three or six from 10 on")
     parser.add_argument("--graphs", nargs="+", help="only these, as NAME or NAME:SHARE")
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
     options = parser.parse_args(arguments)
@@ -167,7 +167,7 @@ def main(arguments: list[str] | None = None) -> int:
         for method in options.methods
         if method != "GTSAM" or available()
     ]
-    rows = {row["key"]: row for row in campaign.episodes("wrong_closures", attempted, jobs, options)}
+    rows = {row["key"]: row for row in runs.episodes("wrong_closures", attempted, jobs, options)}
     asked = [rows[key] for job in jobs if (key := tuple(vars(job).values())) in rows]
     head = ("graph", "wrong", "claim", "seed", "method")
     publish("wrong-closures", listing(head, {named(row): row for row in asked}, COLUMNS))

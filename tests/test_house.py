@@ -47,6 +47,7 @@ STOREYS: tuple[tuple[str, ...], ...] = (
     ("",),
     ("show",),
     ("commands",),
+    ("campaigns",),
     ("command",),
 )
 STOREY = {room: floor for floor, rooms in enumerate(STOREYS) for room in rooms}

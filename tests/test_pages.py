@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import campaign, pages, report, sources
+from benchmarks import pages, report, runs
 from benchmarks.pages import PAGES
 from benchmarks.report import BEGIN, put_results
-from benchmarks.sources import CHECKOUT, code_of, depends_on
+from benchmarks.sources import CHECKOUT, SOURCES
+from unifg.scenarios.campaigns.comparison import Key
+from unifg.scenarios.campaigns.sources import Sources, code_of
 
 RELEASE = "UNIFG_RELEASE"
 
@@ -26,7 +28,7 @@ def test_every_measured_page_is_in_the_table() -> None:
 
 
 def names(module: str) -> set[str]:
-    return {path.relative_to(CHECKOUT).as_posix() for path in depends_on([module])}
+    return {path.relative_to(CHECKOUT).as_posix() for path in SOURCES.depends_on([module])}
 
 
 def test_digests_follow_imports() -> None:
@@ -39,7 +41,7 @@ def test_digests_follow_imports() -> None:
     assert not {"benchmarks/report.py", "benchmarks/pages.py"} & velocity
 
 
-def house(root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def house(root: Path) -> Sources:
     """A checkout of four files: a measurement, a package that hands names on, and two modules behind it."""
     files = {
         "benchmarks/study.py": '"""Measures."""\nfrom unifg.solvers import Good\n\nprint(Good)  # it\n',
@@ -49,35 +51,22 @@ def house(root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     }
     for name, text in files.items():
         (root / name).parent.mkdir(exist_ok=True)
-        (root / name).write_text(text)
-    monkeypatch.setattr(sources, "CHECKOUT", root)
-    monkeypatch.setattr(sources, "BARE", root / "tests")
-    monkeypatch.setattr(sources, "FOLDERS", {"unifg.solvers": root / "solvers", "benchmarks": root / "benchmarks"})
-    return root
+        if not (root / name).exists():
+            (root / name).write_text(text)
+    return Sources({"unifg.solvers": root / "solvers", "benchmarks": root / "benchmarks"}, bare=root / "tests")
 
 
-def fresh(modules: list[str]) -> str:
-    """The digest by a process that has read nothing yet."""
-    for cached in (sources.imported, sources._handed_on, sources._content):
-        cached.cache_clear()
-    return sources.digest(modules)
+def test_a_digest_changes_with_the_code_alone(tmp_path: Path) -> None:
+    before = house(tmp_path).digest(["benchmarks.study"])
+    assert {p.name for p in house(tmp_path).depends_on(["benchmarks.study"])} == {"study.py", "good.py"}
 
-
-def test_a_digest_changes_with_the_code_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    root = house(tmp_path, monkeypatch)
-    before = fresh(["benchmarks.study"])
-    assert {p.name for p in depends_on(["benchmarks.study"])} == {"study.py", "good.py"}
-
-    study = root / "benchmarks" / "study.py"
+    study = tmp_path / "benchmarks" / "study.py"
     study.write_text('"""Says more."""\n\n# why\nfrom unifg.solvers import Good  # one\n\n\nprint(Good)\n')
-    (root / "solvers" / "bad.py").write_text("Bad = 3\n")
-    assert fresh(["benchmarks.study"]) == before
+    (tmp_path / "solvers" / "bad.py").write_text("Bad = 3\n")
+    assert house(tmp_path).digest(["benchmarks.study"]) == before
 
-    (root / "solvers" / "good.py").write_text("Good = 2\n")
-    assert fresh(["benchmarks.study"]) != before
-    sources.imported.cache_clear()
-    sources._handed_on.cache_clear()
-    sources._content.cache_clear()
+    (tmp_path / "solvers" / "good.py").write_text("Good = 2\n")
+    assert house(tmp_path).digest(["benchmarks.study"]) != before
 
 
 def test_code_is_what_runs() -> None:
@@ -119,12 +108,12 @@ def doubled(setting: int) -> dict[str, int]:
 def test_a_campaign_runs_what_is_missing(tmp_path: Path, workers: str) -> None:
     parser = report.command("Doubles.\n\n    python -m benchmarks.doubles [--workers W]\n")
     assert parser.prog == "python -m benchmarks.doubles"
-    campaign.options(parser)
+    runs.options(parser)
     store, plain = tmp_path / "new" / "rows.jsonl", parser.parse_args(["--workers", workers])
 
-    def rows(count: int, code: str, *words: str) -> dict[campaign.Key, int]:
+    def rows(count: int, code: str, *words: str) -> dict[Key, int]:
         chosen = parser.parse_args(["--workers", workers, *words])
-        found = campaign.recorded(doubled, {("job", k): k for k in range(count)}, store, code, chosen)
+        found = runs.recorded(doubled, {("job", k): k for k in range(count)}, store, code, chosen)
         assert {row["code"] for row in found} <= ({code} if not words else {"old", "new"})
         return {row["key"]: row["double"] for row in found}
 

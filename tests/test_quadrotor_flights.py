@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks import campaign, quadrotor_flights, quadrotor_tables, report
+from benchmarks import quadrotor_flights, quadrotor_tables, report, runs
 from benchmarks.quadrotor_flights import SOLVERS, STUDIES, Job, jobs_of
 from unifg.errors import ScenarioError
+from unifg.scenarios.campaigns.comparison import against, paired, share
+from unifg.scenarios.campaigns.journal import lines_of
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.log.flight_log import FlightLog
 
@@ -68,23 +70,23 @@ def test_finished_flights_are_not_repeated(monkeypatch: pytest.MonkeyPatch, tmp_
         return len(flown)
 
     monkeypatch.setattr(quadrotor_flights, "fly", fly)
-    monkeypatch.setattr(campaign, "OUT", tmp_path)
+    monkeypatch.setattr(runs, "OUT", tmp_path)
     monkeypatch.setattr(report, "OUT", tmp_path)
-    monkeypatch.setattr(campaign, "code_digest", lambda _: "now")
+    monkeypatch.setattr(runs, "code_digest", lambda _: "now")
     store = tmp_path / "quadrotor_flights.jsonl"
     assert run() == 12
     assert [job.study for job in flown] == ["flights"] * 6 + ["timing"] * 6
     store.write_text(store.read_text() + '{"cut off')
     assert run() == 0
-    monkeypatch.setattr(campaign, "code_digest", lambda _: "later")
+    monkeypatch.setattr(runs, "code_digest", lambda _: "later")
     assert run("--any-code") == run("--report") == 0
     assert run() == 12
     assert run("--fresh", "--solvers", "alm") == 12
-    codes = [row["code"] for row in campaign.lines_of(store)]
+    codes = [row["code"] for row in lines_of(store)]
     assert codes == ["now"] * 12 + ["later"] * 24
     assert "Flights refused: 24." in (tmp_path / "quadrotor-mpc.md").read_text()
     with pytest.raises(SystemExit, match="Nothing on file"):
-        monkeypatch.setattr(campaign, "OUT", tmp_path / "elsewhere")
+        monkeypatch.setattr(runs, "OUT", tmp_path / "elsewhere")
         run("--report")
 
 
@@ -118,10 +120,10 @@ def test_differences_are_paired(short_rows: dict[str, Row]) -> None:
     read = quadrotor_tables.MEASURES["time to goal [s]"]
     mine = [variant(0, 3.0), variant(1, 4.0), variant(2, None), variant(4, 9.0)]
     base = [variant(3, 7.0), variant(1, 5.0), variant(0, 1.0), variant(2, 6.0)]
-    np.testing.assert_array_equal(campaign.paired(mine, base, read), ([3.0, 4.0], [1.0, 5.0]))
-    assert campaign.against(mine, base, read) == "3.5 (-1 .. +2), n=2"
-    assert campaign.against(base, base, read) == "4.75"
-    assert campaign.against(mine[2:3], base, read) == "-"
+    np.testing.assert_array_equal(paired(mine, base, read), ([3.0, 4.0], [1.0, 5.0]))
+    assert against(mine, base, read) == "3.5 (-1 .. +2), n=2"
+    assert against(base, base, read) == "4.75"
+    assert against(mine[2:3], base, read) == "-"
 
 
 def test_the_worst_run_counts_and_enough_ticks_are_needed() -> None:
@@ -139,4 +141,4 @@ def test_the_worst_run_counts_and_enough_ticks_are_needed() -> None:
 def test_wilson_intervals() -> None:
     for good, count in ((95, 100), (5, 5), (0, 7), (1, 2)):
         wanted = stats.binomtest(good, count).proportion_ci(0.95, "wilson")
-        assert campaign.share(good, count) == pytest.approx((wanted.low, wanted.high), abs=1e-4)
+        assert share(good, count) == pytest.approx((wanted.low, wanted.high), abs=1e-4)
