@@ -54,6 +54,8 @@ Barrier: TypeAlias = Callable[..., Array]
 Flow: TypeAlias = Callable[[Array, Array], Array]
 """``f(x, u)``: x' in the tangent space, (n, dim)."""
 
+AMBIGUOUS = "say many=True for a function of a set of obstacles, many=False for one of a single one"
+
 P, V = quadrotor.STATE.component("p").storage, quadrotor.STATE.component("v").storage
 DOWN = np.array([0.0, 0.0, -quadrotor.GRAVITY])  # [m/s^2]
 
@@ -70,33 +72,59 @@ def still(clearance: Clearance) -> Barrier:
     return of_resting
 
 
-def moving(clearance: Clearance) -> Barrier:
+def moving(clearance: Clearance, many: bool | None = None) -> Barrier:
     """``h(x, t, centre, velocity, *rest)``: of what goes straight on, ``clearance(x, centre + t velocity, *rest)``.
 
-    centre [m] as the clearance takes it, velocity [m/s] of the same shape; variables, data or constants.
+    Any other motion is a function ``h(x, t, ...)`` of one's own that calls the clearance.
+
+    Args:
+        clearance: of one obstacle, or of a set of them.
+        many: whether it takes a set, centres (M, d) or (n, M, d), or one, (d,) or (n, d). None asks a clearance that
+            ships; a plain function then takes one.
+
+    Returns:
+        A barrier: centre [m] as the clearance takes it, velocity [m/s] of the same shape; variables, data, constants.
+
+    Raises:
+        ModelError: from the barrier, where centres may be those of a set that nobody has spoken of: (M, d) for a
+            function of one obstacle, of which n is no other number or M rows come back.
     """
-    axes = _axes(clearance)
+    falling = accelerated(clearance, many)
 
     def of_moving(x: Array, t: Any, centre: Array, velocity: Array, *rest: Any) -> Array:
-        return clearance(x, centre + _per_factor(t, axes) * velocity, *rest)
+        return falling(x, t, centre, velocity, None, *rest)
 
     return of_moving
 
 
-def accelerated(clearance: Clearance) -> Barrier:
-    """``h(x, t, centre, velocity, acceleration, *rest)``: of what accelerates, as by falling [m/s^2]."""
-    axes = _axes(clearance)
+def accelerated(clearance: Clearance, many: bool | None = None) -> Barrier:
+    """``h(x, t, centre, velocity, acceleration, *rest)``: of what accelerates, as by falling [m/s^2].
 
-    def of_accelerated(x: Array, t: Any, centre: Array, velocity: Array, acceleration: Array, *rest: Any) -> Array:
+    Arguments as those of :func:`moving`.
+    """
+    axes = _axes(clearance) if many is None else 1 + many
+
+    def of_accelerated(x: Array, t: Any, centre: Array, velocity: Array, acceleration: Any, *rest: Any) -> Array:
+        if axes is None:
+            _refuse_sets(centre, t)
         s = _per_factor(t, axes)
-        return clearance(x, centre + s * velocity + 0.5 * s * s * acceleration, *rest)
+        there = centre + s * velocity
+        if acceleration is not None:
+            there = there + 0.5 * s * s * acceleration
+        found = clearance(x, there, *rest)
+        if axes is None and np.size(t) > 1 and np.ndim(centre) == 2 and len(centre) == found.shape[1] > 1:
+            raise ModelError(f"{found.shape[1]} centres, as many rows and as many times: {AMBIGUOUS}")
+        return found
 
     return of_accelerated
 
 
-def thrown(clearance: Clearance) -> Barrier:
-    """``h(x, t, centre, velocity, *rest)``: of what falls freely in space, without drag."""
-    falling = accelerated(clearance)
+def thrown(clearance: Clearance, many: bool | None = None) -> Barrier:
+    """``h(x, t, centre, velocity, *rest)``: of what falls freely in space, without drag.
+
+    Arguments as those of :func:`moving`.
+    """
+    falling = accelerated(clearance, many)
 
     def of_thrown(x: Array, t: Any, centre: Array, velocity: Array, *rest: Any) -> Array:
         return falling(x, t, centre, velocity, DOWN, *rest)
@@ -104,16 +132,25 @@ def thrown(clearance: Clearance) -> Barrier:
     return of_thrown
 
 
-def _axes(clearance: Clearance) -> int:
-    """Axes of an obstacle's centre for one factor: two for a set of M, one for a single one."""
+def _axes(clearance: Clearance) -> int | None:
+    """Axes of an obstacle's centre for one factor: two of a set, one of a single one; None where nobody says."""
     kernel = clearance.kernel if isinstance(clearance, Residual) else None
-    expected = 1 if kernel is None else kernel.arguments[1]
-    return expected if isinstance(expected, int) else 1
+    if kernel is None:
+        return None
+    expected = kernel.arguments[1]
+    return expected if isinstance(expected, int) else len(expected) if isinstance(expected, tuple) else 1
 
 
-def _per_factor(t: Any, axes: int) -> Any:
-    """A time for each factor as what centres are multiplied with."""
-    return np.reshape(t, (-1,) + (1,) * axes)
+def _per_factor(t: Any, axes: int | None) -> Any:
+    """A time for each factor as what centres are multiplied with; one for all of them stays a number."""
+    return np.reshape(t, (-1,) + (1,) * (axes or 1)) if np.size(t) > 1 else np.reshape(t, ())
+
+
+def _refuse_sets(centre: Array, t: Any) -> None:
+    """Refuse what cannot be one centre for each time."""
+    times, axes = np.size(t), np.ndim(centre)
+    if times > 1 and (axes > 2 or (axes == 2 and len(centre) not in (1, times))):
+        raise ModelError(f"centres of shape {np.shape(centre)} for {times} times: {AMBIGUOUS}")
 
 
 # ---------------------------------------------------------------- barriers made of others
@@ -168,7 +205,7 @@ def velocity_extended(h: Barrier, distance: Barrier, gamma: float, *, p: slice =
     return of_velocity
 
 
-def uncertain(h: Barrier, k: float) -> Barrier:
+def uncertain(h: Barrier, k: float, manifold: Manifold | None = None) -> Barrier:
     """``h(x, t, *obstacle) - k sigma_h``, with sigma_h from a square root of a covariance: ``(x, t, root, *obstacle)``.
 
     sigma_h^2 = sum over the columns of the root of the squared change of h along them, so a long axis of an ellipse
@@ -176,8 +213,9 @@ def uncertain(h: Barrier, k: float) -> Barrier:
     is the covariance of their difference.
 
     Args:
-        h: on positions in Rn.
+        h: on x.
         k: of standard deviations, not negative.
+        manifold: of x, in whose tangent space the root is given, as ``solution.covariance`` has it; None for Rn.
 
     Returns:
         A barrier whose third argument is the root, (n, d, c) or (d, c), [m].
@@ -189,7 +227,8 @@ def uncertain(h: Barrier, k: float) -> Barrier:
 
     def of_uncertain(x: Array, t: Any, root: Array, *obstacle: Any) -> Array:
         def along(s: Any, x: Array, column: Array) -> Array:
-            return h(x + s * column, t, *obstacle)
+            moved = x + s * column if manifold is None else manifold.retract(x, s * column)
+            return h(moved, t, *obstacle)
 
         square: Any = 0.0
         for c in range(root.shape[-1]):

@@ -40,11 +40,13 @@ def polyhedron(x: Array, normals: Array, offsets: Array) -> Array:
 
 
 def to_point(p: Array, centre: Array, radius: Any) -> Array:
-    """``|p - c| - radius``, (n, 1): from one sphere, known or estimated. p: (n, 3); centre: (n, 3) or (3,).
+    """``|p - c| - radius``, (n, 1): from one sphere, or disc, known or estimated.
+
+    p: (n, d) positions or poses, of which as many axes count as the centre has, (n, c) or (c,).
 
     The like of it for upright cylinders is :data:`unifg.models.avoidance.landmark_clearance`.
     """
-    return _length(p - centre) - np.reshape(radius, (-1, 1))
+    return _length(p[:, : centre.shape[-1]] - centre) - np.reshape(radius, (-1, 1))
 
 
 def on_body(clearance: Callable[..., Array] | Residual, points: ArrayLike) -> Callable[..., Array]:

@@ -3,7 +3,9 @@
 Each iteration linearises the graph, solves the quadratic subproblem (OSQP first; an interior-point QP when OSQP
 misses its accuracy; an elastic one when the linearised constraints contradict each other) and accepts a step that
 lowers the l1 merit function, with a second-order correction when curvature of the constraints spoils the full
-step. The Hessian is that of Gauss-Newton or of the Lagrangian (:mod:`unifg.solvers.quadratic_programs.exact_hessian`).
+step. The Hessian is that of Gauss-Newton or of the Lagrangian (:mod:`unifg.solvers.quadratic_programs.exact_hessian`),
+or the second where the first creeps: a constraint that bends as much as what it is weighed against, as the distance
+from a small sphere does, makes Gauss-Newton's steps converge linearly, by a few percent each at worst.
 ``max_iterations=1`` is the real-time iteration.
 """
 
@@ -23,6 +25,7 @@ from unifg.program.program import Program
 from unifg.solvers.globalize.least_violation import Watch, leave, settle
 from unifg.solvers.globalize.line_search import Taken, search
 from unifg.solvers.globalize.merit import RowPrices
+from unifg.solvers.globalize.pace import creeps
 from unifg.solvers.globalize.sizes import largest, norm
 from unifg.solvers.quadratic_programs.scaling import Scaling
 from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, subproblem
@@ -48,7 +51,9 @@ class SQP(Solver):
         max_iterations: subproblems before giving up.
         hessian: "gauss-newton", or "exact": of the Lagrangian with the present multipliers, second derivatives of
             residuals and constraints included, which converges quadratically where Gauss-Newton is linear. A step for
-            which it has the wrong inertia, or along which the merit does not fall, takes Gauss-Newton's.
+            which it has the wrong inertia, or along which the merit does not fall, takes Gauss-Newton's. "auto" begins
+            with the first and goes on with the second once it creeps (:mod:`unifg.solvers.globalize.pace`); under a
+            ``time_limit`` it stays with the first, for the second has to be compiled.
         qp: "osqp" (called directly, warm-started), "graph" (an interior point whose systems are eliminated on the
             graph), "elimination" (Ta's primal and dual linear graphs, for equalities only; a reference, written to be
             read) or any name qpsolvers knows. A subproblem without inequalities is one linear system: it goes to
@@ -69,7 +74,7 @@ class SQP(Solver):
     rehearses = True
 
     max_iterations: int = 200
-    hessian: Literal["gauss-newton", "exact"] = "gauss-newton"
+    hessian: Literal["auto", "gauss-newton", "exact"] = "auto"
     qp: str = "osqp"
     fallback: str | None = "piqp"
     qp_iterations: int | None = None
@@ -82,8 +87,10 @@ class SQP(Solver):
     def __post_init__(self) -> None:
         """Refuse options that mean nothing."""
         super().__post_init__()
-        if self.hessian not in ("exact", "gauss-newton"):
-            raise BackendError(f"{self.name}: hessian must be 'exact' or 'gauss-newton', found '{self.hessian}'")
+        if self.hessian not in ("auto", "exact", "gauss-newton"):
+            raise BackendError(
+                f"{self.name}: hessian must be 'auto', 'exact' or 'gauss-newton', found '{self.hessian}'"
+            )
 
     def require(self, program: Program) -> None:
         """Refuse inequalities where the linear algebra knows equalities only."""
@@ -120,13 +127,19 @@ class SQP(Solver):
         damping, missing = SMALLEST_DAMPING, 0.0
         failures = 0
         watch = Watch()
+        turning = self.hessian == "auto" and self.time_limit == np.inf and self.qp != "elimination"
         while run.status is None:
+            if turning and creeps(run.history):
+                turning, workspace = False, workspace.curved()
+                workspace.start(run.lin)
+                merit = RowPrices(run.program, workspace.scaling.rows, run.multipliers, run.lin)
+                damping, missing = SMALLEST_DAMPING, 0.0
             if watch.calls(run) and settle(run, Status.STALLED) is Status.LOCALLY_INFEASIBLE:
                 return Status.LOCALLY_INFEASIBLE
             if run.status is not None:
                 break
             shift = max(damping, missing)
-            shift = self._bounded(run, workspace, shift) if failures == 0 else shift
+            shift = _bounded(run, workspace, shift) if failures == 0 else shift
             qp = workspace.subproblem(run.lin, run.multipliers, shift)
             taken = self._attempt(run, workspace, merit, qp)
             if taken is None and workspace.distrust():
@@ -160,12 +173,12 @@ class SQP(Solver):
                 qp_iterations=answer.iterations,
                 damping=shift,
                 **({"correction": 1} if corrected else {}),
-                **({"hessian": _kind(qp, answer)} if self.hessian == "exact" else {}),
+                **({"hessian": _kind(qp, answer)} if workspace.exact else {}),
             )
             if run.status is None and norm(step) < self.step_tolerance:
                 if run.optimality.violation < self.violation_tolerance:
                     return Status.STOP_RULE
-            damping = self._next_damping(damping, length)
+            damping = _next_damping(workspace.exact, damping, length)
         return None
 
     def _attempt(
@@ -189,22 +202,12 @@ class SQP(Solver):
             multipliers = run.multipliers + found.length * (multipliers - run.multipliers)
         return answer, found.reached, multipliers, found.step, found.length, found.dual is not None
 
-    def _bounded(self, run: SolveState, workspace: UsualSubproblems, damping: float) -> float:
-        """With the exact Hessian damping must vanish with the error, or convergence would be linear."""
-        return damping if self.hessian != "exact" else max(min(damping, _size(run, workspace)), SMALLEST_DAMPING)
-
     def _accuracy(self, run: SolveState, workspace: UsualSubproblems) -> float:
         """Ask the QP for what the outer iteration can use."""
         size = _size(run, workspace)
-        share = min(1e-3, size) if self.hessian == "exact" else 1e-3
+        share = min(1e-3, size) if workspace.exact else 1e-3
         # Where a scaled unit is worth many of the graph's, the test of the graph needs more digits.
         return min(max(share * size, 0.1 * self.tolerance * workspace.scaling.smallest), 1e-4)
-
-    def _next_damping(self, damping: float, length: float) -> float:
-        """A shortened step means curvature that H does not know: damp, and forget it slowly."""
-        if length < 1.0:
-            return max(DAMPING_GROWTH * damping, FIRST_DAMPING)
-        return max((EXACT_DECAY if self.hessian == "exact" else DAMPING_DECAY) * damping, SMALLEST_DAMPING)
 
     def _search(
         self, run: SolveState, workspace: UsualSubproblems, merit: RowPrices, qp: QP, answer: QPAnswer, accuracy: float
@@ -255,6 +258,18 @@ def missing_curvature(
     known = float(step @ (qp.curved(step) - qp.damping * step)) / squared
     missing = float(step @ change[program.columns.free]) / squared - known
     return missing if missing > SECANT_MATTERS * known else 0.0
+
+
+def _bounded(run: SolveState, workspace: UsualSubproblems, damping: float) -> float:
+    """With the exact Hessian damping must vanish with the error, or convergence would be linear."""
+    return max(min(damping, _size(run, workspace)), SMALLEST_DAMPING) if workspace.exact else damping
+
+
+def _next_damping(exact: bool, damping: float, length: float) -> float:
+    """A shortened step means curvature that H does not know: damp, and forget it slowly."""
+    if length < 1.0:
+        return max(DAMPING_GROWTH * damping, FIRST_DAMPING)
+    return max((EXACT_DECAY if exact else DAMPING_DECAY) * damping, SMALLEST_DAMPING)
 
 
 def _size(run: SolveState, workspace: UsualSubproblems) -> float:

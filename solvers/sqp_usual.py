@@ -128,6 +128,8 @@ class UsualSubproblems(Subproblems):
     def __init__(self, program: Program, **options: Any) -> None:
         """Make room; options as for :class:`Subproblems`."""
         super().__init__(program, **options)
+        self._options = options
+        self._curved: UsualSubproblems | None = None
         self._spread = np.zeros(program.columns.width)
         self._norms = np.empty(len(program.arrays.fields))
         self._links = np.zeros(0, dtype=np.int64)
@@ -141,6 +143,12 @@ class UsualSubproblems(Subproblems):
         if not isinstance(self.first, GraphRoute) or program.scalar_terms or not program.fully_compiled:
             return False
         return not program.equality.all()  # without inequalities, subproblems are linear systems
+
+    def curved(self) -> UsualSubproblems:
+        """The same with the Hessian of the Lagrangian, made when it is first asked for."""
+        if self._curved is None:
+            self._curved = UsualSubproblems(self.program, **{**self._options, "hessian": "exact"})
+        return self._curved
 
     def take(
         self, start: SolveState, merit: RowPrices, qp: QP, accuracy: float, correcting: bool

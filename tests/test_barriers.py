@@ -254,6 +254,67 @@ def test_some_of_a_set_may_fall() -> None:
     )
 
 
+SHIFTS = np.array([[1.0, 0.0, 0.0], [0.0, -2.0, 0.5]])
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+def test_a_set_of_a_plain_function_moves_as_that_of_a_shipped_one(n: int) -> None:
+    """Whoever writes a clearance says whether it is of many: as many centres as times is no hint."""
+
+    def mine(p: Array, centre: Array, radius: Array) -> Array:
+        found: Array = np.linalg.norm(p[:, None] - centre, axis=2) - radius
+        return found
+
+    p, t = RNG.normal(size=(n, 3)), np.linspace(0.0, 0.7, n)
+    for make in (barriers.moving, barriers.thrown):
+        expected = make(avoidance.sphere_clearance)(p, t, CENTRE, SHIFTS, RADIUS)
+        np.testing.assert_allclose(make(mine, many=True)(p, t, CENTRE, SHIFTS, RADIUS), expected, atol=1e-13)
+        if n == 1:
+            np.testing.assert_allclose(make(mine)(p, t, CENTRE, SHIFTS, RADIUS), expected, atol=1e-13)
+            continue
+        with pytest.raises(ModelError, match="say many=True"):
+            make(mine)(p, t, CENTRE, SHIFTS, RADIUS)
+        with pytest.raises(ModelError, match="say many=True"):
+            make(mine)(p, t, np.tile(CENTRE, (n, 1, 1)), SHIFTS, RADIUS)
+    np.testing.assert_allclose(  # one time for all is no question
+        barriers.moving(mine)(p, 0.3, CENTRE, SHIFTS, RADIUS),
+        barriers.moving(avoidance.sphere_clearance)(p, 0.3, CENTRE, SHIFTS, RADIUS), atol=1e-13,
+    )  # fmt: skip
+
+
+def test_a_single_one_of_many_points_may_be_as_many_as_times() -> None:
+    """Rows that belong to points of a body, not to obstacles, are said to be of one."""
+    corners = clearances.on_body(clearances.to_point, [[0.2, 0.0, 0.0], [-0.2, 0.0, 0.1]])
+    x, t = quadrotor.STATE.random(RNG, (2,)), np.array([0.0, 0.4])
+    place, velocity = RNG.normal(size=(2, 3)), np.array([1.0, 0.0, 0.0])
+    found = barriers.moving(corners, many=False)(x, t, place, velocity, 0.1)
+    np.testing.assert_allclose(found, corners(x, place + t[:, None] * velocity, 0.1), atol=1e-13)
+
+
+def test_any_motion_is_a_function_of_the_time() -> None:
+    """Round a circle: where it is at either end counts in a decay, how it moves in a condition."""
+
+    def h(p: Array, t: Any, reach: float) -> Array:
+        turn = np.reshape(2.0 * t, (-1, 1))
+        there = reach * np.concatenate([np.cos(turn), np.sin(turn), 0.0 * turn], axis=1)
+        return clearances.to_point(p, there, 0.3)
+
+    p, u, t = RNG.normal(size=(4, 3)), RNG.normal(size=(4, 3)), np.array([0.0, 0.4, 1.0, 3.0])
+    step = 1e-6
+    whole = barriers.decay(h, 1.0)(p, p + step * u, t, step, 1.5) / step
+    np.testing.assert_allclose(barriers.condition(h, 1.0, fg.Rn(3), lambda p, u: u)(p, u, t, 1.5), whole, atol=1e-4)
+    graph = fg.Graph()
+    x = graph.variables("p", fg.Rn(3), 5)
+    graph.minimize(fg.prior, x, np.array([0.0, 1.5, 0.0]))
+    times = 0.2 * np.arange(4)
+    kept = keeping.keep(graph, barriers.decay(h, 1.0), x[:-1], x[1:], times, 0.2, 1.5, obstacles=["moon"])
+    guess = {x: np.tile([0.0, 1.4, 0.1], (5, 1)), **kept.guess()}
+    assert graph.check(guess).routes["barrier"] == EXACT
+    found = InteriorPoint().solve(graph, guess)
+    away = h(found[x], np.append(times, 0.8), 1.5)
+    assert found.converged and (away[1:] >= np.exp(-0.2) * away[:-1] - 1e-4).all() and away.min() > -1e-4
+
+
 def test_in_the_papers_units_the_boundary_is_the_same() -> None:
     h = barriers.inverse(barriers.still(clearances.to_point), 0.75)
     for d in (0.75, 0.5, 2.0):
@@ -301,6 +362,22 @@ def test_the_uncertainty_counts_along_the_obstacle_only() -> None:
     found = barriers.uncertain(h, 3.0)(p, 0.0, root, CENTRE[:1], RADIUS[:1])
     assert found[0, 0] == pytest.approx(1.6 - 3.0 * 0.1)
     assert barriers.uncertain(h, 0.0)(p, 0.0, root, CENTRE[:1], RADIUS[:1])[0, 0] == pytest.approx(1.6)
+
+
+def test_the_covariance_of_a_pose_lies_in_its_own_axes() -> None:
+    """As ``solution.covariance`` has it: who faces the disc knows that distance worst."""
+    x = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi / 2], [0.0, 0.0, np.pi / 4]])
+    root, disc = np.diag([0.2, 0.05, 0.3]), (np.array([[2.0, 0.0]]), np.array([0.5]))
+    found = barriers.uncertain(barriers.still(obstacles.disc_clearance), 3.0, fg.SE2)(x, 0.0, root, *disc)
+    middle = np.sqrt(0.5 * (0.2**2 + 0.05**2))
+    np.testing.assert_allclose(found[:, 0], [1.5 - 0.6, 1.5 - 0.15, 1.5 - 3.0 * middle], atol=1e-12)
+
+
+def test_a_planar_robot_keeps_off_a_disc_that_is_estimated() -> None:
+    """Of a pose the first two axes count, as of a position in space three."""
+    pose, place = np.array([[1.0, 2.0, 0.7]]), np.array([[1.0, 3.0]])
+    assert clearances.to_point(pose, place, 0.25)[0, 0] == pytest.approx(0.75)
+    assert clearances.to_point(pose[:, :2], place[0], 0.25)[0, 0] == pytest.approx(0.75)
 
 
 @pytest.mark.parametrize("value", [-1.0, np.inf, np.nan])
@@ -357,8 +434,7 @@ def push(
     return graph, p, kept, guess
 
 
-# Barriers bend as much as what they are weighed against: Gauss-Newton steps of SQP get there in hundreds of iterations.
-INEQUALITIES: dict[str, fg.Solver] = {**backends("ipm", "alm"), "sqp": SQP(hessian="exact")}
+INEQUALITIES: dict[str, fg.Solver] = {**backends("ipm", "alm", "sqp"), "sqp, exact": SQP(hessian="exact")}
 FAR = np.array([-1.0, 0.0, 0.0])
 SETTINGS = {
     "outside": (FAR, CENTRE, RADIUS, 2.0, 0.1),
@@ -368,6 +444,7 @@ SETTINGS = {
     "no decay at all": (FAR, CENTRE, RADIUS, 0.0, 0.1),
     "all of it at once": (FAR, CENTRE, RADIUS, 1e6, 0.1),
     "steps of no time": (FAR, CENTRE, RADIUS, 2.0, 0.0),
+    "one in the other": (FAR, CENTRE[:1].repeat(2, axis=0), RADIUS, 2.0, 0.1),
 }  # fmt: skip
 
 
@@ -383,6 +460,19 @@ def test_backends_answer_barriers(name: str, where: str) -> None:
         assert found.converged, (form, found.report())
         assert judge(graph, found).worst() < 1e-4, form
         assert np.isfinite(found[p]).all()
+
+
+def test_gauss_newton_creeps_past_a_sphere_and_sqp_turns_to_the_exact_hessian() -> None:
+    """A sphere bends as much as what it is weighed against: Gauss-Newton's steps shrink by a few percent each."""
+    graph, _, _, guess = push("slack", FAR, CENTRE, RADIUS)
+    slow = SQP(hessian="gauss-newton").solve(graph, guess)
+    assert slow.status is fg.Status.ITERATION_LIMIT and slow.iterations == 200
+    found = SQP().solve(graph, guess)
+    assert found.converged and found.iterations < 40
+    kinds = [row.details.get("hessian") for row in found.history[1:]]
+    turned = kinds.index("exact")
+    assert turned >= 20 and all(kind is None for kind in kinds[:turned]) and None not in kinds[turned:]
+    assert SQP(time_limit=60.0).solve(graph, guess).status is fg.Status.ITERATION_LIMIT  # nothing to be compiled there
 
 
 def test_a_start_at_the_very_centre_is_left() -> None:
@@ -503,6 +593,52 @@ def test_the_first_interval_is_a_tick() -> None:
     for count, tick, node in ((0, 0.01, 0.05), (3, 0.0, 0.05), (3, 0.1, 0.05), (3, 0.01, np.inf), (3, np.nan, 0.1)):
         with pytest.raises(ModelError, match="grid"):
             keeping.grid(count, tick, node)
+
+
+def past_two(form: keeping.Form, unit: float, offset: float, flat: bool) -> tuple[Any, Any, Any, Any]:
+    """A unicycle, or a point in space, past two obstacles; lengths in units of ``unit`` metres, far from the origin."""
+    n, dt, graph = 10, 0.1, fg.Graph()
+    centre = unit * np.array([[0.8, 0.05, 0.0], [1.5, -0.3, 0.1]]) + offset
+    radius = unit * np.array([0.3, 0.2])
+    weight = None if form == "hard" else {"exact slack": 1e4 / unit, "hinge": 1e4 / unit**2}.get(form, 1e6 / unit**2)
+    ahead = unit * 0.15 * np.arange(n + 1)[:, None]
+    if flat:
+        x, u = graph.variables("x", fg.SE2, n + 1), graph.variables("u", fg.Rn(2), n)
+        start = np.array([offset, offset, 0.0])
+        graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], dt, lower=0.0, upper=0.0)
+        graph.bound(u, lower=[0.0, -2.0], upper=[2.0 * unit, 2.0])
+        graph.minimize(fg.prior, u, [1.5 * unit, 0.0], sigma=[unit, 1.0])
+        given: tuple[Any, ...] = obstacles.disc_clearance, centre[:, :2], radius
+        guess: dict[Any, Any] = {x: start + ahead * [1.0, 0.0, 0.0], u: np.tile([1.5 * unit, 0.0], (n, 1))}
+    else:
+        x, start = graph.variables("x", fg.Rn(3), n + 1), np.full(3, float(offset))
+        graph.minimize(lambda p, q: (q - p) / (unit * dt) - [1.5, 0.0, 0.0], x[:-1], x[1:])
+        given, guess = (avoidance.sphere_clearance, centre, radius), {x: start + ahead * [1.0, 0.0, 0.0]}
+    graph.fix(x[0], start)
+    barrier = barriers.decay(barriers.still(given[0]), 2.0)
+    kept = keeping.keep(graph, barrier, x[:-1], x[1:], 0.0, dt, *given[1:], obstacles=2, form=form, weight=weight)
+
+    def least(found: Any) -> float:
+        return float(barrier(found[x][:-1], found[x][1:], 0.0, dt, *given[1:]).min()) / unit
+
+    return graph, {**guess, **kept.guess()}, least, (x, start)
+
+
+@pytest.mark.parametrize("form", ["hinge", "hard", "slack", "exact slack"])
+@pytest.mark.parametrize("name", INEQUALITIES)
+def test_neither_units_nor_offsets_nor_the_robot_matter(name: str, form: keeping.Form) -> None:
+    for unit, offset, flat in ((1.0, 0.0, False), (1.0, 1e6, False), (1e3, 0.0, False), (1.0, 1e6, True)):
+        graph, guess, least, (x, start) = past_two(form, unit, offset, flat)
+        if form == "exact slack" and name == "alm":
+            with pytest.raises(fg.BackendError, match="not a square"):
+                INEQUALITIES[name].solve(graph, guess)
+            return
+        if (form, flat) == ("hinge", True):
+            continue  # beside hard dynamics, a hinge of such a weight is for the interior point
+        found = INEQUALITIES[name].solve(graph, guess)
+        assert found.converged, (unit, offset, flat, found.report())
+        assert least(found) > (-5e-3 if form == "hinge" else -1e-4), (unit, offset, flat)
+        assert found[x][-1, 0] - start[0] > 0.5 * unit, (unit, offset, flat)  # it is no way out to stay
 
 
 # ---------------------------------------------------------------- robot and obstacle estimated in the graph of the plan

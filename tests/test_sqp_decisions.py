@@ -13,8 +13,10 @@ from problems.known import short_drive
 from unifg.solvers import SQP
 from unifg.solvers.globalize.least_violation import FALLING, PATIENCE, Watch
 from unifg.solvers.globalize.merit import RowPrices
+from unifg.solvers.globalize.pace import creeps
 from unifg.solvers.quadratic_programs.routes import LEFT, RESTING
 from unifg.solvers.quadratic_programs.subproblem import QPAnswer, subproblem
+from unifg.solvers.sqp import _next_damping
 from unifg.typing import Array
 
 
@@ -106,11 +108,25 @@ def test_the_first_route_rests_after_a_step_that_led_nowhere() -> None:
     assert routes == [work.first.name, *[work.fallback.name] * RESTING, work.first.name]
 
 
+def row(missing: float) -> Any:
+    return SimpleNamespace(stationarity=missing, violation=0.1 * missing, complementarity=0.01 * missing)
+
+
+@pytest.mark.parametrize(("pace", "slow"), [(0.75, False), (0.9, True), (1.1, True)])
+def test_a_solve_creeps_where_ten_iterations_leave_a_tenth_after_twenty(pace: float, slow: bool) -> None:
+    history = [row(pace**k) for k in range(40)]
+    assert not any(creeps(history[:k]) for k in range(21))
+    assert [creeps(history[:k]) for k in range(21, 40)] == [slow] * 19
+    for part in ("stationarity", "violation", "complementarity"):  # each of them keeps a solve from its end
+        held = [row(0.5**k) for k in range(30)]
+        for made in held:
+            setattr(made, part, 1.0)
+        assert creeps(held)
+
+
 def test_damping_grows_with_shortened_steps_and_fades_with_full_ones() -> None:
-    solver = SQP()
-    first = solver._next_damping(1e-12, 0.5)
-    assert solver._next_damping(first, 0.25) > 2.0 * first
-    fading = solver._next_damping(first, 1.0)
+    first = _next_damping(False, 1e-12, 0.5)
+    assert _next_damping(False, first, 0.25) > 2.0 * first
+    fading = _next_damping(False, first, 1.0)
     assert 0.05 * first < fading < first
-    exact = SQP(hessian="exact")
-    assert exact._next_damping(first, 1.0) < fading, "or convergence would be linear"
+    assert _next_damping(True, first, 1.0) < fading, "or convergence would be linear"

@@ -70,7 +70,9 @@ def test_compiled_iterations_are_those_of_python(problem: Unicycle | Quadrotor, 
 
 def test_steps_are_corrected_and_shortened_alike() -> None:
     stated = Quadrotor("goto", True, 20).formulation()
-    solution, went = compare(SQP(qp="graph", max_iterations=60).prepare(stated.graph), stated.guess)
+    solution, went = compare(
+        SQP(qp="graph", hessian="gauss-newton", max_iterations=60).prepare(stated.graph), stated.guess
+    )
     assert set(went) == {"taken"}
     assert sum("correction" in row.details for row in solution.history) > 0
     assert {row.step_length for row in solution.history[1:]} == {1.0, 0.5}

@@ -33,6 +33,7 @@ class Subproblems:
 
     Attributes:
         program: the compiled graph.
+        exact: whether Hessians are those of the Lagrangian.
         pattern: of the Hessians.
         scaling: units in which subproblems are solved, found at the start of each solve.
         tolerance: of the KKT test.
@@ -58,7 +59,8 @@ class Subproblems:
         self.program = program
         self.elastic_asked = False
         self.tolerance = tolerance
-        self._exact = ExactHessian(program) if hessian == "exact" else None
+        self.exact = hessian == "exact"
+        self._exact = ExactHessian(program) if self.exact else None
         self.pattern = program.hessian if self._exact is None else program.normal
         linear = bool(program.equality.all()) and qp != "elimination"
         self.fallback = None if fallback is None else _route(program, fallback, qp_iterations)
