@@ -111,10 +111,15 @@ def keep(
         name: of the term; the slack's family and its cost are called after it.
 
     Raises:
-        ModelError: on a form that is none, no obstacle, another number of obstacles than the barrier has, or a weight
-            that is not positive.
+        ModelError: on a smoother, a form that is none, no obstacle, another number of obstacles than the barrier has,
+            or a weight that is not positive.
         GraphError: as the statements of the graph raise it; the graph is as it was.
     """
+    if not isinstance(graph, Statement):
+        raise ModelError(
+            f"'{name}': {type(graph).__name__} is no graph; a smoother takes the hinge, as a residual: "
+            "minimize(keeping.hinge(barrier), ..., sigma=weight**-0.5)"
+        )
     names = tuple(f"{name} {k}" for k in range(obstacles)) if isinstance(obstacles, int) else tuple(obstacles)
     price = weight if weight is not None else EXACT if form == "exact slack" else WEIGHT
     if form not in ("hinge", "hard", "slack", "exact slack"):

@@ -31,7 +31,7 @@ from unifg.models import (
 )
 from unifg.models.distance_map import DistanceMap
 from unifg.models.spline import SplineField
-from unifg.solvers import SQP, InteriorPoint
+from unifg.solvers import SQP, InteriorPoint, LevenbergMarquardt
 from unifg.solvers.names import backends
 from unifg.typing import Array
 
@@ -639,6 +639,52 @@ def test_neither_units_nor_offsets_nor_the_robot_matter(name: str, form: keeping
         assert found.converged, (unit, offset, flat, found.report())
         assert least(found) > (-5e-3 if form == "hinge" else -1e-4), (unit, offset, flat)
         assert found[x][-1, 0] - start[0] > 0.5 * unit, (unit, offset, flat)  # it is no way out to stay
+
+
+# ---------------------------------------------------------------- where the graph grows
+
+
+@pytest.mark.parametrize(
+    "smoother", [fg.Incremental(0.0, wildfire=0.0), fg.FixedLag(25, relinearize=0.0, wildfire=0.0)]
+)
+def test_barriers_inserted_step_by_step_are_those_of_the_whole(smoother: fg.Incremental | fg.FixedLag) -> None:
+    """Past and plan of a unicycle: one more interval and one more fix a tick, against all factors at once."""
+    rng, ahead, count = np.random.default_rng(4), 6, 20
+    kept = keeping.hinge(barriers.decay(barriers.still(obstacles.disc_clearance), 2.0))
+    disc, step = (np.array([[1.0, 0.1]]), np.array([0.3])), np.array([0.1, 0.0, 0.0])
+    batch = fg.Graph()
+    x, z = smoother.variables("x", fg.SE2), batch.variables("x", fg.SE2, count + 1)
+    sigma = [0.02, 0.01, 0.2]
+
+    def fix(x: Array, place: Array) -> Array:
+        return x[:, :2] - place
+
+    smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.01)
+    batch.minimize(fg.prior, z[0], np.zeros(3), sigma=0.01)
+    smoother.update({x: np.zeros(3)})
+    values = [np.zeros(3)]
+    for k in range(count):
+        values.append(fg.SE2.compose(smoother.estimate(x[-1])[0], step))
+        seen = values[max(k - ahead + 1, 0)][:2] + 0.005 * rng.normal(size=2)
+        pairs: list[tuple[Any, Any]] = [(smoother, x), (batch, z)]
+        for graph, y in pairs:
+            graph.minimize(fg.between, y[k], y[k + 1], step, sigma=sigma, name=f"motion {k}")
+            graph.minimize(kept, y[k], y[k + 1], 0.0, 0.1, *disc, sigma=1e-2, name=f"disc {k}")
+            if k >= ahead:
+                graph.minimize(fix, y[k - ahead + 1], seen, sigma=0.02, name=f"fix {k}")
+        smoother.update({x: values[-1]}, iterations=4)
+    smoother.update(iterations=30)
+    found = LevenbergMarquardt(tolerance=1e-10).solve(batch, {z: smoother.estimate(x)})
+    assert found.converged
+    np.testing.assert_allclose(smoother.estimate(x), found[z], atol=1e-6)
+    assert obstacles.disc_clearance(found[z], *disc).min() > -1e-3  # straight on it would have been -0.2
+
+
+def test_a_slack_in_a_smoother_is_refused_with_what_to_say_instead() -> None:
+    smoother = fg.Incremental()
+    p = smoother.variables("p", fg.Rn(3))
+    with pytest.raises(ModelError, match=r"Incremental is no graph.*keeping.hinge"):
+        keeping.keep(smoother, avoidance.sphere_clearance, p[0], CENTRE, RADIUS, obstacles=2)  # type: ignore[arg-type]
 
 
 # ---------------------------------------------------------------- robot and obstacle estimated in the graph of the plan

@@ -94,6 +94,17 @@ def test_unicycle_mpc_loop(run: Run) -> None:
     assert np.linalg.norm(lane[:, :2] - disc, axis=1).min() < ran["radius"] - 0.1
 
 
+def test_barriers_in_a_smoother(run: Run) -> None:
+    """The trajectory that grew is that of all factors at once, and the robot has kept off."""
+    ran = run("barriers_in_a_smoother")
+    smoother, x, graph, batch = ran["smoother"], ran["x"], ran["graph"], ran["batch"]
+    assert right(graph, batch) and ran["apart"] < 3e-4 and len(smoother.estimate(x)) == 61
+    near = [(np.linalg.norm(np.array(ran["driven"]) - c, axis=1) - r).min() for c, r in ran["discs"]]
+    assert min(near) > 0.0 and max(near) < 0.15
+    assert 11 <= ran["effort"].eliminated < 25  # of the past, what the new measurement has moved
+    assert f"{ran['effort'].eliminated} of 61" in ran.printed
+
+
 def test_covariance_aware_plan(run: Run) -> None:
     ran = run("covariance_aware_plan")
     x, P, light = ran["x"], ran["P"], []
