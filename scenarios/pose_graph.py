@@ -6,7 +6,7 @@ The command ``unifg solve`` is this and `unifg.scenarios.commands.graphs`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,9 @@ from unifg.answers.status import Status
 from unifg.errors import ScenarioError
 from unifg.files.pose_graph import read_pose_graph
 from unifg.kernels.robust import DCS, Cauchy, Huber, Loss, TruncatedLeastSquares, Tukey
-from unifg.pose_graphs.initialise import chordal, lago, odometric
+from unifg.pose_graphs.certificate import Certificate, certify
+from unifg.pose_graphs.initialise import best_guess, chordal, lago, odometric
+from unifg.pose_graphs.judgement import Judgement, judge
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
 from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.options import existing, option
@@ -28,6 +30,7 @@ from unifg.typing import Array, BoolArray
 
 __all__ = ["SolveSettings", "SolvedGraph", "robust_loss", "solve_file"]
 
+AUTO = "auto"
 GUESSES: dict[str, Callable[[PoseGraph], Array]] = {
     "file": lambda pose_graph: pose_graph.poses,
     "odometry": odometric,
@@ -56,15 +59,20 @@ class SolveSettings:
         solver: one of `unifg.solvers.names.LEAST_SQUARES`.
         robust: loss on loop closures, if any: huber, cauchy, tukey, dcs, or gnc (truncated least squares, graduated),
             with its parameter after a colon if it is not the usual one.
-        init: first guess: poses of the file, a spanning tree, LAGO (2D) or chordal relaxation.
+        init: first guess: poses of the file, a spanning tree, LAGO (2D) or chordal relaxation; or the one of them
+            that costs least, but for the tree.
         residual: full logarithm, as GTSAM, or the chart of g2o; their optima differ in 3D.
+        certify: see whether another map could be better, by the dual of the chordal relaxation.
+        staircase: where that finds a way down, follow it and solve again from there.
     """
 
     file: Path = option(text=existing("a pose graph (g2o or TORO)"), metavar="GRAPH")
     solver: str = "gn"
     robust: str | None = option(None, metavar="LOSS[:PARAM]")
-    init: str = option("file", choices=tuple(GUESSES))
+    init: str = option(AUTO, choices=(AUTO, *GUESSES))
     residual: ResidualName = option("log")
+    certify: bool = False
+    staircase: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +89,10 @@ class SolvedGraph:
         outliers: (m,) edges that the loss gives less than half of their weight.
         steps: (k, n, storage) poses of up to a dozen iterates, the first guess and the solution among them.
         step_numbers: (k,) iteration of each.
-        seconds: wall-clock time by what it was spent on: read, initialise, compile, solve.
+        begun: name of the first guess that was taken.
+        judgement: what the graph says about itself at the solution, outliers left out.
+        certificate: of the solution, if it was asked for.
+        seconds: wall-clock time by what it was spent on: read, initialise, compile, solve, certify.
     """
 
     settings: SolveSettings
@@ -93,6 +104,9 @@ class SolvedGraph:
     outliers: BoolArray
     steps: Array
     step_numbers: list[int]
+    begun: str
+    judgement: Judgement
+    certificate: Certificate | None
     seconds: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -135,36 +149,66 @@ def solve_file(settings: SolveSettings, progress: Progress = silent) -> SolvedGr
     in_file = read.chi2(settings.residual)
     progress(0.05, f"first guess: {settings.init}")
     clock.start()
-    before = read.with_poses(GUESSES[settings.init](read))
+    if settings.init == AUTO:
+        begun, poses = best_guess(read, settings.residual, loss)
+    else:
+        begun, poses = settings.init, GUESSES[settings.init](read)
+    before = read.with_poses(poses)
     clock.split("initialise")
     at_start = before.chi2(settings.residual)
-    clock.start()
-    graph, x, guess = before.graph(robust=loss, residual=settings.residual)
-    graph.compile()
-    clock.split("compile")
-
-    snapshots = _Snapshots()
-
-    def tell(row: Iteration) -> None:
-        snapshots.add(row.number, None if row.values is None else row.values[x])
-        stage = f", stage {row.details['stage']}" if "stage" in row.details else ""
-        progress(1.0 - 0.95 * 0.9**row.number, f"iteration {row.number}{stage}, cost {row.cost:.6g}")
-
-    backend = names.backend(settings.solver, keep_values=True)
-    solver = GraduatedNonConvexity(solver=backend) if isinstance(loss, TruncatedLeastSquares) else backend
-    clock.start()
-    solution = solver.solve(graph, guess, callback=tell)
-    clock.split("solve")
-    landmarks = solution[graph.families["landmarks"]] if len(read.landmarks) else None
-    after = before.with_poses(solution[x], landmarks)
-    errors = after.squared_errors(settings.residual)
-    weights = np.ones(len(errors)) if loss is None else np.asarray(loss.weight(errors))
-    outliers = (weights < OUTLIER_WEIGHT) & ~read.edges.odometry
-    snapshots.add(solution.iterations, after.poses)
+    solve = _Solve(settings, loss, clock, progress)
+    solution, after, outliers = solve(before)
+    certificate = None
+    if (settings.certify or settings.staircase) and solution.status is not Status.INTERRUPTED:
+        progress(0.95, "is another map better?")
+        clock.start()
+        certificate = certify(after, used=~outliers, staircase=settings.staircase)
+        clock.split("certify")
+        if certificate.rank > read.group.point_dim:
+            solution, after, outliers = solve(before.with_poses(certificate.poses))
     progress(1.0, solution.status.name.lower().replace("_", " "))
-    numbers, steps = snapshots.chosen()
+    numbers, steps = solve.snapshots.chosen()
     chi2 = (in_file, at_start, after.chi2(settings.residual))
-    return SolvedGraph(settings, before, after, chi2, solution, loss, outliers, steps, numbers, clock.seconds)
+    judgement = judge(replace(after, edges=after.edges[~outliers]), settings.residual)
+    return SolvedGraph(
+        settings, before, after, chi2, solution, loss, outliers, steps, numbers, begun, judgement, certificate,
+        clock.seconds,
+    )  # fmt: skip
+
+
+class _Solve:
+    """State, compile and solve, once or again from elsewhere; iterates of all are kept for pictures."""
+
+    def __init__(self, settings: SolveSettings, loss: Loss | None, clock: Stopwatch, progress: Progress) -> None:
+        self.settings, self.loss, self.clock, self.progress = settings, loss, clock, progress
+        self.snapshots, self.before = _Snapshots(), 0
+
+    def __call__(self, begin: PoseGraph) -> tuple[Solution, PoseGraph, BoolArray]:
+        """The solution, the graph at it, and (m,) which edges the loss takes for outliers."""
+        settings, loss, clock = self.settings, self.loss, self.clock
+        clock.start()
+        graph, x, guess = begin.graph(robust=loss, residual=settings.residual)
+        graph.compile()
+        clock.split("compile")
+
+        def tell(row: Iteration) -> None:
+            number = self.before + row.number
+            self.snapshots.add(number, None if row.values is None else row.values[x])
+            stage = f", stage {row.details['stage']}" if "stage" in row.details else ""
+            self.progress(0.95 * (1.0 - 0.95 * 0.9**number), f"iteration {number}{stage}, cost {row.cost:.6g}")
+
+        backend = names.backend(settings.solver, keep_values=True)
+        solver = GraduatedNonConvexity(solver=backend) if isinstance(loss, TruncatedLeastSquares) else backend
+        clock.start()
+        solution = solver.solve(graph, guess, callback=tell)
+        clock.split("solve")
+        landmarks = solution[graph.families["landmarks"]] if len(begin.landmarks) else None
+        after = begin.with_poses(solution[x], landmarks)
+        errors = after.squared_errors(settings.residual)
+        weights = np.ones(len(errors)) if loss is None else np.asarray(loss.weight(errors))
+        self.before += solution.iterations
+        self.snapshots.add(self.before, after.poses)
+        return solution, after, (weights < OUTLIER_WEIGHT) & ~begin.edges.odometry
 
 
 def robust_loss(text: str | None, dim: int) -> Loss | None:

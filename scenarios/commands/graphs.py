@@ -9,6 +9,8 @@ import numpy as np
 
 from unifg.files.g2o import write_g2o
 from unifg.files.tum import write_tum
+from unifg.pose_graphs.certificate import Certificate
+from unifg.pose_graphs.judgement import FAR
 from unifg.scenarios import pose_graph
 from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.log.metrics import table, write_metrics
@@ -67,7 +69,7 @@ def metrics(solved: SolvedGraph) -> dict[str, Any]:
         "skipped_lines": dict(graph.skipped),
         "solver": solution.solver,
         "robust": settings.robust,
-        "init": settings.init,
+        "init": solved.begun,
         "residual": settings.residual,
         "status": solution.status.name,
         "converged": solution.converged,
@@ -77,6 +79,13 @@ def metrics(solved: SolvedGraph) -> dict[str, Any]:
         "chi2_start": at_start,
         "chi2": at_end,
         "chi2_inliers": solved.chi2_inliers,
+        "degrees_of_freedom": solved.judgement.freedom,
+        "worst_edges": solved.judgement.worst.tolist(),
+        "worst_edges_chi2": solved.judgement.worst_chi2.tolist(),
+        "parts": solved.judgement.parts,
+        "anchors_added": list(solved.judgement.anchors),
+        "remarks": solved.judgement.sentences(),
+        "certificate": None if solved.certificate is None else _certificate(solved.certificate),
         "cost": solution.cost,
         "stationarity": solution.stationarity,
         "outliers": int(solved.outliers.sum()),
@@ -104,15 +113,37 @@ def summary(solved: SolvedGraph) -> str:
         ("robust loss", "" if solved.loss is None else f"{solved.loss}, on loop closures"),
         ("chi2 in the file", f"{numbers['chi2_file']:.9g}"),
         ("chi2 at the start", f"{numbers['chi2_start']:.9g} ({numbers['init']})"),
-        ("chi2 at the end", f"{numbers['chi2']:.9g}"),
+        ("chi2 at the end", f"{numbers['chi2']:.9g}, {numbers['degrees_of_freedom']} degrees of freedom"),
         ("without outliers", f"{numbers['chi2_inliers']:.9g}" if numbers["outliers"] else ""),
         ("outliers", "" if solved.loss is None else f"{numbers['outliers']} of the loop closures"),
+        ("worst edges", _worst(solved)),
+        *(("remark", sentence) for sentence in numbers["remarks"]),
+        ("held where it was", ", ".join(f"pose {name}" for name in numbers["anchors_added"][:5])),
+        ("another map", "" if solved.certificate is None else solved.certificate.sentence()),
         ("believed", "" if verdict is None else verdict.sentence(numbers["cost"])),
         ("iterations", f"{numbers['iterations']}"),
         ("status", solved.solution.status.value),
         ("time", ", ".join(f"{name} {value:.1f} ms" for name, value in milliseconds.items())),
     ]
     return table(rows)
+
+
+def _certificate(certificate: Certificate) -> dict[str, Any]:
+    return {
+        "certified": certificate.certified,
+        "chi2_chordal": certificate.chi2,
+        "gap": certificate.gap,
+        "least_eigenvalue": certificate.least_eigenvalue,
+        "rank": certificate.rank,
+        "caveats": list(certificate.caveats),
+    }
+
+
+def _worst(solved: SolvedGraph) -> str:
+    """The edges that disagree most, where any does."""
+    judgement = solved.judgement
+    pairs = zip(judgement.worst.tolist(), judgement.worst_chi2, strict=True)
+    return ", ".join(f"{a} - {b} ({chi2:.3g})" for (a, b), chi2 in pairs if chi2 > FAR * solved.after.group.dim)
 
 
 def _pairs(solved: SolvedGraph) -> list[list[int]]:

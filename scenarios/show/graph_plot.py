@@ -30,7 +30,7 @@ def picture(solved: SolvedGraph) -> Figure:
         left, right = (figure.add_subplot(grid[0, k], **projection) for k in (0, 1))
         below = figure.add_subplot(grid[1, :])
         origin = {"file": "the poses in the file", "odometry": "odometry alone"}.get(
-            solved.settings.init, f"first guess by {solved.settings.init}"
+            solved.begun, f"first guess by {solved.begun}"
         )
         none = np.zeros(len(solved.outliers), dtype=bool)
         plot_graph(solved.before, none, css("odometry"), "trajectory at the start", left)
@@ -41,7 +41,8 @@ def picture(solved: SolvedGraph) -> Figure:
         figure.legend(*key_of((left, right)), loc="outside lower center", ncols=5)
         graph = solved.after
         edges = f"{len(graph.edges) - len(graph.closures)} odometry edges, {len(graph.closures)} loop closures"
-        headline(figure, f"{solved.name}: {len(graph.poses)} poses, {edges}")
+        remarks = "".join(f"\n{sentence}" for sentence in solved.judgement.sentences())
+        headline(figure, f"{solved.name}: {len(graph.poses)} poses, {edges}{remarks}")
     return figure
 
 
@@ -135,5 +136,5 @@ def _ending(solved: SolvedGraph) -> str:
     """chi2 at the solution, apart from what the loss took for outliers."""
     found = int(solved.outliers.sum())
     if not found:
-        return f"{solved.chi2[2]:.6g}"
+        return f"{solved.chi2[2]:.6g}, {solved.judgement.freedom} degrees of freedom"
     return f"{solved.chi2_inliers:.6g} without {found} outlier{'' if found == 1 else 's'}"

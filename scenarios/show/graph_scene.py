@@ -76,7 +76,7 @@ def _facts(solved: SolvedGraph) -> dict[str, Any]:
         "poses": f"{len(graph.poses)} in {graph.group.point_dim}D",
         "edges": f"{len(graph.edges)}, {len(graph.closures)} close loops",
         "landmarks": f"{len(graph.landmarks)}" if len(graph.landmarks) else "",
-        "first guess": settings.init,
+        "first guess": solved.begun,
         "solver": settings.solver,
         "residual": settings.residual,
         "robust loss": settings.robust or "",

@@ -1,20 +1,27 @@
 """Pose graphs: the data, residuals in two conventions, first guesses, and made-up examples."""
 
+from unifg.pose_graphs.certificate import Certificate, certify
 from unifg.pose_graphs.generate import Simulated, manhattan, sphere
-from unifg.pose_graphs.initialise import chordal, lago, odometric
+from unifg.pose_graphs.initialise import best_guess, chordal, lago, odometric
+from unifg.pose_graphs.judgement import Judgement, judge
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph, Sightings
 from unifg.pose_graphs.residuals import bearing, bearing_range, chart_between, distance, sighting
 
 __all__ = [
+    "Certificate",
     "Edges",
+    "Judgement",
     "PoseGraph",
     "Sightings",
     "Simulated",
     "bearing",
     "bearing_range",
+    "best_guess",
+    "certify",
     "chart_between",
     "chordal",
     "distance",
+    "judge",
     "lago",
     "manhattan",
     "odometric",

@@ -12,15 +12,52 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, dijkstra, minimum_spanning_tree
 
 from unifg.errors import GraphError
+from unifg.kernels.robust import Loss
 from unifg.lie import SE2, SE3, SO3, LieGroup
 from unifg.pose_graphs.linear import block_least_squares
-from unifg.pose_graphs.pose_graph import PoseGraph
+from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
 from unifg.typing import Array, BoolArray, IntArray
 
-__all__ = ["chordal", "lago", "odometric"]
+__all__ = ["best_guess", "chordal", "lago", "odometric"]
 
 _CLOSURE_COST = 1e6  # a spanning tree takes loop closures only where there is no odometry
 _BLIND = 1e-12  # [1 / rad^2]; an edge with less information about the turn is the last that a tree takes
+
+
+def best_guess(pose_graph: PoseGraph, residual: ResidualName = "log", loss: Loss | None = None) -> tuple[str, Array]:
+    """Whichever start costs least: the poses the graph has, chordal relaxation, in the plane also LAGO.
+
+    The poses of a file may lie in the basin of a folded map; a relaxation does not know them.
+
+    Args:
+        pose_graph: the graph.
+        residual: by which they are compared.
+        loss: on the loop closures when they are compared.
+
+    Returns:
+        Its name, "file", "chordal" or "lago", and poses (n, storage). A start that the measurements do not determine
+        is left out.
+    """
+    kinds = {"chordal": chordal, "lago": lago} if pose_graph.group is SE2 else {"chordal": chordal}
+    closures = ~pose_graph.edges.odometry
+
+    def cost(poses: Array) -> float:
+        moved = pose_graph.with_poses(poses)
+        if loss is None:
+            return moved.chi2(residual)
+        squared = moved.squared_errors(residual)
+        return float(squared[~closures].sum() + np.sum(loss.value(squared[closures])))
+
+    name, poses = "file", pose_graph.poses
+    least = cost(poses)
+    for other, method in kinds.items():
+        try:
+            found = method(pose_graph)
+        except GraphError:
+            continue
+        if (value := cost(found)) < least:
+            name, poses, least = other, found, value
+    return name, poses
 
 
 def odometric(pose_graph: PoseGraph) -> Array:

@@ -1,4 +1,4 @@
-"""Linear least squares over a graph of blocks: what every first guess comes down to."""
+"""Quadratics over a graph of blocks: what first guesses, relaxations and certificates come down to."""
 
 from __future__ import annotations
 
@@ -9,7 +9,82 @@ from unifg.elimination.symmetric import Symmetric, scatter
 from unifg.errors import GraphError
 from unifg.typing import Array, IntArray
 
-__all__ = ["block_least_squares"]
+__all__ = ["BlockQuadratic", "block_least_squares"]
+
+
+class BlockQuadratic:
+    """The matrix of sum |A x_i + B x_j|^2 over blocks x of one size: pattern once, entries as often as needed.
+
+    Attributes:
+        free: positions of the blocks that are not known.
+        factorization: of the matrix over the free blocks, (free * d) scalars.
+    """
+
+    def __init__(self, first: IntArray, second: IntArray, count: int, dim: int, fixed: IntArray) -> None:
+        """Find the pattern.
+
+        Args:
+            first: (m,) blocks i.
+            second: (m,) blocks j.
+            count: number of blocks.
+            dim: numbers in a block.
+            fixed: positions of blocks that are known.
+        """
+        self.count, self.dim = count, dim
+        self.free: IntArray = np.setdiff1d(np.arange(count), fixed)
+        self._real = first != second  # an edge from a block to itself says nothing
+        self._first, self._second = first[self._real], second[self._real]
+        unknown = np.full(count, -1, dtype=np.intp)
+        unknown[self.free] = np.arange(len(self.free))
+        self._between = (unknown[self._first] >= 0) & (unknown[self._second] >= 0)
+        left, right = unknown[self._first[self._between]], unknown[self._second[self._between]]
+        self._swapped = left > right
+        left, right = np.minimum(left, right), np.maximum(left, right)
+        pattern = Symmetric.of_blocks(dim * np.arange(len(self.free) + 1), left, right)
+        self._size = pattern.nnz
+        nodes = np.arange(len(self.free))
+        self._upper = np.triu(np.ones((dim, dim), dtype=bool))
+        self._own_places = pattern.positions(*self._scalars(nodes, nodes, self._upper))
+        self._shared_places = pattern.positions(*self._scalars(left, right, np.ones((dim, dim), dtype=bool)))
+        self.factorization = Factorization(pattern, np.repeat(nodes, dim))
+
+    def _scalars(self, rows: IntArray, columns: IntArray, kept: Array) -> tuple[IntArray, IntArray]:
+        steps, shape = np.arange(self.dim), (len(rows), self.dim, self.dim)
+        place = np.broadcast_to((rows * self.dim)[:, None, None] + steps[:, None], shape)[:, kept].ravel()
+        beside = np.broadcast_to((columns * self.dim)[:, None, None] + steps, shape)[:, kept].ravel()
+        return place, beside
+
+    def entries(self, by_first: Array, by_second: Array, added: Array | None = None) -> Array:
+        """(nnz,) entries of the matrix over the free blocks.
+
+        Args:
+            by_first: (m, r, d) A, whitened.
+            by_second: (m, r, d) B, whitened.
+            added: (n, d, d) symmetric, added to the diagonal blocks.
+        """
+        by_first, by_second = by_first[self._real], by_second[self._real]
+        own = np.zeros((self.count, self.dim, self.dim)) if added is None else added.copy()
+        np.add.at(own, self._first, np.swapaxes(by_first, 1, 2) @ by_first)
+        np.add.at(own, self._second, np.swapaxes(by_second, 1, 2) @ by_second)
+        shared = np.swapaxes(by_first[self._between], 1, 2) @ by_second[self._between]
+        shared = np.where(self._swapped[:, None, None], np.swapaxes(shared, 1, 2), shared)
+        result: Array = scatter(self._own_places, own[self.free][:, self._upper].ravel(), self._size)
+        result += scatter(self._shared_places, shared.ravel(), self._size)
+        return result
+
+    def gradient(self, by_first: Array, by_second: Array, error: Array) -> Array:
+        """(n, d, k) sum of A' e and B' e over the edges of every block, for errors (m, r, k)."""
+        real = self._real
+        total = np.zeros((self.count, self.dim, error.shape[2]))
+        np.add.at(total, self._first, np.swapaxes(by_first[real], 1, 2) @ error[real])
+        np.add.at(total, self._second, np.swapaxes(by_second[real], 1, 2) @ error[real])
+        return total
+
+    def solve(self, right: Array) -> Array:
+        """(free, d, k) solution for right-hand sides (free, d, k), once the factorisation has been made."""
+        columns = right.reshape(len(self.free) * self.dim, -1)
+        found = [self.factorization.solve(np.ascontiguousarray(column)) for column in columns.T]
+        return np.stack(found, axis=1).reshape(right.shape)
 
 
 def block_least_squares(
@@ -32,43 +107,14 @@ def block_least_squares(
     Raises:
         GraphError: the measurements do not determine the blocks.
     """
-    count, dim, sides = start.shape
-    real = first != second  # an edge from a block to itself says nothing
-    first, second, by_first, by_second, target = (part[real] for part in (first, second, by_first, by_second, target))
-    unknown = np.full(count, -1, dtype=np.intp)
-    free = np.setdiff1d(np.arange(count), fixed)
-    unknown[free] = np.arange(len(free))
-    if not len(free):
-        return start.copy()
-    error = by_first @ start[first] + by_second @ start[second] - target
-    gradient = np.zeros((count, dim, sides))
-    np.add.at(gradient, first, np.swapaxes(by_first, 1, 2) @ error)
-    np.add.at(gradient, second, np.swapaxes(by_second, 1, 2) @ error)
-
-    own = np.zeros((count, dim, dim))
-    np.add.at(own, first, np.swapaxes(by_first, 1, 2) @ by_first)
-    np.add.at(own, second, np.swapaxes(by_second, 1, 2) @ by_second)
-    between = (unknown[first] >= 0) & (unknown[second] >= 0)
-    left, right = unknown[first[between]], unknown[second[between]]
-    shared = np.swapaxes(by_first[between], 1, 2) @ by_second[between]
-    shared = np.where((left <= right)[:, None, None], shared, np.swapaxes(shared, 1, 2))
-    left, right = np.minimum(left, right), np.maximum(left, right)
-    nodes, steps = np.arange(len(free)), np.arange(dim)
-    pattern = Symmetric.of_blocks(dim * np.arange(len(free) + 1), left, right)
-    entries = np.zeros(pattern.nnz)
-    upper = np.triu(np.ones((dim, dim), dtype=bool))
-    for rows, columns, blocks, kept in (
-        (nodes, nodes, own[free], upper),
-        (left, right, shared, np.ones((dim, dim), dtype=bool)),
-    ):
-        place = np.broadcast_to((rows * dim)[:, None, None] + steps[:, None], blocks.shape)[:, kept].ravel()
-        beside = np.broadcast_to((columns * dim)[:, None, None] + steps, blocks.shape)[:, kept].ravel()
-        entries += scatter(pattern.positions(place, beside), blocks[:, kept].ravel(), pattern.nnz)
-    system = Factorization(pattern, np.repeat(nodes, dim))
-    if not system.factor(entries):
-        raise GraphError("the first guess is not determined: an information matrix does not see some direction")
-    descent = -gradient[free].reshape(len(free) * dim, sides)
-    step = np.stack([system.solve(np.ascontiguousarray(descent[:, side])) for side in range(sides)], axis=1)
+    count, dim, _ = start.shape
+    system = BlockQuadratic(first, second, count, dim, fixed)
     result = start.copy()
-    result[free] += step.reshape(len(free), dim, sides)
+    if not len(system.free):
+        return result
+    error = by_first @ start[first] + by_second @ start[second] - target
+    gradient = system.gradient(by_first, by_second, error)
+    if not system.factorization.factor(system.entries(by_first, by_second)):
+        raise GraphError("the first guess is not determined: an information matrix does not see some direction")
+    result[system.free] -= system.solve(gradient[system.free])
     return result

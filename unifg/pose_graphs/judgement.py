@@ -1,0 +1,125 @@
+"""What a solved pose graph says about itself: residuals against what was stated, and what nothing determines.
+
+The sum of squared residuals, chi2, is expected to be as large as there are degrees of freedom: rows of measurements
+less unknowns. Published information matrices are seldom calibrated, so a ratio is a hint and never a verdict; one that
+is far too large is said, one that is too small is not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtrc
+
+from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
+from unifg.typing import Array, IntArray
+
+__all__ = ["Judgement", "judge"]
+
+FAR = 4.0  # chi2 per degree of freedom: residuals twice as large as stated
+UNLIKELY = 1e-6  # and not by chance
+BLIND = 1e-12  # of the largest eigenvalue of an information matrix
+WORST = 5  # edges named
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """Residuals of a pose graph at its poses, and its structure.
+
+    Attributes:
+        chi2: sum of r' Omega r.
+        freedom: rows that carry information less unknowns; what chi2 is expected to be. Not positive where the
+            measurements only just determine the poses, or do not.
+        worst: up to five edges with the largest r' Omega r, as (k, 2) identifiers of their poses.
+        worst_chi2: (k,) r' Omega r of those.
+        parts: connected parts.
+        anchors: identifiers of poses that are held where they are because nothing else holds their part.
+        isolated: identifiers of poses without any measurement.
+        blind: positions of edges whose information matrix is zero.
+        indefinite: positions of edges whose information matrix has a negative eigenvalue.
+    """
+
+    chi2: float
+    freedom: int
+    worst: IntArray
+    worst_chi2: Array
+    parts: int
+    anchors: tuple[int, ...]
+    isolated: tuple[int, ...]
+    blind: IntArray
+    indefinite: IntArray
+
+    @property
+    def far(self) -> bool:
+        """Whether residuals are far larger than stated."""
+        return self.freedom > 0 and self.chi2 > FAR * self.freedom and chdtrc(self.freedom, self.chi2) < UNLIKELY
+
+    def sentences(self) -> list[str]:
+        """What a user should know; empty when there is nothing to say."""
+        said = []
+        if self.far:
+            ratio = (self.chi2 / self.freedom) ** 0.5
+            said.append(
+                f"residuals are {ratio:.3g} times as large as the file states: its weights are too sure, "
+                "some measurements are wrong, or this is not the best map"
+            )
+        if self.freedom < 0:
+            said.append(f"{-self.freedom} unknowns more than rows of measurements: some poses are not determined")
+        if self.parts > 1:
+            said.append(f"{self.parts} parts that nothing connects")
+        if self.isolated:
+            said.append(f"{len(self.isolated)} poses without any measurement: {_some(self.isolated)}")
+        if len(self.blind):
+            said.append(f"{len(self.blind)} edges without information, the first in place {int(self.blind[0])}")
+        if len(self.indefinite):
+            said.append(
+                f"{len(self.indefinite)} edges with indefinite information, the first in place {int(self.indefinite[0])}"
+            )
+        return said
+
+
+def judge(pose_graph: PoseGraph, residual: ResidualName = "log") -> Judgement:
+    """Compare residuals with what is stated, and look for what nothing determines.
+
+    Args:
+        pose_graph: at the poses to be judged.
+        residual: as for `PoseGraph.graph`.
+
+    Raises:
+        GraphError: there is no measurement.
+    """
+    squared = pose_graph.squared_errors(residual)
+    order = np.argsort(-squared, kind="stable")[:WORST]
+    order = order[squared[order] > 0.0]
+    edges, ids = pose_graph.edges, pose_graph.ids
+    lengths = np.linalg.eigvalsh(edges.information) if len(edges) else np.zeros((0, pose_graph.group.dim))
+    greatest = np.abs(lengths).max(axis=1, initial=0.0)
+    seen = lengths > BLIND * greatest[:, None]
+    rows = int(seen.sum())
+    touched = np.zeros(len(ids), dtype=bool)
+    touched[edges.first[greatest > 0.0]] = touched[edges.second[greatest > 0.0]] = True
+    for kind in pose_graph.sightings.values():
+        rows += int(np.linalg.matrix_rank(kind.information, hermitian=True).sum())
+        touched[kind.pose] = True
+    anchors, known = pose_graph.anchors()
+    added = ids[anchors][~np.isin(ids[anchors], np.array(pose_graph.fixed_ids, dtype=np.int64))]
+    unknown = (len(ids) - len(anchors)) * pose_graph.group.dim
+    unknown += (len(pose_graph.landmarks) - len(known)) * pose_graph.group.point_dim
+    return Judgement(
+        pose_graph.chi2(residual),
+        rows - unknown,
+        np.stack([ids[edges.first[order]], ids[edges.second[order]]], axis=1),
+        squared[order],
+        int(pose_graph.parts().max(initial=-1)) + 1,
+        tuple(added.tolist()),
+        tuple(ids[~touched].tolist()),
+        np.flatnonzero(greatest == 0.0),
+        np.flatnonzero(lengths[:, 0] < -BLIND * greatest) if len(edges) else np.zeros(0, dtype=np.intp),
+    )
+
+
+def _some(identifiers: tuple[int, ...]) -> str:
+    """The first of them, and how many there are more."""
+    first = ", ".join(map(str, identifiers[:3]))
+    return first if len(identifiers) <= 3 else f"{first} and {len(identifiers) - 3} more"

@@ -1,0 +1,221 @@
+"""The quadratic form of a pose graph: chordal costs, over rotations or over frames in a higher space.
+
+With positions p_i in R^r and frames Y_i (r, d) of orthonormal columns, r >= d, the cost of an edge is
+
+    |(Y_j - Y_i R) M|^2 + tau |p_j - p_i - Y_i t|^2
+
+(Frobenius norm), which is quadratic in (p, Y). For r = d and determinant one these are the poses. The weights stand for
+those of the logarithm to second order: rotation information Omega about an axis-angle error w gives
+|(Exp(w) - I) M|^2 = w' Omega w with M^2 = tr(Omega)/2 I - Omega in space and M^2 = Omega/2 in the plane. D. Rosen,
+L. Carlone, A. Bandeira, J. Leonard, "SE-Sync", IJRR 38(2-3), 2019, problem 1; its kappa is M^2 = kappa I.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.lie import SO3
+from unifg.pose_graphs.linear import BlockQuadratic
+from unifg.pose_graphs.pose_graph import PoseGraph
+from unifg.typing import Array, BoolArray, IntArray
+
+__all__ = ["Relaxation"]
+
+ISOTROPIC = 1e-6  # of the largest eigenvalue: information matrices are written with six digits
+ROUNDS = 100
+STILL = 1e-12  # of the cost, what a step must promise
+FRAME = 1e-9  # a bend of the quadratic below this share of its diagonal is damped
+
+
+@dataclass(frozen=True, eq=False)
+class Relaxation:
+    """Chordal costs of the edges of a pose graph.
+
+    A point is (n, d + 1, r): of every pose its position, then the columns of its frame, as rows.
+
+    Attributes:
+        dim: d, 2 or 3.
+        count: n.
+        first, second: (m,) positions of the poses.
+        by_first, by_second: (m, d + 1, d + 1) A and B of |A z_i + B z_j|^2.
+        parts: (n,) number of the connected part of every pose.
+        anchors: (parts,) a pose of each.
+        caveats: sentences, what of the graph's weights this form cannot hold; empty when it holds all.
+    """
+
+    dim: int
+    count: int
+    first: IntArray
+    second: IntArray
+    by_first: Array
+    by_second: Array
+    parts: IntArray
+    anchors: IntArray
+    caveats: tuple[str, ...]
+
+    @classmethod
+    def of(cls, pose_graph: PoseGraph, used: BoolArray | None = None) -> Relaxation:
+        """State it.
+
+        Args:
+            pose_graph: poses and edges.
+            used: (m,) edges that count, say the inliers; all by default.
+
+        Raises:
+            GraphError: the graph has landmarks, or several poses of one part are known.
+        """
+        if len(pose_graph.landmarks):
+            raise GraphError("the chordal relaxation holds relative poses only: this graph has landmarks")
+        kept = pose_graph if used is None else replace(pose_graph, edges=pose_graph.edges[used])
+        edges, anchors, parts = kept.edges, kept.anchors()[0], kept.parts()
+        if len(np.unique(parts[anchors])) < len(anchors):
+            raise GraphError("the chordal relaxation moves every connected part freely: two poses of one are known")
+        dim, angles = pose_graph.group.point_dim, pose_graph.group.dim - pose_graph.group.point_dim
+        moving, turning = edges.information[:, :dim, :dim], edges.information[:, dim:, dim:]
+        caveats = []
+        tau = np.trace(moving, axis1=1, axis2=2) / dim
+        crooked = ~_close(moving, tau[:, None, None] * np.eye(dim))
+        if crooked.any():
+            caveats.append(
+                f"translation information of {crooked.sum()} edges is not the same in all directions: "
+                "its mean stands for it"
+            )
+        coupled = ~_close(edges.information[:, :dim, dim:], 0.0, edges.information)
+        if coupled.any():
+            caveats.append(f"{coupled.sum()} edges couple rotation and translation: the coupling is left out")
+        mean = np.trace(turning, axis1=1, axis2=2)[:, None, None]
+        squared = 0.5 * turning if angles == 1 else 0.5 * mean * np.eye(3) - turning
+        if angles == 1:
+            squared = squared * np.eye(2)
+        lengths, axes = np.linalg.eigh(squared)
+        bent = lengths[:, 0] < -ISOTROPIC * np.abs(lengths[:, -1])
+        if bent.any():
+            caveats.append(
+                f"rotation information of {bent.sum()} edges is larger about one axis than about the others together: "
+                "its mean stands for it"
+            )
+            lengths[bent] = mean[bent, :, 0] / 6.0
+        root = axes @ (np.sqrt(np.maximum(lengths, 0.0))[:, :, None] * np.swapaxes(axes, 1, 2))
+        pull = np.sqrt(np.maximum(tau, 0.0))
+        matrices = pose_graph.group.matrix(edges.measured)
+        by_first = np.zeros((len(edges), dim + 1, dim + 1))
+        by_second = np.zeros_like(by_first)
+        by_first[:, 0, 0], by_second[:, 0, 0] = -pull, pull
+        by_first[:, 0, 1:] = -pull[:, None] * matrices[:, :dim, dim]
+        by_first[:, 1:, 1:] = -root @ np.swapaxes(matrices[:, :dim, :dim], 1, 2)
+        by_second[:, 1:, 1:] = root
+        count = len(pose_graph.poses)
+        order = np.argsort(parts[anchors])
+        return cls(dim, count, edges.first, edges.second, by_first, by_second, parts, anchors[order], tuple(caveats))
+
+    def lift(self, pose_graph: PoseGraph) -> Array:
+        """(n, d + 1, d) the point of a graph's poses."""
+        matrices = pose_graph.group.matrix(pose_graph.poses)[:, : self.dim]
+        return np.concatenate([matrices[:, None, :, self.dim], np.swapaxes(matrices[:, :, : self.dim], 1, 2)], axis=1)
+
+    def lower(self, point: Array, pose_graph: PoseGraph) -> Array:
+        """(n, storage) poses of a point of rank d, frames being rotations."""
+        if self.dim == 3:
+            return np.column_stack([point[:, 0], SO3.from_matrix(np.swapaxes(point[:, 1:], 1, 2))])
+        return np.column_stack([point[:, 0], np.arctan2(point[:, 1, 1], point[:, 1, 0])])
+
+    def errors(self, point: Array) -> Array:
+        """(m, d + 1, r) whitened errors of the edges."""
+        result: Array = self.by_first @ point[self.first] + self.by_second @ point[self.second]
+        return result
+
+    def cost(self, point: Array) -> float:
+        """Sum of the squared errors: chi2 of the chordal residual."""
+        return float(np.sum(self.errors(point) ** 2))
+
+    def multipliers(self, point: Array, quadratic: BlockQuadratic) -> Array:
+        """(n, d, d) Lambda_i = sym(G_i Y_i), multipliers of Y_i' Y_i = I, where G is half the gradient (eq. 106)."""
+        slope = quadratic.gradient(self.by_first, self.by_second, self.errors(point))[:, 1:]
+        product = slope @ np.swapaxes(point[:, 1:], 1, 2)
+        return 0.5 * (product + np.swapaxes(product, 1, 2))
+
+    def minimize(self, point: Array) -> Array:
+        """A local minimum near a point, by Newton's method on positions and frames; anchors stay.
+
+        The second derivative along the manifold is the quadratic less the multipliers; where it is not positive, it is
+        damped.
+        """
+        rank, dim = point.shape[2], self.dim
+        plain = BlockQuadratic(self.first, self.second, self.count, dim + 1, np.zeros(0, dtype=np.intp))
+        spins = [(i, k) for i in range(dim) for k in range(i)]
+        size = rank + len(spins) + dim * (rank - dim)
+        system = BlockQuadratic(self.first, self.second, self.count, size, self.anchors)
+        cost, damping = self.cost(point), 0.0
+        scale = float(np.max(np.abs(self.by_second), initial=0.0) ** 2)
+        for _ in range(ROUNDS):
+            basis = _tangents(point, spins)
+            flat = basis.reshape(self.count, dim + 1, rank * size)
+            shape = (len(self.first), (dim + 1) * rank, size)
+            J_first = (self.by_first @ flat[self.first]).reshape(shape)
+            J_second = (self.by_second @ flat[self.second]).reshape(shape)
+            error = self.errors(point).reshape(len(self.first), -1, 1)
+            gradient = system.gradient(J_first, J_second, error)[system.free]
+            frames = basis[:, 1:]
+            bend = np.einsum("narq,nab,nbrs->nqs", frames, self.multipliers(point, plain), frames)
+            entries = system.entries(J_first, J_second, -bend)
+            step = None
+            while step is None:
+                added = np.full(len(system.free) * size, damping)
+                if system.factorization.factor(entries, added) and system.factorization.definite:
+                    step = -system.solve(gradient)
+                elif damping > 1e3 * scale:
+                    return point
+                else:
+                    damping = max(10.0 * damping, FRAME * scale)
+            promised = -float(np.sum(gradient * step))
+            whole = np.zeros((self.count, size))
+            whole[system.free] = step[:, :, 0]
+            trial = _retract(point, basis, whole)
+            lower = self.cost(trial)
+            if lower <= cost:
+                point, cost, damping = trial, lower, (0.1 * damping if damping > FRAME * scale else 0.0)
+            elif promised > STILL * cost:
+                damping = max(10.0 * damping, FRAME * scale)
+                continue
+            if promised <= STILL * cost:
+                return point
+        return point
+
+
+def _close(found: Array, wanted: Array | float, beside: Array | None = None) -> BoolArray:
+    """(m,) whether blocks are as wanted, measured by their own size or that of larger ones."""
+    size = np.abs(found if beside is None else beside).max(axis=(1, 2), initial=0.0)
+    near: BoolArray = np.abs(found - wanted).max(axis=(1, 2), initial=0.0) <= ISOTROPIC * size
+    return near
+
+
+def _tangents(point: Array, spins: list[tuple[int, int]]) -> Array:
+    """(n, d + 1, r, q) directions of positions and frames: r shifts, turns of the frame, ways out of it."""
+    count, above, rank = point.shape
+    dim = above - 1
+    frames = point[:, 1:]
+    basis = np.zeros((count, above, rank, rank + len(spins) + dim * (rank - dim)))
+    for k in range(rank):
+        basis[:, 0, k, k] = 1.0
+    at = rank
+    for i, k in spins:
+        basis[:, 1 + i, :, at], basis[:, 1 + k, :, at] = frames[:, k], -frames[:, i]
+        at += 1
+    if rank > dim:
+        outside = np.linalg.svd(frames)[2][:, dim:]  # (n, r - d, r), orthogonal to the frame
+        for i in range(dim):
+            for k in range(rank - dim):
+                basis[:, 1 + i, :, at] = outside[:, k]
+                at += 1
+    return basis
+
+
+def _retract(point: Array, basis: Array, step: Array) -> Array:
+    """The nearest frames to a point moved by steps (n, q)."""
+    moved: Array = point + np.einsum("narq,nq->nar", basis, step)
+    left, _, right = np.linalg.svd(moved[:, 1:], full_matrices=False)
+    moved[:, 1:] = left @ right
+    return moved
