@@ -71,8 +71,8 @@ class SolveSettings:
     robust: str | None = option(None, metavar="LOSS[:PARAM]")
     init: str = option(AUTO, choices=(AUTO, *GUESSES))
     residual: ResidualName = option("log")
-    certify: bool = False
-    staircase: bool = False
+    certify: bool = option(False)
+    staircase: bool = option(False)
 
 
 @dataclass(frozen=True, eq=False)

@@ -55,7 +55,8 @@ def test_writes_every_file_and_says_what_came_out(
     assert "100%" in said.err and "100%" not in said.out
     before, after, metrics = read_g2o(file), read_g2o(out / "graph.g2o"), numbers(out)
     assert metrics["converged"] is True
-    assert metrics["chi2_start"] == pytest.approx(before.chi2())
+    assert metrics["chi2_file"] == pytest.approx(before.chi2()) and metrics["init"] != "auto"
+    assert metrics["chi2_start"] < 0.1 * metrics["chi2_file"] and metrics["degrees_of_freedom"] > 0
     assert metrics["chi2"] == pytest.approx(after.chi2())
     assert after.chi2() < 0.5 * before.chi2()
     assert f"{after.chi2():.9g}" in said.out

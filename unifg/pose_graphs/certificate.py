@@ -9,7 +9,7 @@ D. Rosen, L. Carlone, A. Bandeira, J. Leonard, "SE-Sync", IJRR 38(2-3), 2019, th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, eigsh
@@ -87,8 +87,9 @@ def certify(
     verdict = judge(point)
     rank = problem.dim
     if staircase and not verdict.proven:
-        point, rank = _climb(problem, judge, point, verdict)
+        point, rank, bound = _climb(problem, judge, point, verdict)
         verdict = judge(point)
+        verdict = replace(verdict, gap=min(verdict.gap, max(verdict.cost - bound, 0.0)))
     poses = problem.lower(point, pose_graph)
     poses[problem.anchors] = pose_graph.poses[problem.anchors]
     apart = pose_graph.group.local(pose_graph.poses, poses)
@@ -171,14 +172,22 @@ class _Judge:
         return _Verdict(cost, proven, tolerance, least, direction)
 
 
-def _climb(problem: Relaxation, judge: _Judge, point: Array, verdict: _Verdict) -> tuple[Array, int]:
-    """Follow the way down through more dimensions until there is none, and come back to rotations."""
+def _climb(problem: Relaxation, judge: _Judge, point: Array, verdict: _Verdict) -> tuple[Array, int, float]:
+    """Follow the way down through more dimensions until there is none, and come back to rotations.
+
+    Returns:
+        The point of rank d, the rank reached, and what no map costs less than, as proven there.
+    """
     lifted = point
     while not verdict.proven and lifted.shape[2] < problem.dim + RANKS:
         lifted = problem.minimize(_leave(problem, lifted, verdict.direction))
         verdict = judge(lifted)
     returned = problem.minimize(_rounded(problem, lifted, point))
-    return (returned if problem.cost(returned) < problem.cost(point) else point), lifted.shape[2]
+    return (
+        (returned if problem.cost(returned) < problem.cost(point) else point),
+        lifted.shape[2],
+        verdict.cost - verdict.gap,
+    )
 
 
 def _leave(problem: Relaxation, point: Array, direction: Array) -> Array:

@@ -73,9 +73,8 @@ class Judgement:
         if len(self.blind):
             said.append(f"{len(self.blind)} edges without information, the first in place {int(self.blind[0])}")
         if len(self.indefinite):
-            said.append(
-                f"{len(self.indefinite)} edges with indefinite information, the first in place {int(self.indefinite[0])}"
-            )
+            first = int(self.indefinite[0])
+            said.append(f"{len(self.indefinite)} edges with indefinite information, the first in place {first}")
         return said
 
 

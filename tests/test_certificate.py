@@ -1,0 +1,234 @@
+"""Certificates of pose graphs: proofs against dense eigenvalues, ways down against folded loops, and what is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.errors import GraphError
+from unifg.pose_graphs import Edges, PoseGraph, best_guess, certify, chordal, judge, manhattan, sphere
+from unifg.pose_graphs.relaxation import Relaxation
+from unifg.solvers import GaussNewton, LevenbergMarquardt
+from unifg.typing import Array
+
+GROUPS = {"plane": fg.SE2, "space": fg.SE3}
+
+
+def lifted(poses: Array) -> Array:
+    """Planar poses in space."""
+    nothing = np.zeros(len(poses))
+    half = 0.5 * poses[:, 2]
+    return np.column_stack([poses[:, :2], nothing, np.cos(half), nothing, nothing, np.sin(half)])
+
+
+def ring(count: int, turns: int, group: fg.LieGroup = fg.SE2, weight: float = 1.0, at: float = 0.0) -> PoseGraph:
+    """A loop that turns once, begun where it turns more often: the start lies in the basin of a folded map."""
+    rng = np.random.default_rng(0)
+
+    def loop(times: int) -> Array:
+        angle = 2.0 * np.pi * times * np.arange(count) / count
+        radius = count / (2.0 * np.pi * times)
+        places = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), angle + 0.5 * np.pi])
+        return fg.SE2.retract(places, np.zeros(3))
+
+    first = np.arange(count)
+    second = (first + 1) % count
+    truth, begun = loop(1), loop(turns)
+    measured = fg.SE2.retract(fg.SE2.between(truth[first], truth[second]), 0.01 * rng.standard_normal((count, 3)))
+    begun[:, :2] += at
+    diagonal = [100.0, 100.0, 400.0]
+    if group is fg.SE3:
+        measured, begun, diagonal = lifted(measured), lifted(begun), [100.0] * 3 + [400.0] * 3
+    information = np.tile(weight * np.diag(diagonal), (count, 1, 1))
+    return PoseGraph(np.arange(count), begun, Edges(first, second, measured, information))
+
+
+def solved(pose_graph: PoseGraph) -> PoseGraph:
+    graph, x, guess = pose_graph.graph()
+    return pose_graph.with_poses(LevenbergMarquardt().solve(graph, guess, check=True)[x])
+
+
+def dense_dual(pose_graph: PoseGraph, poses: Array) -> Array:
+    """The dual matrix over positions and frames, positions eliminated, written as SE-Sync's section 3 says."""
+    dim, count = pose_graph.group.point_dim, len(poses)
+    problem = Relaxation.of(pose_graph)
+    size = dim + 1
+    whole = np.zeros((count * size, count * size))
+    for i, j, A, B in zip(problem.first, problem.second, problem.by_first, problem.by_second, strict=True):
+        wide = np.zeros((size, count * size))
+        wide[:, i * size : (i + 1) * size] += A
+        wide[:, j * size : (j + 1) * size] += B
+        whole += wide.T @ wide
+    point = problem.lift(pose_graph.with_poses(poses)).reshape(count * size, dim)
+    slope = (whole @ point).reshape(count, size, dim)[:, 1:]
+    frames = point.reshape(count, size, dim)[:, 1:]
+    for k in range(count):
+        own = slope[k] @ frames[k].T
+        whole[k * size + 1 : (k + 1) * size, k * size + 1 : (k + 1) * size] -= 0.5 * (own + own.T)
+    turning = np.tile(np.arange(size) > 0, count)
+    places = whole[np.ix_(~turning, ~turning)]
+    across = whole[np.ix_(turning, ~turning)]
+    return whole[np.ix_(turning, turning)] - across @ np.linalg.pinv(places) @ across.T
+
+
+@pytest.mark.parametrize("name", GROUPS)
+def test_the_cost_is_that_of_the_logarithm_to_second_order(name: str) -> None:
+    group, rng = GROUPS[name], np.random.default_rng(1)
+    dim, angles = group.point_dim, group.dim - group.point_dim
+    turning = np.diag([300.0, 200.0, 250.0][:angles])
+    if angles == 3:
+        frame = fg.SO3.matrix(fg.SO3.exp(rng.standard_normal((1, 3))))[0]
+        turning = frame @ turning @ frame.T
+    information = np.zeros((1, group.dim, group.dim))
+    information[0, :dim, :dim], information[0, dim:, dim:] = 50.0 * np.eye(dim), turning
+    poses = group.exp(rng.standard_normal((2, group.dim)))
+    exact = group.between(poses[:1], poses[1:])
+    edges = Edges(np.array([0]), np.array([1]), exact, information)
+    graph = PoseGraph(np.arange(2), poses, edges)
+    problem = Relaxation.of(graph)
+    assert problem.caveats == ()
+    assert problem.cost(problem.lift(graph)) == pytest.approx(0.0, abs=1e-24)
+    for _ in range(5):
+        moved = poses.copy()
+        moved[1:] = group.retract(poses[1:], 1e-4 * rng.standard_normal((1, group.dim)))
+        here = graph.with_poses(moved)
+        assert problem.cost(problem.lift(here)) == pytest.approx(here.chi2(), rel=1e-3)
+
+
+@pytest.mark.parametrize("made", [manhattan(150, seed=3), sphere(5, 8, seed=3)], ids=["plane", "space"])
+def test_a_solved_graph_is_certified(made: object) -> None:
+    after = solved(made.pose_graph)  # type: ignore[attr-defined]
+    found = certify(after)
+    assert found.certified and 0.0 <= found.gap <= 2e-6 * found.chi2
+    assert found.rank == after.group.point_dim and found.caveats == ()
+    assert found.chi2 == pytest.approx(after.chi2(), rel=0.02)
+    assert np.linalg.eigvalsh(dense_dual(after, found.poses))[0] > -1e-6
+    assert "no map has a lower chordal chi2" in found.sentence()
+    assert found.moved[0] < 0.05 and found.moved[1] < 0.02
+
+
+@pytest.mark.parametrize("name", GROUPS)
+@pytest.mark.parametrize(("count", "turns"), [(20, 2), (30, 3)])
+def test_a_folded_loop_is_refused_and_unfolded(name: str, count: int, turns: int) -> None:
+    folded = solved(ring(count, turns, GROUPS[name]))
+    right = solved(ring(count, 1, GROUPS[name]))
+    assert folded.chi2() > 100.0 * right.chi2()
+    refused = certify(folded)
+    assert not refused.certified and "not certified" in refused.sentence()
+    # What is proven is proven: no graph lies below chi2 less gap.
+    assert refused.chi2 - refused.gap <= certify(right).chi2
+    assert refused.least_eigenvalue == pytest.approx(np.linalg.eigvalsh(dense_dual(folded, refused.poses))[0], rel=1e-3)
+    found = certify(folded, staircase=True)
+    assert found.certified and found.rank > folded.group.point_dim
+    assert solved(folded.with_poses(found.poses)).chi2() == pytest.approx(right.chi2(), rel=1e-6)
+    assert np.array_equal(found.poses[0], folded.poses[0])  # the anchor stays
+
+
+@pytest.mark.parametrize("weight", [1e-6, 1e6])
+@pytest.mark.parametrize("at", [0.0, 1e6])
+def test_units_and_offsets_decide_nothing(weight: float, at: float) -> None:
+    right, folded = (solved(ring(20, turns, weight=weight, at=at)) for turns in (1, 2))
+    assert certify(right, tolerance=1e-5).certified
+    assert not certify(folded, tolerance=1e-5).certified
+    assert certify(folded, tolerance=1e-5, staircase=True).certified
+
+
+def test_parts_are_judged_together() -> None:
+    one = ring(20, 2)
+    both = PoseGraph(
+        np.arange(40),
+        np.concatenate([one.poses, one.poses + np.array([50.0, 0.0, 0.0])]),
+        Edges(*(np.concatenate([a, b]) for a, b in (
+            (one.edges.first, one.edges.first + 20),
+            (one.edges.second, one.edges.second + 20),
+            (one.edges.measured, one.edges.measured),
+            (one.edges.information, one.edges.information),
+        ))),
+    )  # fmt: skip
+    folded = solved(both)
+    assert not certify(folded).certified
+    found = certify(folded, staircase=True)
+    assert found.certified
+    assert found.poses[[0, 20]] == pytest.approx(folded.poses[[0, 20]])
+    assert judge(folded).parts == 2 and judge(folded).anchors == (0, 20)
+
+
+def test_only_what_is_used_counts() -> None:
+    made = manhattan(150, seed=4, outliers=0.1)
+    assert made.outliers.any()
+    clean = replace(made.pose_graph, edges=made.pose_graph.edges[~made.outliers])
+    after = made.pose_graph.with_poses(solved(clean).poses)
+    found = certify(after, used=~made.outliers)
+    assert found.certified and found.chi2 == pytest.approx(certify(solved(clean)).chi2)
+    assert certify(after).chi2 > 2.0 * found.chi2
+
+
+def test_what_the_form_cannot_hold_is_said() -> None:
+    graph = solved(sphere(4, 6).pose_graph)
+    information = graph.edges.information.copy()
+    information[0, 0, 0] *= 3.0
+    information[1, 3, 3] *= 30.0
+    information[2, 0, 4] = information[2, 4, 0] = 5.0
+    found = certify(solved(replace(graph, edges=replace(graph.edges, information=information))))
+    assert [word in " ".join(found.caveats) for word in ("directions", "about one axis", "couple")] == [True] * 3
+    assert all(caveat in found.sentence() for caveat in found.caveats)
+
+
+def test_landmarks_and_known_poses_are_refused() -> None:
+    graph = ring(20, 1)
+    with pytest.raises(GraphError, match="landmarks"):
+        certify(replace(graph, landmark_ids=np.array([99]), landmarks=np.zeros((1, 2))))
+    with pytest.raises(GraphError, match="two poses"):
+        certify(replace(graph, fixed_ids=(0, 5)))
+
+
+def test_the_start_that_costs_least_is_taken() -> None:
+    folded = solved(ring(20, 2))
+    name, poses = best_guess(folded)
+    assert name in ("chordal", "lago") and folded.with_poses(poses).chi2() < 0.1 * folded.chi2()
+    right = solved(ring(20, 1))
+    assert best_guess(right)[0] == "file" and best_guess(right)[1] is right.poses
+    made = manhattan(150, seed=4, outliers=0.1)
+    truth = made.pose_graph.with_poses(made.truth)
+    loss = fg.TruncatedLeastSquares(3.0)
+    assert chordal(made.pose_graph) != pytest.approx(made.truth)
+    assert best_guess(truth, loss=loss)[0] == "file"  # outliers have no say in what the truth costs
+
+
+def test_residuals_are_held_against_what_was_stated() -> None:
+    right = solved(ring(20, 1))
+    calm = judge(right)
+    assert calm.freedom == 3 * 20 - 3 * 19 and not calm.far and calm.sentences() == []
+    folded = judge(solved(ring(20, 2)))
+    assert folded.far and "times as large" in folded.sentences()[0]
+    timid = judge(solved(ring(20, 1, weight=1e-6)))
+    assert not timid.far and timid.sentences() == []  # too small is no reason to doubt
+    information = right.edges.information.copy()
+    information[3] = 0.0
+    information[5] = -np.eye(3)
+    edges = Edges(right.edges.first, right.edges.second, right.edges.measured, information)
+    alone = np.concatenate([right.poses, np.zeros((1, 3))])
+    odd = judge(PoseGraph(np.arange(21), alone, edges))
+    assert odd.isolated == (20,) and odd.blind.tolist() == [3] and odd.indefinite.tolist() == [5]
+    assert odd.parts == 2 and odd.anchors == (0, 20)
+    said = " ".join(odd.sentences())
+    assert all(word in said for word in ("20", "place 3", "place 5", "2 parts", "not determined"))
+
+
+def test_worst_edges_are_named() -> None:
+    graph = solved(ring(20, 1))
+    measured = graph.edges.measured.copy()
+    measured[7, 0] += 0.5
+    named = judge(replace(graph, ids=np.arange(100, 120), edges=replace(graph.edges, measured=measured)))
+    assert named.worst[0].tolist() == [107, 108]
+    assert named.worst_chi2[0] == named.worst_chi2.max()
+
+
+def test_gauss_newton_agrees_from_the_best_start() -> None:
+    made = sphere(5, 8, seed=5).pose_graph
+    _, poses = best_guess(made)
+    graph, x, guess = made.with_poses(poses).graph()
+    assert certify(made.with_poses(GaussNewton().solve(graph, guess, check=True)[x])).certified
