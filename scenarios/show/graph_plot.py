@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 from itertools import pairwise
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -41,7 +42,7 @@ def picture(solved: SolvedGraph) -> Figure:
         figure.legend(*key_of((left, right)), loc="outside lower center", ncols=5)
         graph = solved.after
         edges = f"{len(graph.edges) - len(graph.closures)} odometry edges, {len(graph.closures)} loop closures"
-        remarks = "".join(f"\n{sentence}" for sentence in solved.judgement.sentences())
+        remarks = "".join(f"\n{fill(sentence, 110)}" for sentence in solved.judgement.sentences())
         headline(figure, f"{solved.name}: {len(graph.poses)} poses, {edges}{remarks}")
     return figure
 
