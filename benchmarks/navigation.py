@@ -89,8 +89,9 @@ class Drive:
         """The episode to run."""
         case, controller = cases[self.case], replace(ControllerSettings(), control_weight=self.weight)
         return NavigationSettings(
-            case.path, case.start, case.goals, self.solver, self.coupling, case.obstacles, self.seed, controller
-        )
+            case.path, case.start, case.goals, self.solver, self.coupling, case.obstacles, seed=self.seed,
+            controller=controller,
+        )  # fmt: skip
 
 
 def drive(job: Drive, cases: Mapping[str, Case] = CASES) -> Row:

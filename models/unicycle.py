@@ -39,6 +39,11 @@ def _defect(x: Array, u: Array, after: Array, dt: Array) -> Array:
     return np.concatenate([(after[:, :2] - x[:, :2]) - moves[:, :2], turned], axis=1)
 
 
+def _ramped_defect(x: Array, before: Array, u: Array, after: Array, dt: Array) -> Array:
+    """The same of velocities that change steadily from ``before`` to ``u`` over the step."""
+    return _defect(x, 0.5 * (before + u), after, dt)
+
+
 def _deviation(x: Array, reference: Array) -> Array:
     """(p - p_ref, theta - theta_ref) in world axes (eq. 8), heading wrapped."""
     return np.concatenate([x[:, :2] - reference[:, :2], wrap_angle(x[:, 2:] - reference[:, 2:])], axis=1)
@@ -83,6 +88,12 @@ def rollout(start: Array, u: Array, dt: ArrayLike) -> Array:
     return states
 
 
+def ramp(last: Array, u: Array) -> Array:
+    """Mean velocities (n, 2) of steps at whose ends the velocities are u (n, 2), from ``last`` (2,) on."""
+    means: Array = 0.5 * (np.concatenate([last[None], u[:-1]]) + u)
+    return means
+
+
 def _rows(part: ArrayLike, moved: Array, size: int) -> Array:
     """One contiguous row per result."""
     return np.ascontiguousarray(np.broadcast_to(np.asarray(part, dtype=np.float64), (len(moved), size)))
@@ -95,6 +106,10 @@ def _samples(dt: ArrayLike, moved: Array) -> Array:
 
 dynamics = residual(StatedKernel(_defect, (SE2, CONTROL, SE2, ()), 3, name="dynamics"))
 """``dynamics(x, u, x_next, dt)``: x_next - f(x, u), (n, 3) [m, m, rad] (Bazzana eq. 11-14)."""
+
+ramped = residual(StatedKernel(_ramped_defect, (SE2, CONTROL, CONTROL, SE2, ()), 3, name="ramped dynamics"))
+"""``ramped(x, before, u, x_next, dt)``: x_next - f(x, (before + u) / 2), (n, 3) [m, m, rad]: u is reached at the end of
+the step, from ``before`` at its beginning, as by a base of limited accelerations."""
 
 tracking = residual(StatedKernel(_deviation, (SE2, (3,)), 3, name="tracking"))
 """``tracking(x, reference)``: deviation from a reference pose in world axes, (n, 3) [m, m, rad] (Bazzana eq. 8)."""

@@ -7,7 +7,7 @@ Bazzana et al. 2022, sections IV, V and VII.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,12 +25,12 @@ from unifg.scenarios.driving.route import Route
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.options import existing, option, pose
+from unifg.scenarios.options import existing, option, pose, positive
 from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.ways.polyline import path_length
 from unifg.scenarios.worlds.building import DEMO_GOALS, DEMO_START, building_map
 from unifg.scenarios.worlds.drivetrain import Drivetrain, draw_patches
-from unifg.scenarios.worlds.placement import place_obstacles
+from unifg.scenarios.worlds.placement import PlacementRules, place_obstacles
 from unifg.scenarios.worlds.plane import World
 from unifg.typing import Array
 
@@ -52,10 +52,12 @@ class NavigationSettings:
         goals: poses to be reached in this order, an option for each; without any, the demonstration's.
         solver: one of `unifg.solvers.names.CONSTRAINED`.
         coupling: of estimation and control: estimation first, then control conditioned on it; or one graph for both.
-        obstacles: number of obstacles that are not on the map.
+        obstacles: number of obstacles that are not on the map; one in three moves.
+        mover_speed: speed of those that move [m/s], which the robot is not told.
+        courteous: whether they wait for a robot at rest; else they go on through it.
         seed: of everything random.
         controller: weights and limits.
-        drivetrain: of the base.
+        drivetrain: of the base; the controller is told the accelerations on its data sheet.
     """
 
     map: Path | None = option(None, text=existing("the YAML file of a ROS map"), metavar="F.yaml")
@@ -66,6 +68,8 @@ class NavigationSettings:
     solver: str = "ipm"
     coupling: str = option("sequential", choices=("sequential", "joint"))
     obstacles: int = option(0, metavar="K")
+    mover_speed: float = option(0.3, text=positive, metavar="M/S")
+    courteous: bool = option(False)
     seed: int = option(0, metavar="S")
     controller: ControllerSettings = field(default_factory=ControllerSettings)
     drivetrain: Drivetrain = field(default_factory=Drivetrain)
@@ -90,7 +94,7 @@ class Episode:
     def __init__(self, settings: NavigationSettings, *, rehearsal: bool = False) -> None:
         """Load the map, plan the legs, place the obstacles, wake the robot, and rehearse unless this is a rehearsal."""
         self.settings = settings
-        control = settings.controller
+        self.controller = control = replace(settings.controller, accelerations=settings.drivetrain.sheet)
         self.occupancy = building_map() if settings.map is None else load_map(settings.map)
         self.start = _pose(settings.start, DEMO_START if settings.map is None else None, "start")
         if settings.goals is None and settings.map is not None:
@@ -114,10 +118,12 @@ class Episode:
             placement,
             start=self.start,
             goals=self.goals,
+            rules=PlacementRules(speed=settings.mover_speed),
         )
         self.world = World(
             self.occupancy, self.start, discs, sensors, robot_radius=control.robot_radius,
             drivetrain=settings.drivetrain, patches=draw_patches(settings.drivetrain, self.path, floor),
+            courteous=settings.courteous,
         )  # fmt: skip
         sigma = np.array(INITIAL_SIGMA)
         believed = self.start + sigma * belief.standard_normal(3)
@@ -205,6 +211,7 @@ class Episode:
             clearance=world.clearance(),
             goal_index=self._goal,
             emergency=plan.emergency,
+            rescued=plan.rescued,
         )
 
     def _route(self, begin: Array, end: Array) -> Route:

@@ -90,6 +90,7 @@ def episode(ticks: int = 40, obstacles: int = 2, *, map_yaw: float = 0.0, seed: 
         goal_index=np.zeros(ticks, dtype=np.intp),
         reached=[True],
         emergency=emergency,
+        rescued=np.zeros(ticks, dtype=bool),
     )
 
 

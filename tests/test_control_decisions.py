@@ -10,15 +10,15 @@ import pytest
 
 import unifg as fg
 from episodes import room
-from unifg.horizon import Plan
-from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap, SmoothField
-from unifg.scenarios.driving.drive_control import BRAKING, LEFT_BEHIND, PATIENCE, Controller, is_behind
-from unifg.scenarios.driving.drive_parts import disc_limits, predicted, wall_limits
+from unifg.scenarios.driving.drive_control import LEFT_BEHIND, PATIENCE, Controller, is_behind
+from unifg.scenarios.driving.drive_parts import along, disc_limits, in_world, predicted, wall_limits
 from unifg.scenarios.driving.drive_past import Smoother
 from unifg.scenarios.driving.drive_settings import ControllerSettings
+from unifg.scenarios.driving.stopping import followed, stopped
 from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.seeing.tracks import Tracks
+from unifg.scenarios.ways.polyline import polyline_distance
 from unifg.scenarios.worlds.plane import World
 from unifg.solvers import SQP
 from unifg.typing import Array
@@ -50,41 +50,59 @@ def tracks(
     return Tracks(rows[:, :2], np.tile(np.array(velocity), (count, 1)), rows[:, 2], names, np.zeros(count), moving)
 
 
-def ahead(pose: Array = OPEN, speed: float = SETTINGS.speed) -> Array:
-    """A straight reference from a pose."""
-    way = speed * SETTINGS.dt * np.arange(SETTINGS.horizon + 1.0)
+def ahead(pose: Array = OPEN, way: Array | None = None) -> Array:
+    """A straight reference from a pose, of a robot that begins at rest, if nothing else is said."""
+    way = SETTINGS.stations(0.0) if way is None else way
     heading = pose[2]
     return np.column_stack(
         [pose[0] + way * np.cos(heading), pose[1] + way * np.sin(heading), np.full(len(way), heading)]
     )
 
 
-# ---------------------------------------------------------------- whom it yields to
+# ---------------------------------------------------------------- whom it makes way for
 
 
-GAP = SETTINGS.yield_distance - 0.05
-BESIDE = (OPEN[0], OPEN[1] + HULL + GAP + 0.2, 0.2)  # not in the way: nothing else would stop the robot
+@pytest.mark.parametrize("speed", [0.3, 0.6, 1.0])
+@pytest.mark.parametrize("slant", [0.0, 0.1])
+def test_the_robot_makes_way_for_one_who_does_not_wait(controller: Controller, speed: float, slant: float) -> None:
+    """Somebody walks straight into a robot that has nothing to do; it is not run over, and comes back."""
+    s, pose, begin = SETTINGS, OPEN.copy(), np.array([OPEN[0] + 2.5, OPEN[1] + slant])
+    least, aside = np.inf, 0.0
+    for tick in range(round((3.5 / speed + 2.5) / s.dt)):
+        at = begin - np.array([speed * s.dt * tick, 0.0])
+        others = tracks((at[0], at[1], 0.2), velocity=(-speed, 0.0), mover=True)
+        before = controller.loop.applied
+        plan = controller.plan(pose, np.tile(OPEN, (s.horizon + 1, 1)), others if at[0] > -0.5 else tracks())
+        assert np.all(np.abs(plan.control - before) <= s.most + 1e-9)
+        pose = followed(pose, before, plan.control[None], s.dt)[1]
+        gap = float(np.hypot(*(pose[:2] - at + np.array([speed * s.dt, 0.0])))) - 0.2 - HULL
+        least, aside = min(least, gap), max(aside, float(np.hypot(*(pose - OPEN)[:2])))
+    assert least > 0.02
+    assert aside > 0.1
+    assert np.hypot(*(pose - OPEN)[:2]) < 0.2
 
 
-@pytest.mark.parametrize(
-    ("others", "rests"),
-    [
-        (tracks(BESIDE, velocity=(0.0, -0.3), mover=True), True),
-        (tracks(BESIDE, velocity=(0.0, 0.3), mover=True), False),  # it goes away
-        (tracks(BESIDE, velocity=(0.0, -0.04), mover=True), False),  # as good as at rest
-        (tracks(BESIDE, velocity=(0.0, -0.3), mover=False), False),  # a velocity nobody trusts
-        (tracks((OPEN[0], BESIDE[1] + 0.1, 0.2), velocity=(0.0, -0.3), mover=True), False),  # far enough
-        (tracks((OPEN[0], BESIDE[1] + 0.1, 0.31), velocity=(0.0, -0.3), mover=True), True),  # its hull is near
-        (tracks((5.0, 4.0, 0.2), BESIDE, velocity=(0.0, -0.3), mover=True), True),  # one of two
-    ],
-    ids=["closing in", "leaving", "creeping", "standing", "far", "large", "second"],
-)
-def test_the_robot_rests_for_a_mover_that_closes_in(controller: Controller, others: Tracks, rests: bool) -> None:
-    plan = controller.plan(OPEN, ahead(), others)
-    assert not plan.emergency and plan.excess < 1e-3
-    assert (not plan.control.any()) == rests
-    if rests:  # the next tick goes on from rest, as the first change of control is counted from there
-        assert not controller.loop.applied.any()
+def test_the_way_out_is_rest_unless_somebody_comes_into_it(controller: Controller) -> None:
+    """Who passes at a distance, stands, or never moved gives no cause to leave; who comes on does."""
+    s, reference = SETTINGS, np.tile(OPEN, (SETTINGS.horizon + 1, 1))
+    coming = tracks((OPEN[0] + 0.9, OPEN[1], 0.2), velocity=(-0.6, 0.0), mover=True)
+    for others, evades in (
+        (tracks(), False),
+        (tracks((OPEN[0] + 0.9, OPEN[1], 0.2), velocity=(-0.6, 0.0)), False),
+        (tracks((OPEN[0] + 0.9, OPEN[1], 0.2), mover=True), False),
+        (tracks((OPEN[0] + 0.9, OPEN[1] + 0.8, 0.2), velocity=(-0.6, 0.0), mover=True), False),
+        (coming, True),
+    ):
+        way = controller.given(OPEN, reference, others).way_out
+        assert way.evades == evades
+        assert way.states.shape == (s.horizon + 1, 3)
+        assert np.all(np.abs(np.diff(way.controls, axis=0, prepend=0.0, append=0.0)) <= s.most + 1e-9)
+        np.testing.assert_allclose(way.states, followed(OPEN, np.zeros(2), way.controls, s.dt))
+        if not evades:
+            assert not way.controls.any()
+    places = coming.centre + s.dt * np.arange(1.0, s.horizon + 1)[:, None] * coming.velocity
+    assert (np.hypot(*(way.states[1:, :2] - places).T) - 0.2).min() > HULL
+    assert controller.field.distance(way.states[:, :2]).min() > HULL
 
 
 # ---------------------------------------------------------------- how near it may come
@@ -95,14 +113,58 @@ def test_a_robot_beside_a_standing_disc_may_come_a_little_nearer() -> None:
     s, gap = SETTINGS, 0.05  # less than the clearance that is kept from discs
     place = (OPEN[0] + HULL + gap + 0.2, OPEN[1], 0.2)
     for mover in (False, True):
-        others = tracks(place, mover=mover)
-        centres = np.tile(others.centre, (s.horizon, 1, 1))
-        limits = disc_limits(SETTINGS, OPEN, centres, others.radius, others.mover)
-        assert limits[:, 0] == pytest.approx(HULL + (gap if mover else gap - 0.02))  # not nearer than 3 cm
-    roomy = disc_limits(
-        SETTINGS, OPEN, np.tile([OPEN[0] + 1.0, OPEN[1]], (s.horizon, 1, 1)), np.array([0.2]), np.array([False])
-    )
-    assert roomy[:, 0] == pytest.approx(HULL + s.disc_clearance)
+        limits = limits_of(tracks(place, mover=mover))
+        assert limits == pytest.approx(HULL + (gap if mover else gap - 0.02))  # not nearer than 3 cm
+    assert limits_of(tracks((OPEN[0] + 1.0, OPEN[1], 0.2))) == pytest.approx(HULL + s.disc_clearance)
+
+
+RESTING = np.tile(OPEN, (SETTINGS.horizon + 1, 1))
+
+
+def limits_of(others: Tracks, way_out: Array = RESTING, spread: Array | None = None) -> Array:
+    """(N,) least distances to one disc, of a robot at a place known to a spread (2, 2)."""
+    centres = predicted(SETTINGS, OPEN, others)
+    limits = disc_limits(SETTINGS, OPEN, centres, others, way_out, np.zeros((2, 2)) if spread is None else spread)
+    assert limits.shape == (SETTINGS.horizon, 1)
+    return limits[:, 0]
+
+
+def test_clearances_widen_along_the_normal_with_what_the_estimate_may_be_off(field: DistanceMap) -> None:
+    """Two standard deviations towards a wall or a disc; what lies across costs nothing."""
+    s, smooth = SETTINGS, SmoothField(field)
+    place = np.array([0.0, 0.0, 0.7])
+    body = np.diag([0.05**2, 0.01**2, 0.3])  # uncertain ahead and certain aside
+    cosine, sine = np.cos(0.7), np.sin(0.7)
+    spread = in_world(place, body)
+    assert along(spread, np.array([cosine, sine])) == pytest.approx(0.05)
+    assert along(spread, np.array([[-sine, cosine], [-2.0 * sine, 2.0 * cosine]])) == pytest.approx([0.01, 0.01])
+    level = np.diag([0.05**2, 0.01**2])
+    near_wall = np.array([1.5, -0.3, 0.0])  # the wall is below
+    reference = np.tile(near_wall, (s.horizon + 1, 1))
+    for given, extra in ((level, 0.01), (level[::-1, ::-1], 0.05), (np.zeros((2, 2)), 0.0)):
+        found = wall_limits(s, smooth, reference, reference, given)
+        assert found == pytest.approx(HULL + s.wall_clearance + s.sigmas * extra, abs=1e-6)
+    for disc, extra in (((OPEN[0] + 1.0, OPEN[1], 0.2), 0.05), ((OPEN[0], OPEN[1] + 1.0, 0.2), 0.01)):
+        found = limits_of(tracks(disc), spread=level)
+        assert found == pytest.approx(HULL + s.disc_clearance + s.sigmas * extra)
+
+
+def test_limits_are_no_stricter_than_the_way_out(field: DistanceMap) -> None:
+    """A robot that cannot stop in time may come as near as it comes when it brakes at once, and no nearer."""
+    s, last = SETTINGS, np.array([1.0, 0.0])
+    controls = stopped(last, np.zeros((0, 2)), s.most, s.horizon)
+    braking = followed(OPEN, last, controls, s.dt)
+    reach = braking[-1, 0] - OPEN[0]
+    assert reach == pytest.approx(1.0 / (2.0 * s.accelerations[0]))
+    others = tracks((OPEN[0] + HULL + 0.2 + reach + 0.01, OPEN[1], 0.2), mover=True)
+    kept = others.centre[0, 0] - braking[1:, 0] - 0.2
+    np.testing.assert_allclose(limits_of(others, braking), np.minimum(kept, limits_of(others, RESTING)))
+    assert limits_of(others, braking)[-1] == pytest.approx(HULL + 0.01)
+    wall = np.array([1.5, -0.8 + HULL + 0.01, -np.pi / 2])
+    towards = followed(wall + np.array([0.0, reach, 0.0]), last, controls, s.dt)
+    found = wall_limits(s, SmoothField(field), towards, towards, np.zeros((2, 2)))
+    assert np.all(np.diff(found[:, 0]) <= 1e-12)
+    assert found[-1, 0] < HULL + s.wall_clearance < found[0, 0] + 1e-9
 
 
 def driven_through(field: DistanceMap, place: float, heading: float, squeeze: float) -> tuple[float, float]:
@@ -112,8 +174,9 @@ def driven_through(field: DistanceMap, place: float, heading: float, squeeze: fl
     aside, least = HULL + 0.2 + 0.045, np.inf  # 0.045 m on either side, where 0.06 m are to be kept
     others = tracks(*((OPEN[0] + place, OPEN[1] + side * aside, 0.2) for side in (-1.0, 1.0)))
     for _ in range(20):
-        plan = controller.plan(pose, ahead(np.array([pose[0], OPEN[1], 0.0])), others)
-        pose = unicycle.step(pose[None], plan.control[None], settings.dt)[0]
+        before = controller.loop.applied
+        plan = controller.plan(pose, ahead(np.array([pose[0], OPEN[1], 0.0]), controller.stations()), others)
+        pose = followed(pose, before, plan.control[None], settings.dt)[1]
         least = min(least, float(np.hypot(*(pose[:2] - others.centre).T).min()) - 0.2 - HULL)
     return float(pose[0] - OPEN[0]), least
 
@@ -125,7 +188,7 @@ def test_squeezing_lets_a_robot_out_of_a_gap_that_is_too_narrow(
 ) -> None:
     """Where tracks say that it stands too near to two discs already, it may pass between them; else it must go back."""
     way, least = driven_through(field, place, heading, SETTINGS.squeeze)
-    assert way > 1.5
+    assert way > 1.2
     assert least > SETTINGS.squeeze - 2e-3
     assert driven_through(field, place, heading, 0.0)[0] < 0.1
 
@@ -189,7 +252,7 @@ def test_only_a_solve_that_ended_moves_the_pose(field: DistanceMap, claims: dict
     window, registered = smoother.window, smoother.pose
     states, departure = window.history.states.copy(), window.left.departure
     assert window.history.full and departure is not None
-    for name in ("warm", "cold"):
+    for name in ("warm", "cold", "second"):
         setattr(controller.loop, name, Bent(getattr(controller.loop, name), **claims))
     plan = controller.plan(registered, ahead(OPEN), tracks())
     assert plan.emergency == (claims.get("violation", 0.0) > 0.0)
@@ -254,42 +317,69 @@ def test_a_guess_of_the_joint_solve_begins_at_the_estimate(field: DistanceMap) -
 
 def failing(controller: Controller) -> None:
     """From now on no plan keeps its constraints."""
-    for name in ("warm", "cold"):
+    for name in ("warm", "cold", "second"):
         inner = getattr(controller.loop, name)
         setattr(controller.loop, name, Bent(inner, violation=1.0, status=fg.Status.LOCALLY_INFEASIBLE))
 
 
-def test_braking_keeps_the_shape_of_the_last_plan_and_rests_in_time(controller: Controller) -> None:
-    good = controller.plan(OPEN, ahead(), tracks())
-    assert good.control[0] > 0.3
-    stored = controller.loop.kept.controls.copy()
+def test_braking_keeps_the_path_and_the_accelerations(controller: Controller) -> None:
+    """From full speed, in a turn: as hard as the base can, along the path of the last plan, and then rest."""
+    s, pose = SETTINGS, OPEN.copy()
+    for _ in range(6):
+        reference = followed(pose, controller.loop.applied, np.column_stack([s.pace(1.0), 0.6 * s.pace(1.0)]), s.dt)
+        before = controller.loop.applied
+        plan = controller.plan(pose, reference, tracks())
+        assert not plan.emergency
+        pose = followed(pose, before, plan.control[None], s.dt)[1]
+    assert before[0] > 0.8 and abs(before[1]) > 0.3
+    expected, speeds = plan.states, [plan.control]
     failing(controller)
-    plans: list[Plan] = [controller.plan(OPEN, ahead(), tracks()) for _ in range(BRAKING + 2)]
-    assert all(plan.emergency for plan in plans)
-    speeds = np.array([good.control[0], *(plan.control[0] for plan in plans)])
-    assert np.all(np.diff(speeds) <= 1e-12) and speeds[1] > 0.0
-    assert not speeds[BRAKING:].any()
-    for age, plan in enumerate(plans[: BRAKING - 1], start=1):  # the same curvature, driven more slowly
-        assert plan.control[0] <= stored[age, 0] * (1.0 - age / BRAKING) + 1e-12
-        assert plan.control[1] * stored[age, 0] == pytest.approx(plan.control[0] * stored[age, 1])
-    assert plans[-1].states[-1] == pytest.approx(OPEN)
+    while np.any(speeds[-1]):
+        plan = controller.plan(pose, reference, tracks())
+        assert plan.emergency and plan.source == "braking"
+        np.testing.assert_allclose(plan.states, followed(pose, speeds[-1], plan.controls, s.dt))
+        pose = followed(pose, speeds[-1], plan.control[None], s.dt)[1]
+        speeds.append(plan.control)
+        assert polyline_distance(pose[None, :2], expected)[0] < 0.01
+        assert len(speeds) < 20
+    changes = np.abs(np.diff(speeds, axis=0))
+    assert np.all(changes <= s.most + 1e-9)
+    assert np.all(changes[:-2, 0] >= 0.9 * s.most[0])  # as hard as it can
+    assert controller.plan(pose, reference, tracks()).states[-1] == pytest.approx(pose)
 
 
-def test_after_a_failure_the_guess_is_rest_until_it_is_forgotten(controller: Controller) -> None:
+def test_after_a_failure_the_guess_is_the_way_out_until_it_is_forgotten(controller: Controller) -> None:
     loop = controller.loop
-    now = loop.now(OPEN, controller.given(ahead(), tracks()))
     controller.plan(OPEN, ahead(), tracks())
+    now = loop.now(OPEN, controller.given(OPEN, ahead(), tracks()))
     assert loop.begin(now) == (loop.warm, loop.guess)
     good = (loop.warm, loop.cold)
     failing(controller)
     controller.plan(OPEN, ahead(), tracks())
     loop.warm, loop.cold = good
+    now = loop.now(OPEN, controller.given(OPEN, ahead(), tracks()))
     run, guess = loop.begin(now)
     assert run is loop.warm
-    assert not guess.values[loop.u].any() and (guess.values[loop.x.family] == OPEN).all()
+    assert np.array_equal(guess.values[loop.u], now.given.way_out.controls)
+    assert np.array_equal(guess.values[loop.x.family], now.given.way_out.states)
     controller.forget()
     run, guess = loop.begin(now)
-    assert run is loop.cold and guess.values[loop.u].any()
+    assert run is loop.cold and not np.array_equal(guess.values[loop.u], now.given.way_out.controls)
+
+
+def test_another_backend_is_asked_before_the_robot_brakes(controller: Controller) -> None:
+    """A plan of the second is driven, counted, and goes on as a warm start; without one the robot brakes."""
+    loop = controller.loop
+    good = loop.second
+    failing(controller)
+    loop.second = good
+    plan = controller.plan(OPEN, ahead(), tracks())
+    assert plan.rescued and not plan.emergency and plan.control[0] > 0.1
+    assert loop.rescues == 1 and loop.guess is not None and not loop.failed
+    assert plan.status == fg.Status.CONVERGED or plan.status == fg.Status.STOP_RULE
+    failing(controller)
+    plan = controller.plan(OPEN, ahead(), tracks())
+    assert plan.emergency and not plan.rescued and loop.rescues == 1
 
 
 def test_plans_that_stay_behind_are_started_over(controller: Controller) -> None:
@@ -308,40 +398,40 @@ def test_plans_that_stay_behind_are_started_over(controller: Controller) -> None
     assert not loop.stays_behind(is_far)
 
 
-def test_a_mover_waits_for_a_robot_at_rest_and_is_not_trusted_to_leave() -> None:
+def test_a_mover_is_expected_to_walk_on_and_not_trusted_to_leave() -> None:
     s = SETTINGS
     towards = tracks((OPEN[0] + 1.5, OPEN[1], 0.2), velocity=(-0.5, 0.0), mover=True)
-    gaps = predicted(SETTINGS, OPEN, towards)[:, 0, 0] - OPEN[0] - 0.2 - HULL
-    assert gaps[0] == pytest.approx(1.5 - 0.05 - 0.2 - HULL)
-    assert np.all(np.diff(gaps) <= 1e-12)
-    assert s.courtesy <= gaps[-1] < s.courtesy + 0.05 + 1e-9  # the last stage before it has to wait
+    stages = s.dt * np.arange(1, s.horizon + 1)
+    assert predicted(SETTINGS, OPEN, towards)[:, 0, 0] == pytest.approx(OPEN[0] + 1.5 - 0.5 * stages)
     away = tracks((OPEN[0] + 1.5, OPEN[1], 0.2), velocity=(0.5, 0.2), mover=True)
     centres = predicted(SETTINGS, OPEN, away)[:, 0]
     assert np.all(centres[:, 0] == OPEN[0] + 1.5)
     assert centres[-1, 1] == pytest.approx(OPEN[1] + 0.2 * s.dt * s.horizon)
 
 
-def test_the_gap_to_a_mover_is_a_barrier() -> None:
+@pytest.mark.parametrize("speed", [0.0, 0.9])
+def test_the_gap_to_a_mover_is_a_barrier(speed: float) -> None:
+    """It is kept off by what it can walk, at the speed it has shown, and the rest of the gap shrinks at a rate."""
     s = SETTINGS
-    centres = np.tile([OPEN[0] + 2.0, OPEN[1]], (s.horizon, 1, 1))
-    radius, mover = np.array([0.2]), np.array([True])
-    limits = disc_limits(SETTINGS, OPEN, centres, radius, mover)[:, 0]
+    others = tracks((OPEN[0] + 2.0, OPEN[1], 0.2), velocity=(speed, 0.0), mover=True)
+    limits = limits_of(others)
     stages = np.arange(1, s.horizon + 1)
-    travel = np.minimum(s.mover_speed * s.dt * stages, s.mover_allowance)
+    travel = np.minimum(max(s.mover_speed, speed) * s.dt * stages, s.mover_allowance)
     least = HULL + s.disc_clearance + travel
     expected = least + (1.8 - least) * 0.88**stages  # an eighth of it in a tenth of a second
     np.testing.assert_allclose(limits, np.minimum(expected, 1.8))
-    standing = disc_limits(SETTINGS, OPEN, centres, radius, ~mover)[:, 0]
+    standing = limits_of(tracks((OPEN[0] + 2.0, OPEN[1], 0.2)))
     assert standing == pytest.approx(HULL + s.disc_clearance)
 
 
 def test_a_robot_too_near_a_wall_may_stay_and_not_come_nearer(field: DistanceMap) -> None:
-    s, smooth = SETTINGS, SmoothField(field)
-    assert wall_limits(SETTINGS, smooth, OPEN) == pytest.approx(HULL + s.wall_clearance)
+    s, smooth, sure = SETTINGS, SmoothField(field), np.zeros((2, 2))
+    assert wall_limits(SETTINGS, smooth, RESTING, RESTING, sure) == pytest.approx(HULL + s.wall_clearance)
     close = np.array([1.5, -0.8 + HULL + 0.01, 0.0])
     now = float(smooth.distance(close[None, :2])[0])
     assert now < HULL + s.wall_clearance
-    assert wall_limits(SETTINGS, smooth, close) == pytest.approx(now)
+    staying = np.tile(close, (s.horizon + 1, 1))
+    assert wall_limits(SETTINGS, smooth, staying, staying, sure) == pytest.approx(now)
 
 
 def test_a_scan_without_returns_changes_nothing(field: DistanceMap) -> None:

@@ -161,7 +161,7 @@ def test_a_goal_at_hand_still_gives_two_poses(apart: float) -> None:
     assert len(path) >= 2
     assert np.allclose(path[-1], (1.012 + apart, 1.033, 2.0))
     assert path_length(path) < apart + 0.05
-    PathFollower(path).reference((1.0, 1.0), 0.06, 5)
+    PathFollower(path).reference((1.0, 1.0), 0.06 * np.arange(5.0))
 
 
 def eight() -> Array:
@@ -177,7 +177,7 @@ def test_the_reference_follows_a_path_that_crosses_itself() -> None:
     follower = PathFollower(path)
     arc, seen = 0.0, []
     for pose in path[::5]:
-        poses, arc = follower.reference(pose[:2] + 0.05, 0.06, 31, arc)
+        poses, arc = follower.reference(pose[:2] + 0.05, 0.06 * np.arange(31.0), arc)
         seen.append(arc)
         assert poses.shape == (31, 3)
         assert np.hypot(*(poses[0, :2] - pose[:2])) < 0.12
@@ -191,18 +191,18 @@ def test_the_reference_is_spaced_turns_with_the_path_and_ends_at_the_goal() -> N
     path = eight()
     path[-1, 2] = -1.0
     follower = PathFollower(path)
-    poses, reached = follower.reference(path[100], 0.06, 40, 3.0)
+    poses, reached = follower.reference(path[100], 0.06 * np.arange(40.0), 3.0)
     assert abs(np.hypot(*(poses[0, :2] - path[100, :2]))) < 1e-6
     assert np.allclose(np.hypot(*np.diff(poses[:, :2], axis=0).T), 0.06, rtol=5e-3)
     direction = np.arctan2(*np.diff(poses[:, :2], axis=0).T[::-1])
     assert np.abs((poses[:-1, 2] - direction + math.pi) % (2 * math.pi) - math.pi).max() < 0.05
     assert np.all((poses[:, 2] >= -math.pi) & (poses[:, 2] < math.pi))
     assert reached > 3.0
-    poses, reached = follower.reference(path[-3], 0.06, 40, follower.length - 0.5)
+    poses, reached = follower.reference(path[-3], 0.06 * np.arange(40.0), follower.length - 0.5)
     assert np.array_equal(poses[-1], path[-1])
     assert np.array_equal(poses[5:], np.repeat(path[-1:], 35, axis=0))
     assert np.abs(poses[0, 2] - path[-3, 2]) < 0.05  # the goal's heading is not blended in before the goal
-    past, reached = follower.reference((9.0, 9.0), 0.06, 3, follower.length + 1.0)
+    past, reached = follower.reference((9.0, 9.0), 0.06 * np.arange(3.0), follower.length + 1.0)
     assert reached == follower.length
     assert np.array_equal(past, np.repeat(path[-1:], 3, axis=0))
 
@@ -210,12 +210,12 @@ def test_the_reference_is_spaced_turns_with_the_path_and_ends_at_the_goal() -> N
 def test_the_reference_never_goes_back_and_a_follower_remembers_nothing() -> None:
     path = eight()
     used = PathFollower(path)
-    used.reference(path[90], 0.06, 10, 0.0)
-    once, arc = used.reference(path[50], 0.06, 10, 0.0)
-    again, arc_again = PathFollower(path).reference(path[50], 0.06, 10, 0.0)
+    used.reference(path[90], 0.06 * np.arange(10.0), 0.0)
+    once, arc = used.reference(path[50], 0.06 * np.arange(10.0), 0.0)
+    again, arc_again = PathFollower(path).reference(path[50], 0.06 * np.arange(10.0), 0.0)
     assert np.array_equal(once, again)
     assert arc == arc_again
-    assert used.reference(path[0], 0.06, 10, 3.0)[1] == 3.0
+    assert used.reference(path[0], 0.06 * np.arange(10.0), 3.0)[1] == 3.0
     with pytest.raises(ScenarioError, match="at least two poses"):
         PathFollower(path[:1])
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from unifg.files.ros_map import OccupancyMap
-from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.driving.drive_control import Controller
 from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.driving.route import ALLOWANCE, GAP, PATIENCE, STUCK_TICKS, WALL_GAP, Route
+from unifg.scenarios.driving.stopping import followed
 from unifg.scenarios.seeing.tracks import Tracks
 from unifg.scenarios.ways.grid import SPACING
 from unifg.typing import Array
@@ -58,7 +58,7 @@ def test_route_finds_a_detour_around_a_disc() -> None:
     assert np.hypot(*np.diff(route.path[:, :2], axis=0).T).max() < 0.08
     # Far beyond the disc the old path is kept.
     assert np.array_equal(route.path[-80:], before[-80:])
-    reference = route.reference(start, 0.1, 31)
+    reference = route.reference(start, 0.1 * np.arange(31.0))
     assert reference.shape == (31, 3)
     assert not any(route.repair(start, tracks) for _ in range(20)), "the detour is clear: no reason for another"
 
@@ -95,7 +95,7 @@ def test_stuck_robot_looks_for_another_way_on_the_whole_map() -> None:
     ):
         route = Route(occupancy, field, start, goal, RADIUS)
         for x in np.arange(1.0, 9.0):
-            route.reference(np.array([x, 1.0, 0.0]), 0.1, 2)
+            route.reference(np.array([x, 1.0, 0.0]), 0.1 * np.arange(2.0))
         answers = [route.repair(here, closing) for _ in range(STUCK_TICKS + PATIENCE)]
         assert any(answers)
         highest = route.path[:, 1].max()
@@ -110,7 +110,7 @@ def test_robot_that_waits_beside_a_mover_goes_back_the_way_it_came() -> None:
     for x in np.arange(1.0, 4.01, 0.1):
         here = np.array([x, 0.45, 0.0])
         route.repair(here, nothing)
-        route.reference(here, 0.1, 2)
+        route.reference(here, 0.1 * np.arange(2.0))
     waiting = replace(disc(4.47, 0.45, 0.2), mover=np.array([True]))
     assert any(route.repair(here, waiting) for _ in range(STUCK_TICKS + 2 * PATIENCE))
     furthest = route.path[: round(2.0 / SPACING), 0].min()
@@ -121,17 +121,21 @@ def test_robot_that_waits_beside_a_mover_goes_back_the_way_it_came() -> None:
 
 @pytest.mark.parametrize("heading", [0.0, 1.6, 3.1])
 def test_a_guess_without_a_warm_start_can_be_driven(heading: float) -> None:
-    """It keeps limits and dynamics, turns before it drives, and ends near the end of the reference."""
-    controller = Controller(hall()[1], "sqp", ControllerSettings())
+    """It keeps limits, accelerations and dynamics, turns before it drives, rests at the end, near the reference's."""
+    settings = ControllerSettings()
+    controller = Controller(hall()[1], "sqp", settings)
     route, start = through_the_hall()
     pose = np.array([start[0], start[1], heading])
-    reference = route.reference(pose, 0.1, 31)
-    states, controls = controller.along(controller.loop.now(pose, controller.given(reference, Tracks.none())))
+    reference = route.reference(pose, controller.stations())
+    now = controller.loop.now(pose, controller.given(pose, reference, Tracks.none()))
+    states, controls = controller.along(now)
     assert np.abs(controls).max() <= 1.0
-    np.testing.assert_allclose(states, unicycle.rollout(pose, controls, 0.1), atol=1e-9)
+    assert np.all(np.abs(np.diff(controls, axis=0, prepend=0.0, append=0.0)) <= settings.most + 1e-9)
+    np.testing.assert_allclose(states, followed(pose, now.last, controls, 0.1), atol=1e-9)
     if heading > 1.5:
         assert abs(controls[0, 0]) < 0.1
-        assert abs(controls[0, 1]) == 1.0
+        assert abs(controls[0, 1]) == settings.most[1]
+        assert np.abs(controls[:, 1]).max() == 1.0
     else:
         assert np.hypot(*(states[-1] - reference[-1])[:2]) < 0.4
 

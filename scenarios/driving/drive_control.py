@@ -1,7 +1,8 @@
 """Where to go? A model-predictive controller as a factor graph (Bazzana et al. 2022, section V).
 
 Costs: distance to reference poses along the path (eq. 8), control effort, control rate, soft margins to walls and
-discs. Constraints: unicycle dynamics, velocity limits, hard clearance from walls and from tracked discs.
+discs. Constraints: unicycle dynamics, limits of velocities and of accelerations, rest at the end, hard clearance from
+walls and from tracked discs.
 """
 
 from __future__ import annotations
@@ -9,20 +10,19 @@ from __future__ import annotations
 import numpy as np
 
 import unifg as fg
-from unifg.horizon import Choice, ControlCost, Dynamics, Kept, Loop, Now, Plan, Starts, Term, Window
+from unifg.horizon import Choice, ControlCost, Kept, Loop, Now, Plan, Starts, Term, Window
 from unifg.lie import wrap_angle
 from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap, SmoothField
-from unifg.scenarios.driving.drive_parts import Clearance, Drive, Following, Limits
+from unifg.scenarios.driving.drive_parts import Clearance, Drive, Following, Limits, Motion, WayOut, predicted
 from unifg.scenarios.driving.drive_past import robot
-from unifg.scenarios.driving.drive_settings import ControllerSettings, backend
+from unifg.scenarios.driving.drive_settings import SECOND, ControllerSettings, backend
+from unifg.scenarios.driving.stopping import evasions, followed, stopped
 from unifg.scenarios.seeing.tracks import Tracks
 from unifg.typing import Array
 
 COLD_PATIENCE = 3  # a tick without a warm start may iterate longer
-YIELD_SPEED = 0.05  # [m/s] towards the robot
 LEFT_BEHIND = 0.6  # [m] between the ends of plan and reference
-BRAKING = 6  # ticks to come to rest when no new plan is found
 PURSUIT = 0.3  # [m] ahead of the robot, where a guess aims at the reference
 PURSUIT_TIME = 0.2  # [s] in which it would turn there
 ARRIVED = 0.05  # [m] to the end of the reference, where it only turns
@@ -43,79 +43,113 @@ class Controller:
     ) -> None:
         """State the graph and prepare the backend; with a window, past and future are one graph."""
         self.settings = s = settings
+        self.field = SmoothField(distance_map)
+        self._coming = np.zeros((0, 2))  # what would be driven next if nothing were decided any more
         terms: list[Term] = [
             Following(s),
             ControlCost(s.weighted(s.control_sigma), s.weighted(s.rate_sigma), wanted=lambda now: now.given.wanted),
-            Dynamics(unicycle.dynamics, s.dt),
+            Motion(s),
             Limits(s),
-            Clearance(s, SmoothField(distance_map)),
+            Clearance(s, self.field),
         ]
         self.loop = Loop(
             robot(s.dt) if window is None else window.robot, s.horizon, terms, solver=backend(solver, s),
-            cold=backend(solver, s, COLD_PATIENCE), window=window, coupling="sequential" if window is None else "joint",
-            pull=s.pull, limits=s.box, judge=self.judge, starts=Starts(self.along, self.staying), believable=settled,
-            patience=PATIENCE,
+            cold=backend(solver, s, COLD_PATIENCE), second=backend(SECOND[solver], s, COLD_PATIENCE), window=window,
+            coupling="sequential" if window is None else "joint", pull=s.pull, limits=s.box, judge=self.judge,
+            starts=Starts(self.along, self.leaving), believable=settled, patience=PATIENCE,
         )  # fmt: skip
 
-    def plan(self, pose: Array, reference: Array, tracks: Tracks) -> Plan:
+    def stations(self) -> Array:
+        """(N + 1,) how far ahead along the path the reference is [m], which begins at the speed of now."""
+        return self.settings.stations(max(float(self.loop.applied[0]), 0.0))
+
+    def plan(self, pose: Array, reference: Array, tracks: Tracks, covariance: Array | None = None) -> Plan:
         """Decide the next control.
 
         Args:
             pose: (3,) estimate by the past alone [m, m, rad].
             reference: (N + 1, 3) poses along the path, the first beside the robot.
             tracks: discs the robot has seen.
+            covariance: (3, 3) of the estimate, in its tangent space; None for an estimate without error.
         """
-        return self.loop.plan(pose, self.given(reference, tracks))
+        plan = self.loop.plan(pose, self.given(pose, reference, tracks, covariance))
+        self._coming = plan.controls[1:]
+        return plan
 
-    def given(self, reference: Array, tracks: Tracks) -> Drive:
-        """What the terms are given."""
+    def given(self, pose: Array, reference: Array, tracks: Tracks, covariance: Array | None = None) -> Drive:
+        """What the terms are given; arguments as of :meth:`plan`."""
         cruise = np.zeros((self.settings.horizon, 2))
         cruise[:, 0] = np.hypot(*np.diff(reference[:, :2], axis=0).T) / self.settings.dt
-        return Drive(cruise, reference, tracks)
+        spread = np.zeros((3, 3)) if covariance is None else covariance
+        return Drive(cruise, reference, tracks, spread, self._way_out(pose, tracks))
+
+    def _way_out(self, pose: Array, tracks: Tracks) -> WayOut:
+        """Rest along the path of the last plan; if a mover would come too near there, the best simple way of evading.
+
+        Which is the best is judged by the least distance on the way, of discs and of walls alike, beyond what is to be
+        kept from them.
+        """
+        s, last = self.settings, self.loop.applied
+        controls = stopped(last, self._coming, s.most, s.horizon)
+        rest = WayOut(followed(pose, last, controls, s.dt), controls)
+        movers = tracks.at(tracks.mover)
+        if not len(movers) or self._room(rest.states, predicted(s, pose, movers), movers.radius) >= 0.0:
+            return rest
+        centres, best = predicted(s, pose, tracks), rest
+        most = min(self._room(rest.states, centres, tracks.radius), self._off_walls(rest.states))
+        for way in evasions(last, s.most, s.box[1], s.horizon, s.dt):
+            states = followed(pose, last, way, s.dt)
+            room = min(self._room(states, centres, tracks.radius), self._off_walls(states))
+            if room > most:
+                most, best = room, WayOut(states, way, evades=True)
+        return best
+
+    def _room(self, states: Array, centres: Array, radii: Array) -> float:
+        """Least gap between the hull at states (N + 1, 3) and discs at centres (N, k, 2), beyond what is to be kept."""
+        apart = np.hypot(*np.moveaxis(states[1:, None, :2] - centres, 2, 0)) - radii
+        return float(apart.min(initial=np.inf)) - self.settings.robot_radius - self.settings.disc_clearance
+
+    def _off_walls(self, states: Array) -> float:
+        """The same of walls."""
+        return (
+            float(self.field.distance(states[1:, :2]).min()) - self.settings.robot_radius - self.settings.wall_clearance
+        )
 
     def forget(self) -> None:
         """Drop the warm start, as when a new route makes it misleading."""
         self.loop.forget()
 
     def judge(self, solution: fg.Solution, states: Array, controls: Array, now: Now[Drive], kept: Kept) -> Choice:
-        """Drive a plan that keeps the constraints; brake along the last one otherwise; rest where a mover nears.
+        """Drive a plan that keeps the constraints; leave by the way out otherwise.
 
         Of a solve that ended early this is where it stopped. The cheapest iterate it has passed that keeps the
         constraints was tried: such plans brush past obstacles and creep up to those that stand in the way.
         """
-        s, source, behind = self.settings, "solved", False
-        if solution.violation <= s.feasible:
-            behind, driven = is_behind(states, now.given.reference), kept.within(controls)
-        else:
-            source, driven = "braking", self._braking(kept, now.last)
-            states = unicycle.rollout(now.present, driven, s.dt)
-        if self._yields(now.present, now.given.tracks):
-            driven = np.zeros_like(driven)
-        return Choice(driven, states, source, behind=behind)
+        if solution.violation <= self.settings.feasible:
+            driven = self._within_reach(kept.within(controls), now.last)
+            return Choice(driven, states, "solved", behind=is_behind(states, now.given.reference))
+        way = now.given.way_out
+        return Choice(way.controls, way.states, "evading" if way.evades else "braking")
 
-    def _braking(self, kept: Kept, last: Array) -> Array:
-        """(N, 2) stored plan slowed to rest; the path keeps its shape, and the robot rests well before its end."""
-        left, controls = kept.left(), np.zeros((self.settings.horizon, 2))
-        fade = np.maximum(1.0 - (kept.age + np.arange(len(left))) / BRAKING, 0.0)
-        stored = left * fade[:, None]
-        fastest = np.abs(stored[:, 0]).max(initial=0.0)
-        slower = min(1.0, abs(float(last[0])) / fastest) if fastest > 0.0 else 1.0
-        controls[: len(left)] = slower * stored
+    def _within_reach(self, controls: Array, last: Array) -> Array:
+        """Controls (N, 2) of which the first is no farther from the last than the base can follow."""
+        most = self.settings.most
+        controls[0] = np.clip(controls[0], last - most, last + most)
         return controls
 
-    def staying(self, now: Now[Drive]) -> tuple[Array, Array]:
-        """Guess rest, which is feasible: from there a solver that failed finds the near side of what stopped it."""
-        n = self.settings.horizon
-        return np.tile(now.present, (n + 1, 1)), np.zeros((n, 2))
+    def leaving(self, now: Now[Drive]) -> tuple[Array, Array]:
+        """Guess the way out, which is feasible: a solver that failed finds the near side of what stopped it."""
+        return now.given.way_out.states, now.given.way_out.controls
 
     def along(self, now: Now[Drive]) -> tuple[Array, Array]:
         """Guess how a simple pursuit would follow the reference, which leads around whatever the route leads around.
 
-        It keeps limits and dynamics: it turns first where the reference begins behind the robot's back.
+        It keeps limits, accelerations and dynamics, and ends at rest: it turns first where the reference begins behind
+        the robot's back.
         """
         s, reference = self.settings, now.given.reference
         speeds, controls = now.given.wanted[:, 0], np.zeros((s.horizon, 2))
-        states = np.tile(now.present, (s.horizon + 1, 1))
+        states, last = np.tile(now.present, (s.horizon + 1, 1)), now.last
         aim = 0
         for k in range(s.horizon):
             here = states[k]
@@ -126,18 +160,12 @@ class Controller:
             bearing = np.arctan2(ahead[1], ahead[0]) if distance > ARRIVED else reference[aim, 2]
             turn = float(wrap_angle(bearing - here[2]))
             speed = min(speeds[k], distance / s.dt) * max(np.cos(turn), 0.0) ** 2 if distance > ARRIVED else 0.0
-            controls[k] = np.clip([speed, turn / PURSUIT_TIME], *s.box)
-            states[k + 1] = unicycle.step(here[None], controls[k : k + 1], s.dt)[0]
+            fastest = np.minimum(s.box[1], s.most * (s.horizon - k))
+            wanted = np.clip([speed, turn / PURSUIT_TIME], -fastest, fastest)
+            controls[k] = np.clip(wanted, last - s.most, last + s.most)
+            states[k + 1] = unicycle.step(here[None], 0.5 * (last + controls[k])[None], s.dt)[0]
+            last = controls[k]
         return states, controls
-
-    def _yields(self, pose: Array, tracks: Tracks) -> bool:
-        """Whether a mover is so near and closing in that resting, which it respects, is the only safe answer."""
-        s = self.settings
-        offset = pose[:2] - tracks.centre
-        distance = np.hypot(*offset.T)
-        closing = np.einsum("ij,ij->i", offset, tracks.velocity) / np.maximum(distance, 1e-9)
-        near = distance - tracks.radius - s.robot_radius < s.yield_distance
-        return bool((tracks.mover & near & (closing > YIELD_SPEED)).any())
 
 
 def is_behind(states: Array, reference: Array) -> bool:

@@ -87,7 +87,8 @@ class Pilot:
         if route.repair(pose, self.tracks):
             self.controller.forget()
         self.clock.split("route")
-        plan = self.controller.plan(pose, route.reference(pose, s.speed * s.dt, s.horizon + 1), self.tracks)
+        reference = route.reference(pose, self.controller.stations())
+        plan = self.controller.plan(pose, reference, self.tracks, self.estimator.covariance)
         self.clock.split("plan")
         self.pose = self.controller.loop.estimate
         return plan

@@ -14,6 +14,9 @@ from unifg.typing import Array
 
 PENALTY = 3e4  # of the augmented Lagrangian; the automatic one is stiffer than a tick has time for
 
+SECOND = {"ipm": "sqp", "sqp": "ipm", "alm": "ipm", "penalty": "ipm"}
+"""Who is asked when a backend finds no plan."""
+
 
 @dataclass(frozen=True)
 class ControllerSettings:
@@ -24,6 +27,7 @@ class ControllerSettings:
         dt: sampling time [s].
         speed: reference speed along the path [m/s].
         limits: greatest |v| [m/s] and |omega| [rad/s].
+        accelerations: greatest changes of both, by the data sheet of the base [m/s^2, rad/s^2].
         pose_sigma: (x, y, theta) of the stage cost [m, m, rad].
         terminal_sigma: the same at the end of the horizon.
         control_sigma: (v, omega) deviation from the reference control [m/s, rad/s].
@@ -33,13 +37,12 @@ class ControllerSettings:
         robot_radius: [m].
         wall_clearance: least distance of the hull to walls [m].
         disc_clearance: least distance of the hull to tracked discs [m].
-        mover_speed: fastest walk of a mover [m/s].
+        sigmas: by how many standard deviations of the estimate, along the normal, both distances are wider.
+        mover_speed: at least this fast is a disc that has ever moved believed to be able to go on [m/s].
         mover_allowance: most that is added to the clearance from discs that have ever moved [m].
         mover_margin: added to the soft margin around such discs [m].
         approach: rate at which the gap to such a disc may close, alpha of its barrier [1/s].
         squeeze: how much nearer than at rest a plan may pass a standing disc where the clearance is violated [m].
-        courtesy: gap at which movers wait for a robot at rest [m].
-        yield_distance: gap to a mover that closes in at which the robot rests [m].
         margin: distance of the hull below which the soft costs begin [m].
         margin_sigma: [m].
         discs: tracked discs considered at once.
@@ -52,6 +55,7 @@ class ControllerSettings:
     dt: float = 0.1
     speed: float = 1.0
     limits: tuple[float, float] = (1.0, 1.0)
+    accelerations: tuple[float, float] = (2.5, 3.2)
     pose_sigma: tuple[float, float, float] = (0.3, 0.3, 0.6)
     terminal_sigma: tuple[float, float, float] = (0.1, 0.1, 0.2)
     control_sigma: tuple[float, float] = (1.0, 2.0)
@@ -61,13 +65,12 @@ class ControllerSettings:
     robot_radius: float = 0.17
     wall_clearance: float = 0.03
     disc_clearance: float = 0.06
+    sigmas: float = 2.0
     mover_speed: float = 0.3
     mover_allowance: float = 0.15
     mover_margin: float = 0.3
     approach: float = -math.log(0.88) / 0.1
     squeeze: float = 0.03
-    courtesy: float = 0.1
-    yield_distance: float = 0.3
     margin: float = 0.2
     margin_sigma: float = 0.1
     discs: int = 3
@@ -80,10 +83,29 @@ class ControllerSettings:
         scaled: Array = np.array(sigma) / np.sqrt(self.control_weight)
         return scaled
 
+    def pace(self, speed: float) -> Array:
+        """(N,) speeds at the ends of the steps of one who drives on at ``speed``, his limit, and rests at the end."""
+        up, down = np.arange(1.0, self.horizon + 1), np.arange(self.horizon, 0.0, -1.0)
+        most = float(self.most[0])
+        pace: Array = np.minimum(np.minimum(speed + most * up, most * down), min(self.speed, self.box[1][0]))
+        return pace
+
+    def stations(self, speed: float) -> Array:
+        """(N + 1,) how far he comes [m]."""
+        pace = self.pace(speed)
+        means = 0.5 * (np.concatenate([[speed], pace[:-1]]) + pace)
+        return np.concatenate([[0.0], np.cumsum(self.dt * means)])
+
+    @property
+    def most(self) -> Array:
+        """(2,) greatest changes of the controls in a step [m/s, rad/s]; more than from end to end means nothing."""
+        most: Array = np.minimum(np.array(self.accelerations) * self.dt, 2.0 * np.array(self.limits))
+        return most
+
     @property
     def box(self) -> tuple[Array, Array]:
-        """Least and greatest controls (2,) [m/s, rad/s]."""
-        limits: Array = np.array(self.limits)
+        """Least and greatest controls (2,) [m/s, rad/s], from which the base comes to rest within the horizon."""
+        limits: Array = np.minimum(np.array(self.limits), self.horizon * self.most)
         return -limits, limits
 
 

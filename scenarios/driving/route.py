@@ -66,9 +66,9 @@ class Route:
         self._follower = PathFollower(path)
         self._reached = 0.0
 
-    def reference(self, pose: Array, spacing: float, count: int) -> Array:
-        """(count, 3) poses along the path, the first beside the robot at ``pose``."""
-        poses, self._reached = self._follower.reference(pose, spacing, count, self._reached)
+    def reference(self, pose: Array, ahead: Array) -> Array:
+        """(count, 3) poses along the path, so far ahead (count,) [m] of where the robot at ``pose`` is beside it."""
+        poses, self._reached = self._follower.reference(pose, ahead, self._reached)
         return poses
 
     def repair(self, pose: Array, tracks: Tracks) -> bool:

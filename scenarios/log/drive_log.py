@@ -99,7 +99,9 @@ class EpisodeLog:
     goal_index: IntArray = column(dtype=np.intp)
     """Goal being approached."""
     emergency: BoolArray = column(dtype=np.bool_)
-    """True where the stored plan was driven because the tick's solve failed."""
+    """True where the robot braked or got out of the way because nobody found a plan."""
+    rescued: BoolArray = column(dtype=np.bool_)
+    """True where the plan is that of the second backend, asked because the first had none."""
 
     @property
     def ticks(self) -> int:

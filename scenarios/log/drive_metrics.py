@@ -25,9 +25,10 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
 
     Returns:
         The metrics, of plain Python numbers; the key says the unit. ``path_length_m`` is the way the robot really
-        drove, ``planned_length_m`` that of the planned path; ``solver_failures`` counts ticks whose solve was rejected,
-        so that the stored plan was driven (``emergency_ticks``, the same ticks), and ``plan_status`` counts the status
-        words of all ticks. ``odometry_error_m`` is the error of dead reckoning.
+        drove, ``planned_length_m`` that of the planned path; ``solver_failures`` counts ticks for which nobody had a
+        plan, so that the robot braked (``emergency_ticks``, the same ticks), ``rescued_ticks`` those for which the
+        second backend had one and the first had not, and ``plan_status`` counts the status words of all ticks.
+        ``odometry_error_m`` is the error of dead reckoning.
 
     Raises:
         ScenarioError: the episode has no tick.
@@ -64,6 +65,7 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         "odometry_error_rad": spread(odometry_heading),
         "solver_failures": emergencies,
         "emergency_ticks": emergencies,
+        "rescued_ticks": int(np.count_nonzero(log.rescued)),
         "plan_status": dict(sorted(Counter(log.status).items())),
         "max_bound_violation": float(max(0.0, np.max(log.bound_violation))),
         **statistics(log),

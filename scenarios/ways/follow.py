@@ -56,15 +56,12 @@ class PathFollower:
         nearest = int(np.argmin(np.einsum("ij,ij->i", miss, miss)))
         return min(max(begin, float(self._arc[first + nearest] + along[nearest])), self.length)
 
-    def reference(
-        self, position: ArrayLike, spacing: float, count: int, start_arclength: float = 0.0
-    ) -> tuple[Array, float]:
-        """Poses ahead of the robot: the first is its projection, each next one `spacing` further.
+    def reference(self, position: ArrayLike, ahead: Array, start_arclength: float = 0.0) -> tuple[Array, float]:
+        """Poses ahead of the robot, beginning at its projection on the path.
 
         Args:
             position: (2,) or (3,) [m] of the robot.
-            spacing: arc length between poses, v_ref times the sampling time [m].
-            count: number of poses.
+            ahead: (count,) arc lengths from the projection on, not decreasing [m].
             start_arclength: arc length returned by the previous call [m].
 
         Returns:
@@ -73,7 +70,7 @@ class PathFollower:
             call.
         """
         reached = self.project(position, start_arclength)
-        stations = reached + spacing * np.arange(count, dtype=np.float64)
+        stations = reached + ahead
         poses = at_stations(np.column_stack([self.path[:, :2], self._headings]), self._arc, stations)
         poses[stations >= self.length - 1e-9] = self.path[-1]
         poses[:, 2] = (poses[:, 2] + math.pi) % (2.0 * math.pi) - math.pi

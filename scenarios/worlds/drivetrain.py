@@ -44,8 +44,8 @@ class Drivetrain:
         patch_slip: share of the wheels' motion that a patch takes.
     """
 
-    acceleration: float = option(math.inf, text=positive, metavar="M/S2")
-    turning: float = option(math.inf, text=positive, metavar="RAD/S2")
+    acceleration: float = option(2.5, text=positive, metavar="M/S2")
+    turning: float = option(3.2, text=positive, metavar="RAD/S2")
     load: float = option(0.0, text=not_negative, metavar="SHARE")
     lag: float = option(0.0, text=not_negative, metavar="S")
     latency: float = option(0.0, text=not_negative, metavar="S")

@@ -90,6 +90,7 @@ class World:
         odometry: OdometryModel | None = None,
         drivetrain: Drivetrain | None = None,
         patches: Array | None = None,
+        courteous: bool = True,
     ) -> None:
         """Build the walls, place the obstacles and the robot.
 
@@ -103,6 +104,7 @@ class World:
             odometry: wheel odometry to simulate; None for 5 % scale error and 2 % noise.
             drivetrain: what the base makes of its commands; None for a base that follows them at once.
             patches: (K, 3) x, y, radius [m] of slippery patches on the floor.
+            courteous: whether movers wait for a robot at rest, or go on through it.
 
         Raises:
             ScenarioError: if the start is not a finite pose, or the robot would stand in a wall or an
@@ -126,7 +128,7 @@ class World:
         self._wheels = Wheels(self._drivetrain)
         self._command = (0.0, 0.0)
         self._left, self._spun, self._gripped = 0, 0.0, 0.0
-        self._space = Space(pose, robot_radius)
+        self._space = Space(pose, robot_radius, courteous)
         self._add_walls()
         for index, obstacle in enumerate(self.obstacles):
             self._space.add_disc(obstacle, index)

@@ -72,8 +72,8 @@ class Space:
         collisions: contact events so far; contacts with one owner less than 0.5 s apart are one.
     """
 
-    def __init__(self, place: Array, radius: float) -> None:
-        """Stand at ``place`` (2,) or (3,), x, y and heading [m, m, rad], alone."""
+    def __init__(self, place: Array, radius: float, courteous: bool = True) -> None:
+        """Stand at ``place`` (2,) or (3,), x, y and heading [m, m, rad], alone; ``courteous`` movers wait for rest."""
         self.engine = pymunk.Space()
         self.engine.collision_slop = 1e-4  # the default lets shapes overlap by 0.1 m
         self.engine.collision_bias = 1e-6
@@ -81,6 +81,7 @@ class Space:
         self.vehicle.position = (float(place[0]), float(place[1]))
         self.vehicle.angle = float(place[2]) if len(place) > 2 else 0.0
         self.radius = radius
+        self._courteous = courteous
         self.obstacles: list[Obstacle] = []
         self.time = 0.0
         self.collisions = 0
@@ -145,9 +146,9 @@ class Space:
             yield dt / count
 
     def step(self, pause: float, resting: bool = False) -> None:
-        """Move everything for a substep [s]; movers wait for a vehicle that is ``resting``."""
+        """Move everything for a substep [s]; courteous movers wait for a vehicle that is ``resting``."""
         for mover in self._movers.values():
-            mover.advance(self.vehicle, self.radius, resting, pause)
+            mover.advance(self.vehicle, self.radius, resting and self._courteous, pause)
         self.engine.step(pause)
 
     def without_contacts(self, velocity: pymunk.Vec2d, relative: bool = True) -> pymunk.Vec2d:

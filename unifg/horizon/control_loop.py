@@ -59,6 +59,7 @@ class Loop:
         tie: what ties the horizon to the past.
         x, u: nodes (N + 1) of the future, and the family of controls (N).
         warm, cold: the prepared backend for solves with and without a warm start.
+        second: another one, asked when the plan of the first is refused; None for nobody.
         guess: where the next solve begins; None for anew.
         failed: whether the last plan was refused.
         kept: the last plan that was accepted.
@@ -72,6 +73,7 @@ class Loop:
         solution: of the last tick; None before.
         statuses: how often solves ended in what way.
         sources: how often what was applied; "late" counts plans that came after the deadline.
+        rescues: how often the second backend had a plan when the first had none.
         milliseconds: wall-clock times of the last ticks [ms].
     """
 
@@ -83,6 +85,7 @@ class Loop:
         *,
         solver: Solver,
         cold: Solver | None = None,
+        second: Solver | None = None,
         window: Window | None = None,
         coupling: Coupling = "sequential",
         pull: float | Sequence[float] | Array = 0.5,
@@ -104,6 +107,8 @@ class Loop:
             terms: what is said of the nodes and controls of the future.
             solver: for a solve with a warm start.
             cold: for one without, which may iterate longer; None for the same.
+            second: asked in the same tick when the plan of the first is refused, from where solves begin after a
+                failure; None for nobody.
             window: of the past.
             coupling: "separate", "sequential" or "joint".
             pull: see :class:`unifg.horizon.coupled.Joined`.
@@ -152,12 +157,14 @@ class Loop:
         timed = [replace(own, time_limit=min(own.time_limit, deadline)) for own in (solver, cold or solver)]
         self._limits = [own.time_limit for own in timed]
         self.warm, self.cold = (own.prepare(graph) for own in timed)
+        self.second = None if second is None else second.prepare(graph)
         self.kept = Kept(steps, robot, between)
         self.judge: Judge = judge or KeepThenBrake(robot)
         self.starts: Starts = starts or Starts()
         self._believable = believable or _close
         self.statuses: Counter[Status] = Counter()
         self.sources: Counter[str] = Counter()
+        self.rescues = 0
         self.milliseconds: deque[float] = deque(maxlen=TIMES)
         self.guess: Guess | None = None
         self.solution: Solution | None = None
@@ -255,7 +262,9 @@ class Loop:
         if np.isfinite(self._deadline):
             limit = self._limits[0 if run is self.warm else 1]
             run.solver.time_limit = max(LEAST_TIME, min(limit, self._deadline - (self._clock() - begin)))
-        solution = run.solve(self.tie.begin(guess, now), data=data)
+        solution, rescued = run.solve(self.tie.begin(guess, now), data=data), False
+        if self.second is not None and self._refuses(solution, now):
+            solution, rescued = self._ask(self.second, solution, now, data, begin)
         self.solution = solution
         self.statuses[solution.status] += 1
         choice = self.decide(solution, now, late=self._clock() - begin > self._deadline)
@@ -266,8 +275,33 @@ class Loop:
         self.milliseconds.append(elapsed)
         return Plan(
             choice.controls, choice.states, solution.status, solution.iterations, choice.source, self.kept.excess,
-            elapsed,
+            elapsed, rescued,
         )  # fmt: skip
+
+    def _refuses(self, solution: Solution, now: Now[Any]) -> bool:
+        """Whether the judge would have something else applied than the plan."""
+        return self.judge(solution, solution[self.x], solution[self.u], now, self.kept).source != "solved"
+
+    def _ask(
+        self, other: Prepared, first: Solution, now: Now[Any], data: dict[Data, ArrayLike], begin: float
+    ) -> tuple[Solution, bool]:
+        """What another backend finds, and True, if the judge takes it; else the first solution, and False."""
+        left = self._deadline - (self._clock() - begin)
+        if left <= 0.0:
+            return first, False
+        if np.isfinite(left):
+            other.solver.time_limit = left
+        start = self.starts.after_failure or self.starts.cold
+        states, controls = (
+            (np.tile(now.present, (self.steps + 1, 1)), np.zeros((self.steps, self.robot.control.storage)))
+            if start is None
+            else start(now)
+        )
+        found = other.solve(self.tie.begin(self.guess_of(states, controls, now), now), data=data)
+        if self._refuses(found, now):
+            return first, False
+        self.rescues += 1
+        return found, True
 
     def decide(self, solution: Solution, now: Now[Any], *, late: bool = False) -> Choice:
         """Judge a solve, keep its plan if it may be applied, and say where the next one begins.

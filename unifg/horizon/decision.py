@@ -27,6 +27,7 @@ class Plan:
         source: "solved", or what is done instead of the solver's answer.
         excess: by how much the plan exceeded the limits of the controls before it was clipped.
         milliseconds: wall-clock time of the whole decision.
+        rescued: whether the plan is that of the second backend, asked because the first had none.
     """
 
     controls: Array
@@ -36,6 +37,7 @@ class Plan:
     source: str
     excess: float
     milliseconds: float
+    rescued: bool = False
 
     @property
     def control(self) -> Array:
