@@ -41,6 +41,10 @@ def difference(group: Any) -> Function:
     return lambda x, y: group.log(group.compose(group.inverse(x), y))
 
 
+def unicycle_ramped(x: Array, before: Array, u: Array, y: Array, dt: Array) -> Any:
+    return unicycle_dynamics(x, 0.5 * (before + u), y, dt)
+
+
 def unicycle_dynamics(x: Array, u: Array, y: Array, dt: Array) -> Any:
     middle = x[:, 2] + 0.5 * dt * u[:, 1]
     return np.stack(
@@ -397,7 +401,8 @@ def uncertain(p: Array, t: Array, root: Array, centre: Array, radius: Array) -> 
 
 
 DEFINED: dict[str, Function] = {
-    "unicycle.dynamics": unicycle_dynamics, "unicycle.tracking": tracking, "unicycle.rate": difference(Rn(2)),
+    "unicycle.dynamics": unicycle_dynamics, "unicycle.ramped": unicycle_ramped,
+    "unicycle.tracking": tracking, "unicycle.rate": difference(Rn(2)),
     "obstacles.disc_clearance": discs, "obstacles.wall_distance": wall_distance, "lidar.endpoint": endpoint,
     "obstacles.shortfall": shortfall(wall_distance), "potential.potential": repulsion(discs),
     "potential.potential, walls": repulsion(wall_distance), "potential.potential, vortex": repulsion(discs),

@@ -63,6 +63,9 @@ CASES: dict[str, tuple[Residual, list[Array], list[fg.Manifold], list[object]]] 
     "unicycle.dynamics": (
         unicycle.dynamics, [poses(), vectors(2), poses()], [fg.SE2, fg.Rn(2), fg.SE2], [0.13],
     ),
+    "unicycle.ramped": (
+        unicycle.ramped, [poses(), vectors(2), vectors(2), poses()], [fg.SE2, fg.Rn(2), fg.Rn(2), fg.SE2], [0.13],
+    ),
     "unicycle.tracking": (unicycle.tracking, [poses()], [fg.SE2], [poses()]),
     "unicycle.rate": (unicycle.rate, [vectors(2), vectors(2)], [fg.Rn(2), fg.Rn(2)], []),
     "obstacles.disc_clearance": (
