@@ -24,7 +24,7 @@ from unifg.language.variables import Family
 from unifg.lie import Rn
 from unifg.typing import Array
 
-__all__ = ["Form", "Kept", "Use", "grid", "hinge", "keep"]
+__all__ = ["Form", "Kept", "Use", "aligned", "grid", "hinge", "keep"]
 
 Form: TypeAlias = Literal["hinge", "hard", "slack", "exact slack"]
 WEIGHT = 1e6  # of the squared slack: a multiplier of 1000 /m moves the boundary by a millimetre
@@ -202,4 +202,37 @@ def grid(count: int, tick: float, node: float) -> tuple[Array, Array]:
         raise ModelError(f"a grid needs an interval and 0 < tick <= node, found {count}, {tick!r} s and {node!r} s")
     lengths = np.full(count, float(node))
     lengths[0] = tick
+    return np.concatenate([[0.0], np.cumsum(lengths)[:-1]]), lengths
+
+
+def aligned(count: int, tick: float, node: float, number: int) -> tuple[Array, Array]:
+    """Begin and length of the intervals of a plan whose nodes stay where they are from tick to tick.
+
+    The first interval is what is left of a node: as long as the others, then a tick shorter at every tick. Held from
+    the state at the node that has passed, as ``decay(h, alpha)(passed, x[1], -gone, node)`` with ``gone`` since then,
+    barriers ask for the same at every tick, so that the last plan, cut off at its begin, is one of the next. With
+    :func:`grid`, whose nodes move on with every tick, it need not be.
+
+    Args:
+        count: N, intervals.
+        tick: time between two solves [s].
+        node: length of an interval [s], a whole number of ticks.
+        number: of the tick, from zero.
+
+    Returns:
+        (N,) begins, from now, and (N,) lengths [s].
+
+    Raises:
+        ModelError: on no interval, lengths that are not positive, or a node that is no whole number of ticks.
+    """
+    if count < 1 or number < 0 or not (0.0 < tick <= node < np.inf):
+        raise ModelError(
+            "aligned nodes need an interval, a number >= 0 and 0 < tick <= node, "
+            f"found {count}, {number}, {tick!r} s and {node!r} s"
+        )
+    parts = round(node / tick)
+    if abs(parts * tick - node) > 1e-9 * node:
+        raise ModelError(f"aligned nodes: {node!r} s is no whole number of ticks of {tick!r} s")
+    lengths = np.full(count, float(node))
+    lengths[0] = node * (1.0 - number % parts / parts)
     return np.concatenate([[0.0], np.cumsum(lengths)[:-1]]), lengths

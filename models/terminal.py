@@ -2,7 +2,10 @@
 
 A plan that satisfies hard barriers and ends in such a set can be continued by a step inside it; moved by one interval
 it is a plan of the next solve. So the hard form is never infeasible on the nominal vehicle, if it was not at first.
-This is so where a plan moves on by whole intervals; between them the last plan is what can be flown.
+This is so where a plan moves on by whole intervals. Where solves are more frequent than nodes, it is so with nodes that
+stay where they are (:func:`unifg.models.keeping.aligned`), and not with nodes that move on by a tick: controls that are
+held over the new intervals cannot repeat the old plan, and its nodes kept the barrier elsewhere. Then a plan may be
+missing by millimetres, and what can be flown is the last one.
 
 :data:`resting` asks the vehicle to hover at the end. :func:`brakeable` asks
 that it could come to rest: with h in metres, v <= alpha h and v <= a / alpha, braking by a keeps both, since

@@ -924,6 +924,89 @@ def test_a_terminal_set_keeps_hard_plans_possible(end: str) -> None:
         assert all(held) and away.min() > -1e-6, (end, seed, len(held))
 
 
+class Floor:
+    """A point above a floor, planned anew several times a node, hard; each plan is whatever the constraints allow."""
+
+    def __init__(self, aligns: bool, carries: bool, end: str) -> None:
+        self.aligns, self.carries, n, node = aligns, carries, 4, 0.1
+        self.graph = graph = fg.Graph()
+        self.x, self.u = x, u = graph.variables("x", fg.Rn(2), n + 1), graph.variables("u", fg.Rn(1), n)
+        self.start = graph.data("start", np.ones(2))
+        self.passed = graph.data("passed", np.ones((1, 2)), each=True)
+        self.lengths = graph.data("lengths", np.full((n, 1), node), each=True)
+        self.first, self.wish = graph.data("first", node), graph.data("wish", np.zeros((n, 1)), each=True)
+        self.alpha, self.push = graph.data("alpha", 1.0), graph.data("push", np.ones(1))
+        graph.fix(x[0], self.start)
+        graph.minimize(fg.prior, u, self.wish)
+        graph.constrain(self.motion, x[:-1], u, x[1:], self.lengths, lower=0.0, upper=0.0, name="motion")
+        graph.constrain(lambda u, a: np.concatenate([a - u, a + u], axis=1), u, self.push, lower=0.0, name="push")
+        graph.constrain(self.decay, self.passed, x[1:2], self.first, self.alpha, lower=0.0, name="first")
+        graph.constrain(self.decay, x[1:-1], x[2:], node, self.alpha, lower=0.0, name="barrier")
+        if end == "rest":
+            graph.constrain(lambda x: x[:, 1:], x[-1:], lower=0.0, upper=0.0, name="end")
+        else:
+            graph.constrain(self.brakeable, x[-1:], self.alpha, self.push, lower=0.0, name="end")
+        self.run = InteriorPoint(tolerance=1e-9, max_iterations=100).prepare(graph)
+
+    @staticmethod
+    def motion(x: Array, u: Array, y: Array, h: Array) -> Array:
+        found: Array = y - np.concatenate([x[:, :1] + h * x[:, 1:] + 0.5 * h * h * u, x[:, 1:] + h * u], axis=1)
+        return found
+
+    @staticmethod
+    def decay(x: Array, y: Array, h: Any, alpha: Any) -> Array:
+        found: Array = y[:, :1] - np.exp(-alpha * h) * x[:, :1]
+        return found
+
+    @staticmethod
+    def brakeable(x: Array, alpha: Any, push: Any) -> Array:
+        """``terminal.brakeable`` of a line, up and down, with numbers that are data."""
+        both = np.concatenate([x[:, 1:], -x[:, 1:]], axis=1)
+        return np.concatenate([alpha * x[:, :1] - both, push / alpha - both], axis=1)
+
+    def fly(self, seed: int, ticks: int = 40) -> float:
+        """The worst violation of any tick, in a random world, after a first plan."""
+        rng = np.random.default_rng(seed)
+        parts, alpha, push = int(rng.integers(2, 6)), float(rng.uniform(0.5, 15.0)), float(rng.uniform(1.0, 6.0))
+        state, worst = np.array([rng.uniform(0.1, 1.0), 0.0]), 0.0
+        plan: Any = {self.x: np.tile(state, (5, 1)), self.u: np.zeros((4, 1))}
+        for k in range(ticks):
+            spans = (keeping.aligned(4, 0.1 / parts, 0.1, k) if self.aligns else keeping.grid(4, 0.1 / parts, 0.1))[1]
+            if not self.carries or k % parts == 0:
+                passed, first = state[None], spans[0]
+            given = {self.start: state, self.lengths: spans[:, None], self.passed: passed, self.first: first}
+            wish = -1e2 * push * (rng.normal(size=(4, 1)) if rng.random() < 0.7 else np.ones((4, 1)))  # a vertex
+            given |= {self.alpha: alpha, self.push: np.array([push]), self.wish: wish}
+            plan = self.run.solve(plan, data=given)
+            worst = max(worst, float(plan.violation))
+            pushed, h = plan[self.u][0, 0], 0.1 / parts
+            state = state + h * np.array([state[1] + 0.5 * h * pushed, pushed])
+        return worst
+
+
+@pytest.mark.parametrize("end", ["rest", "brake"])
+def test_nodes_that_stay_keep_hard_plans_possible_at_every_tick(end: str) -> None:
+    """Nodes that move on by a tick do not, nor do those that stay if what has passed is forgotten."""
+    stays, moves, forgets = (Floor(*how, end) for how in ((True, True), (False, False), (True, False)))
+    assert max(stays.fly(seed) for seed in range(16)) < 1e-6
+    assert sum(moves.fly(seed) > 1e-5 for seed in range(16)) >= 8
+    assert max(forgets.fly(seed) for seed in range(16)) > 1e-4
+
+
+def test_aligned_nodes_stay_where_they_are() -> None:
+    for number in range(12):
+        begins, lengths = keeping.aligned(3, 0.01, 0.05, number)
+        np.testing.assert_allclose(begins + lengths, np.cumsum(lengths))
+        ends = 0.01 * number + begins + lengths
+        np.testing.assert_allclose(ends, 0.05 * (number // 5 + 1 + np.arange(3)), atol=1e-12)
+        assert lengths[0] > 0.0 and (lengths[1:] == 0.05).all()
+    for count, tick, node, number in ((0, 0.01, 0.05, 0), (3, 0.0, 0.05, 0), (3, 0.01, 0.05, -1), (3, 0.1, 0.05, 0)):
+        with pytest.raises(ModelError, match="aligned nodes need"):
+            keeping.aligned(count, tick, node, number)
+    with pytest.raises(ModelError, match="no whole number of ticks"):
+        keeping.aligned(3, 0.02, 0.05, 0)
+
+
 def test_without_a_terminal_set_hard_plans_end() -> None:
     assert not any(all(closed_loop("", seed)[0]) for seed in range(3))
 
