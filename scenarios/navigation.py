@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,13 +20,14 @@ from unifg.lie import wrap_angle
 from unifg.machine.tally import counting
 from unifg.models.distance_map import DistanceMap
 from unifg.models.unicycle import step
-from unifg.scenarios.driving.drive_pilot import make_pilot
+from unifg.scenarios.driving.drive_pilot import Pilot, make_pilot
 from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.driving.route import Route
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.options import existing, option, pose, positive
+from unifg.scenarios.rivals.choices import OWN_PLANNER, PLANNERS, make_planner
 from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.ways.polyline import path_length
 from unifg.scenarios.worlds.building import DEMO_GOALS, DEMO_START, building_map
@@ -58,6 +60,7 @@ class NavigationSettings:
         seed: of everything random.
         controller: weights and limits.
         drivetrain: of the base; the controller is told the accelerations on its data sheet.
+        planner: of the motion along the route: that of this library, or one of others to compare with.
     """
 
     map: Path | None = option(None, text=existing("the YAML file of a ROS map"), metavar="F.yaml")
@@ -73,6 +76,7 @@ class NavigationSettings:
     seed: int = option(0, metavar="S")
     controller: ControllerSettings = field(default_factory=ControllerSettings)
     drivetrain: Drivetrain = field(default_factory=Drivetrain)
+    planner: str = option(OWN_PLANNER, choices=PLANNERS)
 
 
 def run_navigation(settings: NavigationSettings, progress: Progress | None = None) -> EpisodeLog:
@@ -95,6 +99,8 @@ class Episode:
         """Load the map, plan the legs, place the obstacles, wake the robot, and rehearse unless this is a rehearsal."""
         self.settings = settings
         self.controller = control = replace(settings.controller, accelerations=settings.drivetrain.sheet)
+        if settings.planner != OWN_PLANNER and settings.coupling != "sequential":
+            raise ScenarioError(f"the planner '{settings.planner}' takes an estimate: its coupling is 'sequential'")
         self.occupancy = building_map() if settings.map is None else load_map(settings.map)
         self.start = _pose(settings.start, DEMO_START if settings.map is None else None, "start")
         if settings.goals is None and settings.map is not None:
@@ -109,7 +115,7 @@ class Episode:
         legs = zip([self.start, *self.goals[:-1]], self.goals, strict=True)
         self.legs = [self._route(begin, end) for begin, end in legs]
         self.path = np.concatenate([leg.path for leg in self.legs])
-        placement, sensors, belief, floor = np.random.default_rng(settings.seed).spawn(4)
+        placement, sensors, belief, floor, drawn = np.random.default_rng(settings.seed).spawn(5)
         discs = place_obstacles(
             self.occupancy,
             self.distance_map,
@@ -127,11 +133,15 @@ class Episode:
         )  # fmt: skip
         sigma = np.array(INITIAL_SIGMA)
         believed = self.start + sigma * belief.standard_normal(3)
-        self.pilot = make_pilot(
+        pilot: Pilot[Any] = make_pilot(
             settings.coupling, self.distance_map, settings.solver, control, believed, sigma, self.world.lidar.beams
         )
+        other = make_planner(settings.planner, self.distance_map, control, drawn)
+        if other is not None:
+            pilot.controller = other
+        self.pilot = pilot
         if not rehearsal:
-            kind = "navigation", settings.coupling, settings.solver
+            kind = "navigation", settings.coupling, settings.solver, settings.planner
             rehearse(kind, lambda: Episode(settings, rehearsal=True))
 
     def run(self, progress: Progress) -> EpisodeLog:
@@ -145,7 +155,7 @@ class Episode:
             start=self.start,
             dt=s.controller.dt,
             robot_radius=s.controller.robot_radius,
-            solver=s.solver,
+            solver=s.solver if s.planner == OWN_PLANNER else s.planner,
             coupling=s.coupling,
             seed=s.seed,
             control_limits=s.controller.limits,

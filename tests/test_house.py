@@ -43,6 +43,7 @@ STOREYS: tuple[tuple[str, ...], ...] = (
     ("seeing",),
     ("worlds",),
     ("driving", "flying", "safety"),
+    ("rivals",),
     ("log",),
     ("",),
     ("show",),

@@ -76,6 +76,11 @@ class Controller:
         self._coming = plan.controls[1:]
         return plan
 
+    @property
+    def estimate(self) -> Array:
+        """(3,) present pose as it is believed after the last plan [m, m, rad]."""
+        return self.loop.estimate
+
     def given(self, pose: Array, reference: Array, tracks: Tracks, covariance: Array | None = None) -> Drive:
         """What the terms are given; arguments as of :meth:`plan`."""
         cruise = np.zeros((self.settings.horizon, 2))

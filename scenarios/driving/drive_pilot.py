@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 from unifg.errors import ScenarioError
 from unifg.horizon import Plan
@@ -44,7 +44,33 @@ class Estimator(Protocol):
         ...
 
 
-class Pilot:
+class Planner(Protocol):
+    """What says where to go."""
+
+    settings: ControllerSettings
+
+    @property
+    def estimate(self) -> Array:
+        """(3,) present pose as it is believed after the last plan [m, m, rad]."""
+        ...
+
+    def stations(self) -> Array:
+        """(N + 1,) how far ahead along the path the reference is [m]."""
+        ...
+
+    def plan(self, pose: Array, reference: Array, tracks: Tracks, covariance: Array | None = None) -> Plan:
+        """Decide the next control from a pose (3,), poses (N + 1, 3) along the route, discs, and the pose's (3, 3)."""
+        ...
+
+    def forget(self) -> None:
+        """Drop the warm start, as when a new route makes it misleading."""
+        ...
+
+
+PlannerT = TypeVar("PlannerT", bound=Planner)
+
+
+class Pilot(Generic[PlannerT]):
     """Estimates, looks for discs that no map shows, repairs the route, and plans along it.
 
     Attributes:
@@ -57,7 +83,7 @@ class Pilot:
         clock: how long the stages of the last tick took: localise, perceive, route, plan.
     """
 
-    def __init__(self, estimator: Estimator, controller: Controller, tracker: DiscTracker) -> None:
+    def __init__(self, estimator: Estimator, controller: PlannerT, tracker: DiscTracker) -> None:
         """Join what stands for itself."""
         self.estimator, self.controller, self.tracker = estimator, controller, tracker
         self.tracks = Tracks.none()
@@ -90,7 +116,7 @@ class Pilot:
         reference = route.reference(pose, self.controller.stations())
         plan = self.controller.plan(pose, reference, self.tracks, self.estimator.covariance)
         self.clock.split("plan")
-        self.pose = self.controller.loop.estimate
+        self.pose = self.controller.estimate
         return plan
 
     def forget(self) -> None:
@@ -106,7 +132,7 @@ def make_pilot(
     pose: Array,
     sigma: Array,
     beams: int,
-) -> Pilot:
+) -> Pilot[Controller]:
     """The pilot for a coupling.
 
     Args:

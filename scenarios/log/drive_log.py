@@ -27,7 +27,7 @@ class EpisodeLog:
         start: (3,) true start pose [m, m, rad].
         dt: control period [s].
         robot_radius: radius of the robot's disc [m].
-        solver: name of the backend.
+        solver: name of the backend, or of the planner in its place.
         coupling: how estimation and control were joined, such as ``"sequential"``.
         seed: seed of the episode.
         scan_angles: (B,) beam angles in the body frame [rad].

@@ -1,0 +1,266 @@
+"""Other people's planners: they keep the robot's limits, get past what stands, stop where there is no way."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from episodes import room
+from unifg.errors import ScenarioError
+from unifg.files.ros_map import save_map
+from unifg.models import unicycle
+from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.driving.drive_settings import ControllerSettings
+from unifg.scenarios.navigation import Episode, NavigationSettings
+from unifg.scenarios.rivals.choices import PLANNERS, make_planner
+from unifg.scenarios.rivals.dynamic_window import DynamicWindow, WindowSettings
+from unifg.scenarios.rivals.elastic_band import BandSettings, ElasticBand
+from unifg.scenarios.rivals.local_planner import LocalPlanner, Situation, Wish
+from unifg.scenarios.rivals.path_integral import PathIntegral, PathIntegralSettings
+from unifg.scenarios.rivals.pure_pursuit import PurePursuit
+from unifg.scenarios.rivals.sampled_drives import driven, nearest_on
+from unifg.scenarios.seeing.tracks import Tracks
+from unifg.scenarios.worlds.drivetrain import Drivetrain
+from unifg.typing import Array
+
+SLOW = (1.0, 2.1)  # [m/s^2, rad/s^2]
+SETTINGS = ControllerSettings(accelerations=SLOW)
+OTHERS = PLANNERS[1:]
+START = np.array([2.0, 2.0, 0.0])
+
+
+@functools.cache
+def hall() -> DistanceMap:
+    """An empty hall of 8 m by 4 m."""
+    occupied = np.zeros((84, 164), dtype=bool)
+    occupied[:2] = occupied[-2:] = True
+    occupied[:, :2] = occupied[:, -2:] = True
+    return DistanceMap.from_occupancy(occupied, 0.05, (-0.1, -0.1, 0.0))
+
+
+@functools.cache
+def bands(accelerations: tuple[float, float]) -> ElasticBand:
+    """As many graphs as these short ways need."""
+    return ElasticBand(hall(), replace(SETTINGS, accelerations=accelerations), BandSettings(poses=(3, 16)))
+
+
+def planner(name: str, accelerations: tuple[float, float] = SLOW, seed: int = 0) -> LocalPlanner:
+    """One of the others."""
+    if name == "teb":
+        bands(accelerations).forget()
+        bands(accelerations).applied = np.zeros(2)
+        return bands(accelerations)
+    if name == "mppi":
+        own = PathIntegralSettings(drives=400)
+        return PathIntegral(hall(), replace(SETTINGS, accelerations=accelerations), np.random.default_rng(seed), own)
+    made = make_planner(name, hall(), replace(SETTINGS, accelerations=accelerations), np.random.default_rng(seed))
+    assert made is not None
+    return made
+
+
+def straight(pose: Array, end: float = math.inf) -> Array:
+    """A reference along x at y = 2 m from beside the robot; it ends, or goes on through walls."""
+    way = pose[0] + SETTINGS.speed * SETTINGS.dt * np.arange(SETTINGS.horizon + 1.0)
+    return np.column_stack([np.minimum(way, end), np.full(len(way), 2.0), np.zeros(len(way))])
+
+
+def discs(*rows: tuple[float, float, float], velocity: tuple[float, float] = (0.0, 0.0)) -> Tracks:
+    """Discs (x, y, radius)."""
+    table = np.array(rows, dtype=np.float64).reshape(-1, 3)
+    return Tracks.of_movers(table[:, :2], np.tile(np.array(velocity), (len(table), 1)), table[:, 2])
+
+
+def drives(
+    own: LocalPlanner, ticks: int, others: Tracks | None = None, end: float = math.inf, start: Array = START
+) -> tuple[Array, Array]:
+    """Poses and controls of a drive in a perfect world."""
+    poses, controls, seen = [start], [], discs() if others is None else others
+    for k in range(ticks):
+        now = replace(seen, centre=seen.centre + k * SETTINGS.dt * seen.velocity)
+        plan = own.plan(poses[-1], straight(poses[-1], end), now)
+        assert plan.controls.shape == (SETTINGS.horizon, 2) and plan.states.shape == (SETTINGS.horizon + 1, 3)
+        assert np.array_equal(own.estimate, poses[-1])
+        controls.append(plan.control)
+        poses.append(unicycle.step(poses[-1][None], plan.control[None], SETTINGS.dt)[0])
+    return np.array(poses), np.array(controls)
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_limits_of_speed_and_acceleration_are_kept(name: str) -> None:
+    poses, controls = drives(planner(name), 25, start=np.array([2.0, 2.2, 0.2]))
+    assert (np.abs(controls) <= np.array(SETTINGS.limits) + 1e-12).all()
+    changes = np.abs(np.diff(np.concatenate([np.zeros((1, 2)), controls]), axis=0)) / SETTINGS.dt
+    assert (changes <= np.array(SLOW) + 1e-9).all()
+    assert controls[:, 0].max() > 0.6, "it speeds up where nothing is in the way"
+    assert abs(poses[-1, 1] - 2.0) < 0.12, "it comes back to its path"
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_base_without_limits_of_acceleration_is_driven_too(name: str) -> None:
+    _, controls = drives(planner(name, (math.inf, math.inf)), 8)
+    assert np.isfinite(controls).all() and controls[-1, 0] > 0.4
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_the_robot_stops_before_a_wall(name: str) -> None:
+    start = np.array([6.0, 2.0, 0.0])
+    poses, _ = drives(planner(name), 40, start=start)
+    room = hall().distance(poses[:, :2]) - SETTINGS.robot_radius
+    assert room.min() > SETTINGS.wall_clearance - 0.01
+    assert poses[:, 0].max() > 6.3, "it drives as far as it may"
+    assert np.ptp(poses[-8:, 0]) < (0.3 if name == "mppi" else 0.1)  # noise never rests
+
+
+@pytest.mark.parametrize(("name", "aside"), [("teb", 0.25), ("mppi", 0.25), ("dwa", 0.48), ("pursuit", 0.48)])
+def test_a_disc_beside_the_path_is_passed(name: str, aside: float) -> None:
+    """Nearer than the clearance allows, where the planner can leave its path; the others need a route that is free."""
+    seen = discs((4.0, 2.0 - aside, 0.2))
+    poses, _ = drives(planner(name), 50, seen)
+    room = np.hypot(*(poses[:, :2] - seen.centre[0]).T) - 0.2 - SETTINGS.robot_radius
+    assert room.min() > SETTINGS.disc_clearance - 0.01
+    assert poses[-1, 0] > 4.5
+
+
+def test_pure_pursuit_waits_before_a_disc_on_its_arc() -> None:
+    seen = discs((4.0, 1.75, 0.2))
+    own = planner("pursuit")
+    poses, controls = drives(own, 40, seen)
+    room = np.hypot(*(poses[:, :2] - seen.centre[0]).T) - 0.2 - SETTINGS.robot_radius
+    assert room.min() > SETTINGS.disc_clearance - 0.01
+    assert poses[-1, 0] < 4.0
+    plan = own.plan(poses[-1], straight(poses[-1]), seen)
+    assert controls[-5:, 0].min() == 0.0 or plan.emergency
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_mover_that_will_have_gone_is_no_hindrance_and_one_that_comes_is(name: str) -> None:
+    """What crosses is met where it will be, not where it is."""
+    now = Situation(START, np.zeros(2), straight(START), discs((3.0, 2.0, 0.2), velocity=(0.0, 1.0)), hall(), SETTINGS)
+    ahead = np.array([[3.0, 2.0]])
+    assert now.clearance(ahead, 0.0)[0] < 0.0 < now.clearance(ahead, 1.0)[0]
+    assert planner(name).plan(START, now.reference, now.tracks).source == "solved"
+
+
+def test_a_robot_too_near_may_leave_but_not_come_nearer() -> None:
+    pose = np.array([0.2, 2.0, 0.0])  # the wall is 0.03 m from the hull, less what is to be kept
+    now = Situation(pose, np.zeros(2), straight(pose), discs(), hall(), SETTINGS)
+    places = np.array([[[0.19, 2.0], [0.2, 2.0], [0.25, 2.0]]])
+    times = np.array([0.1, 0.2, 0.3])
+    assert now.hits(now.clearance(places, times), times).tolist() == [[True, False, False]]
+
+
+def test_an_uncertain_robot_keeps_farther_off() -> None:
+    """By as many standard deviations as the controller, of the axis that is known least."""
+    heard: list[float] = []
+
+    class Noting(PurePursuit):
+        def wish(self, now: Situation) -> Wish | None:
+            heard.append(float(now.clearance(START[None, :2], 0.0)[0]))
+            return super().wish(now)
+
+    own = Noting(hall(), SETTINGS)
+    for covariance in (None, np.diag([0.1**2, 1e-6, 1e-6])):
+        own.plan(START, straight(START), discs(), covariance)
+    assert heard[0] - heard[1] == pytest.approx(SETTINGS.sigmas * 0.1)
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_goal_is_reached_with_its_heading(name: str) -> None:
+    goal = np.array([3.2, 2.0, 0.5])
+    own, pose = planner(name), START
+    for _ in range(70):
+        way = np.minimum(pose[0] + SETTINGS.speed * SETTINGS.dt * np.arange(SETTINGS.horizon + 1.0), goal[0])
+        reference = np.column_stack([way, np.full(len(way), 2.0), np.where(way >= goal[0], goal[2], 0.0)])
+        pose = unicycle.step(pose[None], own.plan(pose, reference, discs()).control[None], SETTINGS.dt)[0]
+        if np.hypot(*(pose - goal)[:2]) < 0.1 and abs(pose[2] - goal[2]) < 0.1:
+            return
+    pytest.fail(f"ended at {pose}")
+
+
+def test_path_integral_is_decided_by_its_seed() -> None:
+    first, again, other = (drives(planner("mppi", seed=seed), 4)[1] for seed in (1, 1, 2))
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+
+
+def test_path_integral_forgets_its_plan() -> None:
+    own = planner("mppi")
+    assert isinstance(own, PathIntegral)
+    drives(own, 3)
+    assert own.mean[:, 0].max() > 0.0
+    own.forget()
+    assert not own.mean.any()
+
+
+def test_the_window_is_what_a_tick_can_reach_and_always_holds_straight_on() -> None:
+    own = DynamicWindow(hall(), SETTINGS, WindowSettings(samples=(3, 4)))
+    now = Situation(START, np.array([0.5, 0.1]), straight(START), discs(), hall(), SETTINGS)
+    tried = own.window(now)
+    assert np.isclose(tried[:, 0].min(), 0.4) and np.isclose(tried[:, 0].max(), 0.6)
+    assert np.isclose(tried[:, 1].min(), -0.11) and np.isclose(tried[:, 1].max(), 0.31)
+    assert (tried[:, 1] == 0.0).any()
+    fast = replace(now, applied=np.array([-0.3, 0.0]))  # backwards, which it does not choose: as far forward as it can
+    assert np.isclose(own.window(fast)[:, 0].max(), -0.2)
+
+
+def test_velocities_from_which_the_robot_cannot_stop_are_not_admissible() -> None:
+    own = DynamicWindow(hall(), SETTINGS)
+    steps = round(own.own.horizon / own.own.step)
+    hit = np.zeros((3, steps), dtype=bool)
+    hit[1:, 8:] = True  # after 0.4 s
+    tried = np.array([[1.0, 0.0], [1.0, 0.0], [0.3, 0.0]])  # braking takes 1 s and 0.5 m; 0.3 s and 0.045 m
+    assert own.admissible(tried, hit).tolist() == [True, False, True]
+
+
+def test_pursuit_is_slow_in_bends_near_things_and_before_the_goal() -> None:
+    own = PurePursuit(hall(), SETTINGS)
+    now = Situation(START, np.array([1.0, 0.0]), straight(START), discs(), hall(), SETTINGS)
+    assert own.speed(now, 0.0) == SETTINGS.speed
+    assert own.speed(now, 2.0) == pytest.approx(1.0 / (0.9 * 2.0))
+    assert own.speed(replace(now, tracks=discs((START[0], START[1] + 0.8, 0.3))), 0.0) == pytest.approx(0.44 / 0.6)
+    assert own.speed(replace(now, reference=straight(START, 2.3)), 0.0) == pytest.approx(0.5)
+    assert np.allclose(own.carrot(now)[:2], [2.9, 2.0])
+    assert np.allclose(own.carrot(replace(now, applied=np.zeros(2)))[:2], [2.3, 2.0])
+
+
+def test_a_band_is_resized_to_even_intervals_and_keeps_its_ends() -> None:
+    own = ElasticBand(hall(), SETTINGS, BandSettings(poses=(3, 8)))
+    poses = np.column_stack([[0.0, 2.0, 2.1, 2.2, 3.0], np.full(5, 2.0), np.zeros(5)])
+    times = np.array([1.6, 0.1, 0.1, 0.5])
+    found, lengths = own.resized(poses, times)
+    assert len(found) == len(lengths) + 1 <= 8
+    assert np.isclose(lengths.sum(), times.sum())
+    assert np.array_equal(found[[0, -1]], poses[[0, -1]])
+    assert (np.diff(found[:, 0]) > 0.0).all()
+
+
+def test_drives_are_those_of_the_robots_model() -> None:
+    controls = np.random.default_rng(3).uniform(-1.0, 1.0, (2, 7, 2))
+    states = driven(START, controls, 0.1)
+    for row, used in zip(states, controls, strict=True):
+        assert np.allclose(row, unicycle.rollout(START, used, 0.1))
+
+
+def test_places_are_held_against_the_path() -> None:
+    now = Situation(START, np.zeros(2), straight(START, 4.0), discs(), hall(), SETTINGS)
+    away, left = nearest_on(now, np.array([[2.55, 2.3], [5.0, 2.0], [1.0, 2.0]]))
+    assert np.allclose(away, [0.3, 1.0, 1.0]) and np.allclose(left, [1.45, 0.0, 2.0])
+
+
+def test_who_plans_is_chosen_by_name(tmp_path: Path) -> None:
+    assert make_planner("mpc", hall(), SETTINGS, np.random.default_rng(0)) is None
+    with pytest.raises(ScenarioError, match="unknown planner 'best': choose mpc, teb, mppi, dwa, pursuit"):
+        make_planner("best", hall(), SETTINGS, np.random.default_rng(0))
+    with pytest.raises(ScenarioError, match="its coupling is 'sequential'"):
+        Episode(NavigationSettings(planner="dwa", coupling="joint"))
+    save_map(tmp_path / "room.yaml", room())
+    settings = NavigationSettings(tmp_path / "room.yaml", (0.0, 0.0, 0.0), ((2.0, 0.0, 0.0),), planner="pursuit")
+    episode = Episode(replace(settings, drivetrain=Drivetrain(*SLOW)), rehearsal=True)
+    assert isinstance(episode.pilot.controller, PurePursuit)
+    assert np.array_equal(episode.pilot.controller.settings.accelerations, SLOW)
+    log = episode.run(lambda done, text: None)
+    assert log.solver == "pursuit" and log.succeeded
