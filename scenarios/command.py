@@ -4,27 +4,32 @@ Exit status: 0 if the robot did what it was asked (every goal reached without a 
 its limits), 1 if not, 2 for arguments that cannot be served, 130 after an interrupt (what was done until then is
 written all the same).
 
-What can be run stands in `unifg.scenarios.commands.catalogue`; only the scenario that is named is loaded.
+``unifg campaign`` runs many episodes (0 if every one of them succeeded), ``unifg report`` says what came of them,
+``unifg replay`` shows one of them. What can be run stands in `unifg.scenarios.commands.catalogue`; only the scenario
+that is named is loaded.
 """
 
 from __future__ import annotations
 
 import argparse
 import re
+import shlex
 import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from unifg import __version__
 from unifg.errors import UnifgError
 from unifg.scenarios.commands.catalogue import SCENARIOS, SOLVE
 from unifg.scenarios.commands.outcome import Outcome, Progress
-from unifg.scenarios.options import settings_of
+from unifg.scenarios.options import count, settings_of
 
 __all__ = ["main"]
 
@@ -47,8 +52,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refuse(f"scenarios need {error.name}: pip install 'unifg[scenarios]'")
     except SystemExit as stop:  # argparse has said what is wrong, or has printed help
         return stop.code if isinstance(stop.code, int) else REFUSED
+    does = {"warmup": _warm_up, "campaign": _campaign, "report": _report, "replay": _replay}
     try:
-        return _warm_up(chosen) if chosen.name == "warmup" else _run(chosen)
+        return does.get(chosen.name, _run)(chosen)
     except UnifgError as error:
         return _refuse(str(error))
     except KeyboardInterrupt:
@@ -82,7 +88,88 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     other.add_argument("--check", action="store_true", help="say whether these are out of date; compile nothing")
     if list(words[:1]) == ["warmup"]:
         warm.set_defaults(module=import_module("unifg.scenarios.commands.warm"))
+    _add_campaigns(commands)
     return parser
+
+
+def _add_campaigns(commands: Any) -> None:
+    """Campaigns, what they say, and one of their episodes again."""
+    about = (
+        "Run every episode of a campaign that is not on file: a scenario, settings, seeds, as a TOML file states them."
+    )
+    many = commands.add_parser("campaign", help="run many episodes", description=about, allow_abbrev=False)
+    many.set_defaults(name="campaign")
+    many.add_argument("file", type=Path, metavar="FILE.toml", help="what to run")
+    many.add_argument("--out", type=Path, metavar="DIR", help="folder for results (default: out/campaigns/FILE)")
+    where = many.add_mutually_exclusive_group()
+    where.add_argument(
+        "--workers",
+        type=partial(count, least=1),
+        default=1,
+        metavar="N",
+        help="processes, one thread each (default: 1)",
+    )
+    where.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of a dask.distributed cluster, such as tcp://10.0.0.1:8786"
+    )
+    many.add_argument("--again", action="store_true", help="repeat episodes that ended in an error or were lost")
+    many.add_argument("--any-code", action="store_true", help="keep episodes that other states of the code have run")
+    about = "Write tables and pictures of a campaign, finished or not, as report.html and report.md in its folder."
+    said = commands.add_parser("report", help="what a campaign says", description=about, allow_abbrev=False)
+    said.set_defaults(name="report")
+    said.add_argument("folder", type=Path, metavar="DIR", help="of the campaign")
+    said.add_argument("--against", type=Path, metavar="DIR2", help="compare with the same episodes of another campaign")
+    said.add_argument(
+        "--any-code", action="store_true", help="episodes that other states of the code have run count, too"
+    )
+    about = "Run one episode of a campaign again and write what `unifg run` writes: scene, pictures, metrics."
+    one = commands.add_parser("replay", help="one episode of a campaign again", description=about, allow_abbrev=False)
+    one.set_defaults(name="replay")
+    one.add_argument("folder", type=Path, metavar="DIR", help="of the campaign")
+    one.add_argument("key", metavar="KEY", help="of the episode, as the report names it")
+    one.add_argument("--out", type=Path, metavar="DIR2", help="folder for results (default: DIR/replay/KEY)")
+    one.add_argument("--live", action="store_true", help="show it in a browser while it runs; says where")
+
+
+def _campaign(chosen: argparse.Namespace) -> int:
+    """Run what is missing of a campaign."""
+    from unifg.scenarios.campaigns.campaign import run_campaign
+
+    folder: Path = chosen.out or Path("out") / "campaigns" / chosen.file.stem
+    with _progress_bar(chosen.file.stem, signal.SIGINT, signal.SIGTERM) as progress:
+        found = run_campaign(
+            chosen.file, folder, workers=chosen.workers, scheduler=chosen.scheduler, again=chosen.again,
+            any_code=chosen.any_code, progress=progress,
+        )  # fmt: skip
+    for remark in found.remarks:
+        print(f"note: {remark}")
+    print(found.summary)
+    print(f"{folder}: `{shlex.join(('unifg', 'report', str(folder)))}` says more")
+    if found.interrupted:
+        return INTERRUPTED
+    return SUCCEEDED if found.succeeded else FAILED
+
+
+def _report(chosen: argparse.Namespace) -> int:
+    """Write what a campaign says."""
+    from unifg.scenarios.campaigns.account import write_report
+
+    try:
+        files = write_report(chosen.folder, chosen.against, chosen.any_code)
+    except OSError as error:
+        return _refuse(f"{chosen.folder}: cannot write the report ({error})")
+    for file in files:
+        print(file)
+    return SUCCEEDED
+
+
+def _replay(chosen: argparse.Namespace) -> int:
+    """Run an episode of a campaign as ``unifg run`` would."""
+    from unifg.scenarios.campaigns.replay import episode_of
+
+    module, settings = episode_of(chosen.folder, chosen.key)
+    chosen.out = chosen.out or chosen.folder / "replay" / chosen.key
+    return _run_settings(chosen, module, settings, chosen.key)
 
 
 def _warm_up(chosen: argparse.Namespace) -> int:
@@ -106,15 +193,20 @@ def _warm_up(chosen: argparse.Namespace) -> int:
 
 def _run(chosen: argparse.Namespace) -> int:
     """Run the chosen scenario, write what it left and say how it went."""
+    settings = settings_of(chosen.module.SETTINGS, chosen, solver=chosen.solver)
+    return _run_settings(chosen, chosen.module, settings, chosen.name)
+
+
+def _run_settings(chosen: argparse.Namespace, module: Any, settings: Any, name: str) -> int:
+    """The same for settings that are known."""
     folder: Path = chosen.out
     try:
         folder.mkdir(parents=True, exist_ok=True)  # better refused now than after the run
     except OSError as error:
         return _refuse(f"--out {folder}: cannot make this folder ({error.strerror})")
-    settings = settings_of(chosen.module.SETTINGS, chosen, solver=chosen.solver)
-    with _progress_bar(chosen.name) as progress:
+    with _progress_bar(name) as progress:
         watched = {"announce": _announce} if getattr(chosen, "live", False) else {}
-        outcome: Outcome = chosen.module.run(settings, progress, **watched)
+        outcome: Outcome = module.run(settings, progress, **watched)
     try:
         files = outcome.write(folder)
     except OSError as error:
@@ -129,8 +221,13 @@ def _run(chosen: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _progress_bar(name: str) -> Iterator[Progress]:
-    """A bar on stderr; the first interrupt waits for the end of a tick, so that the record stays whole."""
+def _progress_bar(name: str, *stops: signal.Signals) -> Iterator[Progress]:
+    """A bar on stderr; the first interrupt waits for the end of a tick, so that the record stays whole.
+
+    Args:
+        name: beside the bar.
+        stops: signals that interrupt; none for control-C alone.
+    """
     from tqdm import tqdm
 
     wanted = False
@@ -153,14 +250,15 @@ def _progress_bar(name: str) -> Iterator[Progress]:
                 raise KeyboardInterrupt
 
         try:
-            before = signal.signal(signal.SIGINT, interrupt)
+            before = [(stop, signal.signal(stop, interrupt)) for stop in stops or (signal.SIGINT,)]
         except ValueError:  # not in the main thread, where no interrupt arrives either
             yield progress
             return
         try:
             yield progress
         finally:
-            signal.signal(signal.SIGINT, before)
+            for stop, handler in before:
+                signal.signal(stop, handler)
 
 
 def _announce(url: str) -> None:

@@ -18,12 +18,14 @@ from types import NoneType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 __all__ = [
+    "Option",
     "add_options",
     "count",
     "existing",
     "not_negative",
     "option",
     "pair",
+    "plain",
     "pose",
     "positive",
     "settings_of",
@@ -36,7 +38,9 @@ Text = Callable[[str], Any]
 
 
 @dataclass(frozen=True)
-class _Option:
+class Option:
+    """What the command line is told of a field: see :func:`option`."""
+
     text: Text | None
     metavar: str | None
     choices: tuple[str, ...]
@@ -63,7 +67,7 @@ def option(
         flag: name of the option where it is not that of the field.
         many: the option may be repeated, and the field holds a tuple of all values.
     """
-    declared = _Option(text, metavar, tuple(choices), flag, many)
+    declared = Option(text, metavar, tuple(choices), flag, many)
     return field(default=default, metadata={"option": declared})
 
 
@@ -79,7 +83,7 @@ def add_options(parser: argparse.ArgumentParser, settings: type, **defaults: Any
         name = path[-1]
         default = defaults.get(name, declared.default)
         words: dict[str, Any] = {"help": _help(path, settings, default).replace("%", "%%"), "metavar": chosen.metavar}
-        kind = _plain(get_type_hints(_owner(settings, path))[name])
+        kind = plain(get_type_hints(_owner(settings, path))[name])
         if kind is bool:
             del words["metavar"]
             words["action"] = "store_true"
@@ -114,7 +118,7 @@ def settings_of(settings: type[S], chosen: argparse.Namespace, **more: Any) -> S
     return made  # type: ignore[no-any-return]
 
 
-def _options(settings: type) -> Iterator[tuple[tuple[str, ...], dataclasses.Field[Any], _Option]]:
+def _options(settings: type) -> Iterator[tuple[tuple[str, ...], dataclasses.Field[Any], Option]]:
     """Every option with its path, at most one level down."""
     for declared in dataclasses.fields(settings):
         inner = declared.default_factory
@@ -137,7 +141,7 @@ def _owner(settings: type, path: tuple[str, ...]) -> type:
     return inner
 
 
-def _plain(kind: Any) -> Any:
+def plain(kind: Any) -> Any:
     """An annotation without its None."""
     kinds = [part for part in get_args(kind) if part is not NoneType]
     return kinds[0] if NoneType in get_args(kind) and len(kinds) == 1 else kind

@@ -19,10 +19,13 @@ BEAT = 0.25  # [s]
 
 def died(error: BaseException | None) -> bool:
     """Whether an error says that a worker died, and nothing about the job itself."""
-    if isinstance(error, WorkerDied | BrokenExecutor):
-        return True
     cluster = sys.modules.get("distributed")
-    return cluster is not None and isinstance(error, cluster.KilledWorker)
+    return _once(error) or (cluster is not None and isinstance(error, cluster.KilledWorker))
+
+
+def _once(error: BaseException | None) -> bool:
+    """Whether it died for the first time; the scheduler of a cluster has tried several before it says so."""
+    return isinstance(error, WorkerDied | BrokenExecutor)
 
 
 def finished(
@@ -72,7 +75,7 @@ def finished(
             job, first = waiting.pop(future)
             if future.cancelled():
                 raise ScenarioError("the executor has dropped its jobs; what ended before is kept: start again")
-            if first and died(future.exception()):
+            if first and _once(future.exception()):
                 again.append(job)
             else:
                 yield job, future

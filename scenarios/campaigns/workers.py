@@ -107,6 +107,8 @@ class Workers(Executor):
             try:
                 if lane not in self._workers:
                     self._workers[lane] = self._started()
+                    if self._killed:  # while it was started
+                        self._workers[lane].process.kill()
                 found = self._workers[lane].do(call)
             except BaseException as error:
                 if isinstance(error, WorkerDied):

@@ -1,0 +1,287 @@
+"""A campaign: every episode of a statement run once, a line on file for each, continued where it was stopped."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from unifg.errors import ScenarioError
+from unifg.scenarios.campaigns.cluster import cluster
+from unifg.scenarios.campaigns.dispatch import died, finished
+from unifg.scenarios.campaigns.journal import Journal, lines_of
+from unifg.scenarios.campaigns.performed import ERROR, FAILED, LOST, OK, Order, lost, perform
+from unifg.scenarios.campaigns.sources import fingerprint, library
+from unifg.scenarios.campaigns.statement import Statement, module_of, read
+from unifg.scenarios.campaigns.workers import Workers
+from unifg.scenarios.episode import Progress, silent
+
+__all__ = ["EPISODES", "MANIFEST", "Campaign", "code_of_scenario", "manifest_of", "replay_command", "run_campaign"]
+
+EPISODES, MANIFEST = "episodes.jsonl", "campaign.json"
+
+
+@dataclass
+class Campaign:
+    """What became of a campaign.
+
+    Attributes:
+        folder: with its files.
+        episodes: how many it has.
+        outcomes: how many of them are ok, failed, error, lost.
+        ran: how many were run by this call.
+        interrupted: whether it was stopped before its end.
+        remarks: what the user should know.
+    """
+
+    folder: Path
+    episodes: int
+    outcomes: Counter[str] = field(default_factory=Counter)
+    ran: int = 0
+    interrupted: bool = False
+    remarks: list[str] = field(default_factory=list)
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether every episode was run and did what was asked."""
+        return self.outcomes[OK] == self.episodes
+
+    @property
+    def summary(self) -> str:
+        """One line for people."""
+        counts = ", ".join(f"{self.outcomes[name]} {name}" for name in (OK, FAILED, ERROR, LOST))
+        missing = self.episodes - self.outcomes.total()
+        return f"{self.outcomes.total()} of {self.episodes} episodes: {counts}" + (
+            f"; {missing} to do: start the same command again" if missing else ""
+        )
+
+
+def run_campaign(
+    campaign: Statement | str | Path,
+    out: str | Path,
+    *,
+    workers: int = 1,
+    executor: Executor | None = None,
+    scheduler: str | None = None,
+    again: bool = False,
+    any_code: bool = False,
+    progress: Progress = silent,
+) -> Campaign:
+    """Run what is missing of a campaign.
+
+    Args:
+        campaign: or the TOML file that states it.
+        out: folder of its files; episodes that are on file there are not repeated.
+        workers: processes of this machine, one thread each; with an executor, how many episodes it runs at once.
+        executor: any of ``concurrent.futures``, instead of processes of our own.
+        scheduler: address of a dask.distributed scheduler, instead of either.
+        again: repeat episodes that ended in an error or were lost.
+        any_code: keep episodes that earlier states of the code have run.
+        progress: called several times a second with the share done and a short text; a KeyboardInterrupt it raises ends
+            the campaign with what there is.
+
+    Returns:
+        What became of it.
+
+    Raises:
+        ScenarioError: the statement is wrong, the folder cannot be written or is in use, the disk is full, or there are
+            no workers.
+    """
+    statement = campaign if isinstance(campaign, Statement) else read(campaign)
+    folder = Path(out)
+    code = code_of_scenario(statement.scenario)
+    found = Campaign(folder, len(statement))
+    with Journal(folder / EPISODES) as journal:
+        found.remarks += [journal.mended] if journal.mended else []
+        known = {episode.key for episode in statement.episodes()}
+        done = _on_file(found, known, code, again, any_code)
+        _remark_changes(found, statement, code, done)
+        _write_manifest(folder, statement, code)
+        found.outcomes = Counter(done.values())
+        orders = _orders(statement, code, done)
+        meter = _Meter(found, progress)
+        if len(done) == len(known):
+            return found
+        with _executor(statement, workers, executor, scheduler) as (at_work, at_once):
+            try:
+                for order, future in finished(at_work, perform, orders, at_once, meter.beat):
+                    error = future.exception()
+                    if isinstance(error, ScenarioError):  # of the workers: every other episode would say the same
+                        raise error
+                    if error is not None and not died(error):
+                        raise ScenarioError(f"an episode cannot be handed to a worker: {error!r}") from error
+                    text = lost(order, f"the worker died, twice: {error}") if error is not None else future.result()
+                    journal.add(text)
+                    found.outcomes[json.loads(text)["outcome"]] += 1
+                    found.ran += 1
+                    meter.beat()
+            except KeyboardInterrupt:
+                found.interrupted = True
+            except BaseException:
+                _stop(at_work)
+                raise
+            if found.interrupted:
+                _stop(at_work)
+    return found
+
+
+def code_of_scenario(scenario: str) -> str:
+    """Digest of the sources an episode depends on."""
+    module = module_of(scenario).__name__
+    return library(module).digest([module])
+
+
+def manifest_of(folder: Path) -> dict[str, Any]:
+    """What the folder of a campaign says of it: "campaign" as it was stated, "base", "code", "axes", "bundles", "keys".
+
+    Raises:
+        ScenarioError: there is no campaign.
+    """
+    try:
+        kept: dict[str, Any] = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        if {"campaign", "base", "code", "axes", "bundles", "compare", "keys"} <= kept.keys():
+            return kept
+        why = "entries are missing"
+    except (OSError, ValueError, AttributeError) as error:
+        why = str(error)
+    raise ScenarioError(f"{folder}: holds no campaign ({why})")
+
+
+def replay_command(folder: Path, key: str) -> str:
+    """What a user types to see an episode again."""
+    return f"unifg replay {shlex.quote(str(folder))} {key}"
+
+
+def _on_file(found: Campaign, known: set[str], code: str, again: bool, any_code: bool) -> dict[str, str]:
+    """Outcomes of episodes that need not be run, by key."""
+    unreadable: list[int] = []
+    done: dict[str, str] = {}
+    others = Counter[str]()
+    left: set[str] = set()
+    for row in lines_of(found.folder / EPISODES, unreadable):
+        key, outcome = str(row.get("key")), str(row.get("outcome"))
+        if key not in known:
+            left.add(key)
+        elif row.get("code") != code and not any_code:
+            others[str(row.get("code"))] += 1
+        elif again and outcome in (ERROR, LOST):
+            done.pop(key, None)
+        else:
+            done[key] = outcome
+    if unreadable:
+        found.remarks.append(f"{EPISODES}: line {', '.join(map(str, unreadable))} cannot be read and does not count")
+    if others:
+        which = ", ".join(f"{count} of {other}" for other, count in others.items())
+        found.remarks.append(
+            f"the code has changed ({code} now, on file {which}): those episodes are repeated; --any-code keeps them"
+        )
+    if left:
+        found.remarks.append(f"{len(left)} episodes on file are not of this campaign (any more): left alone")
+    return done
+
+
+def _remark_changes(found: Campaign, statement: Statement, code: str, done: dict[str, str]) -> None:
+    path = found.folder / MANIFEST
+    if not path.is_file():
+        return
+    try:
+        before = json.loads(path.read_text(encoding="utf-8"))["campaign"]
+    except (OSError, ValueError, KeyError, TypeError):
+        found.remarks.append(f"{MANIFEST} cannot be read: it is written anew")
+        return
+    if before != json.loads(json.dumps(statement.given, default=str)):
+        changed = sorted(
+            {word for word in {*before, *statement.given} if before.get(word) != statement.given.get(word)} - {"title"}
+        )
+        found.remarks.append(
+            f"the campaign has changed since it was begun here ({', '.join(changed) or 'title'}): "
+            f"{len(done)} episodes on file still belong to it"
+        )
+
+
+def _write_manifest(folder: Path, statement: Statement, code: str) -> None:
+    said = {
+        "campaign": statement.given,
+        "base": str(statement.base),
+        "code": code,
+        "axes": {axis.name: list(axis.values) for axis in statement.axes},
+        "bundles": [axis.name for axis in statement.axes if axis.bundle],
+        "compare": statement.compare,
+        "keys": [episode.key for episode in statement.episodes()],
+    }
+    text = json.dumps(said, default=str)
+    path = folder / MANIFEST
+    try:
+        beside = path.with_suffix(".new")
+        beside.write_text(text + "\n", encoding="utf-8")
+        beside.replace(path)
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def _orders(statement: Statement, code: str, done: dict[str, str]) -> Iterator[Order]:
+    sources, base = fingerprint(), str(statement.base)
+    for episode in statement.episodes():
+        if episode.key not in done:
+            yield Order(
+                statement.scenario, episode.key, episode.labels, episode.settings, episode.seed, base, code, sources
+            )
+
+
+@contextmanager
+def _executor(
+    statement: Statement, workers: int, executor: Executor | None, scheduler: str | None
+) -> Iterator[tuple[Executor, Callable[[], int]]]:
+    if executor is not None:
+        yield executor, lambda: 2 * workers
+    elif scheduler is not None:
+        with cluster(scheduler) as there:
+            yield there
+    else:
+        with Workers(workers, partial(_ready, module_of(statement.scenario).__name__)) as ours:
+            yield ours, lambda: workers + 1  # the next is at hand when one ends
+
+
+def _ready(module: str) -> None:
+    """What a process does before its first episode."""
+    import_module(module)
+    fingerprint()
+
+
+def _stop(executor: Executor) -> None:
+    """End what is under way."""
+    if isinstance(executor, Workers):
+        executor.kill()
+    else:
+        executor.shutdown(wait=False, cancel_futures=True)
+
+
+class _Meter:
+    """Tells how far a campaign is, and how long it will take."""
+
+    def __init__(self, campaign: Campaign, progress: Progress) -> None:
+        self._campaign, self._progress, self._began = campaign, progress, time.monotonic()
+
+    def beat(self) -> None:
+        c = self._campaign
+        done = c.outcomes.total()
+        bad = ", ".join(f"{c.outcomes[name]} {name}" for name in (FAILED, ERROR, LOST) if c.outcomes[name])
+        text = f"{done} of {c.episodes}" + (f", {bad}" if bad else "")
+        if c.ran:
+            text += f", {_clock((time.monotonic() - self._began) / c.ran * (c.episodes - done))} left"
+        self._progress(done / max(1, c.episodes), text)
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

@@ -1,0 +1,183 @@
+"""Settings as a file states them: which field a name means, whether a value fits it, and the settings they make.
+
+What a field may be is declared where it stands (`unifg.scenarios.options`); a file can name every field, also those
+that are no options: ``controller.speed`` is the field ``speed`` of the settings in ``controller``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import hashlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+from unifg.errors import ScenarioError
+from unifg.scenarios.options import Option, plain
+
+__all__ = ["Fields", "identity", "nearest"]
+
+S = TypeVar("S")
+
+
+class Fields:
+    """The fields of a class of settings and of the settings inside, by name.
+
+    Attributes:
+        settings: the class.
+        base: folder that relative paths are relative to.
+        choices: words to choose from, by field, beside those that are declared.
+    """
+
+    def __init__(self, settings: type, base: Path, choices: Mapping[str, Sequence[str]] | None = None) -> None:
+        """Look at a class."""
+        self.settings, self.base, self.choices = settings, base, dict(choices or {})
+        self._kinds = dict(_leaves(settings))
+        self._short: dict[str, list[str]] = {}
+        for path, (_, declared) in self._kinds.items():
+            flag = declared.metadata["option"].flag if "option" in declared.metadata else ""
+            for short in {path.rpartition(".")[2], flag} - {"", path}:
+                if "option" in declared.metadata:
+                    self._short.setdefault(short, []).append(path)
+
+    def named(self, name: str, where: str) -> str:
+        """The path of a field; options inside settings need no more than the name they have on the command line.
+
+        Raises:
+            ScenarioError: there is none, or more than one.
+        """
+        if name in self._kinds:
+            return name
+        found = self._short.get(name.replace("-", "_"), [])
+        if len(found) == 1:
+            return found[0]
+        if found:
+            raise ScenarioError(f"{where}: {name!r} may mean {' or '.join(found)}; write which")
+        raise ScenarioError(f"{where}: there is no setting {name!r}; {nearest(name, [*self._kinds, *self._short])}")
+
+    def __contains__(self, name: str) -> bool:
+        """Whether a name means one field."""
+        try:
+            self.named(name, "")
+        except ScenarioError:
+            return False
+        return True
+
+    def value(self, path: str, given: Any, where: str) -> Any:
+        """A value as its field wants it.
+
+        Raises:
+            ScenarioError: it does not fit.
+        """
+        kind, declared = self._kinds[path]
+        option: Option | None = declared.metadata.get("option")
+        many = option is not None and option.many
+        values = given if not many or (isinstance(given, list | tuple) and not _single(kind, given)) else [given]
+        found = self._fitting(plain(kind), values, where)
+        for one in found if many else (found,):
+            self._permitted(path, option, one, where)
+        return found
+
+    def built(self, values: Mapping[str, Any], **defaults: Any) -> Any:
+        """The settings that have these values; the others are the defaults."""
+        made = self.settings(**{name: value for name, value in defaults.items() if name not in values})
+        for path, value in values.items():
+            made = _replaced(made, path.split("."), value)
+        return made
+
+    def _fitting(self, kind: Any, given: Any, where: str) -> Any:
+        arguments = get_args(kind)
+        wrong = ScenarioError(f"{where}: {given!r} does not fit: {_words(kind)} is expected")
+        if get_origin(kind) is Literal:
+            if given not in arguments or isinstance(given, bool):
+                raise ScenarioError(f"{where}: {given!r} is none of {', '.join(map(str, arguments))}")
+            return given
+        if get_origin(kind) is tuple:
+            if not isinstance(given, list | tuple):
+                raise wrong
+            if len(arguments) == 2 and arguments[1] is Ellipsis:
+                return tuple(self._fitting(plain(arguments[0]), one, where) for one in given)
+            if len(given) != len(arguments):
+                raise wrong
+            return tuple(self._fitting(plain(k), one, where) for k, one in zip(arguments, given, strict=True))
+        if kind is float:
+            if isinstance(given, bool) or not isinstance(given, int | float) or math.isnan(given):
+                raise wrong
+            return float(given)
+        if kind is Path:
+            if not isinstance(given, str | Path):
+                raise wrong
+            return self.base / given
+        if kind in (bool, int, str):
+            if type(given) is not kind:
+                raise wrong
+            return given
+        raise ScenarioError(f"{where}: {_words(kind)} cannot be stated in a file")
+
+    def _permitted(self, path: str, option: Option | None, value: Any, where: str) -> None:
+        """Refuse what the command line refuses."""
+        words = self.choices.get(path, option.choices if option is not None else ())
+        if words and value not in words:
+            raise ScenarioError(f"{where}: {value!r} is none of {', '.join(words)}")
+        if option is None or option.text is None or isinstance(value, tuple | bool):
+            return
+        try:
+            option.text(str(value))
+        except argparse.ArgumentTypeError as error:
+            raise ScenarioError(f"{where}: {error}") from None
+
+
+def nearest(name: str, known: Sequence[str]) -> str:
+    """What somebody may have meant."""
+    close = get_close_matches(name.lower(), known, 3, 0.5)
+    return f"did you mean {' or '.join(close)}?" if close else f"there are {', '.join(sorted(known))}"
+
+
+def identity(value: Any) -> Any:
+    """What two equal values have in common, as JSON can hold it; of a file, what it holds and what is named like it."""
+    if isinstance(value, Path):
+        total = hashlib.sha256()
+        for beside in sorted(value.parent.glob(f"{_literal(value.stem)}.*")):
+            if beside.is_file():
+                total.update(beside.name.encode() + b"\0" + beside.read_bytes() + b"\0")
+        return total.hexdigest()[:12]
+    return [identity(one) for one in value] if isinstance(value, tuple) else value
+
+
+def _literal(name: str) -> str:
+    """A name that holds no wildcard."""
+    return "".join(f"[{c}]" if c in "*?[" else c for c in name)
+
+
+def _leaves(settings: type, before: str = "") -> Iterator[tuple[str, tuple[Any, dataclasses.Field[Any]]]]:
+    kinds = get_type_hints(settings)
+    for declared in dataclasses.fields(settings):
+        kind = plain(kinds[declared.name])
+        if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+            yield from _leaves(kind, f"{before}{declared.name}.")
+        elif declared.init:
+            yield f"{before}{declared.name}", (kinds[declared.name], declared)
+
+
+def _single(kind: Any, given: Sequence[Any]) -> bool:
+    """Whether a list is one of many values, such as a pose among poses, and not the list of them."""
+    arguments = get_args(plain(kind))
+    return get_origin(arguments[0]) is tuple and not any(isinstance(one, list | tuple) for one in given)
+
+
+def _replaced(settings: S, path: Sequence[str], value: Any) -> S:
+    first, *rest = path
+    inner = _replaced(getattr(settings, first), rest, value) if rest else value
+    return dataclasses.replace(settings, **{first: inner})  # type: ignore[type-var]
+
+
+def _words(kind: Any) -> str:
+    names = {bool: "true or false", int: "a whole number", float: "a number", str: "a word", Path: "a file"}
+    if get_origin(kind) is tuple:
+        first, *rest = get_args(kind)
+        inner = names.get(plain(first)) or f"a list of {len(get_args(plain(first)))} numbers"
+        return f"a list, each {inner}," if rest == [Ellipsis] else f"a list of {1 + len(rest)}, each {inner},"
+    return names.get(kind, f"a {getattr(kind, '__name__', kind)}")
