@@ -27,7 +27,14 @@ from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.options import existing, option, pose, positive
-from unifg.scenarios.rivals.choices import OWN_PLANNER, PLANNERS, make_planner
+from unifg.scenarios.rivals.choices import (
+    LOCALISERS,
+    OWN_LOCALISER,
+    OWN_PLANNER,
+    PLANNERS,
+    make_localiser,
+    make_planner,
+)
 from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.ways.polyline import path_length
 from unifg.scenarios.worlds.building import DEMO_GOALS, DEMO_START, building_map
@@ -61,6 +68,7 @@ class NavigationSettings:
         controller: weights and limits.
         drivetrain: of the base; the controller is told the accelerations on its data sheet.
         planner: of the motion along the route: that of this library, or one of others to compare with.
+        localiser: of the estimate: that of this library, or another one to compare with.
     """
 
     map: Path | None = option(None, text=existing("the YAML file of a ROS map"), metavar="F.yaml")
@@ -77,6 +85,7 @@ class NavigationSettings:
     controller: ControllerSettings = field(default_factory=ControllerSettings)
     drivetrain: Drivetrain = field(default_factory=Drivetrain)
     planner: str = option(OWN_PLANNER, choices=PLANNERS)
+    localiser: str = option(OWN_LOCALISER, choices=LOCALISERS)
 
 
 def run_navigation(settings: NavigationSettings, progress: Progress | None = None) -> EpisodeLog:
@@ -99,8 +108,13 @@ class Episode:
         """Load the map, plan the legs, place the obstacles, wake the robot, and rehearse unless this is a rehearsal."""
         self.settings = settings
         self.controller = control = replace(settings.controller, accelerations=settings.drivetrain.sheet)
-        if settings.planner != OWN_PLANNER and settings.coupling != "sequential":
-            raise ScenarioError(f"the planner '{settings.planner}' takes an estimate: its coupling is 'sequential'")
+        if settings.coupling != "sequential":
+            for word, chosen, own in (
+                ("planner", settings.planner, OWN_PLANNER),
+                ("localiser", settings.localiser, OWN_LOCALISER),
+            ):
+                if chosen != own:
+                    raise ScenarioError(f"the {word} '{chosen}' stands for itself: its coupling is 'sequential'")
         self.occupancy = building_map() if settings.map is None else load_map(settings.map)
         self.start = _pose(settings.start, DEMO_START if settings.map is None else None, "start")
         if settings.goals is None and settings.map is not None:
@@ -136,12 +150,16 @@ class Episode:
         pilot: Pilot[Any] = make_pilot(
             settings.coupling, self.distance_map, settings.solver, control, believed, sigma, self.world.lidar.beams
         )
-        other = make_planner(settings.planner, self.distance_map, control, drawn)
-        if other is not None:
-            pilot.controller = other
+        of_planner, of_localiser = drawn.spawn(2)
+        planner = make_planner(settings.planner, self.distance_map, control, of_planner)
+        localiser = make_localiser(settings.localiser, self.occupancy, self.distance_map, believed, sigma, of_localiser)
+        if planner is not None:
+            pilot.controller = planner
+        if localiser is not None:
+            pilot.estimator, pilot.pose = localiser, localiser.pose
         self.pilot = pilot
         if not rehearsal:
-            kind = "navigation", settings.coupling, settings.solver, settings.planner
+            kind = "navigation", settings.coupling, settings.solver, settings.planner, settings.localiser
             rehearse(kind, lambda: Episode(settings, rehearsal=True))
 
     def run(self, progress: Progress) -> EpisodeLog:

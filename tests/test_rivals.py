@@ -21,6 +21,7 @@ from unifg.scenarios.rivals.choices import PLANNERS, make_planner
 from unifg.scenarios.rivals.dynamic_window import DynamicWindow, WindowSettings
 from unifg.scenarios.rivals.elastic_band import BandSettings, ElasticBand
 from unifg.scenarios.rivals.local_planner import LocalPlanner, Situation, Wish
+from unifg.scenarios.rivals.monte_carlo import MonteCarlo
 from unifg.scenarios.rivals.path_integral import PathIntegral, PathIntegralSettings
 from unifg.scenarios.rivals.pure_pursuit import PurePursuit
 from unifg.scenarios.rivals.sampled_drives import driven, nearest_on
@@ -257,10 +258,16 @@ def test_who_plans_is_chosen_by_name(tmp_path: Path) -> None:
         make_planner("best", hall(), SETTINGS, np.random.default_rng(0))
     with pytest.raises(ScenarioError, match="its coupling is 'sequential'"):
         Episode(NavigationSettings(planner="dwa", coupling="joint"))
+    with pytest.raises(ScenarioError, match="localiser 'amcl' stands for itself"):
+        Episode(NavigationSettings(localiser="amcl", coupling="joint"))
     save_map(tmp_path / "room.yaml", room())
-    settings = NavigationSettings(tmp_path / "room.yaml", (0.0, 0.0, 0.0), ((2.0, 0.0, 0.0),), planner="pursuit")
+    settings = NavigationSettings(
+        tmp_path / "room.yaml", (0.0, 0.0, 0.0), ((0.8, 0.0, 0.0),), planner="pursuit", localiser="amcl"
+    )
     episode = Episode(replace(settings, drivetrain=Drivetrain(*SLOW)), rehearsal=True)
     assert isinstance(episode.pilot.controller, PurePursuit)
     assert np.array_equal(episode.pilot.controller.settings.accelerations, SLOW)
     log = episode.run(lambda done, text: None)
     assert log.solver == "pursuit" and log.succeeded
+    assert isinstance(episode.pilot.estimator, MonteCarlo)
+    assert log.localisation_iterations[0] >= 500  # particles
