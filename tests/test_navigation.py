@@ -24,6 +24,7 @@ from unifg.scenarios.seeing.tracks import Tracks
 from unifg.scenarios.ways.polyline import path_length, polyline_distance
 from unifg.scenarios.worlds.building import building_map
 from unifg.scenarios.worlds.plane import World
+from unifg.scenarios.worlds.space import Obstacle
 from unifg.typing import Array
 
 RADIUS = 0.17
@@ -337,6 +338,21 @@ def test_localiser_converges(place: tuple[float, float, float], off: tuple[float
     assert localiser.iterations > 0
     # It knows better than before, in every direction.
     assert np.linalg.eigvalsh(localiser.covariance).max() < SIGMA.min() ** 2
+
+
+def test_a_disc_beside_a_wall_does_not_pull_the_estimate_along_a_corridor() -> None:
+    """Little says how far along a corridor the robot is: beams that end on a disc, near a wall, must not decide it."""
+    occupancy, field = building()
+    place = np.array([15.0, 14.2, -0.3])
+    shelf = [Obstacle(np.array([15.0 + x, 13.45]), 0.2) for x in (0.6, 1.1, 1.6)]
+    world = World(occupancy, place, shelf, np.random.default_rng(1))
+    localiser = Localiser(field, place.copy(), SIGMA, world.lidar.beams)
+    iterations = []
+    for _ in range(10):
+        localiser.correct(world.scan())
+        iterations.append(localiser.iterations)
+    assert pose_errors(localiser.pose[None], world.pose[None])[0][0] < 0.02
+    assert max(iterations) < 12  # it converges
 
 
 def test_localiser_keeps_the_prediction_without_a_scan() -> None:

@@ -54,7 +54,7 @@ class Controller:
         ]
         self.loop = Loop(
             robot(s.dt) if window is None else window.robot, s.horizon, terms, solver=backend(solver, s),
-            cold=backend(solver, s, COLD_PATIENCE), second=backend(SECOND[solver], s, COLD_PATIENCE), window=window,
+            cold=backend(solver, s, COLD_PATIENCE), second=backend(SECOND, s, COLD_PATIENCE), window=window,
             coupling="sequential" if window is None else "joint", pull=s.pull, limits=s.box, judge=self.judge,
             starts=Starts(self.along, self.leaving), believable=settled, patience=PATIENCE,
         )  # fmt: skip

@@ -15,7 +15,7 @@ import unifg as fg
 from unifg.horizon import Now, Robot, Window
 from unifg.models import lidar, odometry, unicycle
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.driving.localiser import BEAM_SIGMA
+from unifg.scenarios.driving.localiser import BEAM_SIGMA, MATCHING
 from unifg.scenarios.seeing.readings import Scan
 from unifg.solvers import GaussNewton
 from unifg.typing import Array, ArrayLike, IntArray
@@ -83,14 +83,13 @@ class Registration:
         graph.minimize(endpoint, x[which], points, information=weights, active=counting, name="lidar")
 
     def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
-        """End-points, and their information [1/m^2] by the weights of Bazzana et al., section VII-A."""
+        """End-points, and their information [1/m^2]."""
         scans, seen = now.past.recorded("scan")
         which = self._poses(len(scans))
         rows = np.concatenate([scans[:-1, ::STRIDE].reshape(-1, 3), scans[-1]])
         share = np.where(which == len(scans) - 1, 1.0, float(STRIDE))
         distance = self.distance_map.distance(lidar.in_world(now.past.states[which], rows[:, :2]))
-        loss = lidar.endpoint_loss(BEAM_SIGMA, self.distance_map.resolution)
-        information = loss.weight((distance / BEAM_SIGMA) ** 2) / BEAM_SIGMA**2 * share
+        information = MATCHING.weight((distance / BEAM_SIGMA) ** 2) / BEAM_SIGMA**2 * share
         counting = (rows[:, 2] > 0.0) & seen[which] & (information > 0.0)
         return {
             "lidar: end-points": rows[:, :2],

