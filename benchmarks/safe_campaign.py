@@ -35,7 +35,13 @@ def could(flight: SafeFlight, log: SafeLog) -> Answer:
         state = log.states[min(int(np.ceil(first / log.dt)), log.ticks - 1)]
         axes = 2 if body.upright else 3
         away, speed = (state[:3] - place[0])[:axes], (state[7:] - velocity[0])[:axes]
-        authority = Authority(VEHICLE, 0.1, flight.lead + TILT, bend, ball.flight if ball else 3.0)
+        authority = Authority(
+            VEHICLE,
+            0.1,
+            flight.settings.books.loops.delay + flight.settings.dt + TILT,
+            bend,
+            ball.flight if ball else 3.0,
+        )
         pull = np.array([0.0, 0.0, -GRAVITY]) if ball else None
         keep = body.radius + log.hull + log.margin
         worst = min(worst, ANSWERS.index(exists(away, speed, keep, authority, pull)))

@@ -25,8 +25,10 @@ from unifg.scenarios.options import count, not_negative, option, positive
 from unifg.scenarios.safety.flatness import TUNED, FlatnessController, Gains, flat_flight
 from unifg.scenarios.safety.keeper import TRACKING, Decision, Keeper, KeeperSettings, Obstacles, Reading
 from unifg.scenarios.safety.one_step import FilterSettings, filtered
+from unifg.scenarios.safety.pace import Pace
 from unifg.scenarios.safety.situations import Kind, Situation, situation
 from unifg.scenarios.safety.spline_planner import SplinePath, SplineSettings, around
+from unifg.scenarios.safety.state_filter import FilterStatistics, StateFilter
 from unifg.scenarios.safety.weighing import Weighing, WeighingSettings
 from unifg.scenarios.ways.flat_path import Line
 from unifg.scenarios.worlds.body_rate import SUBSTEP, Airframe, BodyRatePlant, Loops
@@ -80,7 +82,9 @@ class SafeSettings:
         seed: of sizes, places, phases and noise; without one, the case as it is described.
         solver: one of `unifg.solvers.names.CONSTRAINED`.
         margin: to be kept between hull and obstacles [m].
-        faster: speed limit along each axis over the speed of the path.
+        faster: speed limit over the speed of the path.
+        patience: by how much the vehicle, at the speed of the path, may be late before time on the path stands still
+            [s].
         dt: length of a tick [s].
         books: vehicle that everybody believes in at first.
         truth: mass and drag of the vehicle.
@@ -92,6 +96,7 @@ class SafeSettings:
         keeper: numbers of the controller by barriers.
         tracking: the same where nothing is in the way and it predicts.
         weighing: numbers of the estimate.
+        believed: statistics of sensors and air that an estimate of the state goes by.
         seen: standard deviations of position, attitude and velocity as they are seen [m, rad, m/s].
         disturbance: of rates and accelerations.
     """
@@ -107,6 +112,7 @@ class SafeSettings:
     solver: str = "ipm"
     margin: float = 0.05
     faster: float = 1.25
+    patience: float = 2.0
     dt: float = 0.01
     books: Airframe = field(default_factory=Airframe)
     truth: quadrotor.Parameters = field(default_factory=_true_vehicle)
@@ -117,6 +123,7 @@ class SafeSettings:
     keeper: KeeperSettings = field(default_factory=KeeperSettings)
     tracking: KeeperSettings = TRACKING
     weighing: WeighingSettings = field(default_factory=WeighingSettings)
+    believed: FilterStatistics = field(default_factory=FilterStatistics)
     seen: tuple[float, float, float] = (1e-3, 3e-3, 1e-2)
     disturbance: DisturbanceModel = field(default_factory=DisturbanceModel)
 
@@ -162,31 +169,41 @@ class SafeFlight:
         self.plant, self.model = BodyRatePlant(truth, start, s.dt), BodyRatePlant(s.books, start, s.dt)
         estimating = s.knowledge == "estimated"
         self.weighing = Weighing(s.weighing, s.books.parameters, s.dt) if estimating else None
-        lead = s.books.loops.delay + s.dt if estimating else 0.0
-        self.lead = round(lead / SUBSTEP) * SUBSTEP
+        self.filter = StateFilter(s.believed, s.dt) if estimating else None
+        path = self._spline() if controller == "spline" else about.path
+        self.pace = Pace(path, s.patience * speed)
         self._decide = self._deciders(controller, barriers, s.faster * speed)
 
     def _deciders(
         self, controller: Controller, barriers: tuple[float, float], limit: float
-    ) -> Callable[[Array, float, Obstacles], Decision]:
-        s, path = self.settings, self.situation.path
+    ) -> Callable[[Array, Obstacles], Decision]:
+        s, link = self.settings, self.settings.books.loops.link
+        estimating = self.weighing is not None
         if controller == "barrier":
             slots, (alpha, gamma) = min(s.keeper.slots, len(self.situation.bodies)), barriers
-            weights = s.tracking if self.weighing is not None and not slots else s.keeper
+            weights = s.tracking if estimating and not slots else s.keeper
             numbers = replace(weights, alpha=alpha, gamma=gamma, reading=s.reading, speed=limit, slots=slots)
-            keeper = Keeper(numbers, s.books, path, s.dt, self.weighing, s.solver)
-            return lambda state, now, seen: keeper.decide(state, now + self.lead, seen, now)
-        gains = Gains() if self.weighing is None else s.gains
+            frame = s.books if estimating else replace(s.books, loops=replace(s.books.loops, gain=np.inf))
+            keeper, lead = Keeper(numbers, frame, s.dt, self.weighing, s.solver), link + s.dt if estimating else 0.0
+
+            def plan(state: Array, seen: Obstacles) -> Decision:
+                start = np.concatenate(self.model.ahead(state, lead, self._air))
+                fade = np.exp(-(lead + keeper.nodes[:-1]) / s.believed.air.gust_time)
+                gust = fade[:, None] * self._air[3:]
+                return keeper.decide(start, self.pace.at(lead + keeper.nodes), seen, lead, gust)
+
+            return plan
+        gains = s.gains if estimating else Gains()
         flat = FlatnessController(gains, s.books.least, s.books.most)
-        if controller == "spline":
-            path = self._spline()
+        ahead = s.books.loops.delay + s.dt if estimating else 0.0
         numbers_of_filter = replace(s.filter, alpha=barriers[0])
 
-        def follow(state: Array, now: float, seen: Obstacles) -> Decision:
-            begin, p, slack = time.thread_time(), self.believed, 0.0
-            flown = path.at(np.array([now + self.lead]))
+        def follow(now: Array, seen: Obstacles) -> Decision:
+            begin, slack = time.thread_time(), 0.0
+            state, p = self.model.ahead(now, ahead, self._air)[0], self._windy
+            flown = self.pace.at(np.array([ahead]))
             if controller == "filter":
-                acceleration, slack = filtered(flat.wanted(state, flown), state, seen, self.lead, numbers_of_filter)
+                acceleration, slack = filtered(flat.wanted(state, flown), state, seen, ahead, numbers_of_filter)
                 control = flat.steer(state, acceleration, flown.jerk[0], p)
             else:
                 control = flat.control(state, flown, p)
@@ -194,6 +211,17 @@ class SafeFlight:
             return Decision(control, state[None, :3], "none", 0, slack, p.mass, np.array(p.drag), elapsed)
 
         return follow
+
+    @property
+    def _air(self) -> Array:
+        """(6,) rates and accelerations by which the air is believed to disturb the vehicle."""
+        return np.zeros(6) if self.filter is None else np.concatenate([np.zeros(3), self.filter.gust])
+
+    @property
+    def _windy(self) -> quadrotor.Parameters:
+        """What is believed of the vehicle, with the gust of the moment for a wind."""
+        p, (x, y, z) = self.believed, self._air[3:].tolist()
+        return replace(p, wind=(p.wind[0] + x, p.wind[1] + y), updraft=p.updraft + z)
 
     def _spline(self) -> SplinePath:
         """A path around what stands in the way, planned before the flight."""
@@ -239,10 +267,18 @@ class SafeFlight:
             if self.weighing is not None:
                 self.weighing.see(state, float(self.model.loops[6]))
                 self.model.airframe = replace(s.books, parameters=self.believed)
+            begin = time.thread_time()
+            state = state if self.filter is None else self.filter.see(state)
+            filtered_ms = 1e3 * (time.thread_time() - begin)
+            self.pace.see(state[:3])
             before = self.plant.state.copy()
-            decision = self._decide(self.model.ahead(state, self.lead), now, obstacles)
-            self.model.state = state.copy()
-            self.model.tick(decision.control)
+            decision = self._decide(state, obstacles)
+            if self.filter is None:
+                self.model.state = state.copy()
+                self.model.tick(decision.control)
+            else:
+                self.filter.tick(self.model, decision.control)
+            self.pace.pass_by(s.dt)
             path = self.plant.tick(decision.control, self._shake.draw(s.dt))
             times = now + SUBSTEP * np.arange(len(path), dtype=np.float64)
             wanted = about.path.at(times[:1])
@@ -250,8 +286,8 @@ class SafeFlight:
                 time=now, states=before, wanted=np.concatenate([wanted.position[0], wanted.velocity[0]]),
                 controls=decision.control, plans=decision.plan, bodies=about.bodies.at(times[:1])[0][0],
                 near=about.bodies.nearest(path, times).min(axis=0, initial=np.inf), slack=decision.slack,
-                mass=decision.mass, drag=decision.drag, decide_ms=decision.milliseconds, steps=decision.iterations,
-                statuses=decision.status,
+                mass=decision.mass, drag=decision.drag, decide_ms=decision.milliseconds + filtered_ms,
+                steps=decision.iterations, statuses=decision.status, late=times[0] + s.dt - self.pace.now,
             )  # fmt: skip
             return (number + 1) / total, f"{self.label}: {now:.1f} s"
 

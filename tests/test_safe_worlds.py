@@ -25,12 +25,14 @@ TURN = np.array([1.0, -2.0, 0.5, 12.0])
 
 @pytest.mark.parametrize("loops", [Loops(), Loops(5.0, 0.1, 0.0), Loops(80.0, 0.004, 0.03)])
 def test_loops_are_stepped_exactly(loops: Loops) -> None:
-    a = np.array([[0.0, 1.0], [-loops.gain / loops.lag, -1.0 / loops.lag]])
+    a = np.array([[0.0, 1.0 / loops.lag], [-loops.gain, -1.0 / loops.lag]])  # of rate and lag rate'
     exact = np.array([expm(SUBSTEP * share * a) for share in np.linspace(0.0, 1.0, 2001)])
     np.testing.assert_allclose(loops.step()[:4].reshape(2, 2), exact[-1], atol=1e-12, rtol=1e-12)
     np.testing.assert_allclose(
-        loops.step()[5:], np.trapezoid(exact[:, 0], dx=1.0 / 2000, axis=0), rtol=1e-6, atol=1e-12
+        loops.step()[5:7], np.trapezoid(exact[:, 0], dx=1.0 / 2000, axis=0), rtol=1e-6, atol=1e-12
     )
+    kept = np.exp(-SUBSTEP * np.linspace(0.0, 1.0, 2001) / loops.lag)
+    np.testing.assert_allclose(loops.step()[[4, 7]], [kept[-1], np.trapezoid(kept, dx=1.0 / 2000)], rtol=1e-6)
 
 
 @pytest.mark.parametrize("wrong", [{"gain": 0.0}, {"lag": -1.0}, {"link": -0.01}, {"gain": float("nan")}])
@@ -95,15 +97,18 @@ def test_what_is_pending_predicts_what_happens() -> None:
     for _ in range(10):
         plant.tick(TURN * rng.uniform(0.5, 1.5, 4))
     kept = plant.state.copy(), plant.loops.copy(), plant.time
-    expected = plant.ahead(plant.state, plant.late)
+    expected, loops = plant.ahead(plant.state, plant.late)
     for now, before in zip((plant.state, plant.loops), kept, strict=False):
         np.testing.assert_array_equal(now, before)  # looking changes nothing
     for _ in range(2):
         plant.tick(rng.uniform(size=4))  # decided too late to matter
     np.testing.assert_allclose(plant.state, expected, atol=1e-12)
+    np.testing.assert_allclose(plant.loops, loops, atol=1e-12)
     longer = plant.ahead(plant.state, 0.5)
-    assert np.isfinite(longer).all()
-    np.testing.assert_array_equal(plant.ahead(START, 0.0), START)
+    blown = plant.ahead(plant.state, 0.5, [0.0, 0.0, 0.0, 0.0, 0.3, 0.0])
+    assert np.isfinite(longer[0]).all()
+    assert blown[0][1] - longer[0][1] == pytest.approx(0.5 * 0.3 * 0.5**2, rel=0.05)  # less what drag takes
+    np.testing.assert_array_equal(plant.ahead(START, 0.0)[0], START)
 
 
 def test_commands_beyond_the_limits_are_limited_and_those_that_are_no_numbers_refused() -> None:

@@ -48,7 +48,9 @@ class SafeLog:
     time: Array = column("s")
     states: Array = column("m, 1, m/s", 10)
     wanted: Array = column("m, m/s", 6)
-    """Position and velocity of the path."""
+    """Position and velocity of the path, had it not waited."""
+    late: Array = column("s")
+    """By which the path has waited at the end of the tick."""
     controls: Array = column("rad/s, N", 4)
     plans: Array = column("m", None, 3)
     bodies: Array = column("m", None, 3)
@@ -118,6 +120,7 @@ def safe_metrics(log: SafeLog) -> dict[str, Any]:
         "min_clearance_m": None if free else float(log.clearance.min()),
         "min_boundary_distance_m": None if free else float(log.boundary.min()),
         "tracking_error_m": errors(late),
+        "late_s": float(log.late[-1]),
         "max_speed_m_per_s": float(np.linalg.norm(log.states[:, 7:], axis=1).max()),
         "greatest_slack_m": float(log.slack.max()),
         "mass_kg": float(log.mass[-1]),

@@ -82,7 +82,7 @@ class Gains:
         return cls((a, b), (c, d), e, f)
 
 
-TUNED = Gains((157.0, 197.0), (8.0, 6.4), 84.0, 2.0)
+TUNED = Gains((161.0, 412.0), (26.2, 16.4), 52.4, 2.0)
 """What ``python -m benchmarks.flight_tuning --controller flatness`` finds, from the gains of a new :class:`Gains`."""
 
 

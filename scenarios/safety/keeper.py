@@ -1,8 +1,8 @@
 """Model-predictive flight along a path that keeps off things by barriers (FactorMPC, eq. 4, 7, 12 to 19).
 
-The plan is a factor graph: states and controls of a quadrotor, N steps ahead; where the path is, as priors on the
-manifold; the dynamics and the limits of the controls as hard constraints. For every obstacle and every step the
-clearance h, measured from the distance that is to be kept, may shrink by no more than its share
+The plan is a factor graph: states and controls of a quadrotor with its loops, N steps ahead; where the path is, as
+priors on the manifold; the dynamics and the limits of the controls as hard constraints. For every obstacle and every
+step the clearance h, measured from the distance that is to be kept, may shrink by no more than its share
 (:func:`unifg.models.barriers.decay`, held by :func:`unifg.models.keeping.keep`),
 
     h(x_{k+1}, t_{k+1}) >= exp(-alpha dt_k) h(x_k, t_k) - s_k
@@ -11,7 +11,9 @@ and what a step takes beyond that, its slack, is dear. With gamma > 0 the veloci
 published, instead, a hinge asks at every node for h' + alpha h >= 0, h in 1/m, of an obstacle that rests in h' (eq. 19,
 and eq. 22 for gamma > 0).
 
-Slack that is used says which obstacle could not be kept off, and by how much.
+Slack that is used says which obstacle could not be kept off, and by how much. The speed is limited with a slack, too:
+a vehicle that a gust made faster than allowed still has a plan, in which it slows down. A solve that ends with
+constraints violated has found no plan; then the last one is flown on, for a while, and after that the vehicle brakes.
 """
 
 from __future__ import annotations
@@ -23,12 +25,12 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 import unifg as fg
-from unifg.models import quadrotor
+from unifg.models import quadrotor, quadrotor_loops
 from unifg.models.barriers import Barrier, Flow, condition, decay, velocity_extended
-from unifg.models.keeping import Form, Kept, grid, keep
-from unifg.scenarios.safety.flatness import flat_flight
+from unifg.models.keeping import Form, Kept, keep
+from unifg.scenarios.safety.flatness import FlatnessController, Gains, flat_flight
 from unifg.scenarios.safety.weighing import Weighing
-from unifg.scenarios.ways.flat_path import FlatPath
+from unifg.scenarios.ways.flat_path import Flown
 from unifg.scenarios.worlds.body_rate import Airframe
 from unifg.solvers.names import backend
 from unifg.typing import Array, BoolArray
@@ -39,6 +41,15 @@ Reading: TypeAlias = Literal["decay", "published"]
 
 TOLERANCE = 1e-4  # of the KKT test, in a loop that goes on
 FAR = 1e3  # where obstacles are that are not there [m]
+PRICE = 1e5  # of violation: multipliers of squared slacks that are used grow with them
+SLOWING = 3.0  # deceleration of a vehicle that is faster than it may be [m/s^2]
+SPEEDING = 1e4  # weight of the squared slack of the speed [s^2/m^2]
+KEPT = 1e-3  # violation of constraints up to which an answer is a plan
+TRIES = 3  # ticks in a row without a plan until the search begins anew
+ON = 0.2  # how long the last plan is flown on [s]
+INSIDE = 1e-3  # deeper than this within the distance to be kept is too near [m]
+PULL = 0.02, 0.05  # how far a plan may move mass, relative, and drag [kg/s] from where the past alone puts them
+FIERCE = 6.0  # greatest acceleration along each axis of the world in braking [m/s^2]
 
 
 @dataclass(frozen=True)
@@ -47,16 +58,19 @@ class KeeperSettings:
 
     Attributes:
         horizon: steps N.
-        step: length of all steps but the first [s].
+        step: greatest length of a step [s].
+        growth: how much longer a step is than the one before it, the first being as long as a tick; infinite where all
+            but the first have the greatest length.
         slots: obstacles that are looked at, the nearest first.
         alpha: rate at which a clearance may shrink [1/s].
         gamma: of the velocity in a second barrier, none if zero [s]; as published [s/m^2].
         reading: "decay" from node to node, or the hinge on h' + alpha h as it is "published".
         form: of the barriers by decay.
-        position, attitude, velocity: weights at each node [1/m^2, 1, s^2/m^2].
-        rate, thrust: weights of the controls less those of the path in each step [s^2, 1/N^2].
+        position, attitude, velocity: weights at each node [1/m^2, 1, s^2/m^2], in proportion to the step before it and
+            as they are for one of the greatest length.
+        rate, thrust: weights of the controls less those of the path in each step [s^2, 1/N^2], alike.
         rate_change, thrust_change: weights of their changes from step to step.
-        speed: greatest velocity along each axis of the world [m/s].
+        speed: greatest speed [m/s].
         slack: its weight; None for that of the form.
         hinge: weight of the squared hinge [s^2 m^2], as published without one.
         iterations: most of a solve with a warm start.
@@ -65,6 +79,7 @@ class KeeperSettings:
 
     horizon: int = 20
     step: float = 0.05
+    growth: float = np.inf
     slots: int = 3
     alpha: float = 1.2
     gamma: float = 0.0
@@ -85,7 +100,7 @@ class KeeperSettings:
 
 
 TRACKING = KeeperSettings(
-    position=60.0, attitude=5.4e-3, velocity=0.12, rate=2.5e-6, thrust=1.1e-5, rate_change=4e-5, thrust_change=2e-5
+    position=180.0, attitude=5e-3, velocity=2.7, rate=2.9e-5, thrust=8.3e-5, rate_change=1.3e-6, thrust_change=3.7e-5
 )
 """Weights for flights with nothing in the way; ``python -m benchmarks.flight_tuning --controller barrier`` finds them.
 
@@ -118,11 +133,16 @@ class Obstacles:
         found: Array = self.position + self.velocity * t + 0.5 * down * t * t
         return found
 
+    def clearance(self, places: Array, later: Array) -> Array:
+        """(n, M) distances of places (n, 3) from where they are expected ``later`` (n,), beyond what is to be kept."""
+        away = places[:, None, :] - self.at(later)
+        away[:, self.upright, 2] = 0.0
+        beyond: Array = np.linalg.norm(away, axis=2) - self.keep
+        return beyond
+
     def nearest(self, place: Array, count: int, later: float = 0.0) -> Obstacles:
         """The ``count`` nearest to a place (3,) some seconds later, with others far away if there are fewer."""
-        away = self.at(np.array([later]))[0] - place
-        away[self.upright, 2] = 0.0
-        order = np.argsort(np.linalg.norm(away, axis=1) - self.keep, kind="stable")[:count]
+        order = np.argsort(self.clearance(place[None], np.array([later]))[0], kind="stable")[:count]
         parts = self.position[order], self.velocity[order], self.keep[order], self.upright[order], self.falls[order]
         missing = count - len(order)
         if not missing:
@@ -138,7 +158,8 @@ class Decision:
     Attributes:
         control: (4,) to be told.
         plan: (k, 3) where the vehicle is expected to go [m].
-        status: of the solve, in words.
+        status: of the solve, in words; "too near" where the plan comes nearer to an obstacle than it is to, "last plan"
+            and "braking" where the solve found none.
         iterations: of it.
         slack: greatest slack in the plan [m].
         mass: as it is believed [kg].
@@ -182,20 +203,26 @@ def inverse_clearance(
     return found
 
 
+def slower(v: Array, limit: Array) -> Array:
+    """(n, 1) by how much a velocity (n, 3) is slower than a limit (n,), to first order near it [m/s]."""
+    most = np.reshape(limit, (-1, 1))
+    left: Array = (most * most - np.sum(v * v, axis=1, keepdims=True)) / (2.0 * most)
+    return left
+
+
 class Keeper:
     """Plans anew at each tick.
 
     Attributes:
         settings: the numbers.
         airframe: as it is believed.
-        path: to be followed.
+        nodes: when the nodes of a plan are, from its begin [s].
     """
 
     def __init__(
         self,
         settings: KeeperSettings,
         airframe: Airframe,
-        path: FlatPath,
         dt: float,
         weighing: Weighing | None = None,
         solver: str = "ipm",
@@ -204,30 +231,38 @@ class Keeper:
 
         Args:
             settings: the numbers.
-            airframe: as it is believed; its mass and drag where they are not estimated.
-            path: to be followed.
+            airframe: as it is believed; its mass and drag where they are not estimated. Loops of an infinite gain are
+                none.
             dt: length of a tick [s].
             weighing: the past that says what the vehicle weighs, a part of the same graph; None to believe.
             solver: one of `unifg.solvers.names.CONSTRAINED`.
         """
-        self.settings, self.airframe, self.path = settings, airframe, path
+        self.settings, self.airframe = settings, airframe
         s = settings
-        self._weighing = weighing
+        self._weighing, self._dt = weighing, dt
         n = s.horizon
-        begins, steps = grid(n, dt, s.step)
-        self.nodes = np.append(begins, begins[-1] + steps[-1])
+        steps = np.full(n, s.step)
+        with np.errstate(over="ignore"):
+            steps = np.minimum(steps, dt * s.growth ** np.arange(n))
+        self.nodes = np.concatenate([[0.0], np.cumsum(steps)])
         graph = fg.Graph()
-        self.x = x = graph.variables("state", quadrotor.STATE, n + 1)
+        self.x = x = graph.variables("state", quadrotor_loops.STATE, n + 1)
         self.u = u = graph.variables("control", quadrotor.CONTROL, n)
         self.mass, self.drag = graph.variables("mass", quadrotor.MASS, 1), graph.variables("drag", quadrotor.DRAG, 1)
-        self._start = graph.data("start", quadrotor.STATE.identity())
+        self._start = graph.data("start", quadrotor_loops.STATE.identity())
         graph.fix(x[0], self._start)
+        self._by_the_past: tuple[fg.Data, ...] = ()
         if weighing is None:
             graph.fix(self.mass, [airframe.parameters.mass], name="given mass")
             graph.fix(self.drag, airframe.parameters.drag, name="given drag")
         else:
             weighing.state(graph, self.mass, self.drag)
-        ahead = x[1:]
+            mass, drag = self._believed_numbers()
+            self._by_the_past = graph.data("mass by the past", mass), graph.data("drag by the past", drag)
+            mass_pull = PULL[0] * airframe.parameters.mass
+            for what, past, pull in zip((self.mass, self.drag), self._by_the_past, (mass_pull, PULL[1]), strict=True):
+                graph.constrain(fg.prior, what, past, lower=-pull, upper=pull, name=f"pull of {what.name}")
+        ahead, share = x[1:], (steps / s.step)[:, None]
         weights = {"p": s.position, "R": s.attitude, "v": s.velocity}
         self._wanted = {}
         for part, weight in weights.items():
@@ -235,30 +270,41 @@ class Keeper:
             self._wanted[part] = data = graph.data(
                 f"wanted {part}", np.tile(rest.manifold.identity(), (n, 1)), each=True
             )
-            graph.minimize(fg.prior, rest, data, sigma=weight**-0.5, name=f"path {part}")
+            sigma = np.broadcast_to((weight * share) ** -0.5, (n, 3))
+            graph.minimize(fg.prior, rest, data, sigma=sigma, name=f"path {part}")
         self._effort = graph.data("wanted controls", np.zeros((n, 4)), each=True)
         self._last = graph.data("last control", np.zeros(4))
+        self._gust = graph.data("gust", np.zeros((n, 3)), each=True)
         effort, change = (
             np.array([a, a, a, b]) ** -0.5 for a, b in ((s.rate, s.thrust), (s.rate_change, s.thrust_change))
         )
-        graph.minimize(fg.prior, u, self._effort, sigma=effort, name="effort")
+        graph.minimize(fg.prior, u, self._effort, sigma=effort * share**-0.5, name="effort")
         graph.minimize(fg.prior, u[0], self._last, sigma=change, name="first change")
         graph.minimize(fg.difference, u[:-1], u[1:], sigma=change, name="change")
-        motion = x[:-1], u, np.zeros((n, 6)), self.mass, self.drag, np.zeros(2), np.zeros(1), ahead, steps
-        graph.constrain(quadrotor.disturbed_dynamics, *motion, lower=0.0, upper=0.0, name="dynamics")
+        loops = airframe.loops
+        held = quadrotor_loops.held(loops.gain, loops.lag, steps)
+        motion = x[:-1], u, self.mass, self.drag, self._gust, ahead, steps, held
+        graph.constrain(quadrotor_loops.defect, *motion, lower=0.0, upper=0.0, name="dynamics")
         graph.bound(u, lower=airframe.least, upper=airframe.most, name="limits")
-        graph.bound(ahead.v, lower=-s.speed, upper=s.speed, name="speed")
+        self._allowed = graph.data("allowed speed", np.full(n, s.speed), each=True)
+        self._speed = keep(graph, slower, ahead.v, self._allowed, obstacles=["speed"], weight=SPEEDING, name="speed")
         self.kept: list[Kept] = []
         if s.slots:
             self._state_barriers(graph, steps)
         self.graph = graph
         # One step of the interior point a tick, and more of them only while the plan violates the constraints.
         early = {"step_tolerance": np.inf} if solver == "ipm" else {}
-        self._cold = backend(solver, tolerance=TOLERANCE).prepare(graph)
-        hurried = backend(solver, tolerance=TOLERANCE, time_limit=s.budget, max_iterations=s.iterations, **early)
+        dear = {"price": PRICE} if solver == "ipm" else {}
+        self._cold = backend(solver, tolerance=TOLERANCE, **dear, **early).prepare(graph)
+        hurried = backend(
+            solver, tolerance=TOLERANCE, time_limit=s.budget, max_iterations=s.iterations, **dear, **early
+        )
         self._warm = hurried.prepare(graph)
         self._guess: fg.Guess | None = None
         self._applied = quadrotor.hover(airframe.parameters)
+        self._plan: tuple[Array, Array] | None = None  # places and controls of the last plan
+        self._age = 0  # of it [ticks]
+        self._brakes = FlatnessController(Gains(), airframe.least, airframe.most)
 
     def _state_barriers(self, graph: fg.Graph, steps: Array) -> None:
         s, x, m = self.settings, self.x, self.settings.slots
@@ -277,8 +323,7 @@ class Keeper:
             h: Barrier = inverse_clearance
             lost = _of_states(h)
             held = velocity_extended(h, clearance, s.gamma) if s.gamma > 0.0 else lost
-            flow = _flow(self.airframe.parameters)
-            asked = condition(held, s.alpha, quadrotor.STATE, flow, as_published=True, lost=lost)
+            asked = condition(held, s.alpha, quadrotor_loops.STATE, _flow(self.airframe), as_published=True, lost=lost)
             self.kept = [
                 keep(graph, asked, x[:-1], self.u, self._since, *seen, obstacles=m, form="hinge", weight=s.hinge)
             ]
@@ -293,59 +338,110 @@ class Keeper:
                 keep(graph, decay(held, s.alpha), *states, obstacles=m, form=s.form, weight=s.slack, name=name)
             )
 
-    def decide(self, state: Array, now: float, obstacles: Obstacles, seen: float) -> Decision:
+    def decide(self, start: Array, flown: Flown, obstacles: Obstacles, later: float, gust: Array) -> Decision:
         """Plan.
 
         Args:
-            state: (10,) in which the command of this tick begins to act.
-            now: when that is [s].
+            start: (17,) state with loops in which the command of this tick begins to act.
+            flown: the path at the nodes of the plan.
             obstacles: as they were seen.
-            seen: when that was [s].
+            later: how much later the plan begins than they were [s].
+            gust: (N, 3) acceleration by the air that is expected in each step [m/s^2].
         """
         begin = time.thread_time()
         s = self.settings
-        states, controls = flat_flight(self.path.at(now + self.nodes), self.believed)
-        data: dict[fg.Data, Array] = {self._start: state, self._last: self._applied, self._effort: controls[:-1]}
-        for part, place in (("p", slice(0, 3)), ("R", slice(3, 7)), ("v", slice(7, 10))):
-            data[self._wanted[part]] = states[1:, place]
+        states, controls = flat_flight(flown, self.believed)
+        data: dict[fg.Data, Array] = {
+            self._start: start, self._last: self._applied, self._effort: controls[:-1], self._gust: gust,
+        }  # fmt: skip
+        data[self._allowed] = np.maximum(s.speed, np.linalg.norm(start[7:10]) - SLOWING * self.nodes[1:])
+        for name, place in (("p", slice(0, 3)), ("R", slice(3, 7)), ("v", slice(7, 10))):
+            data[self._wanted[name]] = states[1:, place]
         if self._weighing is not None:
-            data |= self._weighing.data()
+            data |= self._weighing.data() | dict(zip(self._by_the_past, self._believed_numbers(), strict=True))
         if s.slots:
-            near = obstacles.nearest(state[:3], s.slots, now - seen)
+            near = obstacles.nearest(start[:3], s.slots, later)
             flat = np.ones((s.slots, 3))
             flat[near.upright, 2] = 0.0
             fall = np.array([0.0, 0.0, -quadrotor.GRAVITY]) * near.falls[:, None]
             given = near.position, near.velocity, fall, near.keep, flat
-            data |= {self._since: now - seen + self.nodes[:-1], **dict(zip(self._seen.values(), given, strict=True))}
-        guess, run = self._guess, self._warm
+            data |= {self._since: later + self.nodes[:-1], **dict(zip(self._seen.values(), given, strict=True))}
+        first, guess = self._plan is None, self._guess
         if guess is None:
-            states[0] = state
-            values = {self.x: states, self.u: controls[:-1], **self._parameters()}
-            for kept in self.kept:
-                values |= kept.guess()
-            guess, run = fg.Guess(values), self._cold
-        solution = run.solve(guess, data=data)
-        usable = bool(np.isfinite(solution[self.u]).all())
-        self._guess = solution.shifted(self.x, self.u, by=0) if usable else None
-        control = np.clip(solution[self.u][0] if usable else self._applied, self.airframe.least, self.airframe.most)
+            if not first:
+                states, controls = flat_flight(_braked(start, self.nodes), self.believed)
+            guess = self._begun(start, states, controls)
+        solution = (self._cold if first else self._warm).solve(guess, data=data)
+        numbers = solution[self.x], solution[self.u]
+        found = all(np.isfinite(part).all() for part in numbers) and solution.violation < KEPT
+        status, slack = solution.status.name.lower(), 0.0
+        if found:
+            self._plan, self._age, self._guess = (
+                (numbers[0][:, :3], numbers[1]),
+                0,
+                solution.shifted(self.x, self.u, by=0),
+            )
+            slack = max((use.amount for kept in self.kept for use in kept.used(solution)), default=0.0)
+            if len(obstacles.keep) and obstacles.clearance(self._plan[0], later + self.nodes).min() < -INSIDE:
+                status = "too near"
+        else:
+            self._age += 1
+            # Nearer than before, or never: what was begun is ended in the next tick, and after a few begun anew.
+            on = self._guess is not None and all(np.isfinite(part).all() for part in numbers) and self._age % TRIES
+            self._guess = solution.shifted(self.x, self.u, by=0) if on else None
+        control, plan = self._flown(start)
+        if not found:
+            status = "braking" if self._plan is None or self._age * self._dt > ON else "last plan"
         self._applied = control
-        slack = max((use.amount for kept in self.kept for use in kept.used(solution)), default=0.0)
         spent = 1e3 * (time.thread_time() - begin)
-        return Decision(
-            control, solution[self.x][:, :3], solution.status.name.lower(), solution.iterations, slack,
-            float(solution[self.mass][0, 0]), solution[self.drag][0], spent,
-        )  # fmt: skip
+        p = self.believed if not found else None
+        mass, drag = (p.mass, np.array(p.drag)) if p else (float(solution[self.mass][0, 0]), solution[self.drag][0])
+        return Decision(control, plan, status, solution.iterations, slack, mass, drag, spent)
+
+    def _flown(self, start: Array) -> tuple[Array, Array]:
+        """Control and places of the last plan at its age; of braking where it is too old."""
+        age = self._age * self._dt
+        if self._plan is None or age > ON:
+            level = np.clip(-np.array(Gains().velocity)[[0, 0, 1]] * start[7:10], -FIERCE, FIERCE)
+            return self._brakes.steer(start[:10], level, np.zeros(3), self.believed), np.tile(
+                start[:3], (len(self.nodes), 1)
+            )
+        step = int(np.searchsorted(self.nodes, age + 0.5 * self._dt)) - 1
+        return np.clip(self._plan[1][step], self.airframe.least, self.airframe.most), self._plan[0]
+
+    def _begun(self, start: Array, states: Array, controls: Array) -> fg.Guess:
+        """A first guess: as if the vehicle flew like that (n, 10), (n, 4) from its second node on."""
+        looped = np.concatenate([states, controls[:, :3], np.zeros((len(states), 3)), controls[:, 3:]], axis=1)
+        looped[0] = start
+        values = {self.x: looped, self.u: controls[:-1], **self._parameters(), **self._speed.guess()}
+        for kept in self.kept:
+            values |= kept.guess()
+        return fg.Guess(values)
 
     @property
     def believed(self) -> quadrotor.Parameters:
         """Mass and drag as the past says."""
         return self.airframe.parameters if self._weighing is None else self._weighing.believed
 
+    def _believed_numbers(self) -> tuple[Array, Array]:
+        """(1,) mass and (3,) drag by the past alone."""
+        p = self.believed
+        return np.array([p.mass]), np.array(p.drag)
+
     def _parameters(self) -> dict[fg.Family, Array]:
         if self._weighing is None:
             return {}
-        p = self.airframe.parameters
-        return {self.mass: np.array([[p.mass]]), self.drag: np.array([p.drag])}
+        mass, drag = self._believed_numbers()
+        return {self.mass: mass[None], self.drag: drag[None]}
+
+
+def _braked(start: Array, times: Array) -> Flown:
+    """The way of a vehicle that slows down evenly to rest."""
+    place, velocity = start[:3], start[7:10]
+    rest = max(float(np.linalg.norm(velocity)) / FIERCE, 1e-3)
+    t = np.minimum(times, rest)[:, None]
+    slowing = np.where(times[:, None] < rest, -velocity / rest, 0.0)
+    return Flown(place + velocity * (t - 0.5 * t * t / rest), velocity * (1.0 - t / rest), slowing, 0.0 * slowing)
 
 
 def _of_states(h: Barrier) -> Barrier:
@@ -358,12 +454,12 @@ def _of_states(h: Barrier) -> Barrier:
     return of_states
 
 
-def _flow(parameters: quadrotor.Parameters) -> Flow:
-    """F of the vehicle without noise."""
-    mass, *rest = parameters.packed.tolist()
-    drag, wind, updraft = (np.array([part]) for part in (rest[:3], rest[3:5], rest[5:]))
+def _flow(airframe: Airframe) -> Flow:
+    """F of the vehicle without wind."""
+    books, loops = airframe.parameters, airframe.loops
+    mass, drag = np.array([[books.mass]]), np.array([books.drag])
 
     def flow(x: Array, u: Array) -> Array:
-        return quadrotor.field(x, u, np.zeros((1, 6)), np.array([[mass]]), drag, wind, updraft)
+        return quadrotor_loops.field(x, u, mass, drag, np.zeros((1, 3)), loops.gain, loops.lag)
 
     return flow

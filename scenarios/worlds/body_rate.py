@@ -11,7 +11,6 @@ middle of each millisecond (:func:`unifg.models.quadrotor.fly` does the same wit
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass, field
 
@@ -20,6 +19,7 @@ import numpy as np
 from unifg.errors import ScenarioError
 from unifg.machine.jit import compiled
 from unifg.models import quadrotor, quadrotor_dynamics
+from unifg.models.quadrotor_loops import held
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["SUBSTEP", "Airframe", "BodyRatePlant", "Loops"]
@@ -52,20 +52,9 @@ class Loops:
             raise ScenarioError(f"loops need a gain and a lag above zero and a link of no negative delay, got {self}")
 
     def step(self) -> Array:
-        """(7,) how one millisecond changes the loops.
-
-        With e = rate - told and torque t: e' = t, t' = -(gain/lag) e - t/lag. The entries are those of the matrix
-        exponential row by row, what thrust keeps of its distance to what it is told, and two paddings for the mean of
-        the rate over the step (entries 5 and 6 weigh e and t).
-        """
-        h, k, tau = SUBSTEP, self.gain, self.lag
-        a = np.array([[0.0, 1.0], [-k / tau, -1.0 / tau]])
-        power, series, mean = np.eye(2), np.eye(2), np.eye(2)
-        for n in range(1, 12):
-            power = power @ a * (h / n)
-            series = series + power
-            mean = mean + power / (n + 1)
-        return np.array([*series.ravel(), math.exp(-h / tau), *mean[0]])
+        """(8,) how one millisecond changes the loops, as :func:`unifg.models.quadrotor_loops.held` has it."""
+        found: Array = held(self.gain, self.lag, SUBSTEP)[0]
+        return found
 
     @property
     def delay(self) -> float:
@@ -104,18 +93,18 @@ class Airframe:
 
 @compiled
 def _advance(x: Array, loop: Array, told: Array, noise: Array, rho: Array, step: Array, h: float, path: Array) -> None:
-    """Move the state x (10,) and the loops (rates, torques, thrust) by one substep per row of ``told`` (n, 4)."""
-    held = np.zeros(4)
+    """Move the state x (10,) and the loops (7,) by one substep per row of ``told`` (n, 4)."""
+    during = np.zeros(4)
     for n in range(len(told)):
         for i in range(3):
-            error, torque = loop[i] - told[n, i], loop[3 + i]
-            held[i] = told[n, i] + step[5] * error + step[6] * torque
-            loop[i] = told[n, i] + step[0] * error + step[1] * torque
-            loop[3 + i] = step[2] * error + step[3] * torque
+            error, spin = loop[i] - told[n, i], loop[3 + i]
+            during[i] = told[n, i] + step[5] * error + step[6] * spin
+            loop[i] = told[n, i] + step[0] * error + step[1] * spin
+            loop[3 + i] = step[2] * error + step[3] * spin
         before = loop[6]
         loop[6] = told[n, 3] + step[4] * (before - told[n, 3])
-        held[3] = 0.5 * (before + loop[6])
-        quadrotor_dynamics.integrate(x, held, noise, rho, h, 1)
+        during[3] = 0.5 * (before + loop[6])
+        quadrotor_dynamics.integrate(x, during, noise, rho, h, 1)
         for i in range(3):
             path[n, i] = x[i]
 
@@ -126,7 +115,7 @@ class BodyRatePlant:
     Attributes:
         airframe: what flies.
         state: (10,) now.
-        loops: (7,) rates [rad/s], torques per inertia [rad/s^2] and thrust [N] now.
+        loops: (7,) rates [rad/s], torques per inertia times the lag of the motors [rad/s] and thrust [N] now.
         time: [s].
     """
 
@@ -174,20 +163,24 @@ class BodyRatePlant:
         rows = np.array([self._pipe.popleft() for _ in range(self._rows)])
         return self._fly(rows, np.zeros(6) if noise is None else np.asarray(noise, dtype=np.float64))
 
-    def ahead(self, state: Array, duration: float) -> Array:
-        """(10,) where the vehicle, were it in ``state`` now, would be after what is pending has acted for a while.
+    def ahead(self, state: Array, duration: float, noise: ArrayLike | None = None) -> tuple[Array, Array]:
+        """Where the vehicle, were it in ``state`` now, would be after what is pending has acted for a while.
 
         Args:
             state: (10,) as it is seen.
             duration: how far to look [s]; the last command is held where none is left.
+            noise: (6,) rates and accelerations that disturb it meanwhile; None for none.
+
+        Returns:
+            (10,) state and (7,) loops then.
         """
         kept = self.state, self.loops.copy(), self.time
         rows = list(self._pipe)[: round(duration / SUBSTEP)]
         rows += [self._pipe[-1]] * (round(duration / SUBSTEP) - len(rows))
         self.state = state.copy()
         if rows:
-            self._fly(np.array(rows), np.zeros(6))
-        found = self.state
+            self._fly(np.array(rows), np.zeros(6) if noise is None else np.asarray(noise, dtype=np.float64))
+        found = self.state, self.loops
         self.state, self.loops, self.time = kept
         return found
 
