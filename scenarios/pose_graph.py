@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from scipy.special import chdtri
@@ -26,6 +27,7 @@ from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.options import existing, option
 from unifg.scenarios.stopwatch import Stopwatch
 from unifg.solvers import GraduatedNonConvexity, names
+from unifg.solvers.least_squares import MAP
 from unifg.typing import Array, BoolArray
 
 __all__ = ["SolveSettings", "SolvedGraph", "robust_loss", "solve_file"]
@@ -62,6 +64,9 @@ class SolveSettings:
         init: first guess: poses of the file, a spanning tree, LAGO (2D) or chordal relaxation; or the one of them
             that costs least, but for the tree.
         residual: full logarithm, as GTSAM, or the chart of g2o; their optima differ in 3D.
+        tolerance: "optimum", to all digits, or "map", until a step would lower the cost by less than 1e-5 of it.
+        max_iterations: before giving up.
+        no_scene: leave out the scene and the picture, which take longer than the solve.
         certify: see whether another map could be better, by the dual of the chordal relaxation.
         staircase: where that finds a way down, follow it and solve again from there.
     """
@@ -71,6 +76,9 @@ class SolveSettings:
     robust: str | None = option(None, metavar="LOSS[:PARAM]")
     init: str = option(AUTO, choices=(AUTO, *GUESSES))
     residual: ResidualName = option("log")
+    tolerance: Literal["optimum", "map"] = option("optimum")
+    max_iterations: int = option(100, metavar="N")
+    no_scene: bool = option(False)
     certify: bool = option(False)
     staircase: bool = option(False)
 
@@ -197,7 +205,9 @@ class _Solve:
             stage = f", stage {row.details['stage']}" if "stage" in row.details else ""
             self.progress(0.95 * (1.0 - 0.95 * 0.9**number), f"iteration {number}{stage}, cost {row.cost:.6g}")
 
-        backend = names.backend(settings.solver, keep_values=True)
+        tolerance = {"tolerance": MAP} if settings.tolerance == "map" else {}
+        limit, watched = settings.max_iterations, not settings.no_scene
+        backend = names.backend(settings.solver, keep_values=watched, max_iterations=limit, **tolerance)
         solver = GraduatedNonConvexity(solver=backend) if isinstance(loss, TruncatedLeastSquares) else backend
         clock.start()
         solution = solver.solve(graph, guess, callback=tell)

@@ -8,6 +8,7 @@ factorisation per linearisation, for when a step is rejected only the radius cha
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from unifg.solvers.globalize.merit import Merit
 from unifg.solvers.globalize.sizes import norm
 from unifg.typing import Array
 
+MAP = 1e-5**0.5  # the relative offset is the root of the share of the cost that a step promises to remove
 ROUNDING = 1e-14
 SHORTEST = 1e-8  # length of a Gauss-Newton step
 SMALLEST, POOR, GOOD = 1e-14, 0.25, 0.75  # radius of a trust region; gains at which it shrinks and grows
@@ -34,6 +36,9 @@ class LeastSquares(Solver):
     """Unconstrained sums of squares with robust losses.
 
     Attributes:
+        tolerance: for the KKT test, the relative offset of the residuals (:mod:`unifg.answers.relative_offset`). "map"
+            stands for `MAP`, where another step would lower the cost by less than 1e-5 of it: what GTSAM stops at, and
+            enough for a map; the default goes on until the optimum is reached to all digits that matter to anybody.
         step_tolerance: optional stop rule on the norm of the step; it does not grant CONVERGED.
     """
 
@@ -41,7 +46,20 @@ class LeastSquares(Solver):
     constraints = "none"
     scalar_costs = False
 
+    tolerance: float | Literal["map"] = 1e-6  # type: ignore[assignment]  # a number as soon as it has been made
     step_tolerance: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Let names stand for numbers.
+
+        Raises:
+            BackendError: for another name, or options no solve could honour.
+        """
+        if isinstance(self.tolerance, str):
+            if self.tolerance != "map":
+                raise BackendError(f"{self.name}: tolerance is a number or 'map', found {self.tolerance!r}")
+            self.tolerance = MAP
+        super().__post_init__()
 
     def workspace(self, program: Program) -> Primal:
         """The factorisation of the normal equations."""

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.errors import GraphError
-from unifg.pose_graphs import Edges, PoseGraph, best_guess, certify, chordal, judge, manhattan, sphere
+from unifg.errors import BackendError, GraphError
+from unifg.pose_graphs import Edges, PoseGraph, Simulated, best_guess, certify, chordal, judge, manhattan, sphere
 from unifg.pose_graphs.relaxation import Relaxation
-from unifg.solvers import GaussNewton, LevenbergMarquardt
+from unifg.solvers import DogLeg, GaussNewton, LevenbergMarquardt
 from unifg.typing import Array
 
 GROUPS = {"plane": fg.SE2, "space": fg.SE3}
@@ -99,8 +99,8 @@ def test_the_cost_is_that_of_the_logarithm_to_second_order(name: str) -> None:
 
 
 @pytest.mark.parametrize("made", [manhattan(150, seed=3), sphere(5, 8, seed=3)], ids=["plane", "space"])
-def test_a_solved_graph_is_certified(made: object) -> None:
-    after = solved(made.pose_graph)  # type: ignore[attr-defined]
+def test_a_solved_graph_is_certified(made: Simulated) -> None:
+    after = solved(made.pose_graph)
     found = certify(after)
     assert found.certified and 0.0 <= found.gap <= 2e-6 * found.chi2
     assert found.rank == after.group.point_dim and found.caveats == ()
@@ -232,3 +232,17 @@ def test_gauss_newton_agrees_from_the_best_start() -> None:
     _, poses = best_guess(made)
     graph, x, guess = made.with_poses(poses).graph()
     assert certify(made.with_poses(GaussNewton().solve(graph, guess, check=True)[x])).certified
+
+
+@pytest.mark.parametrize("made", [manhattan(150, seed=3), sphere(5, 8, seed=3)], ids=["plane", "space"])
+@pytest.mark.parametrize("solver", [GaussNewton, LevenbergMarquardt, DogLeg])
+@pytest.mark.parametrize("weight", [1e-6, 1.0, 1e6])
+def test_a_map_needs_no_more_digits_than_it_shows(made: Simulated, solver: type[GaussNewton], weight: float) -> None:
+    edges = made.pose_graph.edges
+    scaled = replace(made.pose_graph, edges=replace(edges, information=weight * edges.information))
+    graph, _, guess = scaled.graph()
+    exact, near = (solver(**options).solve(graph, guess, check=True) for options in ({}, {"tolerance": "map"}))  # type: ignore[arg-type]
+    assert near.iterations < exact.iterations
+    assert exact.cost <= near.cost <= (1.0 + 2e-5) * exact.cost
+    with pytest.raises(BackendError, match="'map'"):
+        solver(tolerance="good")  # type: ignore[arg-type]

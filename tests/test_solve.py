@@ -216,3 +216,14 @@ def test_published_graphs(shared_data: Path, name: str, chi2: float) -> None:
     solved = solve_file(SolveSettings(shared_data / "pose_graphs" / name))
     assert solved.chi2[2] == pytest.approx(chi2, abs=2e-7)
     assert len(solved.steps) <= 12
+
+
+def test_numbers_alone_as_good_as_a_map_needs(city: Path, tmp_path: Path) -> None:
+    for more in ([], ["--tolerance", "map"], ["--max-iterations", "1"]):
+        out = tmp_path / "-".join(["out", *more])
+        status = command.main(["solve", str(city), "--init", "file", "--no-scene", *more, "--out", str(out)])
+        assert status == (1 if "1" in more else 0)
+        assert {file.name for file in out.iterdir()} == {"graph.g2o", "trajectory.tum", "metrics.json"}
+    exact, near, early = (numbers(tmp_path / name) for name in ("out", "out---tolerance-map", "out---max-iterations-1"))
+    assert early["iterations"] == 1 < near["iterations"] < exact["iterations"]
+    assert exact["chi2"] <= near["chi2"] <= (1.0 + 2e-5) * exact["chi2"] < early["chi2"]

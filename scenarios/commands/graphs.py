@@ -42,13 +42,15 @@ def write_results(folder: Path, solved: SolvedGraph) -> list[Path]:
         solved: a solved pose graph.
 
     Returns:
-        The files written: ``graph.g2o``, ``trajectory.tum`` (the positions in the file as times), ``metrics.json``,
-        ``graph.png`` and ``scene.html``.
+        The files written: ``graph.g2o``, ``trajectory.tum`` (the positions in the file as times), ``metrics.json``
+        and, unless they were not wanted, ``graph.png`` and ``scene.html``.
     """
     graph = write_g2o(folder / "graph.g2o", solved.after)
     poses = solved.after.poses
     trajectory = write_tum(folder / "trajectory.tum", np.arange(len(poses), dtype=np.float64), poses)
     numbers = write_metrics(folder / "metrics.json", metrics(solved), sort_keys=False)
+    if solved.settings.no_scene:
+        return [graph, trajectory, numbers]
     shown = write_figure(folder / "graph.png", picture(solved), 130)
     scene = graph_scene(solved).save(folder / "scene.html")
     return [scene, shown, graph, trajectory, numbers]
