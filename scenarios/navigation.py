@@ -2,7 +2,8 @@
 
 Each tick: odometry predicts, the scan corrects (one factor graph), tracked discs are updated, the route is
 repaired if a disc stands on it, and the controller (a second factor graph, conditioned on the estimate) decides.
-Bazzana et al. 2022, sections IV, V and VII.
+Bazzana et al. 2022, sections IV, V and VII. A supervisor lowers the speed, down to rest, with what the robot has to
+rely on; a goal that cannot be reached is given up, by name, and the next one is tried.
 """
 
 from __future__ import annotations
@@ -14,15 +15,15 @@ from typing import Any
 import numpy as np
 
 from unifg.errors import ScenarioError
-from unifg.files.ros_map import load_map
+from unifg.files.ros_map import OccupancyMap, load_map
 from unifg.horizon import Plan
 from unifg.lie import wrap_angle
 from unifg.machine.tally import counting
 from unifg.models.distance_map import DistanceMap
 from unifg.models.unicycle import step
-from unifg.scenarios.driving.drive_pilot import Pilot, make_pilot
+from unifg.scenarios.driving.drive_pilot import STOPPED, Pilot, make_pilot
 from unifg.scenarios.driving.drive_settings import ControllerSettings
-from unifg.scenarios.driving.route import Route
+from unifg.scenarios.driving.route import Blocked, Route
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.drive_log import EpisodeLog
@@ -39,6 +40,7 @@ from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.ways.polyline import path_length
 from unifg.scenarios.worlds.building import DEMO_GOALS, DEMO_START, building_map
 from unifg.scenarios.worlds.drivetrain import Drivetrain, draw_patches
+from unifg.scenarios.worlds.faults import DRIVE_FAULTS, DriveFaults, Fault, one_of
 from unifg.scenarios.worlds.placement import PlacementRules, place_obstacles
 from unifg.scenarios.worlds.plane import World
 from unifg.typing import Array
@@ -48,7 +50,11 @@ REACHED_DISTANCE = 0.1  # [m], by the estimate
 REACHED_HEADING = 0.1  # [rad]
 TRUE_DISTANCE = 0.2  # [m], what the truth must confirm
 TRUE_HEADING = 0.2  # [rad]
-SLOWEST = 0.25  # [m/s]; an episode that needs longer than this, and a minute, has failed
+USUAL_SIGMA = 0.01  # [m] of a position localised on a map
+SURE = 3.0  # standard deviations of the position that have to fit into the true distance
+SLOWEST = 0.25  # [m/s]; a goal that takes longer than this, and a minute, is given up
+HELPLESS = 20.0  # [s] that a robot that may not move waits before it gives up
+REACHED = "reached"
 
 
 @dataclass(frozen=True)
@@ -69,6 +75,7 @@ class NavigationSettings:
         drivetrain: of the base; the controller is told the accelerations on its data sheet.
         planner: of the motion along the route: that of this library, or one of others to compare with.
         localiser: of the estimate: that of this library, or another one to compare with.
+        faults: what goes wrong; may be repeated.
     """
 
     map: Path | None = option(None, text=existing("the YAML file of a ROS map"), metavar="F.yaml")
@@ -86,6 +93,9 @@ class NavigationSettings:
     drivetrain: Drivetrain = field(default_factory=Drivetrain)
     planner: str = option(OWN_PLANNER, choices=PLANNERS)
     localiser: str = option(OWN_LOCALISER, choices=LOCALISERS)
+    faults: tuple[Fault, ...] = option(
+        (), text=one_of(DRIVE_FAULTS), metavar="KIND@SECONDS[:DURATION]", flag="fault", many=True
+    )
 
 
 def run_navigation(settings: NavigationSettings, progress: Progress | None = None) -> EpisodeLog:
@@ -123,9 +133,7 @@ class Episode:
         self.goals = np.array([_pose(goal, None, "goal") for goal in goals])
         if not len(self.goals):
             raise ScenarioError("at least one goal is needed")
-        self.distance_map = DistanceMap.from_occupancy(
-            self.occupancy.occupied, self.occupancy.resolution, self.occupancy.origin
-        )
+        self.distance_map = _field(self.occupancy)
         legs = zip([self.start, *self.goals[:-1]], self.goals, strict=True)
         self.legs = [self._route(begin, end) for begin, end in legs]
         self.path = np.concatenate([leg.path for leg in self.legs])
@@ -147,24 +155,32 @@ class Episode:
         )  # fmt: skip
         sigma = np.array(INITIAL_SIGMA)
         believed = self.start + sigma * belief.standard_normal(3)
+        self.faults = DriveFaults(settings.faults, settings.seed)
+        self._right, self._drawn = (self.occupancy, self.distance_map), drawn
+        self.pilot = self._pilot(believed, sigma)
+        if not rehearsal:
+            kind = "navigation", settings.coupling, settings.solver, settings.planner, settings.localiser
+            rehearse(kind, lambda: Episode(replace(settings, faults=()), rehearsal=True))
+
+    def _pilot(self, pose: Array, sigma: Array) -> Pilot[Any]:
+        """Who drives with the map as it was given."""
+        settings = self.settings
         pilot: Pilot[Any] = make_pilot(
-            settings.coupling, self.distance_map, settings.solver, control, believed, sigma, self.world.lidar.beams
-        )
-        of_planner, of_localiser = drawn.spawn(2)
-        planner = make_planner(settings.planner, self.distance_map, control, of_planner)
-        localiser = make_localiser(settings.localiser, self.occupancy, self.distance_map, believed, sigma, of_localiser)
+            settings.coupling, self.occupancy, self.distance_map, settings.solver, self.controller, pose, sigma,
+            self.world.lidar.beams,
+        )  # fmt: skip
+        of_planner, of_localiser = self._drawn.spawn(2)
+        planner = make_planner(settings.planner, self.distance_map, self.controller, of_planner)
+        localiser = make_localiser(settings.localiser, self.occupancy, self.distance_map, pose, sigma, of_localiser)
         if planner is not None:
             pilot.controller = planner
         if localiser is not None:
             pilot.estimator, pilot.pose = localiser, localiser.pose
-        self.pilot = pilot
-        if not rehearsal:
-            kind = "navigation", settings.coupling, settings.solver, settings.planner, settings.localiser
-            rehearse(kind, lambda: Episode(settings, rehearsal=True))
+        return pilot
 
     def run(self, progress: Progress) -> EpisodeLog:
-        """Tick until the last goal is reached or time is up."""
-        length, s = path_length(self.path), self.settings
+        """Tick until the last goal is reached or given up."""
+        s = self.settings
         self._recorder = Recorder(
             EpisodeLog,
             occupancy=self.occupancy,
@@ -179,43 +195,114 @@ class Episode:
             control_limits=s.controller.limits,
             scan_angles=self.world.lidar.angles,
             obstacle_moving=self.world.obstacle_states()[:, 3].astype(bool),
+            faults=[str(fault) for fault in s.faults],
         )
-        self._reached = [False] * len(self.goals)
+        self._outcomes = ["time ran out"] * len(self.goals)
         self._goal, self._driven, self._dead_reckoning = 0, 0.0, self.pilot.pose
-        limit = int((length / SLOWEST + 60.0) / s.controller.dt)
-        interrupted = run_ticks(limit, lambda number: self._tick(number, length), progress)
+        self._begun, self._helpless = 0.0, 0.0
+        limit = int(sum(map(_longest, self.legs)) / s.controller.dt)
+        interrupted = run_ticks(limit, self._tick, progress)
         return self._recorder.finish(
             collisions=self.world.collisions,
-            reached=self._reached,
+            reached=[outcome == REACHED for outcome in self._outcomes],
+            outcomes=self._outcomes,
+            dropped=dict(self.pilot.door.dropped),
             interrupted=interrupted,
         )
 
-    def _tick(self, number: int, length: float) -> tuple[float, str] | None:
+    def _tick(self, number: int) -> tuple[float, str] | None:
         """Move on from the last tick, scan, decide, record and drive; None at the last goal."""
-        dt, goal = self.settings.controller.dt, self._goal
+        dt, goal, now = self.settings.controller.dt, self._goal, self.world.time
+        faults = self.faults
+        if faults.carries(now):
+            self.world.carry(faults.elsewhere(self._right[1], self._free_places(), self.world.pose))
+        self._swap_maps(now)
         odometry = None
         if number:
-            odometry = np.array(self.world.odometry())
-            self._dead_reckoning = step(self._dead_reckoning[None], odometry[None], dt)[0]
-            self._driven += abs(odometry[0]) * dt
-        scan = self.world.scan()
+            measured = np.array(self.world.odometry())
+            self._dead_reckoning = step(self._dead_reckoning[None], measured[None], dt)[0]
+            self._driven += abs(measured[0]) * dt
+            odometry = faults.odometry(measured, now)
+        true_scan = self.world.scan()
+        self.pilot.planless = faults.hold("solver-timeout", now)
         with counting() as new:
-            plan = self.pilot.tick(scan, odometry, self.legs[goal])
-        self._record(scan, plan, new.everything)
-        if self._arrived(goal):
-            self._reached[goal] = self._confirmed(goal)
+            plan = self.pilot.tick(faults.scan(true_scan, now), odometry, self.legs[goal], now, first=not number)
+        self._record(true_scan, plan, new.everything)
+        outcome = self._outcome(goal)
+        if outcome is not None:
+            self._outcomes[goal] = outcome
             self._goal = goal = goal + 1
-            if goal == len(self.goals):
+            if goal == len(self.goals) or self._hopeless():
+                self._outcomes[goal:] = [outcome] * (len(self.goals) - goal)
                 return None
+            self._begin_leg(goal)
+        elif self.pilot.relocated:
+            self._begin_leg(goal)
+        asked = np.array(plan.control, dtype=np.float64)
+        v, omega = faults.control(asked, now, dt).tolist()
+        self.world.step(v, omega, dt)
+        return self._driven / path_length(self.path), f"goal {goal + 1}/{len(self.goals)}"
+
+    def _outcome(self, goal: int) -> str | None:
+        """What has become of a goal; None while the robot is on its way."""
+        pilot, dt = self.pilot, self.settings.controller.dt
+        helpless = pilot.verdict.rests or pilot.planless_for > dt
+        self._helpless = self._helpless + dt if helpless else 0.0
+        if self._arrived(goal):
+            if self._confirmed(goal):
+                return REACHED
+            away = float(np.hypot(*(self.world.pose - self.goals[goal])[:2]))
+            return f"believed to be reached, {away:.2f} m away"
+        if self._hopeless():
+            return f"{pilot.verdict.health.value}: {pilot.verdict.cause}"
+        leg = self.legs[goal]
+        if leg.blocked is not None and not pilot.verdict.cause:
+            return str(leg.blocked)
+        if self.world.time - self._begun > _longest(leg):
+            return "timed out" + (f": {pilot.verdict.cause}" if pilot.verdict.cause else "")
+        return None
+
+    def _hopeless(self) -> bool:
+        """Whether the robot has not been allowed to move for so long that it gives up all goals."""
+        return self._helpless > HELPLESS
+
+    def _begin_leg(self, goal: int) -> None:
+        """Plan to a goal from where the robot believes to be; without a way it is given up at the next tick."""
+        self._begun = self.world.time
+        self.pilot.forget()
+        try:
             self.legs[goal] = self._route(self.pilot.pose, self.goals[goal])
-            self.pilot.forget()
-        self.world.step(float(plan.control[0]), float(plan.control[1]), dt)
-        return self._driven / length, f"goal {goal + 1}/{len(self.goals)}"
+        except ScenarioError:
+            gap = self.controller.robot_radius + self._gaps()[0]
+            self.legs[goal].blocked = Blocked(self.pilot.pose[:2].copy(), gap)
+
+    def _gaps(self) -> tuple[float, float]:
+        """Between hull and walls, hull and discs, as the controller keeps them of an estimate as sure as usual [m]."""
+        s = self.controller
+        return s.wall_clearance + s.sigmas * USUAL_SIGMA, s.disc_clearance + s.sigmas * USUAL_SIGMA
+
+    def _swap_maps(self, now: float) -> None:
+        """Give the robot the wrong map while that fault holds, and the right one before and after."""
+        wrong = self.faults.hold("wrong-map", now)
+        if wrong == (self.occupancy is not self._right[0]):
+            return
+        before = self.pilot
+        self.occupancy, self.distance_map = self._right
+        if wrong:
+            self.occupancy = askew(self.occupancy, before.pose)
+            self.distance_map = _field(self.occupancy)
+        self.pilot = self._pilot(before.pose, np.array(INITIAL_SIGMA))
+        self.pilot.take_over(before)
+
+    def _free_places(self) -> Array:
+        """(n, 2) centres of free cells [m]."""
+        occupancy = self._right[0]
+        return occupancy.grid_to_world(np.argwhere(occupancy.free)[:, ::-1].astype(np.float64) + 0.5)
 
     def _record(self, scan: Scan, plan: Plan, compiled: int) -> None:
         """Keep what this tick leaves behind; the measured time is what a robot would spend."""
         pilot, world = self.pilot, self.world
-        took = pilot.clock.milliseconds
+        took, verdict = pilot.clock.milliseconds, pilot.verdict
         self._recorder.add(
             time=world.time,
             true_pose=world.pose,
@@ -234,23 +321,55 @@ class Episode:
             compiled=compiled,
             localisation_iterations=pilot.iterations,
             plan_iterations=plan.iterations,
-            status=plan.status.name.lower(),
+            status=STOPPED if plan.source == STOPPED else plan.status.name.lower(),
             bound_violation=plan.excess,
             clearance=world.clearance(),
             goal_index=self._goal,
             emergency=plan.emergency,
             rescued=plan.rescued,
+            health=verdict.health.value,
+            cause=verdict.cause,
+            allowed=verdict.share,
+            explained=pilot.share,
+            last_stop=pilot.slowed,
+            fault=self.faults.names(world.time),
         )
 
     def _route(self, begin: Array, end: Array) -> Route:
-        return Route(self.occupancy, self.distance_map, begin, end, self.settings.controller.robot_radius)
+        s = self.controller
+        return Route(self.occupancy, self.distance_map, begin, end, s.robot_radius, *self._gaps())
 
     def _arrived(self, goal: int) -> bool:
+        """Whether the robot believes to be there, knows where it is, and surely enough."""
+        pilot = self.pilot
+        spread = float(np.linalg.eigvalsh(pilot.estimator.covariance[:2, :2])[-1])
+        if pilot.verdict.rests or not SURE * np.sqrt(max(spread, 0.0)) < TRUE_DISTANCE:
+            return False
         return _near(self.pilot.pose, self.goals[goal], REACHED_DISTANCE, REACHED_HEADING)
 
     def _confirmed(self, goal: int) -> bool:
         """Whether the robot truly is where it believes to have arrived."""
         return _near(self.world.pose, self.goals[goal], TRUE_DISTANCE, TRUE_HEADING)
+
+
+def askew(occupancy: OccupancyMap, pose: Array) -> OccupancyMap:
+    """A map that is wrong: x and y exchanged about where a robot (3,) stands, so that it shows another building."""
+    column, row = occupancy.world_to_grid(pose[:2]).tolist()
+    x, y = np.array([row, column]) * occupancy.resolution
+    yaw = occupancy.origin[2]
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    origin = (float(pose[0] - cosine * x + sine * y), float(pose[1] - sine * x - cosine * y), yaw)
+    occupied, free = occupancy.occupied.T.copy(), occupancy.free.T.copy()
+    return OccupancyMap(occupied, free, occupancy.resolution, origin, f"{occupancy.name}, askew")
+
+
+def _field(occupancy: OccupancyMap) -> DistanceMap:
+    return DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+
+
+def _longest(leg: Route) -> float:
+    """Time that the way to a goal may take [s]."""
+    return path_length(leg.path) / SLOWEST + 60.0
 
 
 def _near(pose: Array, goal: Array, distance: float, heading: float) -> bool:

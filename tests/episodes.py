@@ -91,6 +91,13 @@ def episode(ticks: int = 40, obstacles: int = 2, *, map_yaw: float = 0.0, seed: 
         reached=[True],
         emergency=emergency,
         rescued=np.zeros(ticks, dtype=bool),
+        outcomes=["reached"],
+        health=["ok"] * (ticks - 1) + ["degraded"],
+        cause=[""] * (ticks - 1) + ["no plan"],
+        allowed=np.where(emergency, 0.5, 1.0),
+        explained=np.full(ticks, 0.9),
+        last_stop=np.zeros(ticks, dtype=bool),
+        fault=[""] * ticks,
     )
 
 

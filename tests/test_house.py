@@ -41,7 +41,7 @@ FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 STOREYS: tuple[tuple[str, ...], ...] = (
     ("options", "stopwatch", "ways"),
     ("seeing",),
-    ("worlds",),
+    ("supervision", "worlds"),
     ("driving", "flying", "safety"),
     ("rivals",),
     ("log",),

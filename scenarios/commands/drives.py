@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from unifg.files.tum import write_tum
 from unifg.scenarios import navigation
@@ -67,6 +69,9 @@ def summary(log: EpisodeLog) -> str:
         ("scenario", f"{m['scenario']} on {m['map']}"),
         ("solver, coupling, seed", f"{m['solver']}, {m['coupling']}, {m['seed']}"),
         ("goals reached", f"{m['goals_reached']} of {m['goals']}{stopped}"),
+        *((f"goal {k + 1}", words) for k, words in enumerate(m["outcomes"]) if words != "reached"),
+        ("health", health(m)),
+        ("samples not let in", ", ".join(f"{count} {what}" for what, count in m["dropped_samples"].items())),
         ("collisions", f"{m['collisions']}"),
         ("driven", f"{m['path_length_m']:.2f} m in {m['duration_s']:.1f} s, {m['steps']} ticks"),
         ("planned path", f"{m['planned_length_m']:.2f} m"),
@@ -75,7 +80,17 @@ def summary(log: EpisodeLog) -> str:
         ("", spread.format(unit="rad", **m["localisation_error_rad"])),
         ("odometry error", spread.format(unit="m", **m["odometry_error_m"])),
         ("localise + plan", "median {p50:.1f} ms, p99 {p99:.1f}, max {max:.1f}".format(**m["solve_ms"])),
+        ("whole tick", "median {p50:.1f} ms, p99 {p99:.1f}, max {max:.1f}".format(**m["tick_ms"])),
         ("solver failures", f"{m['solver_failures']}"),
         ("worst bound violation", f"{m['max_bound_violation']:.1e}"),
     )
     return table(rows)
+
+
+def health(m: Mapping[str, Any]) -> str:
+    """How well a robot was, and what was the matter longest."""
+    ticks = [f"{count} ticks {state}" for state, count in m["health"].items() if count and state != "ok"]
+    if not ticks:
+        return "ok throughout"
+    causes = sorted(m["causes"], key=lambda cause: -m["causes"][cause])[:2]
+    return f"{', '.join(ticks)} ({'; '.join(causes)})"

@@ -120,6 +120,25 @@ class Controller:
             float(self.field.distance(states[1:, :2]).min()) - self.settings.robot_radius - self.settings.wall_clearance
         )
 
+    def rest(self, pose: Array) -> tuple[Array, Array]:
+        """Come to rest along the path of the last plan, without asking a solver.
+
+        Args:
+            pose: (3,) present [m, m, rad].
+
+        Returns:
+            Controls (N, 2) and states (N + 1, 3), the first of which is taken as applied.
+        """
+        s, last = self.settings, self.loop.applied
+        controls = stopped(last, self._coming, s.most, s.horizon)
+        self.loop.abandon()
+        self.loop.applied, self._coming = controls[0].copy(), controls[1:]
+        return controls, followed(pose, last, controls, s.dt)
+
+    def driven(self, control: Array) -> None:
+        """Be told that another control (2,) than the first of the plan is applied."""
+        self.loop.applied = control.copy()
+
     def forget(self) -> None:
         """Drop the warm start, as when a new route makes it misleading."""
         self.loop.forget()

@@ -118,6 +118,7 @@ class Smoother:
             robot(dt), length, [Odometry(dt), Registration(distance_map, beams)], start=pose, sigma=sigma,
             solver=GaussNewton(max_iterations=12, step_tolerance=1e-3), rounds=ROUNDS, steady=STEADY,
         )  # fmt: skip
+        self._looked = True
 
     @property
     def pose(self) -> Array:
@@ -134,12 +135,23 @@ class Smoother:
         """Gauss-Newton iterations of the last registration."""
         return self.window.iterations
 
-    def update(self, scan: Scan, odometry: Array | None, dt: float) -> None:
-        """Move the window by odometry (2,), None for none, attach the scan and register it."""
+    @property
+    def refused(self) -> str:
+        """Why the last scan has not corrected the estimate, "" where it has."""
+        return "" if self._looked else "no scan"
+
+    def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
+        """Move the window by odometry (2,), None for none, attach the scan, if there is one, and register it."""
         if odometry is not None:
             self.window.move(odometry)
-        self.look(scan)
+        self._looked = scan is not None
+        if scan is not None:
+            self.look(scan)
         self.window.estimate()
+
+    def reset(self, pose: Array, sigma: Array) -> None:
+        """Begin anew at a pose (3,), believed with ``sigma`` (3,)."""
+        self.window.reset(pose, sigma)
 
     def look(self, scan: Scan) -> None:
         """Attach a scan to the present."""

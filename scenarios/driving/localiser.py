@@ -30,6 +30,7 @@ class Localiser:
         pose: (3,) estimate [m, m, rad].
         covariance: (3, 3) in the tangent space at the estimate.
         iterations: Gauss-Newton iterations of the last update.
+        refused: why the last scan has not corrected the estimate, "" where it has.
     """
 
     def __init__(self, distance_map: DistanceMap, pose: Array, sigma: Array, beams: int) -> None:
@@ -43,7 +44,7 @@ class Localiser:
         """
         self.pose = np.asarray(pose, dtype=np.float64)
         self.covariance = np.diag(np.asarray(sigma, dtype=np.float64) ** 2)
-        self.iterations = 0
+        self.iterations, self.refused = 0, ""
         self._noise = odometry.OdometryNoise()
         graph = fg.Graph()
         self._x = graph.variables("robot", fg.SE2, 1)
@@ -63,21 +64,29 @@ class Localiser:
         )
         self._run = GaussNewton(max_iterations=12, step_tolerance=1e-5).prepare(graph)
 
-    def update(self, scan: Scan, odometry: Array | None, dt: float) -> None:
-        """Move by odometry (2,) since the last scan, None for none, and register a scan."""
+    def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
+        """Move by odometry (2,) since the last scan, None for none, and register a scan, if there is one."""
         if odometry is not None:
             self.predict(odometry, dt)
-        self.correct(scan)
+        if scan is None:
+            self.iterations, self.refused = 0, "no scan"
+        else:
+            self.correct(scan)
+
+    def reset(self, pose: Array, sigma: Array) -> None:
+        """Begin anew at a pose (3,), believed with ``sigma`` (3,)."""
+        self.pose, self.covariance = pose.copy(), np.diag(sigma**2)
 
     def predict(self, u: Array, dt: float) -> None:
         """Move the estimate by the wheels' measured velocities (2,) [m/s, rad/s]."""
         self.pose, self.covariance = odometry.predict(self.pose, self.covariance, u, dt, self._noise)
 
     def correct(self, scan: Scan) -> None:
-        """Register a scan on the map; a scan that says too little leaves the prediction."""
+        """Register a scan on the map; a scan that says too little leaves the prediction, and ``refused`` says so."""
         seen = lidar.usable(scan.ranges)
-        self.iterations = 0
+        self.iterations, self.refused = 0, ""
         if seen.sum() < FEWEST_BEAMS:
+            self.refused = "too few beams"
             return
         solution = self._run.solve(
             {self._x: self.pose[None, :]},
@@ -90,6 +99,8 @@ class Localiser:
         )
         self.iterations = solution.iterations
         corrected = solution[self._x][0]
-        if np.hypot(*(corrected - self.pose)[:2]) > LARGEST_JUMP:
+        jump = float(np.hypot(*(corrected - self.pose)[:2]))
+        if not jump <= LARGEST_JUMP:
+            self.refused = "it would move the estimate by more than the wheels can be wrong"
             return
         self.pose, self.covariance = corrected, solution.covariance(self._x)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.seeing.tracks import Tracks
 from unifg.scenarios.ways.follow import PathFollower
 from unifg.scenarios.ways.grid import SPACING, plan
@@ -17,9 +20,9 @@ LOOK_AHEAD = 4.0  # [m] of path checked against tracked discs
 REJOIN = 2.0  # [m] beyond the disc where the detour meets the path again
 WINDOW = 3.0  # [m] of map kept around the detour's ends
 STANDING = 0.15  # [m/s]; faster discs are left to the controller, which predicts them
-GAP = 0.06  # [m] between hull and disc that a path must leave: less, the controller refuses
+GAP = ControllerSettings.disc_clearance  # [m] between hull and disc that a path must leave
+WALL_GAP = ControllerSettings.wall_clearance  # [m] between hull and wall that a path must leave
 ALLOWANCE = 0.04  # [m] added to discs when a detour is planned
-WALL_GAP = 0.03  # [m] between hull and wall that a detour must leave: less, the controller refuses
 WIDE = 0.25  # [m] added to discs when the robot is stuck
 STUCK_TICKS = 25
 STUCK_DISTANCE = 0.1  # [m]
@@ -29,6 +32,28 @@ CRUMB = 0.1  # [m] between remembered places
 NEAR_GOAL = 0.5  # [m] of path left, where turning on the spot is normal
 STANDING_GAP = 0.01  # [m] a planned path needs around its start
 PATIENCE = 5  # ticks between two repairs
+ANYWHERE = 15  # ticks between two searches of the whole map
+CLOSED = 60  # ticks for which no way is to be had at all, after which there is none
+STALLED = 400  # ticks without coming nearer to the goal, after which there is no use
+FRESH_STARTS = 3  # ways round about, on each of which the goal may be farther off again
+
+
+@dataclass(frozen=True)
+class Blocked:
+    """Why a goal is given up.
+
+    Attributes:
+        place: (2,) where the way ends [m].
+        clearance: of the robot's centre that no way keeps [m].
+    """
+
+    place: Array
+    clearance: float
+
+    def __str__(self) -> str:
+        """For people."""
+        x, y = self.place.tolist()
+        return f"blocked near ({x:.1f}, {y:.1f}), no way of clearance {self.clearance:.2f} m"
 
 
 class Route:
@@ -37,6 +62,7 @@ class Route:
     Attributes:
         path: (P, 3) present path [m, m, rad].
         repairs: number of detours planned so far.
+        blocked: why there is no use going on; None as long as there may be.
     """
 
     def __init__(
@@ -46,8 +72,19 @@ class Route:
         start: Array,
         goal: Array,
         robot_radius: float,
+        wall_gap: float = WALL_GAP,
+        disc_gap: float = GAP,
     ) -> None:
-        """Plan from ``start`` (3,) to ``goal`` (3,).
+        """Plan from ``start`` (3,) to ``goal`` (3,), with the clearances that the controller keeps.
+
+        Args:
+            occupancy: the map.
+            distance_map: of it.
+            start: (3,) pose.
+            goal: (3,) pose.
+            robot_radius: [m].
+            wall_gap: between hull and walls that a path must leave [m].
+            disc_gap: between hull and discs that a path must leave [m].
 
         Raises:
             ScenarioError: when there is no way.
@@ -55,11 +92,22 @@ class Route:
         self._occupancy = occupancy
         self._distance_map = distance_map
         self._radius = robot_radius
+        self._wall_gap, self._disc_gap = wall_gap, disc_gap
         self.repairs = 0
-        self._rest = 0
+        self.blocked: Blocked | None = None
+        self._rest = self._since_anywhere = 0
+        self._closed = self._stalled = 0
+        self._nearest, self._starts = np.inf, FRESH_STARTS
         self._trail: list[Array] = []
         self._crumbs: list[Array] = []
-        self._follow(plan(occupancy, distance_map, start, goal, robot_radius=robot_radius))
+        self._follow(self._plan(start, goal))
+
+    def _plan(self, start: Array, goal: Array) -> Array:
+        """A way (P, 3) on the map alone."""
+        return plan(
+            self._occupancy, self._distance_map, start, goal, robot_radius=self._radius,
+            clearance_least=self._radius + self._wall_gap,
+        )  # fmt: skip
 
     def _follow(self, path: Array) -> None:
         self.path = path
@@ -82,8 +130,9 @@ class Route:
         """
         if not self._crumbs or np.hypot(*(pose[:2] - self._crumbs[-1])) > CRUMB:
             self._crumbs = [*self._crumbs[-round(RETREAT / CRUMB) :], pose[:2].copy()]
-        self._rest = max(self._rest - 1, 0)
+        self._rest, self._since_anywhere = max(self._rest - 1, 0), self._since_anywhere + 1
         self._trail = [*self._trail[-STUCK_TICKS + 1 :], pose[:2].copy()]
+        self._look_for_progress(pose)
         if self._rest:
             return False
         arc = SPACING * np.arange(len(self.path))
@@ -104,12 +153,47 @@ class Route:
         ahead = (arc >= self._reached) & (arc <= self._reached + LOOK_AHEAD)
         offsets = self.path[ahead, None, :2] - standing.centre
         room = np.hypot(offsets[..., 0], offsets[..., 1]) - standing.radius
-        blocked = (room < self._radius + GAP).any(axis=1)
+        blocked = (room < self._radius + self._disc_gap).any(axis=1)
         if not blocked.any():
+            self._closed = 0
             return False
         self._rest = PATIENCE
         last = float(arc[ahead][np.flatnonzero(blocked)[-1]])
-        return self._detour(pose, min(last + REJOIN, float(arc[-1])), standing, ALLOWANCE)
+        if self._detour(pose, min(last + REJOIN, float(arc[-1])), standing, ALLOWANCE):
+            self._closed = 0
+            return True
+        staying = ~standing.mover
+        closed = (room[:, staying] < self._radius + self._disc_gap).any(axis=1)
+        if not closed.any():  # what has moved may go on: where it alone is in the way, the robot waits
+            self._closed = 0
+            return False
+        return self._round_about(pose, standing.at(staying), self.path[ahead][np.flatnonzero(closed)[0], :2])
+
+    def _round_about(self, pose: Array, staying: Tracks, place: Array) -> bool:
+        """Whether another way was found on the whole map; if there is none, for long enough, the goal is given up."""
+        self._closed += PATIENCE + 1
+        if self._since_anywhere >= ANYWHERE:
+            self._since_anywhere = 0
+            if self._detour(pose, float(SPACING * len(self.path)), staying, ALLOWANCE, everywhere=True):
+                self._closed = 0
+                return True
+        if self._closed > CLOSED:
+            self.blocked = Blocked(place.copy(), self._radius + self._wall_gap)
+        return False
+
+    def _look_for_progress(self, pose: Array) -> None:
+        """Give up a goal that has not come nearer for long."""
+        left = float(SPACING * len(self.path)) - self._reached
+        if left < self._nearest - CRUMB:
+            self._nearest, self._stalled = left, 0
+            return
+        self._stalled += 1
+        if self._stalled > STALLED:
+            if self._starts and left > self._nearest + 2.0 * REJOIN:  # it is on its way round about
+                self._starts -= 1
+                self._nearest, self._stalled = left, 0
+                return
+            self.blocked = Blocked(pose[:2].copy(), self._radius + self._wall_gap)
 
     def _stuck(self, end: float) -> bool:
         """Whether the robot has hardly moved for a while though the goal is not near."""
@@ -128,7 +212,7 @@ class Route:
             return
         way = headed(resample(back, SPACING), float(pose[2]))
         try:
-            onward = plan(self._occupancy, self._distance_map, back[-1], self.path[-1], robot_radius=self._radius)
+            onward = self._plan(back[-1], self.path[-1])
         except ScenarioError:
             return
         self._follow(np.concatenate([way[:-1], onward]))
@@ -145,7 +229,7 @@ class Route:
         try:
             detour = plan(
                 occupancy, distance_map, pose, target, robot_radius=self._radius,
-                clearance_least=self._radius + WALL_GAP, extra_discs=discs,
+                clearance_least=self._radius + self._wall_gap, extra_discs=discs,
             )  # fmt: skip
         except ScenarioError:
             return False  # the controller stops before the disc; the next scan may see a way

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -37,6 +37,9 @@ class EpisodeLog:
         control_limits: greatest abs(v) [m/s] and abs(omega) [rad/s].
         scenario: name of the scenario.
         interrupted: the user stopped the episode before its end.
+        outcomes: what has become of every goal, in words.
+        dropped: samples that were not let in, by what was wrong with them.
+        faults: what was made to go wrong.
     """
 
     occupancy: OccupancyMap
@@ -55,6 +58,9 @@ class EpisodeLog:
     control_limits: tuple[float, float] = (1.0, 1.0)
     scenario: str = "navigation"
     interrupted: bool = False
+    outcomes: list[str] = field(default_factory=list)
+    dropped: dict[str, int] = field(default_factory=dict)
+    faults: list[str] = field(default_factory=list)
 
     time: Array = column("s")
     true_pose: Array = column("m, m, rad", 3)
@@ -102,11 +108,29 @@ class EpisodeLog:
     """True where the robot braked or got out of the way because nobody found a plan."""
     rescued: BoolArray = column(dtype=np.bool_)
     """True where the plan is that of the second backend, asked because the first had none."""
+    health: list[str] = words()
+    """What the supervisor makes of the robot: "ok", "degraded" or "lost"."""
+    cause: list[str] = words()
+    """Why it is not well."""
+    allowed: Array = column("share")
+    """Of its speed that the robot may use."""
+    explained: Array = column("share")
+    """Of the beams of the last scan that ended near something on the map."""
+    last_stop: BoolArray = column(dtype=np.bool_)
+    """True where beams alone have slowed the robot below what was planned."""
+    fault: list[str] = words()
+    """What was made to go wrong just then."""
 
     @property
     def ticks(self) -> int:
         """Number of ticks recorded."""
         return len(self.time)
+
+    @property
+    def tick_ms(self) -> Array:
+        """(T,) all that a tick takes [ms]."""
+        total: Array = self.localise_ms + self.perceive_ms + self.route_ms + self.plan_ms
+        return total
 
     @property
     def succeeded(self) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 from unifg.errors import ScenarioError
 from unifg.lie import wrap_angle
 from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.log.metrics import spread, statistics
+from unifg.scenarios.log.metrics import spread, statistics, timing
 from unifg.scenarios.ways.polyline import path_length
 from unifg.typing import Array
 
@@ -28,7 +28,10 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         drove, ``planned_length_m`` that of the planned path; ``solver_failures`` counts ticks for which nobody had a
         plan, so that the robot braked (``emergency_ticks``, the same ticks), ``rescued_ticks`` those for which the
         second backend had one and the first had not, and ``plan_status`` counts the status words of all ticks.
-        ``odometry_error_m`` is the error of dead reckoning.
+        ``odometry_error_m`` is the error of dead reckoning. ``outcomes`` says what became of every goal, ``health``
+        and ``causes`` count ticks by what the supervisor made of them, ``dropped_samples`` what was not let in, and
+        ``last_stops`` ticks in which beams alone slowed the robot. ``tick_ms`` is all of a tick: estimate, perception,
+        repair of the route and plan.
 
     Raises:
         ScenarioError: the episode has no tick.
@@ -68,6 +71,14 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         "rescued_ticks": int(np.count_nonzero(log.rescued)),
         "plan_status": dict(sorted(Counter(log.status).items())),
         "max_bound_violation": float(max(0.0, np.max(log.bound_violation))),
+        "outcomes": list(log.outcomes),
+        "faults": list(log.faults),
+        "health": {state: log.health.count(state) for state in ("ok", "degraded", "lost")},
+        "causes": dict(sorted(Counter(cause for cause in log.cause if cause).items())),
+        "dropped_samples": dict(sorted(log.dropped.items())),
+        "last_stops": int(np.count_nonzero(log.last_stop)),
+        "explained_share": {"mean": float(np.mean(log.explained)), "min": float(np.min(log.explained))},
+        "tick_ms": timing(log.tick_ms),
         **statistics(log),
     }
 

@@ -156,6 +156,16 @@ class LocalPlanner(ABC):
             "braking" if wish is None else "solved", excess, 1e3 * (time.perf_counter() - begin),
         )  # fmt: skip
 
+    def rest(self, pose: Array) -> tuple[Array, Array]:
+        """Controls (N, 2) and states (N + 1, 3) of coming to rest, the first of which is taken as applied."""
+        controls = self.reachable(np.zeros((self.settings.horizon, 2)))
+        self.applied, self.estimate = controls[0], np.asarray(pose, dtype=np.float64)
+        return controls, unicycle.rollout(self.estimate, controls, self.settings.dt)
+
+    def driven(self, control: Array) -> None:
+        """Be told that another control (2,) than the first of the plan is applied."""
+        self.applied = control.copy()
+
     def reachable(self, wanted: Array) -> Array:
         """Controls (..., K, 2) nearest to those wanted that keep the limits of speed and acceleration from now on."""
         s, made = self.settings, np.empty_like(wanted)

@@ -96,6 +96,7 @@ class MonteCarlo:
         pose: (3,) mean of the heaviest cluster [m, m, rad].
         covariance: (3, 3) of it, in its tangent space.
         iterations: number of particles at the last update, for the record.
+        refused: why the last scan has said nothing, "" where it may have.
     """
 
     def __init__(
@@ -114,7 +115,7 @@ class MonteCarlo:
         count = self.own.particles[1]
         self.particles: Array = np.asarray(pose) + np.asarray(sigma) * rng.standard_normal((count, 3))
         self.weights: Array = np.full(count, 1.0 / count)
-        self.iterations = count
+        self.iterations, self.refused = count, ""
         self._fresh = True  # nothing has been weighed yet
         self._since: Array = np.zeros(3)  # where the wheels have gone since a scan was taken in
         self._slow = self._fast = 0.0
@@ -127,13 +128,22 @@ class MonteCarlo:
         self._fresh = True
         self._summarise()
 
-    def update(self, scan: Scan, odometry: Array | None, dt: float) -> None:
+    def reset(self, pose: Array, sigma: Array) -> None:
+        """Begin anew around a pose (3,), believed with ``sigma`` (3,)."""
+        count = self.own.particles[1]
+        self.particles = pose + sigma * self._rng.standard_normal((count, 3))
+        self.weights = np.full(count, 1.0 / count)
+        self._fresh, self._since = True, np.zeros(3)
+        self._summarise()
+
+    def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
         """Move by odometry (2,) since the last scan, None for none; weigh by a scan once the robot has moved enough."""
+        self.refused = "" if scan is not None else "no scan"
         if odometry is not None:
             u = np.asarray(odometry, dtype=np.float64)[None]
             self._since = unicycle.step(self._since[None], u, dt)[0]
         far = np.hypot(*self._since[:2]) >= self.own.moved[0] or abs(self._since[2]) >= self.own.moved[1]
-        if not (far or self._fresh):
+        if scan is None or not (far or self._fresh):
             self.pose = SE2.compose(self._mean[None], self._since[None])[0]
             return
         self._move()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,10 +19,12 @@ class Scan:
     Attributes:
         angles: (B,) beam directions in the body frame [rad].
         ranges: (B,) measured ranges [m]; NaN is a dropout, +inf means nothing within the lidar's range.
+        time: when it was taken [s]; NaN where the sensor does not say.
     """
 
     angles: Array
     ranges: Array
+    time: float = math.nan
 
     @property
     def valid(self) -> BoolArray:

@@ -223,6 +223,13 @@ class World:
         noise = self._odometry_model.noise_sigma * self._odometry_rng.standard_normal(2)
         self._measured = np.array([forward, turn]) / (dt * grip) * (self._scale + noise)
 
+    def carry(self, pose: ArrayLike) -> None:
+        """Put the robot down at another pose (3,) [m, m, rad], at rest; its wheels do not turn."""
+        place = np.asarray(pose, dtype=np.float64)
+        self._robot.position, self._robot.angle = (float(place[0]), float(place[1])), float(place[2])
+        self._robot.velocity, self._measured = (0.0, 0.0), np.zeros(2)
+        self._space.engine.reindex_shapes_for_body(self._robot)
+
     # ----------------------------------------------------------------- sensors
 
     def scan(self) -> Scan:
@@ -240,7 +247,7 @@ class World:
         seen = np.isfinite(ranges)
         ranges[seen] = np.clip(ranges[seen] + noise[seen], 0.0, lidar.range_max)
         ranges[lost] = np.nan
-        return Scan(self._angles.copy(), ranges)
+        return Scan(self._angles.copy(), ranges, self.time)
 
     def odometry(self) -> tuple[float, float]:
         """Mean body velocities (v [m/s], omega [rad/s]) over the last step, as the wheels report them.

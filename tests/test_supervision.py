@@ -1,0 +1,397 @@
+"""What robots do when something is the matter: samples that are none, signals that get worse, faults in a drive."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.driving.drive_signals import RAMPS, DriveSignals
+from unifg.scenarios.driving.last_stop import LastStop
+from unifg.scenarios.driving.relocalise import PORTION, Found, Relocaliser
+from unifg.scenarios.log.drive_log import EpisodeLog
+from unifg.scenarios.log.drive_metrics import episode_metrics
+from unifg.scenarios.navigation import Episode, NavigationSettings, askew
+from unifg.scenarios.seeing.readings import Reading, Scan
+from unifg.scenarios.supervision.door import Door
+from unifg.scenarios.supervision.supervisor import RISE, STEADY, Health, Ramp, Supervisor
+from unifg.scenarios.worlds.building import building_map
+from unifg.scenarios.worlds.faults import DRIVE_FAULTS, Fault, one_of
+from unifg.scenarios.worlds.plane import World
+from unifg.typing import Array
+
+BEAMS = 360
+ANGLES = -np.pi + 2.0 * np.pi * np.arange(BEAMS) / BEAMS
+DT = 0.1
+
+
+def scan(ranges: Any = 3.0, time: float = 1.0, seed: int = 0) -> Scan:
+    """A scan of a round room, or of the ranges given."""
+    noise = 0.01 * np.random.default_rng(seed).standard_normal(BEAMS)
+    return Scan(ANGLES, np.broadcast_to(np.asarray(ranges, dtype=np.float64), (BEAMS,)) + noise, time)
+
+
+# ---------------------------------------------------------------------- the door
+
+
+@pytest.mark.parametrize(
+    ("sample", "wrong"),
+    [
+        (None, "no scan came"),
+        (scan(np.nan), "no beam came back (not numbers)"),
+        (scan(np.inf), "no beam came back (out of range)"),
+        (scan(12.0), "no beam came back (out of range)"),
+        (scan(-3.0), "beams shorter than can be"),
+        (Scan(ANGLES, np.zeros(BEAMS), 1.0), "beams shorter than can be"),
+        (Scan(ANGLES[:-1], np.full(BEAMS - 1, 3.0), 1.0), "not the size of a scan"),
+        (Scan(ANGLES, np.full((BEAMS, 1), 3.0), 1.0), "not the size of a scan"),
+        (Scan(np.full(BEAMS, np.nan), np.full(BEAMS, 3.0), 1.0), "not the size of a scan"),
+        (Scan(ANGLES, "three metres", 1.0), "not the size of a scan"),  # type: ignore[arg-type]
+        (scan(time=0.7), "too old"),
+        (scan(time=1.5), "from the future"),
+        (scan(np.where(np.arange(BEAMS) < 19, 3.0, np.nan)), "no beam came back (not numbers)"),
+    ],
+)
+def test_scans_that_are_none_stay_outside(sample: Scan | None, wrong: str) -> None:
+    door = Door(BEAMS)
+    assert door.scan(sample, 1.0) is None
+    assert door.refused["lidar"] == wrong
+    assert dict(door.dropped) == {f"lidar: {wrong}": 1}
+    assert door.scan(scan(time=1.1), 1.1) is not None
+    assert "lidar" not in door.refused
+
+
+def test_a_scan_with_some_bad_beams_comes_in_without_them() -> None:
+    ranges = np.where(np.arange(BEAMS) % 2 == 0, 3.0, np.where(np.arange(BEAMS) % 3 == 0, -np.inf, -1.0))
+    found = Door(BEAMS).scan(Scan(ANGLES, ranges, math.nan), 1.0)
+    assert found is not None
+    assert np.isnan(found.ranges[1::2]).all() and (found.ranges[::2] == 3.0).all()
+    assert np.isinf(ranges).any(), "what was given is left alone"
+    far = np.where(np.arange(BEAMS) < 300, np.inf, 3.0)
+    found = Door(BEAMS).scan(Scan(ANGLES, far, 1.0), 1.0)
+    assert found is not None and np.isinf(found.ranges[:300]).all(), "nothing within range is a measurement"
+
+
+def test_a_scan_once_more_is_none_only_for_a_robot_that_has_moved() -> None:
+    door, still = Door(BEAMS), scan(3.0)
+    assert door.scan(still, 1.0) is not None
+    door.odometry(np.zeros(2), np.zeros(2), DT)
+    assert door.scan(replace(still, time=1.1), 1.1) is not None
+    door.odometry(np.array([0.2, 0.0]), np.zeros(2), DT)
+    assert door.scan(replace(still, time=1.2), 1.2) is None
+    assert door.refused["lidar"] == "the last one once more"
+    assert door.scan(scan(3.0, 1.3, seed=1), 1.3) is not None
+    assert door.scan(scan(3.0, 1.3, seed=2), 1.4) is None, "its stamp says that it is not newer"
+
+
+@pytest.mark.parametrize(
+    ("measured", "wrong"),
+    [
+        (None, "none came"),
+        (np.array([np.nan, 0.0]), "not finite"),
+        (np.array([0.0, np.inf]), "not finite"),
+        (np.array([1e9, 0.0]), "faster than any wheel"),
+        (np.zeros(3), "not two numbers"),
+        ("fast", "not two numbers"),
+    ],
+)
+def test_without_odometry_what_was_asked_for_stands_for_it(measured: Any, wrong: str) -> None:
+    door, asked = Door(), np.array([0.5, -0.1])
+    assert np.array_equal(door.odometry(measured, asked, DT), asked)
+    assert door.refused["wheels"] == wrong
+    assert np.array_equal(door.odometry(np.array([0.4, 0.0]), asked, DT), [0.4, 0.0])
+    assert door.dropped.total() == 1
+
+
+def reading(**changed: Any) -> Reading:
+    """Two cylinders and a corner."""
+    whole = Reading(
+        time=1.0, ids=np.array([0, 1, 7]), bearings=np.array([0.1, -0.2, 1.0]), ranges=np.array([2.0, 3.0, 4.0]),
+        radii=np.array([0.3, 0.3, 0.0]), kinds=np.array([0, 0, 1]), moving=np.zeros(3, dtype=bool), height=1.5,
+        tilt=np.array([0.0, 0.0, 1.0]), rates=np.zeros(3), force=np.array([0.0, 0.0, 9.81]),
+    )  # fmt: skip
+    return replace(whole, **changed)
+
+
+def test_a_reading_loses_what_cannot_be_and_keeps_the_rest() -> None:
+    asked = np.array([0.1, 0.2, 0.3, 9.0])
+    door = Door()
+    whole = door.reading(reading(), 1.0, asked)
+    assert np.array_equal(whole.ids, [0, 1, 7]) and not door.refused
+    bad = door.reading(reading(ranges=np.array([2.0, np.nan, 4.0])), 1.0, asked)
+    assert np.array_equal(bad.ids, [0, 7]) and door.refused == {"detector": "sightings that cannot be"}
+    short = door.reading(reading(bearings=np.zeros(2)), 1.0, asked)
+    assert len(short.ids) == 0 and door.refused == {"detector": "columns of several lengths"}
+    blind = door.reading(reading(rates=np.array([0.0, np.nan, 0.0])), 1.0, asked)
+    assert np.array_equal(blind.rates, asked[:3]) and np.isnan(blind.force).all()
+    assert list(door.refused) == ["inertial unit"]
+    nothing = door.reading(None, 2.0, asked)
+    assert nothing.time == 2.0 and len(nothing.ids) == 0 and np.array_equal(nothing.rates, asked[:3])
+    stuck = door.reading(reading(time=math.nan, height="high"), 3.0, asked)
+    assert stuck.time == 3.0 and math.isnan(stuck.height)
+
+
+# ---------------------------------------------------------------- the supervisor
+
+
+def test_speed_falls_with_a_signal_and_comes_back_slowly() -> None:
+    supervisor = Supervisor({"age": Ramp("no scan", 0.1, 0.3, lost=1.0), "slip": Ramp("slips", 0.2, 0.4, least=0.5)})
+    assert supervisor.judge({"age": 0.1, "slip": 0.1}).health is Health.OK
+    slow = supervisor.judge({"age": 0.2, "slip": 0.25})
+    assert slow.health is Health.DEGRADED and slow.share == pytest.approx(0.5) and slow.cause == "no scan"
+    rest = supervisor.judge({"age": 0.3, "slip": 0.0}, {"age": "not finite"})
+    assert rest.rests and rest.cause == "no scan: not finite"
+    assert supervisor.judge({"age": 0.0, "slip": 9.0}).share == pytest.approx(RISE), "it comes back step by step"
+    shares = [supervisor.judge({"age": 0.0, "slip": 9.0}).share for _ in range(10)]
+    assert shares[-1] == 0.5 and supervisor.verdict.cause == "slips"
+    supervisor.judge({"age": math.nan, "slip": 0.0})
+    assert supervisor.verdict.rests, "what is no number is the worst"
+
+
+def test_a_lost_robot_rests_until_all_has_been_well_for_a_while() -> None:
+    supervisor = Supervisor({"age": Ramp("no scan", 0.1, 0.3, lost=1.0)})
+    assert supervisor.judge({"age": 1.0}).health is Health.DEGRADED, "once may be chance"
+    assert supervisor.judge({"age": 1.1}).health is Health.LOST
+    for _ in range(STEADY - 1):
+        verdict = supervisor.judge({"age": 0.0})
+        assert verdict.health is Health.LOST and verdict.rests and verdict.cause == "no scan"
+    assert supervisor.judge({"age": 0.0}).health is Health.DEGRADED
+    for _ in range(10):
+        supervisor.judge({"age": 0.0})
+    assert supervisor.verdict.health is Health.OK and supervisor.verdict.cause == ""
+
+
+def note(signals: DriveSignals, asked: Array, did: Array, wheels: Array, pose: Array, corrected: bool = True) -> Array:
+    """A tick in which the robot ``did`` something; the pose it leads to."""
+    heading = np.array([math.cos(pose[2]), math.sin(pose[2])])
+    after, predicted = (pose + DT * np.array([*v * heading, omega]) for v, omega in (did, wheels))
+    signals.note(
+        corrected=corrected, share=1.0, predicted=predicted, pose=after, covariance=1e-4 * np.eye(3), wheels=wheels,
+        trusted=True, asked=asked,
+    )  # fmt: skip
+    return after
+
+
+def test_wheels_that_slip_are_told_from_wheels_that_do_not_obey() -> None:
+    asked = np.array([1.0, 0.0])
+    slipping, dead, late = DriveSignals(DT), DriveSignals(DT), DriveSignals(DT)
+    here = there = elsewhere = np.array([2.0, 1.0, 0.5])
+    commands = [np.array([min(1.0, 0.25 * k), 0.0]) for k in range(12)]
+    for k in range(8):
+        here = note(slipping, asked, asked, 1.6 * asked, here)
+        there = note(dead, asked, np.array([0.5, -3.3]), np.array([0.5, -3.3]), there)
+        behind = commands[max(0, k - 2)]
+        elsewhere = note(late, commands[k], behind, behind, elsewhere)
+    assert slipping.values()["slip"] == pytest.approx(0.375) and slipping.values()["wheels"] < 1e-9
+    assert dead.values()["wheels"] > RAMPS["wheels"].ends and dead.values()["slip"] < 1e-9
+    assert late.values()["wheels"] < RAMPS["wheels"].begins, "a base that follows late obeys"
+
+
+def test_wheels_that_did_not_obey_are_given_time_twice_as_long_every_time() -> None:
+    signals, pose = DriveSignals(DT), np.zeros(3)
+    stopped = np.zeros(2)
+    waits = []
+    for _ in range(2):
+        while signals.values()["wheels"] < RAMPS["wheels"].ends:
+            pose = note(signals, np.array([1.0, 0.0]), stopped, stopped, pose)
+        count = 0
+        while signals.values()["wheels"] >= RAMPS["wheels"].ends:
+            pose = note(signals, stopped, stopped, stopped, pose)
+            count += 1
+        waits.append(count)
+    assert waits[1] == pytest.approx(2 * waits[0], abs=2) and waits[0] * DT == pytest.approx(2.0, abs=0.3)
+
+
+# ----------------------------------------------------------------- the last stop
+
+STOP = LastStop(0.17, 2.5, DT)
+
+
+def ahead(distance: float, half: float = 0.15, base: float = 5.0) -> Scan:
+    """A scan with something ``distance`` ahead, ``half`` [rad] wide to both sides, in a wide room."""
+    return scan(np.where(np.abs(ANGLES) < half, distance, base))
+
+
+def test_a_control_is_driven_only_as_fast_as_beams_leave_room_to_brake() -> None:
+    fast = np.array([1.0, 0.0])
+    assert STOP.control(fast, fast, ahead(0.6)) is fast
+    assert STOP.control(fast, np.zeros(2), ahead(0.25))[0] <= 0.5
+    braking = STOP.control(fast, fast, ahead(0.3))
+    assert braking[0] == pytest.approx(0.75), "no harder than braking goes"
+    assert STOP.control(-fast, -fast, ahead(0.3)) is not None
+    assert np.array_equal(STOP.control(-fast, -fast, ahead(0.3)), -fast), "it is in front, not behind"
+    turn = STOP.control(np.array([0.1, 1.0]), np.zeros(2), ahead(0.16, half=0.5))
+    assert turn[0] == 0.0 and turn[1] == 1.0, "turning on the spot touches nothing"
+
+
+def test_an_arc_past_something_is_free_and_one_into_it_is_not() -> None:
+    aside = scan(np.where(np.abs(ANGLES - 0.9) < 0.2, 0.3, 5.0))
+    left, right = np.array([0.8, 2.5]), np.array([0.8, -2.5])
+    assert STOP.is_free(right, aside) and not STOP.is_free(left, aside)
+
+
+def test_single_beams_stop_nobody_and_lost_ones_do() -> None:
+    fast = np.array([1.0, 0.0])
+    ranges = np.full(BEAMS, 5.0)
+    ranges[180] = 0.2
+    assert STOP.is_free(fast, scan(ranges))
+    ranges[179:182] = 0.2
+    assert not STOP.is_free(fast, scan(ranges))
+    blind = np.where(np.abs(ANGLES) < 0.6, np.nan, 5.0)
+    assert not STOP.is_free(fast, scan(blind)) and STOP.is_free(-fast, scan(blind))
+    assert STOP.is_free(fast, scan(np.where(np.abs(ANGLES) < 0.6, np.inf, 5.0))), "nothing within range is free"
+
+
+# ------------------------------------------------------------------- found again
+
+
+@functools.cache
+def building() -> tuple[Any, DistanceMap]:
+    occupancy = building_map()
+    return occupancy, DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+
+
+def searched(search: Relocaliser, sample: Scan) -> tuple[Found, int]:
+    """What a search finds, and in how many portions."""
+    search.begin(sample)
+    for ticks in range(1, 1000):
+        found = search.search()
+        if found is not None:
+            return found, ticks
+    raise AssertionError
+
+
+@pytest.mark.parametrize("place", [(3.0, 25.2, 2.0), (21.0, 9.6, -2.0)], ids=str)
+def test_a_robot_put_down_anywhere_is_found(place: tuple[float, float, float]) -> None:
+    occupancy, field = building()
+    search = Relocaliser(occupancy, field, 0.17)
+    found, ticks = searched(search, World(occupancy, place).scan())
+    assert found.pose is not None and found.share > 0.9 and found.cause == ""
+    assert np.hypot(*(found.pose - place)[:2]) < 0.05
+    assert abs(math.remainder(found.pose[2] - place[2], 2.0 * np.pi)) < 0.02
+    assert ticks == math.ceil(len(search.places) / PORTION) and not search.searching
+
+
+def test_a_scan_of_another_building_is_found_nowhere() -> None:
+    occupancy, field = building()
+    other = askew(occupancy, np.array([10.8, 17.0, 0.0]))
+    where = World(other, (10.8, 17.0, 0.0))
+    found, _ = searched(Relocaliser(occupancy, field, 0.17), where.scan())
+    assert found.pose is None and found.cause
+
+
+def test_a_map_put_askew_leaves_the_robot_in_the_open() -> None:
+    occupancy, field = building()
+    here = np.array([10.8, 17.0, 0.3])
+    other = askew(occupancy, here)
+    turned = DistanceMap.from_occupancy(other.occupied, other.resolution, other.origin)
+    assert turned.distance(here[None, :2])[0] == pytest.approx(field.distance(here[None, :2])[0], abs=0.03)
+
+
+# ------------------------------------------------------------------------ faults
+
+
+def test_faults_are_read_and_refused_by_name() -> None:
+    read = one_of(DRIVE_FAULTS)
+    assert read("lidar-nan@5") == Fault("lidar-nan", 5.0) and str(read("kidnapped@1.5:2")) == "kidnapped@1.5:2"
+    assert not read("lidar-nan@5:1").holds(6.0) and read("lidar-nan@5:1").holds(5.9)
+    for text in ("lidar-nan", "lidar-nan@", "lidar-nan@x", "lidar-nan@-1", "lidar-nan@1:0", "lidar-nan@nan", "gust@1"):
+        with pytest.raises(argparse.ArgumentTypeError):
+            read(text)
+
+
+SHORT = NavigationSettings(start=(6.5, 14.0, 0.0), goals=((13.5, 14.1, 0.0),), obstacles=1)
+
+
+@functools.cache
+def faulty(fault: str, coupling: str = "sequential", ticks: int = 50) -> EpisodeLog:
+    """Some seconds with a fault from second 1."""
+    count = 0
+
+    def stop(done: float, text: str) -> None:
+        nonlocal count
+        count += 1
+        if count == ticks:
+            raise KeyboardInterrupt
+
+    return Episode(replace(SHORT, coupling=coupling, faults=(one_of(DRIVE_FAULTS)(fault),))).run(stop)
+
+
+@pytest.mark.parametrize("kind", ["lidar-max", "lidar-frozen", "lidar-delayed", "beams-missing"])
+def test_a_blind_robot_brakes_at_once_and_says_why(kind: str) -> None:
+    log = faulty(f"{kind}@1", ticks=26)
+    last_good = 9  # the tick at 0.9 s
+    speed = log.control[:, 0]
+    assert speed[last_good] > 0.6
+    assert (np.diff(speed[last_good + 2 : last_good + 5]) < 0.0).all() and speed[last_good + 2] < speed[last_good + 1]
+    assert not speed[last_good + 2 + 4 :].any(), "at rest within v / a"
+    assert log.collisions == 0
+    assert log.health[last_good + 2] == "degraded" and log.health[-1] == "lost"
+    assert log.cause[-1].startswith("no scan says where it is: ")
+    m = episode_metrics(log)
+    assert m["health"]["lost"] == 5 and sum(m["dropped_samples"].values()) == 16
+
+
+def test_a_robot_that_sees_again_goes_on() -> None:
+    log = faulty("lidar-nan@1:1.5")
+    assert log.health[25] == "lost" and log.health[-1] == "ok" and log.control[-1, 0] > 0.9
+    assert log.collisions == 0
+
+
+@pytest.mark.parametrize("coupling", ["sequential", "joint"])
+def test_a_robot_without_odometry_goes_on_slowly(coupling: str) -> None:
+    log = faulty("odometry-nan@1", coupling)
+    assert log.health[-1] == "degraded" and log.cause[-1] == "no odometry: not finite"
+    assert 0.1 < log.control[-1, 0] < 0.6 and np.isfinite(log.estimate).all()
+    assert np.abs(log.estimate - log.true_pose).max() < 0.15
+
+
+@pytest.mark.parametrize("coupling", ["sequential", "joint"])
+def test_a_kidnapped_robot_stops_and_finds_itself(coupling: str) -> None:
+    log = faulty("kidnapped@1", coupling, 60)
+    assert np.hypot(*(log.true_pose[10] - log.true_pose[9])[:2]) > 3.0
+    assert "lost" in log.health and log.control[10:14, 0].max() < 1.0 and log.collisions == 0
+    assert np.hypot(*(log.estimate[-1] - log.true_pose[-1])[:2]) < 0.05
+    assert any(cause == "the scan does not fit the map" for cause in log.cause)
+
+
+def test_a_robot_with_the_wrong_map_rests_and_says_so() -> None:
+    log = faulty("wrong-map@1")
+    assert log.health[-1] == "lost" and log.cause[-1] == "the scan does not fit the map"
+    assert not log.control[20:].any() and log.collisions == 0
+
+
+@pytest.mark.parametrize(
+    ("fault", "cause"),
+    [
+        ("odometry-slip@1", "the wheels slip"),
+        ("wheel-dead@1", "the robot does not do what it is told"),
+        ("solver-timeout@1", "no plan"),
+    ],
+)
+def test_other_faults_are_named_too(fault: str, cause: str) -> None:
+    log = faulty(fault)
+    assert cause in log.cause and log.collisions == 0
+    assert log.control[-1, 0] < 0.8
+
+
+def test_a_tick_that_fails_stops_the_robot_and_not_the_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    episode = Episode(SHORT)
+    monkeypatch.setattr(episode.pilot.tracker, "update", lambda *_: np.linalg.inv(np.zeros((2, 2))))
+    count = 0
+
+    def stop(done: float, text: str) -> None:
+        nonlocal count
+        count += 1
+        if count == 10:
+            raise KeyboardInterrupt
+
+    log = episode.run(stop)
+    assert log.ticks == 10 and not log.control.any()
+    assert log.cause[-1] == "the tick failed: Singular matrix" and log.health[-1] == "degraded"
