@@ -2,8 +2,8 @@
 
 Neither the map nor the estimate, the tracker nor the plan is asked. A control is reached in a tick and then braked
 along its arc; where the hull would come nearer to the end of a beam than it may, the control is slowed, as far as
-braking goes. Three neighbouring beams have to agree, so noise and single echoes stop nobody; where most beams ahead are lost,
-the way is not known to be free.
+braking goes. Three neighbouring beams have to agree, so noise and single echoes stop nobody; where most beams ahead
+are lost, the way is not known to be free.
 """
 
 from __future__ import annotations
