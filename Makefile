@@ -2,6 +2,8 @@
 #
 #   make demo     drive a robot through the shipped building, write out/demo/scene.html
 #   make test     run the tests
+#   make test-lowest    the same with the lowest versions of all packages that pyproject.toml allows, in .venv-lowest
+#   make processes    graphs and solutions in other processes, however these begin, with joblib and dask (a minute)
 #   make lint     check style (ruff) and types (mypy)
 #   make bench    measure everything again and rewrite the tables in docs/ (long)
 #   make results PAGE=control-cases    measure one page of docs/ again; without PAGE, list them
@@ -28,7 +30,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Matrices here are small: more threads per process only make the processes wait for each other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: kernels help demo test lint types bench results stale release-check mutants fences clean offsets examples
+.PHONY: kernels help demo test test-lowest processes lint types bench results stale release-check mutants fences clean offsets examples
 .DELETE_ON_ERROR:
 
 help:
@@ -41,6 +43,13 @@ demo: $(VENV)/ready
 test: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/unifg warmup
 	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(PYTEST)
+
+test-lowest: $(VENV)-lowest/ready
+	$(ONE_THREAD) $(VENV)-lowest/bin/python -m pytest -n $(WORKERS) --dist loadgroup $(PYTEST)
+
+processes: $(VENV)/ready
+	$(PIP) install joblib dask
+	UNIFG_EVERY_START=1 $(ONE_THREAD) $(BIN)/python -m pytest tests/test_processes.py
 
 lint: $(VENV)/ready-dev
 	$(BIN)/ruff check --output-format concise .
@@ -79,7 +88,7 @@ fences: $(VENV)/ready
 	$(BIN)/python docs/check_shell_fences.py
 
 clean:
-	rm -rf $(VENV) out build dist unifg.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage htmlcov
+	rm -rf $(VENV) $(VENV)-lowest out build dist unifg.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage htmlcov
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Each file marks one finished installation; a change of pyproject.toml repeats it.
@@ -92,6 +101,14 @@ $(VENV)/ready: pyproject.toml
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
 		echo "$(PYTHON) cannot build virtual environments; on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
 	@$(PIP) install --editable ".[scenarios,test]"
+	@touch $@
+
+$(VENV)-lowest/ready: pyproject.toml tests/lowest.py
+	@echo "Building $(VENV)-lowest with the lowest versions of all packages (once, some minutes)"
+	@$(PYTHON) -m venv $(VENV)-lowest
+	@$(PYTHON) tests/lowest.py > $(VENV)-lowest/lowest.txt
+	@$(VENV)-lowest/bin/python -m pip --disable-pip-version-check --quiet install --constraint $(VENV)-lowest/lowest.txt \
+		--editable ".[scenarios,test]"
 	@touch $@
 
 $(VENV)/ready-dev: $(VENV)/ready

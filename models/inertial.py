@@ -31,7 +31,8 @@ from unifg.language.variables import Data, Selection, Variable, as_selection
 from unifg.lie import SE23, SO3, Manifold, Product
 from unifg.models.preintegration import BIAS, CLOSE, GRAVITY, ImuNoise, Preintegrated, preintegrate
 from unifg.models.rigid import motion_parts
-from unifg.models.stamped import Alone, Present, by_handle, state_whole
+from unifg.models.stamped import Present, by_handle, state_whole
+from unifg.turns import Turn
 from unifg.typing import Array, ArrayLike
 
 STILL = 1e-6  # standard deviation of each row, and of biases, over a step of no duration
@@ -174,12 +175,12 @@ class InertialMeasurements:
         self._body, self._bias, self._gravity = body, bias, gravity
         self._walk = f"{name}: walk"
         self._place: slice | None = None  # of biases in states
-        self._alone = Alone()
+        self._turn = Turn()
         self.reset()
 
     def reset(self) -> None:
         """Forget all samples, and what has become of them."""
-        with self._alone:
+        with self._turn:
             self._samples: Array = np.empty((0, 7))  # stamp, rates, forces
             self._left = -np.inf  # the last stamp that has left
             self.counts = SampleCounts()
@@ -264,7 +265,7 @@ class InertialMeasurements:
             )
         rows = np.concatenate([t.reshape(-1, 1), w.reshape(-1, 3), a.reshape(-1, 3)], axis=1)
         good = np.isfinite(rows).all(axis=1)
-        with self._alone:
+        with self._turn:
             rows = np.concatenate([self._samples, rows[good]])
             rows = rows[np.argsort(rows[:, 0], kind="stable")]
             first = np.diff(rows[:, 0], prepend=-np.inf) > 0.0
@@ -313,7 +314,7 @@ class InertialMeasurements:
         empty, first = first, int(np.searchsorted(times, times[first], side="right")) - 1
         times = np.concatenate([times[first] - np.arange(first, 0, -1.0), times[first:]])
         since = float(times[first])
-        with self._alone:
+        with self._turn:
             begin = float(self._samples[0, 0]) if len(self._samples) else np.inf
             if since < begin - CLOSE and self._left >= since - self.gap:
                 raise ModelError(
@@ -328,7 +329,7 @@ class InertialMeasurements:
         found = self._integrated(samples, times, bias)
         found.held[:first] = np.inf
         unknown = int((found.held[first:] > self.gap).sum())
-        with self._alone:
+        with self._turn:
             self.counts = replace(self.counts, kept=len(samples), unknown=unknown)
         still = slice(empty, first)  # steps of no duration, in which nothing moves
         found.increment[still], found.by_bias[still], found.duration[still] = SE23.identity(), 0.0, 0.0

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from threading import RLock
 from typing import Any, Protocol
 
 import numpy as np
@@ -21,6 +20,7 @@ from unifg.kernels.robust import Loss
 from unifg.language.statement import Statement
 from unifg.language.variables import Data, Family, Variable, as_selection
 from unifg.models.interpolation import Interpolation, geodesic
+from unifg.turns import Turn
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 CLOSE = 1e-6  # of a step: how far from a node a stamp still falls on it
@@ -127,12 +127,12 @@ class StampedMeasurements:
         self.name, self.size, self.capacity = name, size, capacity
         self.statics, self.offset, self.component = tuple(statics), offset, component
         self._error, self._sigma, self._between, self._robust = _batched(error, name), sigma, between, robust
-        self._alone = Alone()
+        self._turn = Turn()
         self.reset()
 
     def reset(self) -> None:
         """Forget all measurements, and what has become of them."""
-        with self._alone:
+        with self._turn:
             self._stamps: Array = np.empty(0)
             self._values: Array = np.empty((0, self.size))
             self._known: BoolArray = np.empty(0, dtype=bool)  # whether they have been placed before
@@ -193,7 +193,7 @@ class StampedMeasurements:
             raise ModelError(f"'{self.name}': stamps {stamps.shape} need values {wanted}, found {values.shape}")
         stamps, values = np.atleast_1d(stamps), values.reshape(-1, self.size)
         good = np.isfinite(stamps) & np.isfinite(values).all(axis=1)
-        with self._alone:
+        with self._turn:
             self._count(invalid=int((~good).sum()))
             self._stamps = np.concatenate([self._stamps, stamps[good]])
             self._values = np.concatenate([self._values, values[good]])
@@ -233,7 +233,7 @@ class StampedMeasurements:
     def _given(self, times: Array, first: int, offset: float) -> dict[str, Array]:
         """Values of the data, by name, for nodes of which those before the first are not there yet."""
         oldest = int(np.searchsorted(times, times[first], side="right")) - 1  # steps before it have no duration
-        with self._alone:
+        with self._turn:
             if oldest < len(times) - 1:
                 interval, place = self._place(times[oldest:], offset)
                 slot = (interval + oldest) * self.capacity + place
@@ -288,26 +288,6 @@ class StampedMeasurements:
     def _count(self, **more: int) -> None:
         """Add to the counts."""
         self.counts = replace(self.counts, **{name: getattr(self.counts, name) + n for name, n in more.items()})
-
-
-class Alone:
-    """A lock, for one thread at a time; copies have one of their own."""
-
-    def __init__(self) -> None:
-        """Open."""
-        self._lock = RLock()
-
-    def __enter__(self) -> None:
-        """Wait for the others."""
-        self._lock.acquire()
-
-    def __exit__(self, *raised: object) -> None:
-        """Let the next one in."""
-        self._lock.release()
-
-    def __reduce__(self) -> tuple[type[Alone], tuple[()]]:
-        """Locks are not copied."""
-        return Alone, ()
 
 
 def state_whole(graph: Statement, stated: Callable[[Statement], None]) -> None:

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.util
 import pickle
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
+from threading import Event
 from typing import Any
 
+import numba
+import numpy as np
 import pytest
 
+from unifg.machine import jit
 from unifg.machine.jit import compiled
+from unifg.machine.objects import read_sealed, write_sealed
 
 SOURCE = "def twice(x):\n    return 2.0 * x\n"
 
@@ -51,21 +60,140 @@ def test_machine_code_is_read_again(twice: Callable[[float], float]) -> None:
     assert not read_from_cache(first) and read_from_cache(second)
 
 
-@pytest.mark.parametrize("damage", ["types have moved", "cut off", "empty", "no pickle"])
-def test_a_cache_that_cannot_be_read_begins_anew(twice: Callable[[float], float], tmp_path: Path, damage: str) -> None:
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "zeroed": lambda content: bytes(len(content)),
+    "cut off": lambda content: content[: len(content) // 2],
+    "empty": lambda content: b"",
+    "random": lambda content: np.random.default_rng(1).bytes(len(content)),
+    "one bit": lambda content: content[:-100] + bytes([content[-100] ^ 4]) + content[-99:],
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_file_is_named_and_written_anew(
+    twice: Callable[[float], float], tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
+) -> None:
     assert compiled(twice)(3.0) == 6.0
-    (index,) = tmp_path.rglob("*.nbi")
-    content = index.read_bytes()
-    version = pickle.loads(content)
-    index.write_bytes(
-        {
-            "types have moved": pickle.dumps(version) + pickle.dumps(((0.0, 0), {Moved(): "doubling"})),
-            "cut off": content[:-20],
-            "empty": b"",
-            "no pickle": b"\x80\x04nothing of the kind",
-        }[damage]
-    )
+    (file,) = tmp_path.rglob("*.code")
+    file.write_bytes(DAMAGES[damage](file.read_bytes()))
     again = compiled(twice)
     assert again(3.0) == 6.0 and not read_from_cache(again)
+    assert [str(file) in record.message for record in caplog.records if "damaged" in record.message] == [True]
     after = compiled(twice)
     assert after(3.0) == 6.0 and read_from_cache(after), "written anew"
+
+
+def test_code_that_names_what_has_moved_begins_anew(
+    twice: Callable[[float], float], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    first = compiled(twice)
+    assert first(3.0) == 6.0
+    (file,) = tmp_path.rglob("*.code")
+    made = first._cache._made()  # type: ignore[attr-defined]
+    write_sealed(file, made + pickle.dumps(Moved()))
+    again = compiled(twice)
+    assert again(3.0) == 6.0 and not read_from_cache(again) and str(file) in caplog.text
+    assert read_from_cache(again) or compiled(twice)(3.0) == 6.0
+
+
+def test_code_of_other_versions_is_left_alone(
+    twice: Callable[[float], float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert compiled(twice)(3.0) == 6.0
+    monkeypatch.setattr(numba, "__version__", "0.1")
+    other = compiled(twice)
+    assert other(3.0) == 6.0 and not read_from_cache(other)
+    assert "damaged" not in caplog.text
+
+
+def test_a_file_holds_the_signature_it_is_named_by(twice: Callable[[float], float], tmp_path: Path) -> None:
+    assert compiled(twice)(3.0) == 6.0 and compiled(twice)(3) == 6.0
+    one, other = tmp_path.rglob("*.code")
+    content = one.read_bytes()
+    one.write_bytes(other.read_bytes())
+    other.write_bytes(content)
+    again = compiled(twice)
+    assert again(3.0) == 6.0 and again(3) == 6.0
+
+
+def test_functions_of_one_line_that_close_over_other_numbers_have_files_of_their_own(tmp_path: Path) -> None:
+    for number in (2.0, 3.0, 2.0, 3.0):
+        function = compiled(times(number))
+        assert function(2.0) == 2.0 * number
+    assert read_from_cache(function)
+
+
+def times(number: float) -> Callable[[float], float]:
+    def function(x: float) -> float:
+        return number * x
+
+    return function
+
+
+def test_a_full_disk_costs_the_cache_and_a_warning(
+    twice: Callable[[float], float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(jit, "write_sealed", full)
+    monkeypatch.setattr(jit, "_said", Event())
+    assert compiled(twice)(3.0) == 6.0 and compiled(twice)(3) == 6.0
+    assert [record.message.count("No space left") for record in caplog.records if "kept" in record.message] == [1]
+    assert not list(tmp_path.rglob("*.code"))
+
+
+NOWHERE = """
+import logging, os, sys
+os.environ.pop("HOME", None)
+logging.basicConfig(level=logging.WARNING, format="%(message)s")
+from numba.core import caching
+def refuse(self):
+    raise PermissionError("read-only")
+caching._CacheLocator.ensure_cache_path = refuse
+import unifg as fg
+group = fg.SO2.compose([[0.5]], [[0.25]])
+assert group[0, 0] == 0.75
+graph = fg.Graph()
+assert fg.machine.jit.folder_of(fg.kernels.kernel.evaluate_rows) is None
+function = fg.compiled(eval("lambda x: 2.0 * x"))
+assert function(3.0) == 6.0
+"""
+
+
+def test_without_a_folder_to_write_to_everything_works_after_one_warning(tmp_path: Path) -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", NOWHERE], capture_output=True, text=True, cwd=Path(__file__).parent.parent, timeout=120
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stderr.count("\n") == 1 and "NUMBA_CACHE_DIR" in ended.stderr
+
+
+HAMMER = """
+import importlib.util, sys
+from pathlib import Path
+spec = importlib.util.spec_from_file_location("doubling", sys.argv[1])
+module = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(module)
+from unifg.machine.jit import compiled
+for k in range(4):
+    function = compiled(module.twice)
+    kinds = (3.0, 3, True) if k % 2 else (True, 3, 3.0)
+    assert [function(x) for x in kinds] == [2.0 * x for x in kinds]
+    for file in Path(sys.argv[1]).parent.rglob("*.code") if k < 3 else ():
+        file.unlink(missing_ok=True)
+    (Path(sys.argv[1]).parent / "turns").open("a").write("x")
+"""
+
+
+def test_processes_compile_at_once_and_one_is_killed(tmp_path: Path) -> None:
+    (tmp_path / "doubling.py").write_text(SOURCE, encoding="utf-8")
+    command = [sys.executable, "-c", HAMMER, str(tmp_path / "doubling.py")]
+    runs = [subprocess.Popen(command, cwd=Path(__file__).parent.parent) for _ in range(2)]
+    turns = tmp_path / "turns"
+    while runs[0].poll() is None and not (turns.exists() and turns.stat().st_size > 1):
+        time.sleep(0.01)
+    runs[0].kill()
+    runs[0].wait()
+    assert runs[1].wait(timeout=120) == 0
+    assert not [file for file in tmp_path.rglob("*.code") if read_sealed(file) is None]

@@ -20,7 +20,7 @@ FOLDERS = {
 SIDES = ("solvers", "models", "scenarios")
 # From the ground up. A room knows the floors below it; rooms of one floor do not know each other.
 FLOORS: tuple[tuple[str, ...], ...] = (
-    ("errors", "typing"),
+    ("errors", "typing", "turns", "whole"),
     ("machine", "style"),
     ("lie", "elimination"),
     ("kernels",),

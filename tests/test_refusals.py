@@ -218,8 +218,11 @@ def test_names_do_not_take_the_place_of_families() -> None:
     with pytest.raises(fg.GraphError, match=r"contains 'y', which is no family of this graph$"):
         GaussNewton().solve(graph, {"y": guess})  # type: ignore[dict-item]
     solution = GaussNewton().solve(graph, {x: guess})
-    with pytest.raises(fg.GraphError, match="expected a family of variables, or some of its members, found 'x'"):
-        solution["x"]  # type: ignore[index]
+    np.testing.assert_array_equal(solution["x"], solution[x])
+    with pytest.raises(fg.GraphError, match=r"no family is called 'y' \(there are: x\)"):
+        solution["y"]
+    with pytest.raises(fg.GraphError, match="expected a family of variables, or some of its members, found 3"):
+        solution[3]  # type: ignore[index]
     with pytest.raises(fg.GraphError, match=r"covariance\(\) of what"):
         solution.covariance()
 

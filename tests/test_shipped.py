@@ -105,11 +105,27 @@ def test_an_archive_for_others_is_left_alone(
 
 
 @pytest.mark.parametrize("content", [None, b"", b"PK nothing of the kind"], ids=["none", "empty", "no archive"])
-def test_an_archive_that_cannot_be_read_is_none(archive: Path, tmp_path: Path, content: bytes | None) -> None:
+def test_an_archive_that_cannot_be_read_is_none(
+    archive: Path, tmp_path: Path, content: bytes | None, caplog: pytest.LogCaptureFixture
+) -> None:
     archive.unlink()
     if content is not None:
         archive.write_bytes(content)
     assert "doubling.twice" in first_use(tmp_path).compiled
+    assert (f"{archive} is damaged" in caplog.text) == (content is not None)
+
+
+def test_members_that_are_damaged_are_none(archive: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    whole = archive.read_bytes()
+    with zipfile.ZipFile(archive) as file:
+        members = [info for info in file.infolist() if info.filename != shipped.ABOUT]
+    damaged = bytearray(whole)
+    for info in members:
+        first = info.header_offset + 30 + len(info.filename)
+        damaged[first + 20 : first + info.compress_size] = bytes(info.compress_size - 20)
+    archive.write_bytes(damaged)
+    assert "doubling.twice" in first_use(tmp_path).compiled
+    assert caplog.text.count(f"{archive} is damaged") == 1
 
 
 def test_an_archive_names_the_files_that_have_changed_since(archive: Path, tmp_path: Path) -> None:

@@ -40,6 +40,7 @@ from unifg.pose_graphs import Simulated, manhattan, sphere
 from unifg.smoothing import FixedLag, Incremental
 from unifg.solvers import SQP, AugmentedLagrangian, GraduatedNonConvexity, InteriorPoint
 from unifg.solvers.names import TABLE, backend
+from unifg.whole import write_whole
 
 Job: TypeAlias = tuple[str, Callable[[], object]]
 Progress: TypeAlias = Callable[[float, str], object]
@@ -60,9 +61,9 @@ def perform(name: str, works: Callable[[], list[Job]], progress: Progress | None
     Returns:
         What was compiled, generated and read.
     """
-    mark = folder_of(evaluate_rows) / f"warm-{name}.json"
-    present = _present()
-    if not anew and _holds(mark, present):
+    folder, present = folder_of(evaluate_rows), _present()
+    mark = None if folder is None else folder / f"warm-{name}.json"
+    if mark is not None and not anew and _holds(mark, present):
         return Tally()
     with counting() as counted:
         done = works()
@@ -72,9 +73,10 @@ def perform(name: str, works: Callable[[], list[Job]], progress: Progress | None
             job()
         if progress is not None:
             progress(1.0, "")
-    with suppress(OSError):  # a cache that cannot be written is warmed again
-        mark.parent.mkdir(parents=True, exist_ok=True)
-        mark.write_text(json.dumps({"of": present, "files": sorted(set(counted.files))}), encoding="utf-8")
+    if mark is not None:
+        with suppress(OSError):  # a cache that cannot be written is warmed again
+            mark.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(mark, json.dumps({"of": present, "files": sorted(set(counted.files))}))
     return counted
 
 

@@ -17,7 +17,7 @@ from unifg.language.statement import Statement
 from unifg.language.terms import ScalarCost
 from unifg.language.variables import Data, Family
 from unifg.program.columns import Values
-from unifg.program.program import Program, compile_graph
+from unifg.program.program import Program, idle_program
 from unifg.program.term import CompiledTerm
 from unifg.typing import Array, ArrayLike
 
@@ -73,8 +73,13 @@ def check_graph(
     Raises:
         GraphError: for input no solve would accept either (unknown variables, shapes, NaN, crossed limits).
     """
-    program = compile_graph(graph)
-    program.bind(data or {})
+    program = idle_program(graph)
+    with program.turn:
+        return _check(program, guess, data or {})
+
+
+def _check(program: Program, guess: Mapping[Family, ArrayLike], data: Mapping[Data, ArrayLike]) -> Report:
+    program.bind(data)
     values = program.values_from(guess)
     findings: list[Finding] = []
     for term in program.terms:

@@ -13,6 +13,7 @@ from unifg.errors import GraphError
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.program.systems import KktStructure, KktSystem, fill
+from unifg.turns import Turn
 from unifg.typing import Array, BoolArray, IntArray
 
 SOLVED = 1e-6  # residual of a column, in the equilibrated system, that belongs to a determined unknown
@@ -35,6 +36,7 @@ class Covariances:
             GraphError: when the information is singular.
         """
         self._program = program
+        self._turn = Turn()
         self._structure: KktStructure | None = None
         if active.any():
             self._structure = program.systems.structure(active)
@@ -59,9 +61,10 @@ class Covariances:
         if not len(free):
             return result
         if self._structure is None:
-            result[np.ix_(free, free)] = self._factorization.inverse_block(chosen[free])
+            with self._turn:
+                result[np.ix_(free, free)] = self._factorization.inverse_block(chosen[free])
             return result
-        with self._structure.borrowed() as system:
+        with self._turn, self._structure.borrowed() as system:
             if not len(self._data):
                 self._data = np.zeros(system.pattern.nnz)
                 fill(system.arrays, self._lin.hessian, self._lin.constraint_jacobian, self._data)
@@ -80,7 +83,8 @@ class Covariances:
             return np.array([self.joint(row) for row in columns])
         chosen = self._program.columns.unknown[columns]
         _, first, node = np.unique(self._program.blocks, return_index=True, return_inverse=True)
-        every = self._factorization.diagonal_blocks()
+        with self._turn:
+            every = self._factorization.diagonal_blocks()
         result = np.zeros((*columns.shape, columns.shape[1]))
         for k, row in enumerate(chosen):
             free = np.flatnonzero(row >= 0)

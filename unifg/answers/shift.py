@@ -7,6 +7,7 @@ import numpy as np
 from unifg.errors import GraphError
 from unifg.language.variables import Family
 from unifg.program.program import Program
+from unifg.turns import Turn
 from unifg.typing import IntArray
 
 KEPT = 64  # ways to shift that are remembered: control loops ask for the same one every tick
@@ -17,7 +18,7 @@ class Shifts:
 
     def __init__(self, program: Program) -> None:
         """Nothing is known before somebody asks."""
-        self._program = program
+        self._program, self._turn = program, Turn()
         self._known: dict[tuple[tuple[Family, ...], int], tuple[IntArray, IntArray]] = {}
 
     def __call__(self, families: tuple[Family, ...], by: int) -> tuple[IntArray, IntArray]:
@@ -34,9 +35,11 @@ class Shifts:
         if known is None:
             if by < 0:
                 raise GraphError(f"shifted: by must not be negative, found {by}")
-            if len(self._known) == KEPT:
-                self._known.pop(next(iter(self._known)))
-            known = self._known[families, by] = self._stored(families, by), self._rows(families, by)
+            known = self._stored(families, by), self._rows(families, by)
+            with self._turn:
+                if len(self._known) >= KEPT:
+                    self._known.pop(next(iter(self._known)))
+                self._known[families, by] = known
         return known
 
     def _stored(self, families: tuple[Family, ...], by: int) -> IntArray:

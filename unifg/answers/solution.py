@@ -135,10 +135,14 @@ class Solution:
         """Term and factor with the largest violation, None without constraints."""
         return None if self._worst_row < 0 else self._program.row_name(self._worst_row)
 
-    def __getitem__(self, variable: Variable) -> Array:
-        """(n, storage) values of a family or selection."""
-        selection = as_selection(variable)
-        self._require(selection)
+    @property
+    def families(self) -> dict[str, Family]:
+        """The families of variables by their names: of a solution that another process has sent, its own."""
+        return {family.name: family for family in self._program.families}
+
+    def __getitem__(self, variable: Variable | str) -> Array:
+        """(n, storage) values of a family, by itself or by its name, or of a selection."""
+        selection = self._selection(variable)
         return self._lin.values[selection.family][selection.indices][:, selection.storage].copy()
 
     def selections(self, term: str) -> list[Selection]:
@@ -189,7 +193,7 @@ class Solution:
             program.by_term(self._penalties[rows]) if self._penalties.any() else {},
         )
 
-    def covariance(self, *variables: Variable) -> Array:
+    def covariance(self, *variables: Variable | str) -> Array:
         """(k, k) joint covariance of the selected variables, in their tangent spaces, in the order given.
 
         What is fixed is known: its rows and columns are zero, as are directions that an active constraint forbids.
@@ -199,12 +203,10 @@ class Solution:
         """
         if not variables:
             raise GraphError("covariance() of what? Name families or members, as covariance(x[-1])")
-        for variable in variables:
-            self._require(as_selection(variable))
-        columns = [self._program.columns.of(as_selection(variable)).ravel() for variable in variables]
+        columns = [self._program.columns.of(self._selection(variable)).ravel() for variable in variables]
         return self._covariances.joint(np.concatenate(columns))
 
-    def marginals(self, variable: Variable) -> Array:
+    def marginals(self, variable: Variable | str) -> Array:
         """(n, d, d) covariance of each selected variable by itself.
 
         Without active constraints all of them take about as long as one solve, by the selected inverse; with some there
@@ -215,8 +217,7 @@ class Solution:
         Raises:
             GraphError: when the system is singular.
         """
-        self._require(as_selection(variable))
-        return self._covariances.blocks(self._program.columns.of(as_selection(variable)))
+        return self._covariances.blocks(self._program.columns.of(self._selection(variable)))
 
     @cached_property
     def _covariances(self) -> Covariances:
@@ -236,7 +237,7 @@ class Solution:
         """
         return marginal_prior(self._program, self._lin, terms, remove, keep, self._equality)
 
-    def plot(self, *variables: Variable, marginals: bool = False) -> Figure:
+    def plot(self, *variables: Variable | str, marginals: bool = False) -> Figure:
         """Draw families, selections or components; all families where none is named.
 
         Poses are drawn as paths with headings, rotations as angles, vectors over the index of the member, with the
@@ -251,9 +252,7 @@ class Solution:
             GraphError: for variables of another graph, or when there are no covariances.
             ViewError: when there is more than fits into one figure.
         """
-        selections = [as_selection(variable) for variable in variables or self._program.families]
-        for selection in selections:
-            self._require(selection)
+        selections = [self._selection(variable) for variable in variables or self._program.families]
         parts = [self._shown(selection, marginals) for selection in selections]
         return draw_shown(parts, f"{self.solver}: {self.status.name.lower().replace('_', ' ')}, cost {self.cost:.6g}")
 
@@ -329,11 +328,22 @@ class Solution:
         held: BoolArray = np.abs(self._multipliers) > distance
         return held
 
-    def _require(self, selection: Selection) -> None:
+    def _selection(self, variable: Variable | str) -> Selection:
+        """What is meant, if it is part of this solution."""
+        if isinstance(variable, str):
+            if variable not in self.families:
+                raise GraphError(
+                    f"no family is called '{variable}' (there are: {', '.join(self.families)})", family=variable
+                )
+            variable = self.families[variable]
+        selection = as_selection(variable)
         if selection.family not in self._lin.values:
+            name = selection.family.name
+            hint = ": that of another process has families of its own, by name in solution.families"
             raise GraphError(
-                f"family '{selection.family.name}' is not part of this solution", family=selection.family.name
+                f"family '{name}' is not part of this solution{hint if name in self.families else ''}", family=name
             )
+        return selection
 
 
 class NotConverged(UnifgError, RuntimeError):

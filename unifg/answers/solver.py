@@ -24,7 +24,8 @@ from unifg.language.variables import Data
 from unifg.program.by_term import ByTerm
 from unifg.program.columns import Values
 from unifg.program.linearization import Linearization, all_finite
-from unifg.program.program import Program, compile_graph
+from unifg.program.program import Program, idle_program
+from unifg.turns import Turn
 from unifg.typing import Array, ArrayLike
 
 logger = logging.getLogger("unifg")
@@ -140,7 +141,7 @@ class Solver(Backend):
 
     def bound(self, graph: Statement) -> Prepared:
         """Compile the graph alone: a single solve compiles what it comes to need."""
-        program = compile_graph(graph)
+        program = idle_program(graph)
         self.require(program)
         if not program.least_squares:  # there, curvature is asked for in rare cases only
             program.table.require_second()
@@ -408,6 +409,9 @@ class Prepared:
     It solves the graph as it was when it was prepared: terms that are added, removed or replaced later need another
     :meth:`Solver.prepare`. The first solve after such a change says so, in a warning of the logger ``unifg``.
 
+    It belongs to one thread at a time. Others prepare their own: those of one graph wait for each other, those of
+    graphs that were stated twice do not.
+
     Attributes:
         solver: the backend and its options.
         program: the compiled graph.
@@ -420,6 +424,7 @@ class Prepared:
         self._graph = graph or program.graph
         self._edition = self._graph.edition
         self._workspace: Any = None
+        self._turn = Turn()
         self._constraints = {
             t.name: (t, rows) for t, rows in zip(program.constraint_terms, program.slices, strict=True)
         }
@@ -433,7 +438,32 @@ class Prepared:
         check: bool = False,
         callback: Callback | None = None,
     ) -> Solution:
-        """Solve from ``guess``; arguments and errors as for :meth:`Solver.solve`."""
+        """Solve from ``guess``; arguments and errors as for :meth:`Solver.solve`.
+
+        Raises:
+            BackendError: while another thread solves with this object, or this thread is in the midst of a solve.
+        """
+        if not self._turn.acquire(blocking=False):
+            raise BackendError(f"this prepared {self.solver.name} is at work in another thread: prepare one for each")
+        try:
+            if self.program.turn.mine:
+                raise BackendError(
+                    f"this prepared {self.solver.name} is asked for a solve from within a solve of its graph, whose "
+                    f"data and memory it shares: call {self.solver.name}.solve(graph, ...) there"
+                )
+            with self.program.turn:
+                return self._solve(guess, data, duals, check, callback)
+        finally:
+            self._turn.release()
+
+    def _solve(
+        self,
+        guess: AnyGuess,
+        data: Mapping[Data, ArrayLike] | None,
+        duals: Mapping[str, ArrayLike] | None,
+        check: bool,
+        callback: Callback | None,
+    ) -> Solution:
         program = self.program
         program.bind(data or {})
         self._say_if_stale()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time as clocks
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +15,7 @@ from unifg.answers.graph import Graph
 from unifg.answers.solution import Guess, Solution
 from unifg.answers.solver import Prepared, Solver
 from unifg.answers.status import Status
-from unifg.errors import GraphError
+from unifg.errors import BackendError, GraphError
 from unifg.horizon.coupled import COUPLINGS, Coupling, Given, Joined, Tie, weigh
 from unifg.horizon.decision import Choice, Judge, KeepThenBrake, Kept, Plan
 from unifg.horizon.recorded import instant
@@ -22,6 +23,7 @@ from unifg.horizon.robot import Robot
 from unifg.horizon.statements import Now, Term, handles_of, looked_at, reset_all, values_of
 from unifg.horizon.window import Window
 from unifg.language.variables import Data
+from unifg.turns import Turn
 from unifg.typing import Array, ArrayLike
 
 TIMES = 100_000  # ticks whose times are kept
@@ -143,6 +145,7 @@ class Loop:
                 f"delay={delay}: a plan acts now or later; later takes a robot that predicts, and not the coupling "
                 "'joint', where the future begins at the present"
             )
+        self._turn = Turn()
         self.robot, self.steps, self.coupling, self.window, self.delay = robot, steps, coupling, window, delay
         self._terms, self._deadline, self._clock, self._patience = looked_at(terms), deadline, clock, patience
         between = _looked_at((-np.inf, np.inf) if limits is None else limits, robot.control.storage)
@@ -202,22 +205,34 @@ class Loop:
         Raises:
             GraphError: without a window; for a measurement, a control or a time that does not fit, which leaves
                 everything as it was; for data of a term that do not. Not for a hard problem.
+            BackendError: while another thread ticks.
         """
         if self.window is None:
             raise GraphError("a tick needs a window; without one, give the present to plan()")
+        with self._alone():
+            return self._tick(self.window, given, measured, applied, time)
+
+    def _tick(
+        self,
+        window: Window,
+        given: Any,
+        measured: Mapping[str, ArrayLike | None] | None,
+        applied: ArrayLike | None,
+        time: float | None,
+    ) -> Plan:
         begin = self._clock()
         seen = {name: value for name, value in (measured or {}).items() if value is not None}
         for name, value in seen.items():
-            self.window.history.readable(name, value)
+            window.history.readable(name, value)
         last = self.applied if applied is None else self.robot.applicable(applied)
-        if self.window.solution is not None:
-            self.window.move(last, time)
+        if window.solution is not None:
+            window.move(last, time)
         elif time is not None:
-            self.window.history.times[:] = instant(time)
+            window.history.times[:] = instant(time)
         for name, value in seen.items():
-            self.window.record(name, value)
-        self.window.estimate(given)
-        return self._plan(self.window.now(given, last), begin)
+            window.record(name, value)
+        window.estimate(given)
+        return self._plan(window.now(given, last), begin)
 
     def plan(self, present: ArrayLike, given: Any = None, statics: Mapping[str, Array] | None = None) -> Plan:
         """Plan from a present state (storage,) that somebody else has estimated.
@@ -229,9 +244,21 @@ class Loop:
 
         Raises:
             GraphError: for statics that there are not, and data of a term that do not fit.
+            BackendError: while another thread plans.
         """
-        begin = self._clock()
-        return self._plan(self.now(present, given, statics), begin)
+        with self._alone():
+            begin = self._clock()
+            return self._plan(self.now(present, given, statics), begin)
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Refuse what another thread asks for meanwhile: it would not be in time."""
+        if not self._turn.acquire(blocking=False):
+            raise BackendError("this loop is at work in another thread: a loop has one thread at a time")
+        try:
+            yield
+        finally:
+            self._turn.release()
 
     def now(self, present: ArrayLike, given: Any = None, statics: Mapping[str, Array] | None = None) -> Now[Any]:
         """What terms are asked with; arguments as of :meth:`plan`."""
@@ -389,13 +416,17 @@ class Loop:
         Args:
             start: (storage,) believed state; None for that of the beginning.
             sigma: (d,) its standard deviations, or its covariance; None for those of the beginning.
+
+        Raises:
+            BackendError: while another thread ticks.
         """
-        if self.window is not None:
-            self.window.reset(start, sigma)
-        behind = () if self.window is None else self.window.terms
-        reset_all(term for term in self._terms if not any(term is other for other in behind))
-        self.abandon()
-        self._believe_nothing()
+        with self._alone():
+            if self.window is not None:
+                self.window.reset(start, sigma)
+            behind = () if self.window is None else self.window.terms
+            reset_all(term for term in self._terms if not any(term is other for other in behind))
+            self.abandon()
+            self._believe_nothing()
 
     def _believe_nothing(self) -> None:
         """What is known before the first tick."""

@@ -37,6 +37,10 @@ class JointCovariance:
 
     def __call__(self, values: Mapping[Family, Array]) -> Array | None:
         """(D, D) covariance at ``values``, with the data of the last solve; None when it does not exist."""
+        with self._program.turn:
+            return self._found(values)
+
+    def _found(self, values: Mapping[Family, Array]) -> Array | None:
         if not np.array_equal(self._held, self._program.equality):  # some were switched on or off
             self._held = self._program.equality.copy()
             self._arrange()

@@ -24,6 +24,7 @@ from unifg.language.terms import Constraint
 from unifg.language.variables import Data, Family, Selection
 from unifg.solvers.interior_point.method import InteriorPoint
 from unifg.solvers.least_squares import LevenbergMarquardt
+from unifg.turns import Turn, in_turn
 from unifg.typing import Array, ArrayLike
 
 logger = logging.getLogger("unifg")
@@ -85,6 +86,7 @@ class Window:
         Raises:
             GraphError: when sizes do not fit, or a term cannot stand in a window.
         """
+        self._turn = Turn()
         self.robot, self.terms, self.length = robot, looked_at(terms), length
         self._arrival = arrival or Tangent()
         self._records: dict[str, tuple[int, ...]] = {}
@@ -131,6 +133,7 @@ class Window:
         return self.history.present.copy()
 
     @property
+    @in_turn
     def covariance(self) -> Array:
         """(D, D) of the present state and the statics side by side, from the past's terms alone.
 
@@ -168,6 +171,7 @@ class Window:
         reference, information = (self._member(name, member, at, size) for at, size in sizes)
         return reference, information
 
+    @in_turn
     def admit(self, name: str, member: int, value: ArrayLike, sigma: ArrayLike) -> None:
         """Let a member of a static stand for something new, of which nothing was known.
 
@@ -191,6 +195,7 @@ class Window:
         self.left.admit(name, member, array, weight, place)
         self.history.statics[name][member] = array
 
+    @in_turn
     def forget(self, name: str, member: int) -> None:
         """Marginalise a member of a static out of what has left.
 
@@ -208,6 +213,7 @@ class Window:
         dim = self.robot.state.dim
         return self.covariance[:dim, :dim].copy()
 
+    @in_turn
     def move(
         self,
         control: ArrayLike,
@@ -246,6 +252,7 @@ class Window:
             raise GraphError(f"predict must give a finite state {found.shape}, found {found} at {self.history.present}")
         return found
 
+    @in_turn
     def record(self, name: str, value: ArrayLike | None, node: int = -1) -> None:
         """Attach what was measured to a node, by default the present one; None where nothing was.
 
@@ -271,6 +278,7 @@ class Window:
         """What is believed, by the families of the window's own graph."""
         return {self._past.x.family: self._past.nodes(), **self._past.guess()}
 
+    @in_turn
     def estimate(self, given: Any = None) -> Solution:
         """Solve the window and believe it, unless the answer is none; then the prediction is kept.
 
@@ -313,6 +321,7 @@ class Window:
         self.solution, self._due = solution, True
         self._past.depart(solution)
 
+    @in_turn
     def reset(self, start: ArrayLike | None = None, sigma: ArrayLike | None = None) -> None:
         """Forget everything, and begin anew; terms that keep something forget it, too.
 

@@ -16,6 +16,7 @@ from typing import Any, cast
 import numpy as np
 
 from unifg.errors import GraphError
+from unifg.kernels.derive.reach import reach_of
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.steps import (
     FAR,
@@ -62,18 +63,34 @@ def per_factor(
     Raises:
         GraphError: when a manifold has no compiled retraction, or a parameter more than two axes.
     """
-    return _compiled(function, jacobian, rows, tuple(arguments), tuple(shapes), name)
+    return _compiled(_Alike(function), _Alike(jacobian), rows, tuple(arguments), tuple(shapes), name)
+
+
+class _Alike:
+    """A function, equal to all that compute the same: what Numba has compiled is never taken back."""
+
+    def __init__(self, function: Any) -> None:
+        self.function = function
+        known = None if function is None else reach_of(function).key
+        self._key: Hashable = id(function) if known is None else known
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Alike) and self._key == other._key
 
 
 @lru_cache(maxsize=256)
 def _compiled(
-    function: Any,
-    jacobian: Any,
+    functions: _Alike,
+    jacobians: _Alike,
     rows: int,
     arguments: tuple[Hashable, ...],
     shapes: tuple[tuple[int, ...], ...],
     name: str,
 ) -> Kernel:
+    function, jacobian = functions.function, jacobians.function
     names: dict[str, Any] = {"function": function, "jacobian": jacobian, "vector": vector, "matrix": matrix}
     names |= {"local_vector": local_vector, "local_matrix": local_matrix}
     names |= {"step_of": step_of, "step_for": step_for, "largest": largest, "uncertainty": uncertainty, "np": np}

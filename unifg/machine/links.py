@@ -28,8 +28,8 @@ NOTHING, TRUTH, NUMBER, ADDRESS = types.void, types.boolean, types.float64, type
 class _LinkedCache(_Cache):
     """A cache that also asks for what addresses of arrays mean."""
 
-    def _index_key(self, signature: Any, codegen: Any) -> Any:
-        return *super()._index_key(signature, codegen), spelled(memory.kind)
+    def _variant(self) -> tuple[str, ...]:
+        return *super()._variant(), spelled(memory.kind)
 
 
 def linked(function: F) -> F:

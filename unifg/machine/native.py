@@ -33,8 +33,8 @@ _NAME = "derived"  # of every function: each has an engine of its own
 class Native:
     """Machine code of one function, which is there for as long as this object is, and no longer.
 
-    Whoever keeps its address keeps this object too, or what keeps it. Compiled loops hold the interpreter's lock while
-    they run, so nothing that they call can be taken back meanwhile.
+    Whoever keeps its address keeps this object too, or what keeps it, for as long as a compiled loop that calls it may
+    run: such loops do not stop other threads.
 
     Attributes:
         address: where it stands.

@@ -13,7 +13,8 @@ import logging
 import os
 from contextlib import suppress
 from pathlib import Path
-from threading import get_ident
+
+from unifg.whole import write_whole
 
 logger = logging.getLogger("unifg")
 
@@ -25,51 +26,59 @@ EVERY = 64  # files written before the folder is looked through again
 _DIGEST = hashlib.sha256().digest_size
 
 
+def write_sealed(path: Path, content: bytes) -> None:
+    """Write a file that :func:`read_sealed` knows to be whole."""
+    write_whole(path, hashlib.sha256(content).digest() + content)
+
+
+def read_sealed(path: Path) -> bytes | None:
+    """What was written; None where nothing is, nothing can be read, or what is there is damaged, which is said."""
+    try:
+        read = path.read_bytes()
+    except OSError:
+        return None
+    content = read[_DIGEST:]
+    if hashlib.sha256(content).digest() != read[:_DIGEST]:
+        logger.warning("%s is damaged: it counts as none and is written anew", path)
+        return None
+    return content
+
+
 class Objects:
     """Object code in the files of one folder.
 
     Attributes:
-        folder: which need not exist.
+        folder: which need not exist; None where nothing is kept.
     """
 
-    def __init__(self, folder: Path, most: int = MOST) -> None:
+    def __init__(self, folder: Path | None, most: int = MOST) -> None:
         """Touch nothing."""
         self.folder = folder
         self._most, self._written, self._writable = most, 0, True
 
     def find(self, key: str) -> bytes | None:
         """What is kept under a key, if it is there and whole."""
-        if os.environ.get(SWITCH) == "0":
+        if self.folder is None or os.environ.get(SWITCH) == "0":
             return None
         path = self.folder / key
-        try:
-            read = path.read_bytes()
-        except OSError:
-            return None
-        code = read[_DIGEST:]
-        if hashlib.sha256(code).digest() != read[:_DIGEST]:
-            logger.info("%s is damaged and counts as none", path)
-            return None
-        with suppress(OSError):  # a folder that others fill
-            os.utime(path)
+        code = read_sealed(path)
+        if code is not None:
+            with suppress(OSError):  # a folder that others fill
+                os.utime(path)
         return code
 
     def keep(self, key: str, code: bytes) -> None:
         """Write; where that is not possible it is not tried again."""
-        if os.environ.get(SWITCH) == "0" or not self._writable:
+        if self.folder is None or os.environ.get(SWITCH) == "0" or not self._writable:
             return
-        own = self.folder / f"{key}.{os.getpid()}.{get_ident()}"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            own.write_bytes(hashlib.sha256(code).digest() + code)
-            own.replace(self.folder / key)
+            write_sealed(self.folder / key, code)
         except FileNotFoundError:  # another process has found it old
             return
         except OSError as error:
             logger.info("derived code is not kept on disk: %s", error)
             self._writable = False
-            with suppress(OSError):
-                own.unlink()
             return
         self._written += 1
         if self._written % EVERY == 1:

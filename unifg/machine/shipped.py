@@ -33,6 +33,7 @@ from numba.core.registry import cpu_target
 from numba.core.serialize import dumps
 
 from unifg.errors import UnifgError
+from unifg.whole import beside
 
 logger = logging.getLogger("unifg")
 
@@ -72,13 +73,16 @@ class Archive:
 
     def __init__(self, path: Path) -> None:
         """Look at what the file is for."""
-        self.usable = False
+        self.usable, self._path = False, path
         try:
             self._file = zipfile.ZipFile(path)
             self.about = json.loads(self._file.read(ABOUT))
-        except (OSError, KeyError, ValueError, zipfile.BadZipFile):  # none is there, or it is cut off
+            kind, _ = self.about["versions"], self.about["sources"]
+        except FileNotFoundError:  # it is an archive that one may do without
             return
-        kind = self.about["versions"]
+        except Exception as error:  # what is damaged may say anything
+            self._say_damaged(error)
+            return
         different = [f"{name} {kind.get(name)}" for name, present in versions().items() if kind.get(name) != present]
         self.usable = not different
         if different:
@@ -88,8 +92,19 @@ class Archive:
         """What Numba's cache keeps of a function, with code for this processor; None where there is nothing."""
         if not self.usable or key not in self._file.NameToInfo:
             return None
-        (name, bitcode), *others = pickle.loads(self._file.read(key))
-        return (name, "object", _generated(bitcode)), *others
+        try:
+            (name, bitcode), *others = pickle.loads(self._file.read(key))  # checked against its sum as it is read
+            return (name, "object", _generated(bitcode)), *others
+        except Exception as error:
+            self.usable = False
+            self._say_damaged(error)
+            return None
+
+    def _say_damaged(self, error: Exception) -> None:
+        logger.warning(
+            "%s is damaged (%s: %s): functions are compiled instead, which takes longer once; install unifg again",
+            self._path, type(error).__name__, error,
+        )  # fmt: skip
 
 
 @lru_cache(1)
@@ -158,7 +173,7 @@ class Recorder:
             "versions": versions(),
             "sources": {source.relative_to(root).as_posix(): content(str(source)) for source in inside},
         }
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as file:
+        with beside(path) as own, zipfile.ZipFile(own, "w", zipfile.ZIP_LZMA) as file:
             for name, data in {ABOUT: json.dumps(about, indent=1).encode(), **self.members}.items():
                 file.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_LZMA)
 

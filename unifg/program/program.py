@@ -32,6 +32,7 @@ from unifg.program.scalars import add_scalars, evaluate_scalars
 from unifg.program.systems import Systems
 from unifg.program.table import ENTRY, PARAMETER, ROW, WIDTH, TermArrays, TermTable
 from unifg.program.term import CompiledTerm
+from unifg.turns import Turn
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 T = TypeVar("T")
@@ -75,6 +76,7 @@ class Program:
         scratch: memory for compiled loops.
         python_seconds: time spent so far in terms that Python evaluates.
         buffers: memory for linearisations.
+        turn: held by who binds data, until nobody needs them any more, and while anything is evaluated.
     """
 
     def __init__(self, graph: Statement) -> None:
@@ -83,6 +85,7 @@ class Program:
             raise GraphError("the graph has no variables: add a family with graph.variables(...)")
         declared = graph._data
         self.graph = graph = graph.snapshot()
+        self.turn = Turn()
         self.families = list(graph.families.values())
         self.columns = Columns(self.families, graph.fixes)
         self.size = self.columns.size
@@ -279,7 +282,7 @@ class Program:
         values = values if isinstance(values, Values) else self.columns.values(values)
         residual, constraints = np.empty(table.residuals), np.empty(table.constraints)
         squares = np.empty(table.weights)
-        with np.errstate(all="ignore"):
+        with self.turn, np.errstate(all="ignore"):
             if self.batched:
                 began = perf_counter()
                 for term in self.batched:
@@ -302,8 +305,12 @@ class Program:
 
     def linearize(self, values: Mapping[Family, Array], search: bool = False) -> Linearization:
         """Everything a backend needs at ``values``; with ``search``, by search Jacobians where a residual has one."""
-        table = self.table
         values = values if isinstance(values, Values) else self.columns.values(values)
+        with self.turn:
+            return self._linearize(values, search)
+
+    def _linearize(self, values: Values, search: bool) -> Linearization:
+        table = self.table
         residual, jacobian, constraints, constraint_jacobian, gradient, hessian = self.buffers.take()
         gradient[:], hessian[:] = 0.0, 0.0
         squares, weights = np.empty(table.weights), np.empty(table.weights)
@@ -522,4 +529,15 @@ def compile_graph(graph: Statement) -> Program:
     if not isinstance(graph.compiled, Program):
         program = Program(graph)
         program.graph.compiled = graph.compiled = program
+        return program  # another thread may have compiled it, too
     return graph.compiled
+
+
+def idle_program(graph: Statement) -> Program:
+    """The same, or a program of its own where this thread is in the midst of a solve of it, as in a callback.
+
+    Raises:
+        GraphError: as :func:`compile_graph`.
+    """
+    program = compile_graph(graph)
+    return Program(graph) if program.turn.mine else program

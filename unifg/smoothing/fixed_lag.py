@@ -13,6 +13,7 @@ from unifg.smoothing.factors import Staged
 from unifg.smoothing.families import GrowingFamily
 from unifg.smoothing.marginalize import marginalize
 from unifg.smoothing.smoother import Effort, Smoother
+from unifg.turns import in_turn
 from unifg.typing import Array, ArrayLike, BoolArray
 
 
@@ -79,6 +80,7 @@ class FixedLag(Smoother):
         self._drop = late == "drop"
         self._newest = -np.inf
 
+    @in_turn
     def update(
         self,
         values: Mapping[GrowingFamily, ArrayLike] | None = None,
@@ -116,6 +118,7 @@ class FixedLag(Smoother):
         self._batches.forget(self._state)
         return self._effort()
 
+    @in_turn
     def window(self, variable: Variable) -> Selection:
         """Those of the selected members that are still there."""
         selection = as_selection(variable)

@@ -22,6 +22,7 @@ from unifg.smoothing.queries import add_factors, add_variables, estimates, joint
 from unifg.smoothing.state import MADE, PART, SLOT, TYPE, Records, State, empty_state
 from unifg.smoothing.tree import give_up
 from unifg.smoothing.update import begin, renew, update_tree
+from unifg.turns import Turn, in_turn
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 NONE = np.empty(0, dtype=np.int64)
@@ -51,6 +52,8 @@ class Effort(NamedTuple):
 class Smoother:
     """Base of :class:`Incremental` and :class:`FixedLag`.
 
+    Threads may share one: they wait for each other.
+
     Attributes:
         families: by name.
         relinearize: largest entry of a variable's step before its linearisation point follows its estimate.
@@ -67,6 +70,7 @@ class Smoother:
                 raise GraphError(f"{type(self).__name__}: {name} must not be negative, found {value}")
         if every < 1:
             raise GraphError(f"{type(self).__name__}: every must be at least 1, found {every}")
+        self._turn = Turn()
         self.families: dict[str, GrowingFamily] = {}
         self.relinearize = relinearize
         self.every = every
@@ -91,6 +95,7 @@ class Smoother:
         parts = np.array(self._parts.fields, dtype=PART) if self._parts.fields else self._state.parts
         self._hold(self._state._replace(parts=parts))
 
+    @in_turn
     def variables(self, name: str, manifold: Manifold, *, keep: bool = False) -> GrowingFamily:
         """Add a family of unknowns, empty at first.
 
@@ -114,6 +119,7 @@ class Smoother:
         self._order.append(family)
         return family
 
+    @in_turn
     def data(self, name: str, value: ArrayLike, *, each: bool = False) -> Data:
         """Declare an array for the factors stated with it, which take the value it has then.
 
@@ -130,6 +136,7 @@ class Smoother:
         self._data[name] = Data(name, value, each)
         return self._data[name]
 
+    @in_turn
     def minimize(
         self,
         function: AnyResidual,
@@ -200,6 +207,7 @@ class Smoother:
         """(n, storage) points at which the factors of a family or selection are linear now."""
         return self._values(variable, True)
 
+    @in_turn
     def _values(self, variable: Variable, points: bool) -> Array:
         selection = as_selection(variable)
         rows = self._rows(selection)
@@ -209,6 +217,7 @@ class Smoother:
         out = flat.reshape(len(rows), storage)
         return out if selection.component is None else out[:, selection.storage]
 
+    @in_turn
     def covariance(self, *variables: Variable) -> Array:
         """Joint covariance (D, D) of all selected members, in their tangent spaces and the order given.
 
@@ -233,14 +242,17 @@ class Smoother:
         return result[np.ix_(columns, columns)]
 
     @property
+    @in_turn
     def cost(self) -> float:
         """Sum of 1/2 rho(|W r|^2) over all factors at the estimates; half of what is often called chi2."""
         return float(total_cost(self._memory)) + self._batches.cost(self._state, self._memory)
 
+    @in_turn
     def __len__(self) -> int:
         """Number of factors that count."""
         return int(self._state.factors["used"][: self._state.counters["factor_end"][0]].sum())
 
+    @in_turn
     def _update(self, values: Mapping[GrowingFamily, ArrayLike] | None, time: float | None, iterations: int) -> None:
         """Take in new members and staged factors, then bring everything up to date."""
         new = [self._checked(family, value) for family, value in values.items()] if values else []

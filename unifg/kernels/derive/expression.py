@@ -44,7 +44,8 @@ _WRITERS = _digest()  # as they are when they are loaded: they may be edited whi
 @cache
 def _objects() -> Objects:
     """Beside what Numba keeps."""
-    return Objects(folder_of(evaluate_rows) / "derived")
+    folder = folder_of(evaluate_rows)
+    return Objects(None if folder is None else folder / "derived")
 
 
 @dataclass(frozen=True)
