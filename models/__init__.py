@@ -1,1 +1,54 @@
-"""."""
+"""Robots, sensors and what stands in their way, stated as factors: each module is one of them."""
+
+from importlib import import_module as _import_module
+from types import ModuleType as _ModuleType
+
+__all__ = [
+    "avoidance",
+    "barriers",
+    "between_nodes",
+    "bicycle",
+    "cart_pole",
+    "clearances",
+    "compiled_field",
+    "distance_map",
+    "inertial",
+    "interpolation",
+    "keeping",
+    "landmarks",
+    "lidar",
+    "manipulator",
+    "obstacles",
+    "odometry",
+    "potential",
+    "preintegration",
+    "profile",
+    "quadrotor",
+    "quadrotor_dynamics",
+    "quadrotor_loops",
+    "quadrotor_second",
+    "rigid",
+    "rkmk",
+    "rkmk_batch",
+    "space_landmarks",
+    "spline",
+    "stamped",
+    "tableau",
+    "terminal",
+    "uncertainty",
+    "unicycle",
+    "universal",
+    "vehicle",
+]
+
+
+def __getattr__(name: str) -> _ModuleType:
+    """Import a module of this room when it is first asked for."""
+    if name in __all__:
+        return _import_module(f"{__name__}.{name}")
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    """List what is public."""
+    return list(__all__)

@@ -105,12 +105,12 @@ def _round(name: str, dimension: int) -> Callable[..., int]:
 cylinder_clearance = residual(
     Kernel(
         _cylinder, (Rn(3), 2, 1), _round("cylinder clearance", 2), name="cylinder clearance", second=_cylinder_second
-    )
-)
-"""``cylinder_clearance(p, centre, radius)``: |(p_x, p_y) - c| - radius [m], one column per cylinder, (n, M).
+    ),
+    about="""``cylinder_clearance(p, centre, radius)``: |(p_x, p_y) - c| - radius [m], one column per cylinder, (n, M).
 
 p: (n, 3) positions. centre: (M, 2), or (n, M, 2) for moving ones. radius: (M,) or (n, M), with the vehicle's added.
-"""
+""",
+)
 
 
 # ---------------------------------------------------------------- one landmark, itself unknown
@@ -136,12 +136,12 @@ def _landmark_second(v: Array, p: Array, table: Array, w: Array, S: Array) -> No
 
 
 landmark_clearance = residual(
-    Kernel(_landmark, (Rn(3), Rn(2), 0), 1, name="landmark clearance", second=_landmark_second)
-)
-"""``landmark_clearance(p, l, radius)``: |(p_x, p_y) - l| - radius [m], (n, 1).
+    Kernel(_landmark, (Rn(3), Rn(2), 0), 1, name="landmark clearance", second=_landmark_second),
+    about="""``landmark_clearance(p, l, radius)``: |(p_x, p_y) - l| - radius [m], (n, 1).
 
 p: (n, 3) positions. l: (n, 2) centres of cylinders, variables of the map or constants. radius: a number or (n,).
-"""
+""",
+)
 
 
 # ---------------------------------------------------------------- walls
@@ -194,13 +194,14 @@ def _segments(segments: tuple[int, ...], margin: tuple[int, ...]) -> int:
 
 
 segment_clearance = residual(
-    Kernel(_segment, (Rn(3), 3, 1), _segments, name="segment clearance", second=_segment_second)
-)
-"""``segment_clearance(p, segments, margin)``: distance to walls less a margin [m], one column per wall, (n, W).
+    Kernel(_segment, (Rn(3), 3, 1), _segments, name="segment clearance", second=_segment_second),
+    about="""
+``segment_clearance(p, segments, margin)``: distance to walls less a margin [m], one column per wall, (n, W).
 
 p: (n, 3) positions. segments: (W, 2, 2) end points of upright walls without thickness; margin: (W,). The distance has
 no sign: a wall holds between nodes only if no step is longer than twice the margin.
-"""
+""",
+)
 
 
 # ---------------------------------------------------------------- spheres
@@ -238,9 +239,10 @@ def _sphere_second(v: Array, p: Array, table: Array, w: Array, S: Array) -> None
 
 
 sphere_clearance = residual(
-    Kernel(_sphere, (Rn(3), 2, 1), _round("sphere clearance", 3), name="sphere clearance", second=_sphere_second)
+    Kernel(_sphere, (Rn(3), 2, 1), _round("sphere clearance", 3), name="sphere clearance", second=_sphere_second),
+    about="""
+``sphere_clearance(p, centre, radius)``: |p - c| - radius [m] in space, (n, M), for centres (M, 3), radii (M,).""",
 )
-"""``sphere_clearance(p, centre, radius)``: |p - c| - radius [m] in space, (n, M), for centres (M, 3), radii (M,)."""
 
 
 # ---------------------------------------------------------------- one over the distance

@@ -71,20 +71,22 @@ def _bearing_range_second(v: Array, p: Array, table: Array, w: Array, S: Array) 
 bearing_range = residual(
     StatedKernel(
         _bearing_range, (STATE, Rn(2), (2,)), 2, name="landmark bearing and range", second=_bearing_range_second
-    )
-)
-"""``bearing_range(x, l, z)``: bearing [rad], wrapped, and range [m], less z (2,) or (n, 2): (n, 2).
+    ),
+    about="""``bearing_range(x, l, z)``: bearing [rad], wrapped, and range [m], less z (2,) or (n, 2): (n, 2).
 
 x: quadrotor states. l: (n, 2) landmarks on the ground plane. Not finite where x stands on l.
-"""
+""",
+)
 
 
 def _height(p: Array, z: Array) -> Array:
     return (p[:, 2] - z)[:, None]
 
 
-height = residual(StatedKernel(_height, (Rn(3), ()), 1, name="height", linear=True))
-"""``height(p, z)``: p_z - z [m], (n, 1), for positions (n, 3), as ``x.p``, and z a number or (n,)."""
+height = residual(
+    StatedKernel(_height, (Rn(3), ()), 1, name="height", linear=True),
+    about="""``height(p, z)``: p_z - z [m], (n, 1), for positions (n, 3), as ``x.p``, and z a number or (n,).""",
+)
 
 
 @compiled
@@ -111,11 +113,13 @@ def _tilt_second(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
     S[1, 2] = S[2, 1] = 0.5 * (w[1] * q2 + w[2] * q1)
 
 
-tilt = residual(Kernel(_tilt, (SO3, (3,)), 3, name="tilt", second=_tilt_second))
-"""``tilt(R, z)``: R' e3 - z, (n, 3): the vertical as the body sees it, less z (3,) or (n, 3); takes ``x.R``.
+tilt = residual(
+    Kernel(_tilt, (SO3, (3,)), 3, name="tilt", second=_tilt_second),
+    about="""``tilt(R, z)``: R' e3 - z, (n, 3): the vertical as the body sees it, less z (3,) or (n, 3); takes ``x.R``.
 
 With z = (0, 0, 1) it is Ta's cost that keeps the vehicle level: 1/2 |r|^2 = 1 - cos(tilt), whatever the heading.
-"""
+""",
+)
 
 
 def observe(x: ArrayLike, l: ArrayLike) -> Array:  # noqa: E741

@@ -74,13 +74,13 @@ def _discs(centre: tuple[int, ...], radius: tuple[int, ...]) -> int:
 
 
 disc_clearance = residual(
-    Kernel(_disc_clearance, (SE2, 2, 1), _discs, name="disc clearance", second=_disc_clearance_second)
-)
-"""``disc_clearance(x, centre, radius)``: |p - c| - r [m], one column per disc, (n, M).
+    Kernel(_disc_clearance, (SE2, 2, 1), _discs, name="disc clearance", second=_disc_clearance_second),
+    about="""``disc_clearance(x, centre, radius)``: |p - c| - r [m], one column per disc, (n, M).
 
 x: (n, 3) SE(2) poses. centre: (M, 2) shared by all poses or (n, M, 2), one set for each, as for moving discs.
 radius: (M,) or (n, M); give the sum of the disc's and the robot's radii for hull clearance.
-"""
+""",
+)
 
 
 @compiled

@@ -267,12 +267,13 @@ dynamics = residual(
         9,
         name="quadrotor dynamics",
         second=quadrotor_second.dynamics,
-    )
-)
-"""``dynamics(x, u, x_next, parameters, dt)``: defects of position [m], attitude [rad] and velocity [m/s], (n, 9).
+    ),
+    about="""
+``dynamics(x, u, x_next, parameters, dt)``: defects of position [m], attitude [rad] and velocity [m/s], (n, 9).
 
 parameters: (7,) or (n, 7), as :attr:`Parameters.packed` gives them; constants or data. No noise.
-"""
+""",
+)
 
 disturbed_dynamics = residual(
     Kernel(
@@ -281,10 +282,10 @@ disturbed_dynamics = residual(
         9,
         name="disturbed quadrotor dynamics",
         second=quadrotor_second.disturbed_dynamics,
-    )
-)
-"""``disturbed_dynamics(x, u, w, mass, drag, wind, updraft, x_next, dt)``: the same defects, (n, 9).
+    ),
+    about="""``disturbed_dynamics(x, u, w, mass, drag, wind, updraft, x_next, dt)``: the same defects, (n, 9).
 
 Every argument but dt may be a family, a selection or a constant. The Jacobian has a pole at mass zero: bound a mass
 that is estimated.
-"""
+""",
+)

@@ -41,8 +41,10 @@ def _resting(x: Array) -> Array:
     return np.concatenate([x[:, V], up[:, :2]], axis=1)
 
 
-resting = residual(StatedKernel(_resting, (quadrotor.STATE,), 5, name="resting"))
-"""``resting(x)``: velocity [m/s] and sine of the tilt about two axes, (n, 5): zero at hover without wind."""
+resting = residual(
+    StatedKernel(_resting, (quadrotor.STATE,), 5, name="resting"),
+    about="""``resting(x)``: velocity [m/s] and sine of the tilt about two axes, (n, 5): zero at hover without wind.""",
+)
 
 
 def brakeable(h: Barrier, alpha: float, deceleration: float, *, p: slice = P, v: slice = V) -> Callable[..., Array]:

@@ -104,17 +104,27 @@ def _samples(dt: ArrayLike, moved: Array) -> Array:
     return np.ascontiguousarray(np.broadcast_to(np.asarray(dt, dtype=np.float64), len(moved)))
 
 
-dynamics = residual(StatedKernel(_defect, (SE2, CONTROL, SE2, ()), 3, name="dynamics"))
-"""``dynamics(x, u, x_next, dt)``: x_next - f(x, u), (n, 3) [m, m, rad] (Bazzana eq. 11-14)."""
+dynamics = residual(
+    StatedKernel(_defect, (SE2, CONTROL, SE2, ()), 3, name="dynamics"),
+    about="""``dynamics(x, u, x_next, dt)``: x_next - f(x, u), (n, 3) [m, m, rad] (Bazzana eq. 11-14).""",
+)
 
-ramped = residual(StatedKernel(_ramped_defect, (SE2, CONTROL, CONTROL, SE2, ()), 3, name="ramped dynamics"))
-"""``ramped(x, before, u, x_next, dt)``: x_next - f(x, (before + u) / 2), (n, 3) [m, m, rad]: u is reached at the end of
-the step, from ``before`` at its beginning, as by a base of limited accelerations."""
+ramped = residual(
+    StatedKernel(_ramped_defect, (SE2, CONTROL, CONTROL, SE2, ()), 3, name="ramped dynamics"),
+    about="""
+``ramped(x, before, u, x_next, dt)``: x_next - f(x, (before + u) / 2), (n, 3) [m, m, rad]: u is reached at the end of
+the step, from ``before`` at its beginning, as by a base of limited accelerations.""",
+)
 
-tracking = residual(StatedKernel(_deviation, (SE2, (3,)), 3, name="tracking"))
-"""``tracking(x, reference)``: deviation from a reference pose in world axes, (n, 3) [m, m, rad] (Bazzana eq. 8)."""
+tracking = residual(
+    StatedKernel(_deviation, (SE2, (3,)), 3, name="tracking"),
+    about="""
+``tracking(x, reference)``: deviation from a reference pose in world axes, (n, 3) [m, m, rad] (Bazzana eq. 8).""",
+)
 
 _change = difference.on(CONTROL).kernel
 assert _change is not None
-rate = residual(replace(_change, name="rate"))
-"""``rate(u, u_next)``: change of control, (n, 2) [m/s, rad/s]."""
+rate = residual(
+    replace(_change, name="rate"),
+    about="""``rate(u, u_next)``: change of control, (n, 2) [m/s, rad/s].""",
+)

@@ -66,18 +66,26 @@ def _increments(x: Array, u: Array, x_next: Array, dt: Any) -> Array:
 
 STEP = quadrotor.STATE, CONTROL, quadrotor.STATE, ()
 
-dynamics = residual(StatedKernel(_defect, STEP, 9, name="universal dynamics"))
-"""``dynamics(x, u, x_next, dt)``: eq. 10, (n, 9): position [m], attitude [rad] and velocity [m/s] in body axes."""
+dynamics = residual(
+    StatedKernel(_defect, STEP, 9, name="universal dynamics"),
+    about="""
+``dynamics(x, u, x_next, dt)``: eq. 10, (n, 9): position [m], attitude [rad] and velocity [m/s] in body axes.""",
+)
 
-consistency = residual(StatedKernel(_consistency, (quadrotor.STATE, quadrotor.STATE, ()), 3, name="consistency"))
-"""``consistency(x, x_next, dt)``: p_next - p - dt (v + v_next) / 2, (n, 3) [m]; what no noise explains, an equality."""
+consistency = residual(
+    StatedKernel(_consistency, (quadrotor.STATE, quadrotor.STATE, ()), 3, name="consistency"),
+    about="""
+``consistency(x, x_next, dt)``: p_next - p - dt (v + v_next) / 2, (n, 3) [m]; what no noise explains, an equality.""",
+)
 
-increments = residual(StatedKernel(_increments, STEP, 6, name="increments"))
-"""``increments(x, u, x_next, dt)``: rows of attitude and velocity of :data:`dynamics` per second, (n, 6).
+increments = residual(
+    StatedKernel(_increments, STEP, 6, name="increments"),
+    about="""``increments(x, u, x_next, dt)``: rows of attitude and velocity of :data:`dynamics` per second, (n, 6).
 
 Rates [rad/s] and accelerations [m/s^2]: with ``sigma=[sigma_omega] * 3 + [sigma_a] * 3``, and :data:`consistency` as an
 equality, this is eq. 10 under the covariance of eq. 11.
-"""
+""",
+)
 
 
 def covariance(dt: float, sigma_a: float, sigma_omega: float) -> Array:

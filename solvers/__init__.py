@@ -21,3 +21,8 @@ __all__ = [
     "LinearGraphs",
     "Penalty",
 ]
+
+
+def __dir__() -> list[str]:
+    """List what is public."""
+    return list(__all__)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import pkgutil
+import pydoc
 from types import ModuleType
+from typing import Literal, get_origin
 
 import pytest
 
@@ -46,6 +49,44 @@ def test_dir_lists_what_is_public() -> None:
         if not name.startswith("_") and name not in fg.__all__ and not isinstance(value, ModuleType)
     ]
     assert leaked == []
+
+
+@pytest.mark.parametrize("room", [room for room in OPEN if room != "unifg.scenarios"])
+def test_rooms_list_what_is_public_and_nothing_else(room: str) -> None:
+    module = importlib.import_module(room)
+    assert sorted(dir(module)) == sorted(module.__all__)
+    for name in module.__all__:
+        found = getattr(module, name)
+        assert inspect.getdoc(found) or get_origin(found) is Literal, name
+    with pytest.raises(AttributeError, match="nothing_of_the_kind"):
+        _ = module.nothing_of_the_kind
+
+
+@pytest.mark.parametrize("room", ["unifg.models", "unifg.files"])
+def test_rooms_of_modules_know_them_all(room: str) -> None:
+    module = importlib.import_module(room)
+    assert module.__all__ == sorted(found.name for found in pkgutil.iter_modules(module.__path__))
+
+
+def test_help_speaks_of_the_residual_and_not_of_its_class() -> None:
+    boilerplate = {inspect.getdoc(fg.Residual), inspect.getdoc(fg.ManifoldResidual)}
+    shipped = [importlib.import_module(f"unifg.models.{name}") for name in dir(importlib.import_module("unifg.models"))]
+    told = 0
+    for module in [fg, importlib.import_module("unifg.pose_graphs"), *shipped]:
+        for name, value in vars(module).items():
+            if isinstance(value, (fg.Residual, fg.ManifoldResidual)) and not name.startswith("_"):
+                assert inspect.getdoc(value) not in boilerplate, (module.__name__, name)
+                told += 1
+    assert told > 20
+    between = pydoc.plain(pydoc.render_doc(fg.between))
+    assert all(word in between for word in ("Log(measured^-1 x^-1 y)", "Args:", "(n, storage)", "m, m, rad", "Raises:"))
+
+    def mine(x: object, y: object) -> object:
+        """How far the ball is from the bat [m]."""
+        return x
+
+    assert "from the bat" in pydoc.render_doc(fg.residual(mine))  # type: ignore[arg-type]
+    assert "better" in pydoc.render_doc(fg.residual(mine, about="Said better."))  # type: ignore[arg-type]
 
 
 def imported(source: str) -> list[tuple[str, str]]:

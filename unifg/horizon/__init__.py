@@ -40,3 +40,8 @@ __all__ = [
     "Term",
     "Window",
 ]
+
+
+def __dir__() -> list[str]:
+    """List what is public."""
+    return list(__all__)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from inspect import cleandoc, getdoc
+from types import FunctionType
 from typing import Any, Literal, TypeAlias
 
 from unifg.errors import GraphError
@@ -32,6 +34,7 @@ class Residual:
         rows: m, of a ``function`` that a user has compiled for one factor.
         derivatives: "trace" to insist on exact ones, "trace first" to prefer them to the Jacobian, "differences" to
             refuse them, empty for what is possible.
+        about: what ``help`` says of it.
     """
 
     function: Function
@@ -42,6 +45,12 @@ class Residual:
     search_kernel: Kernel | None = None
     rows: int = 0
     derivatives: str = ""
+    about: str = field(default="", repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Give ``help`` its own text instead of that of the class."""
+        if self.about:
+            object.__setattr__(self, "__doc__", cleandoc(self.about))
 
     def __call__(self, *arguments: Any) -> Array:
         """Evaluate the residual."""
@@ -55,6 +64,7 @@ def residual(
     search: JacobianFunction | Kernel | None = None,
     rows: int = 0,
     derivatives: Derivatives | None = None,
+    about: str = "",
 ) -> Residual:
     """Attach a Jacobian and a name to a function.
 
@@ -78,6 +88,7 @@ def residual(
             what may change (methods, instances, dictionaries: their present content is compiled in) and those with a
             Jacobian, which then only serves comparison. "trace first" uses the Jacobian where there is no trace.
             "differences" leaves the function as it is.
+        about: what ``help`` says of the residual; defaults to the docstring of the function.
 
     Raises:
         GraphError: for a compiled function without ``rows``.
@@ -87,12 +98,15 @@ def residual(
     search_kernel = search if isinstance(search, Kernel) else None
     looked_in = search.jacobian if isinstance(search, Kernel) else search
     own = is_compiled(function)
+    about = about or getdoc(function) or "" if isinstance(function, FunctionType) else about
     if own and rows < 1:
         raise GraphError(
             f"the residual '{getattr(function, '__name__', name)}' is compiled: say how many numbers it writes, rows="
         )
     if isinstance(function, Kernel) and jacobian is None:
-        return Residual(function, function.jacobian, name or function.name, looked_in, function, search_kernel)
+        return Residual(
+            function, function.jacobian, name or function.name, looked_in, function, search_kernel, about=about
+        )
     return Residual(
         function,
         jacobian,
@@ -100,6 +114,7 @@ def residual(
         looked_in,
         rows=rows if own else 0,
         derivatives=derivatives or "",
+        about=about,
     )
 
 

@@ -8,8 +8,9 @@ variables they are given. Jacobians are in right perturbation, X Exp(d); equatio
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
+from inspect import cleandoc
 from typing import Any, cast
 
 import numpy as np
@@ -32,10 +33,17 @@ class ManifoldResidual:
     Attributes:
         name: shown in tables and messages.
         build: makes the residual for one manifold.
+        about: what ``help`` says of it.
     """
 
     name: str
     build: Callable[[Manifold], Residual]
+    about: str = field(default="", repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Give ``help`` its own text instead of that of the class."""
+        if self.about:
+            object.__setattr__(self, "__doc__", cleandoc(self.about))
 
     def on(self, manifold: Manifold) -> Residual:
         """The residual for variables on ``manifold``.
@@ -218,11 +226,50 @@ def _build_difference(manifold: Manifold) -> Residual:
     )
 
 
-prior = ManifoldResidual("prior", _build_prior)
-"""``prior(x, reference)``: Log(reference^-1 x), with reference (storage,) or (n, storage)."""
+_PRIOR = """Difference of a variable from what is believed about it: Log(reference^-1 x) on any manifold.
 
-between = ManifoldResidual("between", _build_between)
-"""``between(x, y, measured)``: Log(measured^-1 x^-1 y), with x_T_y measured, (storage,) or (n, storage)."""
+    graph.minimize(fg.prior, x[0], [0.0, 0.0, 0.0], sigma=[0.1, 0.1, 0.05])
 
-difference = ManifoldResidual("difference", _build_difference)
-"""``difference(x, y)``: Log(x^-1 y), zero when both agree; for rates and smoothness."""
+Args:
+    x: variable or selection, n members of a manifold of dimension d.
+    reference: elements of the manifold, (storage,) for all of them or (n, storage), as numbers or ``graph.data``.
+
+Returns:
+    (n, d) rows in the tangent space at the reference, in the manifold's own units (SE2: m, m, rad); plain differences
+    x - reference for vectors. Weighted by ``sigma=``, ``covariance=`` or ``information=`` of the term.
+
+Raises:
+    GraphError: the manifold has no logarithm, or shapes do not fit.
+"""
+_BETWEEN = """A relative measurement: Log(measured^-1 x^-1 y), zero where y is seen from x as measured.
+
+    graph.minimize(fg.between, x[:-1], x[1:], odometry, sigma=[0.05, 0.05, 0.02])
+
+Args:
+    x, y: variables or selections, n members each (or one, shared) of the same group of dimension d.
+    measured: x^-1 y as measured, an element of the group, (storage,) for all or (n, storage), as numbers or
+        ``graph.data``.
+
+Returns:
+    (n, d) rows in the tangent space, in the group's own units (SE2: m, m, rad; SE3: translation before rotation).
+    y - x - measured for vectors. The residual of GTSAM's BetweenFactor.
+
+Raises:
+    GraphError: the manifold is no group, or shapes do not fit.
+"""
+_DIFFERENCE = """Log(x^-1 y), zero where both agree: for rates and smoothness.
+
+    graph.minimize(fg.difference, u[:-1], u[1:], sigma=0.5)
+
+Args:
+    x, y: variables or selections, n members each (or one, shared) of the same manifold of dimension d.
+
+Returns:
+    (n, d) rows in the tangent space at x; y - x for vectors.
+
+Raises:
+    GraphError: the manifold has no logarithm, or shapes do not fit.
+"""
+prior = ManifoldResidual("prior", _build_prior, _PRIOR)
+between = ManifoldResidual("between", _build_between, _BETWEEN)
+difference = ManifoldResidual("difference", _build_difference, _DIFFERENCE)

@@ -36,3 +36,8 @@ __all__ = [
     "elementwise",
     "wrap_angle",
 ]
+
+
+def __dir__() -> list[str]:
+    """List what is public."""
+    return list(__all__)

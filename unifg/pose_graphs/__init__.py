@@ -28,3 +28,8 @@ __all__ = [
     "sighting",
     "sphere",
 ]
+
+
+def __dir__() -> list[str]:
+    """List what is public."""
+    return list(__all__)

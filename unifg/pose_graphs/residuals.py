@@ -109,13 +109,16 @@ def _build_chart(manifold: Manifold) -> Residual:
     return residual(_chart_kernel(manifold == SE3))
 
 
-chart_between = ManifoldResidual("chart between", _build_chart)
-"""``chart_between(x, y, measured)``: the residual of g2o's EdgeSE2 and EdgeSE3.
+chart_between = ManifoldResidual(
+    "chart between",
+    _build_chart,
+    """``chart_between(x, y, measured)``: the residual of g2o's EdgeSE2 and EdgeSE3.
 
 With E = measured^-1 x^-1 y it is (dx, dy, dtheta) of E in the plane and, in space, E's translation and the vector part
 of its quaternion, which is half the angle for small angles. ``between`` is the logarithm of E instead: equal to first
 order in the plane, not in space. measured is (storage,) or (n, storage).
-"""
+""",
+)
 
 
 # ---------------------------------------------------------------- sightings
@@ -181,8 +184,11 @@ def _build_sighting(manifold: Manifold) -> Residual:
     return residual(_sighting_kernel(manifold == SE3))
 
 
-sighting = ManifoldResidual("sighting", _build_sighting)
-"""``sighting(pose, landmark, measured)``: pose^-1 landmark - measured [m], in the plane or in space."""
+sighting = ManifoldResidual(
+    "sighting",
+    _build_sighting,
+    """``sighting(pose, landmark, measured)``: pose^-1 landmark - measured [m], in the plane or in space.""",
+)
 
 
 @compiled
@@ -215,11 +221,17 @@ def _bearing_range(v: Array, p: Array, table: Array, r: Array, J: Array) -> None
     r[1] = _polar(v, J, 1, False) - p[1]
 
 
-bearing = residual(Kernel(_bearing, (SE2, Rn(2), (1,)), 1, name="bearing"))
-"""``bearing(pose, landmark, measured)``: SE2 poses, points in the plane, measured (n, 1) [rad], wrapped."""
+bearing = residual(
+    Kernel(_bearing, (SE2, Rn(2), (1,)), 1, name="bearing"),
+    about="""``bearing(pose, landmark, measured)``: SE2 poses, points in the plane, measured (n, 1) [rad], wrapped.""",
+)
 
-distance = residual(Kernel(_distance, (SE2, Rn(2), (1,)), 1, name="distance"))
-"""``distance(pose, landmark, measured)``: SE2 poses, points in the plane, measured (n, 1) [m]."""
+distance = residual(
+    Kernel(_distance, (SE2, Rn(2), (1,)), 1, name="distance"),
+    about="""``distance(pose, landmark, measured)``: SE2 poses, points in the plane, measured (n, 1) [m].""",
+)
 
-bearing_range = residual(Kernel(_bearing_range, (SE2, Rn(2), (2,)), 2, name="bearing and range"))
-"""``bearing_range(pose, landmark, measured)``: SE2 poses, points in the plane, measured (n, 2) [rad, m]."""
+bearing_range = residual(
+    Kernel(_bearing_range, (SE2, Rn(2), (2,)), 2, name="bearing and range"),
+    about="""``bearing_range(pose, landmark, measured)``: SE2 poses, points in the plane, measured (n, 2) [rad, m].""",
+)

@@ -6,3 +6,8 @@ from unifg.smoothing.incremental import Incremental
 from unifg.smoothing.smoother import Effort
 
 __all__ = ["Effort", "FixedLag", "GrowingFamily", "Incremental"]
+
+
+def __dir__() -> list[str]:
+    """List what is public."""
+    return list(__all__)

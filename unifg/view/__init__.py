@@ -6,3 +6,8 @@ from unifg.view.live import Live
 from unifg.view.scene import Scene
 
 __all__ = ["Frame", "Live", "Part", "Scene"]
+
+
+def __dir__() -> list[str]:
+    """List what is public."""
+    return list(__all__)
