@@ -33,7 +33,7 @@ from unifg.scenarios.safety.weighing import Weighing
 from unifg.scenarios.ways.flat_path import Flown
 from unifg.scenarios.worlds.body_rate import Airframe
 from unifg.solvers.names import backend
-from unifg.typing import Array, BoolArray
+from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["TRACKING", "Decision", "Keeper", "KeeperSettings", "Obstacles"]
 
@@ -61,7 +61,7 @@ class KeeperSettings:
         step: greatest length of a step [s].
         growth: how much longer a step is than the one before it, the first being as long as a tick; infinite where all
             but the first have the greatest length.
-        slots: obstacles that are looked at, the nearest first.
+        slots: obstacles that are looked at: those that the last plan, or a vehicle that brakes, comes nearest to.
         alpha: rate at which a clearance may shrink [1/s].
         gamma: of the velocity in a second barrier, none if zero [s]; as published [s/m^2].
         reading: "decay" from node to node, or the hinge on h' + alpha h as it is "published".
@@ -80,7 +80,7 @@ class KeeperSettings:
     horizon: int = 20
     step: float = 0.05
     growth: float = np.inf
-    slots: int = 3
+    slots: int = 5
     alpha: float = 1.2
     gamma: float = 0.0
     reading: Reading = "decay"
@@ -143,6 +143,10 @@ class Obstacles:
     def nearest(self, place: Array, count: int, later: float = 0.0) -> Obstacles:
         """The ``count`` nearest to a place (3,) some seconds later, with others far away if there are fewer."""
         order = np.argsort(self.clearance(place[None], np.array([later]))[0], kind="stable")[:count]
+        return self.these(order, count)
+
+    def these(self, order: IntArray, count: int) -> Obstacles:
+        """Some of them, in an order; with others far away if there are fewer than ``count``."""
         parts = self.position[order], self.velocity[order], self.keep[order], self.upright[order], self.falls[order]
         missing = count - len(order)
         if not missing:
@@ -304,6 +308,7 @@ class Keeper:
         self._applied = quadrotor.hover(airframe.parameters)
         self._plan: tuple[Array, Array] | None = None  # places and controls of the last plan
         self._age = 0  # of it [ticks]
+        self._looked_at: list[int] = []
         self._brakes = FlatnessController(Gains(), airframe.least, airframe.most)
 
     def _state_barriers(self, graph: fg.Graph, steps: Array) -> None:
@@ -360,7 +365,7 @@ class Keeper:
         if self._weighing is not None:
             data |= self._weighing.data() | dict(zip(self._by_the_past, self._believed_numbers(), strict=True))
         if s.slots:
-            near = obstacles.nearest(start[:3], s.slots, later)
+            near = obstacles.these(self._nearest(start, obstacles, later), s.slots)
             flat = np.ones((s.slots, 3))
             flat[near.upright, 2] = 0.0
             fall = np.array([0.0, 0.0, -quadrotor.GRAVITY]) * near.falls[:, None]
@@ -397,6 +402,16 @@ class Keeper:
         p = self.believed if not found else None
         mass, drag = (p.mass, np.array(p.drag)) if p else (float(solution[self.mass][0, 0]), solution[self.drag][0])
         return Decision(control, plan, status, solution.iterations, slack, mass, drag, spent)
+
+    def _nearest(self, start: Array, obstacles: Obstacles, later: float) -> IntArray:
+        """Which obstacles are looked at; one that was looked at before keeps its place, and so its multipliers."""
+        ways = [_braked(start, self.nodes).position, *([] if self._plan is None else [self._plan[0]])]
+        near = np.min([obstacles.clearance(way, later + self.nodes).min(axis=0) for way in ways], axis=0)
+        wanted = np.argsort(near, kind="stable")[: self.settings.slots]
+        fresh = [k for k in wanted.tolist() if k not in self._looked_at]
+        kept = [k if k in wanted else fresh.pop(0) for k in self._looked_at]
+        self._looked_at = kept + fresh
+        return np.array(self._looked_at, dtype=np.intp)
 
     def _flown(self, start: Array) -> tuple[Array, Array]:
         """Control and places of the last plan at its age; of braking where it is too old."""

@@ -14,11 +14,12 @@ other hand, with the obstacle going straight on, which it may, none exists if at
 
 since nothing that the vehicle can do carries r farther than that. Both are backward reachable sets, the first from
 within and the second from without; between them the oracle does not know. Vehicles that tilt reach A late: the delay
-counts that.
+counts that. Among several obstacles one n has to escape them all.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -26,7 +27,7 @@ import numpy as np
 
 from unifg.typing import Array
 
-__all__ = ["Answer", "Authority", "escape", "exists"]
+__all__ = ["Answer", "Authority", "Threat", "escape", "exists", "exists_among"]
 
 Answer: TypeAlias = Literal["yes", "no", "unknown"]
 
@@ -87,6 +88,55 @@ def exists(away: Array, speed: Array, keep: float, authority: Authority, pull: A
     """Whether a safe control exists; arguments as those of :func:`escape`."""
     certain, best = escape(away, speed, keep, authority, pull)
     return "yes" if certain >= 0.0 else "no" if best < 0.0 else "unknown"
+
+
+@dataclass(frozen=True)
+class Threat:
+    """An obstacle as it is seen.
+
+    Attributes:
+        away: (3,) position of the vehicle from it [m].
+        speed: (3,) its rate [m/s].
+        keep: distance to be kept [m].
+        upright: a cylinder, of which only the plane counts.
+        bend: greatest acceleration of the obstacle in any direction, what is known of it apart [m/s^2].
+        pull: (3,) acceleration of the obstacle that is known [m/s^2]; None for none.
+        until: how long it is there [s].
+    """
+
+    away: Array
+    speed: Array
+    keep: float
+    upright: bool = False
+    bend: float = 0.0
+    pull: Array | None = None
+    until: float = np.inf
+
+
+def exists_among(threats: Sequence[Threat], authority: Authority) -> Answer:
+    """Whether one acceleration that is held escapes all obstacles, or one of them cannot be escaped.
+
+    Args:
+        threats: the obstacles.
+        authority: what the vehicle can do; the obstacles' own accelerations take the place of the one in it.
+    """
+    a = authority
+    times = np.linspace(0.0, a.horizon, 301)
+    late = 0.5 * np.maximum(times - a.delay, 0.0) ** 2
+    level = np.column_stack([_directions(2), np.zeros(72)])
+    ways = np.concatenate([level, _directions(3)])
+    certain, lost = np.full(len(ways), np.inf), False
+    for threat in threats:
+        there = times <= threat.until
+        flat = np.array([1.0, 1.0, 0.0 if threat.upright else 1.0])
+        straight = threat.away + times[there, None] * threat.speed
+        if threat.pull is not None:
+            straight = straight - 0.5 * times[there, None] ** 2 * threat.pull
+        straight, moved = straight * flat, a.usable * ways[:, None, :] * late[None, there, None] * flat
+        lost |= bool((np.linalg.norm(straight, axis=1) + a.usable * late[there] < threat.keep).any())
+        far = np.linalg.norm(straight + moved, axis=2) - 0.5 * threat.bend * times[there] ** 2 - threat.keep
+        certain = np.minimum(certain, far.min(axis=1))
+    return "no" if lost else "yes" if certain.max() >= 0.0 else "unknown"
 
 
 def _directions(axes: int) -> Array:
