@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from inspect import cleandoc, getdoc
 from types import FunctionType
 from typing import Any, Literal, TypeAlias
@@ -34,7 +34,6 @@ class Residual:
         rows: m, of a ``function`` that a user has compiled for one factor.
         derivatives: "trace" to insist on exact ones, "trace first" to prefer them to the Jacobian, "differences" to
             refuse them, empty for what is possible.
-        about: what ``help`` says of it.
     """
 
     function: Function
@@ -45,12 +44,6 @@ class Residual:
     search_kernel: Kernel | None = None
     rows: int = 0
     derivatives: str = ""
-    about: str = field(default="", repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        """Give ``help`` its own text instead of that of the class."""
-        if self.about:
-            object.__setattr__(self, "__doc__", cleandoc(self.about))
 
     def __call__(self, *arguments: Any) -> Array:
         """Evaluate the residual."""
@@ -104,18 +97,19 @@ def residual(
             f"the residual '{getattr(function, '__name__', name)}' is compiled: say how many numbers it writes, rows="
         )
     if isinstance(function, Kernel) and jacobian is None:
-        return Residual(
-            function, function.jacobian, name or function.name, looked_in, function, search_kernel, about=about
+        made = Residual(function, function.jacobian, name or function.name, looked_in, function, search_kernel)
+    else:
+        made = Residual(
+            function,
+            jacobian,
+            name or getattr(function, "__name__", "residual"),
+            looked_in,
+            rows=rows if own else 0,
+            derivatives=derivatives or "",
         )
-    return Residual(
-        function,
-        jacobian,
-        name or getattr(function, "__name__", "residual"),
-        looked_in,
-        rows=rows if own else 0,
-        derivatives=derivatives or "",
-        about=about,
-    )
+    if about:  # help shows it instead of the text of the class
+        object.__setattr__(made, "__doc__", cleandoc(about))
+    return made
 
 
 def as_residual(function: Function | Kernel | Residual) -> Residual:
