@@ -234,7 +234,7 @@ def of_flights() -> Rows:
             ("ipm", "separate"), ("ipm", "sequential"), ("ipm", "joint"), ("sqp", "sequential"), ("alm", "joint"),
         ):  # fmt: skip
             yield f"flight {seed}, {solver}, {coupling}", partial(flown, FlightSettings(solver, coupling, seed))
-    yield "course", lambda: row_of(run_course(CourseSettings()).solution)
+    yield "course", lambda: row_of(run_course(CourseSettings(guess="hover")).solution)
 
 
 PARTS: dict[str, Callable[[], Rows]] = {

@@ -62,7 +62,8 @@ class CourseSettings:
         avoidance: "potential" is Ta's cost 1/d for the cylinder and every wall, d from the hull; "hard" keeps the hull
             clear at every node.
         guess: "hover" stays at the start, "line" flies straight to the target through whatever stands there, "way"
-            follows a shortest way around it. If none is named, hover with the potential and way with hard clearance.
+            follows a shortest way around it, the only one that begins outside of obstacles in every layout, so that it
+            is the default.
         general: state 1/d as a general cost (`minimize_scalar`) instead of as its least-squares twin. It is the same
             objective, differentiated numerically; alm does not take it.
         seed: of a random layout; without one, the layout of the documentation.
@@ -117,7 +118,7 @@ class CourseSettings:
     @property
     def chosen_guess(self) -> Start:
         """The guess that is used."""
-        return self.guess or ("way" if self.avoidance == "hard" else "hover")
+        return self.guess or "way"
 
     def layout(self) -> Layout:
         """Start, target and obstacles."""

@@ -41,8 +41,9 @@ from unifg.scenarios.ways.polyline import path_length
 from unifg.scenarios.worlds.building import DEMO_GOALS, DEMO_START, building_map
 from unifg.scenarios.worlds.drivetrain import Drivetrain, draw_patches
 from unifg.scenarios.worlds.faults import DRIVE_FAULTS, DriveFaults, Fault, one_of
+from unifg.scenarios.worlds.imperfection import Imperfection, imperfect
 from unifg.scenarios.worlds.placement import PlacementRules, place_obstacles
-from unifg.scenarios.worlds.plane import World
+from unifg.scenarios.worlds.plane import LidarModel, OdometryModel, World
 from unifg.typing import Array
 
 INITIAL_SIGMA = (0.1, 0.1, 0.05)  # [m, m, rad]
@@ -51,7 +52,9 @@ REACHED_HEADING = 0.1  # [rad]
 TRUE_DISTANCE = 0.2  # [m], what the truth must confirm
 TRUE_HEADING = 0.2  # [rad]
 USUAL_SIGMA = 0.01  # [m] of a position localised on a map
-SURE = 3.0  # standard deviations of the position that have to fit into the true distance
+SURE = 3.0  # standard deviations of the estimate that have to fit between what is believed and what must be true
+BESIDE = 0.01  # [m] from walls beyond the radius, from where a way is looked for
+FREEING = 20  # steps to there
 SLOWEST = 0.25  # [m/s]; a goal that takes longer than this, and a minute, is given up
 HELPLESS = 20.0  # [s] that a robot that may not move waits before it gives up
 REACHED = "reached"
@@ -73,6 +76,9 @@ class NavigationSettings:
         seed: of everything random.
         controller: weights and limits.
         drivetrain: of the base; the controller is told the accelerations on its data sheet.
+        lidar: as it is; what the robot believes of it is its own.
+        odometry: likewise.
+        imperfection: of the robot's map.
         planner: of the motion along the route: that of this library, or one of others to compare with.
         localiser: of the estimate: that of this library, or another one to compare with.
         faults: what goes wrong; may be repeated.
@@ -91,6 +97,9 @@ class NavigationSettings:
     seed: int = option(0, metavar="S")
     controller: ControllerSettings = field(default_factory=ControllerSettings)
     drivetrain: Drivetrain = field(default_factory=Drivetrain)
+    lidar: LidarModel = field(default_factory=LidarModel)
+    odometry: OdometryModel = field(default_factory=OdometryModel)
+    imperfection: Imperfection = field(default_factory=Imperfection)
     planner: str = option(OWN_PLANNER, choices=PLANNERS)
     localiser: str = option(OWN_LOCALISER, choices=LOCALISERS)
     faults: tuple[Fault, ...] = option(
@@ -133,11 +142,12 @@ class Episode:
         self.goals = np.array([_pose(goal, None, "goal") for goal in goals])
         if not len(self.goals):
             raise ScenarioError("at least one goal is needed")
+        placement, sensors, belief, floor, drawn, wrong = np.random.default_rng(settings.seed).spawn(6)
+        self.occupancy, true = imperfect(self.occupancy, settings.imperfection, self.start, self.goals, wrong)
         self.distance_map = _field(self.occupancy)
         legs = zip([self.start, *self.goals[:-1]], self.goals, strict=True)
         self.legs = [self._route(begin, end) for begin, end in legs]
         self.path = np.concatenate([leg.path for leg in self.legs])
-        placement, sensors, belief, floor, drawn = np.random.default_rng(settings.seed).spawn(5)
         discs = place_obstacles(
             self.occupancy,
             self.distance_map,
@@ -149,7 +159,8 @@ class Episode:
             rules=PlacementRules(speed=settings.mover_speed),
         )
         self.world = World(
-            self.occupancy, self.start, discs, sensors, robot_radius=control.robot_radius,
+            true, self.start, discs, sensors, robot_radius=control.robot_radius, lidar=settings.lidar,
+            odometry=settings.odometry,
             drivetrain=settings.drivetrain, patches=draw_patches(settings.drivetrain, self.path, floor),
             courteous=settings.courteous,
         )  # fmt: skip
@@ -225,8 +236,12 @@ class Episode:
             odometry = faults.odometry(measured, now)
         true_scan = self.world.scan()
         self.pilot.planless = faults.hold("solver-timeout", now)
+        seen = faults.scan(true_scan, now)
+        if not number:
+            self.pilot.wake(seen, now)
+            self._begin_leg(goal)
         with counting() as new:
-            plan = self.pilot.tick(faults.scan(true_scan, now), odometry, self.legs[goal], now, first=not number)
+            plan = self.pilot.tick(seen, odometry, self.legs[goal], now, first=not number)
         self._record(true_scan, plan, new.everything)
         outcome = self._outcome(goal)
         if outcome is not None:
@@ -271,10 +286,20 @@ class Episode:
         self._begun = self.world.time
         self.pilot.forget()
         try:
-            self.legs[goal] = self._route(self.pilot.pose, self.goals[goal])
+            self.legs[goal] = self._route(self._freed(self.pilot.pose), self.goals[goal])
         except ScenarioError:
             gap = self.controller.robot_radius + self._gaps()[0]
             self.legs[goal].blocked = Blocked(self.pilot.pose[:2].copy(), gap)
+
+    def _freed(self, pose: Array) -> Array:
+        """A pose, or one beside it that is not too near to a wall to begin a way there."""
+        found, least = pose.copy(), self.controller.robot_radius + BESIDE
+        for _ in range(FREEING):
+            distance, slope = self.distance_map.distance_and_gradient(found[:2])
+            if distance >= least:
+                break
+            found[:2] += (least - distance) * slope / max(float(np.hypot(*slope)), 1e-9)
+        return found
 
     def _gaps(self) -> tuple[float, float]:
         """Between hull and walls, hull and discs, as the controller keeps them of an estimate as sure as usual [m]."""
@@ -340,12 +365,18 @@ class Episode:
         return Route(self.occupancy, self.distance_map, begin, end, s.robot_radius, *self._gaps())
 
     def _arrived(self, goal: int) -> bool:
-        """Whether the robot believes to be there, knows where it is, and surely enough."""
-        pilot = self.pilot
-        spread = float(np.linalg.eigvalsh(pilot.estimator.covariance[:2, :2])[-1])
-        if pilot.verdict.rests or not SURE * np.sqrt(max(spread, 0.0)) < TRUE_DISTANCE:
+        """Whether the robot believes to be there, by an estimate that leaves room for being wrong.
+
+        The room between what it believes to be near and what the truth must confirm is ``SURE`` standard deviations, in
+        the worst direction.
+        """
+        covariance, goal_pose = self.pilot.estimator.covariance, self.goals[goal]
+        spread = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+        off, turned = (SURE * np.sqrt(max(variance, 0.0)) for variance in (spread, float(covariance[2, 2])))
+        sure = off <= TRUE_DISTANCE - REACHED_DISTANCE and turned <= TRUE_HEADING - REACHED_HEADING
+        if self.pilot.verdict.rests or not sure:
             return False
-        return _near(self.pilot.pose, self.goals[goal], REACHED_DISTANCE, REACHED_HEADING)
+        return _near(self.pilot.pose, goal_pose, REACHED_DISTANCE, REACHED_HEADING)
 
     def _confirmed(self, goal: int) -> bool:
         """Whether the robot truly is where it believes to have arrived."""

@@ -383,3 +383,68 @@ def test_a_drive_plans_with_the_backend_that_the_page_names() -> None:
     row = next(line for line in page.splitlines() if line.startswith("| `--solver"))
     assert f"`{NavigationSettings().solver}`" in row.split("|")[2]
     assert NavigationSettings().solver == SOLVERS[0]
+
+
+# -------------------------------------------------------- what the robot knows
+
+
+class Doubting:
+    """An estimator that is less sure than it was."""
+
+    def __init__(self, inner: Any, covariance: Array) -> None:
+        self.inner, self.covariance = inner, covariance
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.inner, name)
+
+
+@pytest.mark.parametrize(
+    ("sigma", "arrives"),
+    [((0.01, 0.01, 0.01), True), ((0.04, 0.01, 0.01), False), ((0.01, 0.04, 0.01), False), ((0.01, 0.01, 0.04), False)],
+)
+def test_who_does_not_know_where_he_is_has_not_arrived(sigma: tuple[float, float, float], arrives: bool) -> None:
+    """Believed to be at the goal, by an estimate whose three standard deviations leave what the truth must confirm."""
+    episode = Episode(replace(CORRIDOR, seed=1))
+    episode.pilot.pose = episode.goals[0].copy()
+    turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])  # the worst direction is no axis
+    episode.pilot.estimator = Doubting(episode.pilot.estimator, turn @ np.diag(np.square(sigma)) @ turn.T)
+    assert episode._arrived(0) == arrives
+    episode.pilot.pose = episode.goals[0] + np.array([0.11, 0.0, 0.0])
+    assert not episode._arrived(0)
+
+
+@pytest.mark.parametrize("coupling", ["sequential", "joint"])
+def test_the_first_leg_begins_where_the_robot_believes_to_be(coupling: str) -> None:
+    """Nobody tells it the true start: it looks around first, and plans from what that says; no scan counts twice."""
+    episode = Episode(replace(CORRIDOR, seed=4, coupling=coupling))
+    believed = episode.pilot.pose
+    assert np.hypot(*(believed - episode.start)[:2]) > 0.03
+    updates: list[Any] = []
+    inner = episode.pilot.estimator.update
+
+    def counted(scan: Scan | None, odometry: Array | None, dt: float) -> None:
+        updates.append(odometry)
+        inner(scan, odometry, dt)
+
+    episode.pilot.estimator.update = counted  # type: ignore[method-assign]
+    log = drive(episode, 2)
+    assert [u is None for u in updates] == [True, False]
+    first = log.route[0][0, :2]
+    assert not np.array_equal(first, episode.start[:2])
+    assert np.hypot(*(first - log.estimate[0, :2])) < 0.02
+    assert np.hypot(*(first - episode.start[:2])) < 0.03
+
+
+def test_a_leg_can_begin_beside_a_wall_where_the_estimate_touches_it() -> None:
+    episode = Episode(CORRIDOR)
+    wall = np.array([6.5, 14.0, 0.0])
+    while episode.distance_map.distance(wall[:2]) > RADIUS - 0.03:
+        wall[1] -= 0.01
+    with pytest.raises(ScenarioError, match="start"):
+        episode._route(wall, episode.goals[0])
+    episode.pilot.pose = wall
+    episode._begin_leg(0)
+    assert episode.legs[0].blocked is None
+    path = episode.legs[0].path
+    assert np.hypot(*(path[0] - wall)[:2]) < 0.06
+    assert np.array_equal(wall, episode.pilot.pose)

@@ -17,7 +17,16 @@ from unifg.scenarios import command
 from unifg.scenarios import course as obstacles
 from unifg.scenarios.campaigns.comparison import share
 from unifg.scenarios.commands.courses import course_metrics, summary
-from unifg.scenarios.course import HESSIANS, Course, CourseSettings, backend, course_guess, run_course, state_problem
+from unifg.scenarios.course import (
+    AVOIDANCES,
+    HESSIANS,
+    Course,
+    CourseSettings,
+    backend,
+    course_guess,
+    run_course,
+    state_problem,
+)
 from unifg.scenarios.show.course_log import course_log
 from unifg.scenarios.show.course_plot import chosen_iterates, picture, plot_above
 from unifg.scenarios.worlds.air import VEHICLE_RADIUS
@@ -123,7 +132,9 @@ def test_guesses() -> None:
         np.testing.assert_allclose(states[-1, :3], layout.target, atol=1e-12)
         np.testing.assert_allclose(states[:-1, :3] + settings.dt * states[1:, 7:], states[1:, :3], atol=1e-12)
     assert (controls == quadrotor.hover(settings.vehicle)).all()
-    assert settings.chosen_guess == "hover" and replace(settings, avoidance="hard").chosen_guess == "way"
+    for kind in AVOIDANCES:
+        assert replace(settings, avoidance=kind).chosen_guess == "way"
+        assert replace(settings, avoidance=kind, guess="line").chosen_guess == "line"
 
 
 @pytest.mark.parametrize("solver", ["sqp", "ipm", "alm"])
@@ -148,7 +159,7 @@ def test_what_cannot_be_asked_for() -> None:
 
 
 def test_pictures_show_four_iterates_and_every_number() -> None:
-    course = flown()
+    course = flown(guess="hover")
     assert len(course.iterates) == course.solution.iterations + 1
     np.testing.assert_array_equal(course.iterates[-1], course.states)
     assert chosen_iterates(1) == [0] and chosen_iterates(3) == [0, 1, 2] and chosen_iterates(41) == [0, 1, 13, 40]

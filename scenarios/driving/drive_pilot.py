@@ -153,6 +153,8 @@ class Pilot(Generic[PlannerT]):
         self._map, self._search = distance_map, Relocaliser(occupancy, distance_map, s.robot_radius)
         self._signals = DriveSignals(s.dt)
         self._pause, self.search_said = 0, ""
+        self._awake = False
+        self._first: Scan | None = None
 
     @property
     def iterations(self) -> int:
@@ -168,6 +170,15 @@ class Pilot(Generic[PlannerT]):
     def planless_for(self) -> float:
         """Time since the last tick with a plan of its own [s]."""
         return self._signals.values()["plan"]
+
+    def wake(self, scan: Scan | None, now: float) -> None:
+        """Look where the robot stands before anything is decided, as where to go from there; the first tick goes on."""
+        try:
+            self._first = self.door.scan(scan, now)
+            self.estimator.update(self._first, None, self.controller.settings.dt)
+        except (UnifgError, ArithmeticError, ValueError):
+            return  # the first tick tries again, and says what is wrong
+        self.pose, self._awake = self.estimator.pose, True
 
     def tick(self, scan: Scan | None, odometry: Array | None, route: Route, now: float, first: bool = False) -> Plan:
         """Decide; the estimate is that of the plan afterwards. Samples may be anything.
@@ -195,12 +206,14 @@ class Pilot(Generic[PlannerT]):
 
     def _decide(self, scan: Scan | None, odometry: Array | None, route: Route, now: float, first: bool) -> Plan:
         s = self.controller.settings
-        seen = self.door.scan(scan, now)
+        looked = first and self._awake
+        seen = self._first if looked else self.door.scan(scan, now)
         wheels = None if first else self.door.odometry(odometry, self.driven, s.dt)
         predicted = (
             self.estimator.pose if wheels is None else unicycle.step(self.estimator.pose[None], wheels[None], s.dt)[0]
         )
-        self.estimator.update(seen, wheels, s.dt)
+        if not looked:
+            self.estimator.update(seen, wheels, s.dt)
         pose = self.pose = self.estimator.pose
         self.clock.split("localise")
         found = None if seen is None else explained(self._map, seen, pose)

@@ -20,6 +20,7 @@ import pymunk
 
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
+from unifg.scenarios.options import not_negative, option, share
 from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.worlds.drivetrain import Drivetrain, Wheels, slip_at
 from unifg.scenarios.worlds.rectangles import wall_rectangles
@@ -33,6 +34,9 @@ ROBOT_RADIUS = 0.17
 
 _REST_SPEED = 0.02  # [m/s]; below it the robot counts as being at rest
 
+EDGE = 0.3
+"""Neighbouring beams that differ by more have an edge between them [m]."""
+
 _WALLS = -1  # owner of all walls together; obstacles are owned by their index
 
 
@@ -43,14 +47,20 @@ class LidarModel:
     Attributes:
         beams: number of beams.
         range_max: beyond it nothing returns [m].
-        sigma: standard deviation of a range [m].
+        sigma: standard deviation of a range, whatever the robot believes of it [m].
         dropout: probability that a beam is lost.
+        clutter: probability that a beam returns too soon, from anywhere before what it should have met.
+        mixed: probability that a beam beside an edge returns from between what its neighbours meet.
+        turn: duration of one turn [s], during which the robot moves; the robot takes all beams for those of its end.
     """
 
     beams: int = 360
     range_max: float = 12.0
-    sigma: float = 0.02
-    dropout: float = 0.01
+    sigma: float = option(0.02, text=not_negative, metavar="M", flag="range-sigma")
+    dropout: float = option(0.01, text=share, metavar="SHARE")
+    clutter: float = option(0.0, text=share, metavar="SHARE")
+    mixed: float = option(0.0, text=share, metavar="SHARE")
+    turn: float = option(0.0, text=not_negative, metavar="S", flag="scan-time")
 
     @property
     def angles(self) -> Array:
@@ -63,12 +73,12 @@ class OdometryModel:
     """Wheel odometry: measured = true * (1 + scale + noise), for v and omega each on its own.
 
     Attributes:
-        scale_sigma: standard deviation of the scale error drawn once per episode.
-        noise_sigma: standard deviation of the relative noise drawn every step.
+        scale_sigma: standard deviation of the wheels' scale error, drawn once per episode.
+        noise_sigma: standard deviation of the wheels' relative noise, drawn every step.
     """
 
-    scale_sigma: float = 0.05
-    noise_sigma: float = 0.02
+    scale_sigma: float = option(0.05, text=not_negative, metavar="SHARE", flag="odometry-scale")
+    noise_sigma: float = option(0.02, text=not_negative, metavar="SHARE", flag="odometry-noise")
 
 
 class World:
@@ -133,6 +143,9 @@ class World:
         for index, obstacle in enumerate(self.obstacles):
             self._space.add_disc(obstacle, index)
         self._robot = self._space.vehicle
+        self._trail: list[tuple[float, tuple[float, float, float]]] = [
+            (self.time, (*self._robot.position, self._robot.angle))
+        ]
         self._robot.velocity_func = self._drive
         self._space.add_vehicle()
         if self.clearance() < 0.0:
@@ -178,11 +191,13 @@ class World:
         self._wheels.tell((float(v), float(omega)))
         before, heading_before = self._robot.position, self._robot.angle
         self._spun = self._gripped = 0.0
+        self._trail = [entry for entry in self._trail if entry[0] >= self.time - self.lidar.turn]
         for count, pause in enumerate(self._space.substeps(dt)):
             if not count:
                 self._left = round(dt / pause)
                 self._start_tick(pause)
             self._space.step(pause, resting=self._robot.velocity.length < _REST_SPEED)
+            self._trail.append((self.time, (*self._robot.position, self._robot.angle)))
         self._measure(before, heading_before, dt, self._gripped / self._spun if self._spun > 0.0 else 1.0)
 
     def _grip(self, body: pymunk.Body) -> float:
@@ -233,21 +248,43 @@ class World:
     # ----------------------------------------------------------------- sensors
 
     def scan(self) -> Scan:
-        """Turn the lidar once at the present pose; every call draws new noise."""
-        lidar = self.lidar
-        x, y = self._robot.position
-        bearing = self._robot.angle + self._angles
-        tips = np.stack([x + lidar.range_max * np.cos(bearing), y + lidar.range_max * np.sin(bearing)], axis=1)
-        query, origin = self._space.engine.segment_query_first, (x, y)
-        hits = [query(origin, (tip[0], tip[1]), 0.0, OTHERS) for tip in tips.tolist()]
-        fraction = np.array([math.inf if hit is None else hit.alpha for hit in hits])
+        """Turn the lidar once, so that the last beam is one of the present pose; every call draws new noise."""
+        lidar, reach = self.lidar, self.lidar.range_max
+        places = self._track(lidar.turn * (np.arange(lidar.beams) - (lidar.beams - 1)) / lidar.beams)
+        bearing = places[:, 2] + self._angles
+        tips = places[:, :2] + reach * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+        query = self._space.engine.segment_query_first
+        hits = [
+            query((x, y), (tip[0], tip[1]), 0.0, OTHERS)
+            for (x, y), tip in zip(places[:, :2].tolist(), tips.tolist(), strict=True)
+        ]
+        ranges = np.array([math.inf if hit is None else hit.alpha for hit in hits]) * reach
         noise = lidar.sigma * self._lidar_rng.standard_normal(lidar.beams)
         lost = self._lidar_rng.random(lidar.beams) < lidar.dropout
-        ranges = fraction * lidar.range_max
+        if lidar.clutter or lidar.mixed:
+            ranges = self._spoiled(ranges)
         seen = np.isfinite(ranges)
-        ranges[seen] = np.clip(ranges[seen] + noise[seen], 0.0, lidar.range_max)
+        ranges[seen] = np.clip(ranges[seen] + noise[seen], 0.0, reach)
         ranges[lost] = np.nan
         return Scan(self._angles.copy(), ranges, self.time)
+
+    def _track(self, times: Array) -> Array:
+        """(n, 3) where the robot was at times (n,) from now on, none of them positive [m, m, rad]."""
+        then, where = np.array([when for when, _ in self._trail]), np.array([pose for _, pose in self._trail])
+        at = np.maximum(self.time + times, then[0])
+        return np.column_stack([np.interp(at, then, column) for column in where.T])
+
+    def _spoiled(self, ranges: Array) -> Array:
+        """Ranges (B,) with returns that come too soon, and with some from between the two sides of an edge."""
+        lidar = self.lidar
+        early, where, mixed, between = self._lidar_rng.random((4, lidar.beams))
+        met = np.minimum(ranges, lidar.range_max)
+        found = np.where(
+            (np.abs(met - np.roll(met, 1)) > EDGE) & (mixed < lidar.mixed),
+            met + between * (np.roll(met, 1) - met),
+            ranges,
+        )
+        return np.where(early < lidar.clutter, where * np.minimum(found, lidar.range_max), found)
 
     def odometry(self) -> tuple[float, float]:
         """Mean body velocities (v [m/s], omega [rad/s]) over the last step, as the wheels report them.
