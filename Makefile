@@ -4,6 +4,7 @@
 #   make test     run the tests
 #   make test-lowest    the same with the lowest versions of all packages that pyproject.toml allows, in .venv-lowest
 #   make processes    graphs and solutions in other processes, however these begin, with joblib and dask (a minute)
+#   make fuzz     mutated files for every reader, a minute each
 #   make lint     check style (ruff) and types (mypy)
 #   make bench    measure everything again and rewrite the tables in docs/ (long)
 #   make results PAGE=control-cases    measure one page of docs/ again; without PAGE, list them
@@ -30,7 +31,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Matrices here are small: more threads per process only make the processes wait for each other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: kernels help demo test test-lowest processes lint types bench results stale release-check mutants fences clean offsets examples
+.PHONY: kernels help demo test fuzz test-lowest processes lint types bench results stale release-check mutants fences clean offsets examples
 .DELETE_ON_ERROR:
 
 help:
@@ -46,6 +47,9 @@ test: $(VENV)/ready
 
 test-lowest: $(VENV)-lowest/ready
 	$(ONE_THREAD) $(VENV)-lowest/bin/python -m pytest -n $(WORKERS) --dist loadgroup $(PYTEST)
+
+fuzz: $(VENV)/ready
+	$(BIN)/python -m benchmarks.fuzz
 
 processes: $(VENV)/ready
 	$(PIP) install joblib dask

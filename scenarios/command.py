@@ -2,7 +2,7 @@
 
 Exit status: 0 if the robot did what it was asked (every goal reached without a collision, every solve converged within
 its limits), 1 if not, 2 for arguments that cannot be served, 130 after an interrupt (what was done until then is
-written all the same).
+written all the same); SIGTERM interrupts, too.
 
 ``unifg campaign`` runs many episodes (0 if every one of them succeeded), ``unifg report`` says what came of them,
 ``unifg replay`` shows one of them. What can be run stands in `unifg.scenarios.commands.catalogue`; only the scenario
@@ -27,6 +27,7 @@ from typing import Any
 
 from unifg import __version__
 from unifg.errors import UnifgError
+from unifg.files.contents import legible
 from unifg.scenarios.commands.catalogue import SCENARIOS, SOLVE
 from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.options import count, settings_of
@@ -136,7 +137,7 @@ def _campaign(chosen: argparse.Namespace) -> int:
     from unifg.scenarios.campaigns.campaign import run_campaign
 
     folder: Path = chosen.out or Path("out") / "campaigns" / chosen.file.stem
-    with _progress_bar(chosen.file.stem, signal.SIGINT, signal.SIGTERM) as progress:
+    with _progress_bar(chosen.file.stem) as progress:
         found = run_campaign(
             chosen.file, folder, workers=chosen.workers, scheduler=chosen.scheduler, again=chosen.again,
             any_code=chosen.any_code, progress=progress,
@@ -214,22 +215,19 @@ def _run_settings(chosen: argparse.Namespace, module: Any, settings: Any, name: 
     print(outcome.summary)
     print()
     for file in files:
-        print(file)
+        print(legible(file))
     if outcome.interrupted:
         return INTERRUPTED
     return SUCCEEDED if outcome.succeeded else FAILED
 
 
 @contextmanager
-def _progress_bar(name: str, *stops: signal.Signals) -> Iterator[Progress]:
-    """A bar on stderr; the first interrupt waits for the end of a tick, so that the record stays whole.
+def _progress_bar(name: str) -> Iterator[Progress]:
+    """A bar on stderr; the first control-C or SIGTERM waits for the end of a tick, so that the record stays whole.
 
     Args:
         name: beside the bar.
-        stops: signals that interrupt; none for control-C alone.
     """
-    from tqdm import tqdm
-
     wanted = False
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -238,19 +236,17 @@ def _progress_bar(name: str, *stops: signal.Signals) -> Iterator[Progress]:
             raise KeyboardInterrupt
         wanted = True
 
-    layout = "{desc} {percentage:3.0f}%|{bar}| {elapsed} {postfix}"
-    with tqdm(total=1.0, desc=name, bar_format=layout, file=sys.stderr) as bar:
+    with _bar(name) as show:
 
         def progress(done: float, text: str) -> None:
             nonlocal wanted
-            bar.set_postfix_str(text, refresh=False)
-            bar.update(max(0.0, min(done, 1.0) - bar.n))
+            show(done, text)
             if wanted:
                 wanted = False
                 raise KeyboardInterrupt
 
         try:
-            before = [(stop, signal.signal(stop, interrupt)) for stop in stops or (signal.SIGINT,)]
+            before = [(stop, signal.signal(stop, interrupt)) for stop in (signal.SIGINT, signal.SIGTERM)]
         except ValueError:  # not in the main thread, where no interrupt arrives either
             yield progress
             return
@@ -259,6 +255,24 @@ def _progress_bar(name: str, *stops: signal.Signals) -> Iterator[Progress]:
         finally:
             for stop, handler in before:
                 signal.signal(stop, handler)
+
+
+@contextmanager
+def _bar(name: str) -> Iterator[Progress]:
+    """What is told how far a run has come; nothing is drawn where tqdm is not installed."""
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        yield lambda done, text: None
+        return
+    layout = "{desc} {percentage:3.0f}%|{bar}| {elapsed} {postfix}"
+    with tqdm(total=1.0, desc=name, bar_format=layout, file=sys.stderr) as bar:
+
+        def show(done: float, text: str) -> None:
+            bar.set_postfix_str(text, refresh=False)
+            bar.update(max(0.0, min(done, 1.0) - bar.n))
+
+        yield show
 
 
 def _announce(url: str) -> None:

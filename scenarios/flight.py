@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from unifg.scenarios.flying.flight_pilot import COUPLINGS, make_pilot
 from unifg.scenarios.flying.flight_settings import ControllerSettings
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.flight_log import FlightLog
-from unifg.scenarios.options import option, share
+from unifg.scenarios.options import count, option, share
 from unifg.scenarios.worlds.air import QuadrotorWorld
 from unifg.scenarios.worlds.conditions import draw_conditions
 from unifg.typing import Array
@@ -57,7 +58,7 @@ class FlightSettings:
     solver: str = "ipm"
     coupling: str = option("sequential", choices=COUPLINGS)
     seed: int = option(0, metavar="S")
-    movers: int = option(0, metavar="K")
+    movers: int = option(0, text=partial(count, most=200), metavar="K")
     mass_error: float = option(0.05, text=share, metavar="E")
     time_limit: float = 60.0
     estimator: EstimatorSettings = field(default_factory=EstimatorSettings)

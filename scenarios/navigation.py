@@ -9,6 +9,7 @@ rely on; a goal that cannot be reached is given up, by name, and the next one is
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from unifg.scenarios.driving.route import Blocked, Route
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.options import existing, option, pose, positive
+from unifg.scenarios.options import count, existing, option, pose, positive
 from unifg.scenarios.rivals.choices import (
     LOCALISERS,
     OWN_LOCALISER,
@@ -91,7 +92,7 @@ class NavigationSettings:
     )
     solver: str = "ipm"
     coupling: str = option("sequential", choices=("sequential", "joint"))
-    obstacles: int = option(0, metavar="K")
+    obstacles: int = option(0, text=partial(count, most=200), metavar="K")
     mover_speed: float = option(0.3, text=positive, metavar="M/S")
     courteous: bool = option(False)
     seed: int = option(0, metavar="S")

@@ -17,6 +17,8 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
+from unifg.files.contents import legible
+
 __all__ = [
     "Option",
     "add_options",
@@ -156,10 +158,12 @@ def _help(path: tuple[str, ...], settings: type, default: Any) -> str:
     return words if quiet else f"{words} (default: {default})"
 
 
-def count(text: str, least: int = 0) -> int:
-    """A whole number, not below the least."""
-    if not text.isdecimal() or int(text) < least:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least {least}")
+def count(text: str, least: int = 0, most: int = 10**18) -> int:
+    """A whole number, not below the least nor above the most."""
+    if not text.isdecimal() or len(text) > 100 or int(text) < least:
+        raise argparse.ArgumentTypeError(f"{text[:100]!r} is not a whole number of at least {least}")
+    if int(text) > most:
+        raise argparse.ArgumentTypeError(f"{text!r} is more than {most}")
     return int(text)
 
 
@@ -218,7 +222,7 @@ def existing(what: str) -> Text:
     def path(text: str) -> Path:
         found = Path(text)
         if not found.is_file():
-            raise argparse.ArgumentTypeError(f"{text}: no such file; give {what}")
+            raise argparse.ArgumentTypeError(f"{legible(text)}: no such file; give {what}")
         return found
 
     return path

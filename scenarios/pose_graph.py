@@ -6,6 +6,7 @@ The command ``unifg solve`` is this and `unifg.scenarios.commands.graphs`.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -17,6 +18,7 @@ from unifg.answers.history import Iteration
 from unifg.answers.solution import Solution
 from unifg.answers.status import Status
 from unifg.errors import ScenarioError
+from unifg.files.contents import legible
 from unifg.files.pose_graph import read_pose_graph
 from unifg.kernels.robust import DCS, Cauchy, Huber, Loss, TruncatedLeastSquares, Tukey
 from unifg.pose_graphs.certificate import Certificate, certify
@@ -120,7 +122,7 @@ class SolvedGraph:
     @property
     def name(self) -> str:
         """The file's name without its endings."""
-        return self.settings.file.name.removesuffix(".gz").rsplit(".", 1)[0]
+        return legible(self.settings.file.name).removesuffix(".gz").rsplit(".", 1)[0]
 
     @property
     def chi2_inliers(self) -> float:
@@ -146,7 +148,7 @@ def solve_file(settings: SolveSettings, progress: Progress = silent) -> SolvedGr
         GraphError: the measurements do not determine the poses.
     """
     clock = Stopwatch()
-    progress(0.0, f"reading {settings.file.name}")
+    progress(0.0, f"reading {legible(settings.file.name)}")
     read = read_pose_graph(settings.file)
     clock.split("read")
     if not len(read.edges) and not read.sightings:
@@ -174,7 +176,8 @@ def solve_file(settings: SolveSettings, progress: Progress = silent) -> SolvedGr
         clock.split("certify")
         if certificate.rank > read.group.point_dim:
             solution, after, outliers = solve(before.with_poses(certificate.poses))
-    progress(1.0, solution.status.name.lower().replace("_", " "))
+    with suppress(KeyboardInterrupt):  # there is something to write
+        progress(1.0, solution.status.name.lower().replace("_", " "))
     numbers, steps = solve.snapshots.chosen()
     chi2 = (in_file, at_start, after.chi2(settings.residual))
     judgement = judge(replace(after, edges=after.edges[~outliers]), settings.residual)

@@ -59,7 +59,7 @@ class TrackingSettings:
         tolerance: of the KKT test; penalty reaches 1e-5.
     """
 
-    length: int = option(385, text=partial(count, least=1), metavar="N")
+    length: int = option(385, text=partial(count, least=1, most=100_000), metavar="N")
     solver: str = "kkt"
     profile: Path | None = option(None, text=existing("a CSV file with a column v_ref_mps"), metavar="F.csv")
     linear: bool = option(False)

@@ -37,8 +37,9 @@ def _gone() -> None:
 
 
 @pytest.fixture
-def twice(tmp_path: Path) -> Callable[[float], float]:
+def twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[float], float]:
     """A function in a file of its own, whose cache lies beside it."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     path = tmp_path / "doubling.py"
     path.write_text(SOURCE, encoding="utf-8")
     spec = importlib.util.spec_from_file_location("doubling", path)

@@ -23,7 +23,8 @@ from unifg.models.rkmk import integrator
 from unifg.models.tableau import Tableau
 from unifg.pose_graphs.generate import manhattan
 from unifg.pose_graphs.residuals import chart_between, sighting
-from unifg.solvers import SQP
+from unifg.solvers import SQP, GaussNewton
+from unifg.typing import Array
 
 EXCEPTIONS = {
     name for name, kind in vars(builtins).items() if isinstance(kind, type) and issubclass(kind, BaseException)
@@ -172,3 +173,24 @@ def test_an_error_inside_a_residual_names_its_term() -> None:
     with pytest.raises(ValueError) as other:
         graph.minimize(lambda p: p @ np.ones(2), x, name="mine")
     assert other.value.__notes__[0] == "raised by the function of term 'mine'"
+
+
+def test_an_error_of_a_function_says_where_and_keeps_what_was_reached() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 5)
+
+    def fragile(p: Array, z: Array) -> Array:
+        if np.any((p > 2.9) & (p < 5.6)):  # where the second step leads
+            raise ZeroDivisionError("beyond what I know")
+        return np.asarray(np.exp(0.5 * p) - z)
+
+    goals = graph.data("goals", np.exp([[0.1], [0.2], [0.3], [1.4], [0.5]]), each=True)
+    graph.minimize(fg.residual(fragile, derivatives="differences"), x, goals, name="fragile")
+    with pytest.raises(ZeroDivisionError, match="beyond what I know") as raised:
+        GaussNewton(tolerance=1e-14).solve(graph, {x: np.zeros((5, 1))})
+    notes = raised.value.__notes__
+    assert notes[0] == "raised by the function of term 'fragile'"
+    assert notes[1] == "at factor 3, whose first variable is x[3]"
+    reached = raised.value.reached  # type: ignore[attr-defined]
+    assert "`reached`" in notes[2] and reached.status is fg.Status.INTERRUPTED and reached.iterations >= 1
+    assert reached["x"][3, 0] > 5.6

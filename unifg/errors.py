@@ -40,6 +40,13 @@ def name_term(error: Exception, term: str) -> None:
         error.term, error.args = term, (f"term '{term}': {error}",)
 
 
+def place_error(error: Exception, family: str, member: int, factor: int) -> None:
+    """Say for which factor a function raised: in the attributes of an error of ours, in a note to any other."""
+    error.add_note(f"at factor {factor}, whose first variable is {family}[{member}]")
+    if isinstance(error, UnifgError):
+        error.family, error.index = error.family or family, factor
+
+
 class GraphError(UnifgError):
     """The graph, its guess or its data cannot be solved as given."""
 

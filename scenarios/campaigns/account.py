@@ -24,6 +24,7 @@ from unifg.scenarios.campaigns.performed import OK
 from unifg.scenarios.campaigns.sheet import OUTCOMES, Combination, Sheet, load
 from unifg.style.figures import write_figure
 from unifg.typing import Array
+from unifg.whole import write_whole
 
 __all__ = ["differences", "outcome_table", "value_table", "write_report"]
 
@@ -70,8 +71,8 @@ def write_report(folder: Path, against: Path | None = None, any_code: bool = Fal
         blocks += _beside(sheet, load(against, any_code), shown)
     blocks += _failures(sheet)
     files = folder / "report.html", folder / "report.md"
-    files[0].write_text(as_html(sheet.title, blocks), encoding="utf-8", newline="\n")
-    files[1].write_text(as_markdown(sheet.title, blocks, folder), encoding="utf-8", newline="\n")
+    write_whole(files[0], as_html(sheet.title, blocks))
+    write_whole(files[1], as_markdown(sheet.title, blocks, folder))
     return list(files)
 
 

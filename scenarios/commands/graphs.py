@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from unifg.files.contents import legible
 from unifg.files.g2o import write_g2o
 from unifg.files.tum import write_tum
 from unifg.pose_graphs.certificate import Certificate
@@ -15,13 +17,12 @@ from unifg.scenarios import pose_graph
 from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.log.metrics import table, write_metrics
 from unifg.scenarios.pose_graph import SolvedGraph
-from unifg.scenarios.show.graph_plot import picture
-from unifg.scenarios.show.graph_scene import graph_scene
-from unifg.style.figures import write_figure
 
 __all__ = ["SETTINGS", "metrics", "run", "summary", "write_results"]
 
 SETTINGS = pose_graph.SolveSettings
+
+logger = logging.getLogger("unifg")
 
 
 def run(settings: pose_graph.SolveSettings, progress: Progress) -> Outcome:
@@ -43,7 +44,7 @@ def write_results(folder: Path, solved: SolvedGraph) -> list[Path]:
 
     Returns:
         The files written: ``graph.g2o``, ``trajectory.tum`` (the positions in the file as times), ``metrics.json``
-        and, unless they were not wanted, ``graph.png`` and ``scene.html``.
+        and, unless they were not wanted or what draws is not installed, ``graph.png`` and ``scene.html``.
     """
     graph = write_g2o(folder / "graph.g2o", solved.after)
     poses = solved.after.poses
@@ -51,6 +52,16 @@ def write_results(folder: Path, solved: SolvedGraph) -> list[Path]:
     numbers = write_metrics(folder / "metrics.json", metrics(solved), sort_keys=False)
     if solved.settings.no_scene:
         return [graph, trajectory, numbers]
+    try:  # numbers need nothing but the library
+        import matplotlib  # noqa: F401
+        import meshcat  # noqa: F401
+    except ImportError as error:
+        logger.warning("no picture and no scene: they need %s: pip install 'unifg[view]'", error.name)
+        return [graph, trajectory, numbers]
+    from unifg.scenarios.show.graph_plot import picture
+    from unifg.scenarios.show.graph_scene import graph_scene
+    from unifg.style.figures import write_figure
+
     shown = write_figure(folder / "graph.png", picture(solved), 130)
     scene = graph_scene(solved).save(folder / "scene.html")
     return [scene, shown, graph, trajectory, numbers]
@@ -61,7 +72,7 @@ def metrics(solved: SolvedGraph) -> dict[str, Any]:
     settings, graph, solution = solved.settings, solved.after, solved.solution
     in_file, at_start, at_end = solved.chi2
     return {
-        "file": settings.file.name,
+        "file": legible(settings.file.name),
         "poses": len(graph.poses),
         "dimension": graph.group.point_dim,
         "edges": len(graph.edges),

@@ -13,6 +13,7 @@ from unifg.errors import FileFormatError
 from unifg.scenarios.log.columns import column, ragged, words
 from unifg.scenarios.worlds.layouts import Layout
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
+from unifg.whole import beside
 
 __all__ = ["FlightLog", "LandmarkRow"]
 
@@ -133,7 +134,7 @@ class FlightLog:
             arrays[f"{name}_lengths"] = np.array([len(part) for part in parts], dtype=np.int64)
         rest = {name: getattr(self, name) for name in _WORDS}
         rest |= {"version": _VERSION, "layout_name": self.layout.name}
-        with open(path, "wb") as file:  # numpy adds a suffix to a name, not to a file
+        with beside(path) as own, open(own, "wb") as file:  # numpy adds a suffix to a name, not to a file
             np.savez_compressed(file, allow_pickle=False, words=np.array(json.dumps(rest)), **arrays)
 
     @staticmethod

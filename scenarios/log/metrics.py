@@ -16,6 +16,7 @@ import numpy as np
 
 from unifg.scenarios.log.columns import columns
 from unifg.typing import Array, IntArray
+from unifg.whole import write_whole
 
 __all__ = [
     "collision_words",
@@ -81,7 +82,7 @@ def write_metrics(path: str | Path, metrics: Mapping[str, object], *, sort_keys:
     """
     path = Path(path)
     text = json.dumps(_strict(metrics), indent=2, sort_keys=sort_keys, allow_nan=False)
-    path.write_text(text + "\n", encoding="utf-8", newline="\n")
+    write_whole(path, text + "\n")
     return path
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from unifg.errors import FileFormatError, ScenarioError
+from unifg.files.contents import LIMITS, Limits, legible, read_text
 from unifg.typing import Array
 
 __all__ = ["Profile", "drive_cycle", "read_profile"]
@@ -17,6 +19,8 @@ __all__ = ["Profile", "drive_cycle", "read_profile"]
 SPEED_COLUMNS = ("v_ref_mps", "v_mps", "speed", "v")
 TIME_COLUMNS = ("t_s", "time", "t")
 SLOPE_COLUMNS = ("slope_rad",)
+FASTEST = 1000.0  # [m/s]
+LONGEST_STEP = 3600.0  # [s]
 
 # Time [s] and speed [km/h] where the drive cycle turns a corner: a village, a town, a country road, and the way back.
 CORNERS = (
@@ -72,44 +76,54 @@ def drive_cycle(length: int) -> Profile:
     return Profile("drive cycle of unifg", raw @ weight / weight.sum(), np.zeros(length + 1), 1.0)
 
 
-def read_profile(path: Path) -> Profile:
+def read_profile(path: Path, limits: Limits = LIMITS) -> Profile:
     """Read a CSV file with a header: a column of speeds, one of times, and perhaps one of slopes.
 
     Args:
         path: columns ``v_ref_mps`` [m/s], ``t_s`` [s] (evenly spaced; without it 1 s apart) and ``slope_rad`` [rad]
             (without it level); others are ignored.
+        limits: of what the file may hold.
 
     Raises:
-        FileFormatError: naming the line of what is missing or no number.
+        FileFormatError: naming the line of what is missing, no number, or no speed, time or slope of a road; also where
+            two columns hold the same.
     """
+    name = legible(path)
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            lines = list(csv.reader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise FileFormatError(f"{path}: cannot be read as CSV ({error})") from error
-    head = [name.strip() for name in lines[0]] if lines else []
-    speed = _column(path, head, lines, SPEED_COLUMNS)
+        lines = list(csv.reader(io.StringIO(read_text(path, limits), newline="")))
+    except csv.Error as error:
+        raise FileFormatError(f"{name}: cannot be read as CSV ({error})") from error
+    head = [word.strip() for word in lines[0]] if lines else []
+    speed = _column(name, head, lines, SPEED_COLUMNS, (0.0, FASTEST))
     if speed is None:
-        raise FileFormatError(f"{path}:1: no column '{SPEED_COLUMNS[0]}' of speeds (there are: {', '.join(head)})")
+        there = ", ".join(head)[:200]
+        raise FileFormatError(f"{name}, line 1: no column '{SPEED_COLUMNS[0]}' of speeds (there are: {there})")
     if len(speed) < 2:
-        raise FileFormatError(f"{path}: holds {len(speed)} speeds; a drive needs 2 at least")
-    time, slope = _column(path, head, lines, TIME_COLUMNS), _column(path, head, lines, SLOPE_COLUMNS)
+        raise FileFormatError(f"{name}: holds {len(speed)} speeds; a drive needs 2 at least")
+    time = _column(name, head, lines, TIME_COLUMNS, (-1e12, 1e12))
+    slope = _column(name, head, lines, SLOPE_COLUMNS, (-0.5 * math.pi, 0.5 * math.pi))
     dt = 1.0
     if time is not None:
         steps = np.diff(time)
         dt = float(steps[0])
         uneven = np.flatnonzero(np.abs(steps - dt) > 1e-6 * abs(dt))
-        if dt <= 0.0 or len(uneven):
+        if not 0.0 < dt <= LONGEST_STEP or len(uneven):
             line = 3 + (int(uneven[0]) if len(uneven) else 0)
-            raise FileFormatError(f"{path}:{line}: times must grow by the same step throughout")
+            text = f"times must grow by the same step throughout, of at most {LONGEST_STEP:g} s"
+            raise FileFormatError(f"{name}, line {line}: {text}")
     return Profile(path.name, speed, np.zeros_like(speed) if slope is None else slope, dt)
 
 
-def _column(path: Path, head: list[str], lines: list[list[str]], names: tuple[str, ...]) -> Array | None:
-    """The first of the named columns that is there."""
-    found = [head.index(name) for name in names if name in head]
+def _column(
+    file: str, head: list[str], lines: list[list[str]], names: tuple[str, ...], within: tuple[float, float]
+) -> Array | None:
+    """The one of the named columns that is there, with numbers within a range."""
+    found = [k for k, name in enumerate(head) if name in names]
     if not found:
         return None
+    if len(found) > 1:
+        both = " and ".join(f"'{head[k]}'" for k in found[:2])
+        raise FileFormatError(f"{file}, line 1: the columns {both} both hold the same: leave one out")
     numbers = []
     for number, line in enumerate(lines[1:], start=2):
         if not any(word.strip() for word in line):
@@ -119,6 +133,9 @@ def _column(path: Path, head: list[str], lines: list[list[str]], names: tuple[st
         except (IndexError, ValueError):
             value = math.nan
         if not math.isfinite(value):
-            raise FileFormatError(f"{path}:{number}: no finite number in column '{head[found[0]]}'")
+            raise FileFormatError(f"{file}, line {number}: no finite number in column '{head[found[0]]}'")
+        if not within[0] <= value <= within[1]:
+            text = f"{value:g} in column '{head[found[0]]}' is not between {within[0]:g} and {within[1]:g}"
+            raise FileFormatError(f"{file}, line {number}: {text}")
         numbers.append(value)
     return np.array(numbers, dtype=np.float64)

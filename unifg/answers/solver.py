@@ -6,6 +6,7 @@ import logging
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeAlias
 
@@ -315,6 +316,15 @@ class SolveState:
                 return
             self.accept(reached, self.multipliers, float(np.linalg.norm(step)), 1.0, search=1)
 
+    def keep_with(self, error: Exception) -> None:
+        """Hand what has been reached along with an error, as its attribute ``reached``, and say so in a note."""
+        if self._best is None:
+            return
+        with suppress(Exception):  # the functions may raise again
+            self.status = Status.INTERRUPTED
+            error.reached = self.finish(None)  # type: ignore[attr-defined]
+            error.add_note(f"after {self.iterations} iterations; the solution until then is in the error's `reached`")
+
     @property
     def least_violated(self) -> Values:
         """Values of least violation among the start and all iterates."""
@@ -442,6 +452,8 @@ class Prepared:
 
         Raises:
             BackendError: while another thread solves with this object, or this thread is in the midst of a solve.
+            Exception: of a function of the user's. It is passed on with notes on term, factor and variable; where an
+                iterate had been reached, its attribute ``reached`` is the solution until then.
         """
         if not self._turn.acquire(blocking=False):
             raise BackendError(f"this prepared {self.solver.name} is at work in another thread: prepare one for each")
@@ -484,6 +496,9 @@ class Prepared:
                 if run._best is None:
                     raise  # there is nothing to return
                 run.status = Status.INTERRUPTED
+            except Exception as error:
+                run.keep_with(error)
+                raise
             if run.alone and not run.iterations:
                 self._refuse_not_finite(run)
         solution = run.finish(reason)

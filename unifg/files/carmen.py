@@ -11,6 +11,7 @@ since the log began:
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,12 +19,15 @@ from pathlib import Path
 import numpy as np
 
 from unifg.errors import FileFormatError
-from unifg.files.tagged import read_bytes
+from unifg.files.contents import LIMITS, Limits, legible, read_text
 from unifg.typing import Array
 
 __all__ = ["CarmenLog", "Odometry", "Scans", "read_carmen"]
 
+logger = logging.getLogger("unifg")
+
 _READ = ("ODOM", "FLASER", "ROBOTLASER1")
+_WIDEST = 8.0 * math.pi  # where the first beam points and how far the others reach [rad]
 _ENDING = 3  # time, computer, time since the beginning
 
 
@@ -91,27 +95,24 @@ class _Group:
     rows: list[list[float]] = field(default_factory=list)  # time, poses, ranges
 
 
-def read_carmen(path: str | Path, field_of_view: float = math.pi) -> CarmenLog:
-    """Read a log, gzipped or not.
+def read_carmen(path: str | Path, field_of_view: float = math.pi, limits: Limits = LIMITS) -> CarmenLog:
+    """Read a log, gzipped or not; negative ranges, and times that run backwards, are named in one warning each.
 
     Args:
         path: the file.
         field_of_view: of FLASER scans [rad]. They start at minus half of it; an odd number of beams reaches the other
             end, an even one stops a step short (180 and 181 beams: one degree; 360 and 361: half a degree).
+        limits: of what the file may hold.
 
     Raises:
         FileFormatError: the file is missing or holds none of the lines that are read, or a line, named in the message,
             is too short or has something else where a number should be.
     """
-    path = Path(path)
-    try:
-        text = read_bytes(path).decode("utf-8", errors="strict")
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path}: cannot be read as text ({error})") from error
+    name = legible(path)
     motions: list[list[float]] = []
     groups: dict[tuple[float | str, ...], _Group] = {}
     skipped: dict[str, int] = {}
-    for number, line in enumerate(text.split("\n"), start=1):
+    for number, line in enumerate(read_text(path, limits).split("\n"), start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
@@ -127,15 +128,30 @@ def read_carmen(path: str | Path, field_of_view: float = math.pi) -> CarmenLog:
             else:
                 _robot_laser(words, groups)
         except (FileFormatError, IndexError) as error:
-            raise FileFormatError(f"{path}, line {number}: {tag}: {error}") from None
+            raise FileFormatError(f"{name}, line {number}: {tag}: {error}") from None
     if not motions and not groups:
-        raise FileFormatError(f"{path}: no line begins with {', '.join(_READ)}: is this a CARMEN log?")
+        raise FileFormatError(f"{name}: no line begins with {', '.join(_READ)}: is this a CARMEN log?")
     table = np.array(motions, dtype=np.float64).reshape(-1, 6)
+    _report(name, table[:, 0], list(groups.values()))
     return CarmenLog(
         Odometry(table[:, 0], table[:, 1:4], table[:, 4:]),
         tuple(_scans(group) for group in groups.values()),
         skipped,
     )
+
+
+def _report(name: str, odometry: Array, groups: list[_Group]) -> None:
+    """Warn of what is readable and cannot be."""
+    times = {"ODOM": odometry} | {f"laser {k}": np.array([row[0] for row in g.rows]) for k, g in enumerate(groups)}
+    back = {kind: int((np.diff(values) < 0.0).sum()) for kind, values in times.items()}
+    if any(back.values()):
+        said = ", ".join(f"{count} times in {kind}" for kind, count in back.items() if count)
+        logger.warning("%s: time runs backwards: %s", name, said)
+    negative = sum(value < 0.0 for group in groups for row in group.rows for value in row[7:])
+    if negative:
+        logger.warning(
+            "%s: %d ranges of scans are negative: lasers say so where they have measured nothing", name, negative
+        )
 
 
 def _motion(words: list[str]) -> list[float]:
@@ -161,6 +177,8 @@ def _robot_laser(words: list[str], groups: dict[tuple[float | str, ...], _Group]
     poses = 10 + count + remissions
     _require(words, poses + 11 + _ENDING)
     key = (words[0], count, start, step, maximum)
+    if not abs(start) + count * abs(step) < _WIDEST:
+        raise FileFormatError(f"{count} beams from {start:g} rad in steps of {step:g} rad are no scan")
     if key not in groups:
         groups[key] = _Group(start + step * np.arange(count, dtype=np.float64), maximum)
     _append(groups[key], words, 9, count, poses)

@@ -19,11 +19,13 @@ information matrix belongs to is not said in a file; see `unifg.pose_graphs.Pose
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
 
 from unifg.errors import FileFormatError
+from unifg.files.contents import LIMITS, Limits, write_text
 from unifg.files.tagged import (
     Block,
     TaggedFile,
@@ -31,10 +33,10 @@ from unifg.files.tagged import (
     distinct,
     from_triangle,
     positions_of,
+    report_isolated,
     report_skipped,
     triangle_names,
     upper_triangle,
-    write_text,
 )
 from unifg.lie import SE3
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph, Sightings
@@ -44,7 +46,8 @@ __all__ = ["parse_g2o", "read_g2o", "write_g2o"]
 
 _POSE = {3: "id x y theta", 7: "id x y z qx qy qz qw"}
 _EDGE = {3: "i j dx dy dtheta", 7: "i j dx dy dz qx qy qz qw"}
-_SMALLEST_NORM = 1e-6  # below it a quaternion says nothing about a rotation
+_SMALLEST_NORM, _LARGEST_NORM = 1e-6, 1e6  # of a quaternion that says something about a rotation
+_SMALLEST_SIGMA = 1e-12  # [m] or [rad]
 _UNIT = 1e-12  # a squared norm this close to one is one: what was written here is read back unchanged
 _KNOWN = {
     "VERTEX_SE2", "EDGE_SE2", "VERTEX_XY", "EDGE_SE2_XY", "EDGE_BEARING_SE2_XY", "EDGE_RANGE_SE2_XY", "BR",
@@ -52,20 +55,21 @@ _KNOWN = {
 }  # fmt: skip
 
 
-def read_g2o(path: str | Path) -> PoseGraph:
+def read_g2o(path: str | Path, limits: Limits = LIMITS) -> PoseGraph:
     """Read a pose graph; ``#`` begins a comment, lines may come in any order, gzipped files are unpacked.
 
     Quaternions are normalised. Lines with tags that are not read are counted in ``skipped`` and named in one warning.
 
     Args:
         path: the file.
+        limits: of what it may hold.
 
     Raises:
         FileFormatError: the file is missing or holds no pose, mixes planar and spatial poses, or a line (named in the
             message) has the wrong number of fields, is not made of finite numbers, repeats a vertex or refers to one
             that is not there.
     """
-    return parse_g2o(TaggedFile.read(path))
+    return parse_g2o(TaggedFile.read(path, limits))
 
 
 def parse_g2o(file: TaggedFile) -> PoseGraph:
@@ -98,12 +102,17 @@ def parse_g2o(file: TaggedFile) -> PoseGraph:
             values,
             information,
         )
+    first, second = (positions_of(file, pose_places, edges.integers[:, k], edges.lines, "pose") for k in (0, 1))
+    seen_from = [seen.pose for seen in sightings.values()]
+    report_isolated(file, "pose", vertices.integers[:, 0], np.concatenate([first, second, *seen_from]))
+    seen_points = [np.zeros(0, dtype=np.intp), *(seen.landmark for seen in sightings.values())]
+    report_isolated(file, "landmark", points.integers[:, 0], np.concatenate(seen_points))
     return PoseGraph(
         vertices.integers[:, 0],
         poses,
         Edges(
-            positions_of(file, pose_places, edges.integers[:, 0], edges.lines, "pose"),
-            positions_of(file, pose_places, edges.integers[:, 1], edges.lines, "pose"),
+            first,
+            second,
             measured.copy() if planar else spatial_poses(file, edges, measured),
             from_triangle(edges.numbers[:, size:], dim),
         ),
@@ -159,13 +168,15 @@ def spatial_poses(file: TaggedFile, block: Block, poses: Array) -> Array:
     """SE3 poses from x y z qx qy qz qw, quaternions normalised; those of norm one stay as they are, bit by bit.
 
     Raises:
-        FileFormatError: a quaternion, named by its line, is nearly zero.
+        FileFormatError: a quaternion, named by its line, is nearly zero or huge.
     """
-    squared = np.einsum("ni,ni->n", poses[:, 3:], poses[:, 3:])
-    bad = np.flatnonzero(squared < _SMALLEST_NORM**2)
+    with np.errstate(over="ignore", under="ignore"):
+        squared = np.einsum("ni,ni->n", poses[:, 3:], poses[:, 3:])
+    bad = np.flatnonzero(~((squared >= _SMALLEST_NORM**2) & (squared <= _LARGEST_NORM**2)))
     if bad.size:
         k = int(bad[0])
-        raise file.refuse(int(block.lines[k]), f"the quaternion {poses[k, 3:]} has norm {squared[k] ** 0.5:g}, not one")
+        long = math.hypot(*poses[k, 3:].tolist())
+        raise file.refuse(int(block.lines[k]), f"the quaternion {poses[k, 3:]} has norm {long:g}, not one")
     norm = np.where(np.abs(squared - 1.0) <= _UNIT, 1.0, np.sqrt(squared))
     return np.column_stack([poses[:, :3], poses[:, 6] / norm, poses[:, 3:6] / norm[:, None]])
 
@@ -187,9 +198,11 @@ def _planar_sightings(file: TaggedFile) -> dict[str, tuple[Block, Array, Array]]
             found[kind] = block, block.numbers[:, :1].copy(), block.numbers[:, 1:, None].copy()
     both = file.block("BR", 2, "pose landmark bearing range bearing_sigma range_sigma")
     if len(both):
-        wrong = np.flatnonzero((both.numbers[:, 2:] <= 0.0).any(axis=1))
+        wrong = np.flatnonzero((both.numbers[:, 2:] < _SMALLEST_SIGMA).any(axis=1))
         if wrong.size:
-            raise file.refuse(int(both.lines[wrong[0]]), "BR: standard deviations must be positive")
+            sigmas = both.numbers[wrong[0], 2:]
+            text = f"BR: standard deviations must be positive, {_SMALLEST_SIGMA:g} at least, found {sigmas}"
+            raise file.refuse(int(both.lines[wrong[0]]), text)
         information = np.zeros((len(both), 2, 2))
         information[:, [0, 1], [0, 1]] = both.numbers[:, 2:] ** -2.0
         found["bearing-range"] = both, both.numbers[:, :2].copy(), information

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from unifg.errors import FileFormatError
-from unifg.files.tagged import read_bytes, write_text
+from unifg.files.contents import LIMITS, Limits, legible, read_text, write_text
 from unifg.lie import SE2, SE3
 from unifg.typing import Array, ArrayLike
 
@@ -20,11 +20,12 @@ _FIELDS = 12
 _ROTATION = 1e-2  # largest |R'R - I| that rounding and single precision excuse
 
 
-def read_kitti(path: str | Path) -> Array:
+def read_kitti(path: str | Path, limits: Limits = LIMITS) -> Array:
     """Read poses; empty lines are skipped, matrices are moved to the nearest rotation.
 
     Args:
         path: the file, gzipped or not.
+        limits: of what it may hold.
 
     Returns:
         (n, 7) poses of `unifg.SE3`.
@@ -33,32 +34,28 @@ def read_kitti(path: str | Path) -> Array:
         FileFormatError: the file is missing, or a line (named in the message) is not twelve finite numbers with a
             rotation among them.
     """
-    path = Path(path)
-    try:
-        text = read_bytes(path).decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path}: cannot be read as text ({error})") from error
-    rows, lines = [], []
-    for number, line in enumerate(text.split("\n"), start=1):
+    name, rows, lines = legible(path), [], []
+    for number, line in enumerate(read_text(path, limits).split("\n"), start=1):
         words = line.split()
         if not words:
             continue
         if len(words) != _FIELDS:
             hint = "; fields are separated by blanks, not commas" if "," in line else ""
-            raise FileFormatError(f"{path}, line {number}: {len(words)} fields, expected {_FIELDS}{hint}")
+            raise FileFormatError(f"{name}, line {number}: {len(words)} fields, expected {_FIELDS}{hint}")
         try:
             rows.append([float(word) for word in words])
         except ValueError:
-            raise FileFormatError(f"{path}, line {number}: not twelve numbers: {line.strip()!r}") from None
+            raise FileFormatError(f"{name}, line {number}: not twelve numbers: {line.strip()[:200]!r}") from None
         lines.append(number)
     matrices = np.array(rows, dtype=np.float64).reshape(-1, 3, 4)
     rotations = matrices[:, :, :3]
     # In this order NaN counts as too far.
-    right = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2), initial=0.0) < _ROTATION
-    right &= np.isfinite(matrices).all(axis=(1, 2)) & (np.linalg.det(np.nan_to_num(rotations)) > 0.0)
+    with np.errstate(all="ignore"):
+        right = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2), initial=0.0) < _ROTATION
+        right &= np.isfinite(matrices).all(axis=(1, 2)) & (np.linalg.det(np.nan_to_num(rotations)) > 0.0)
     if not right.all():
         k = int(np.flatnonzero(~right)[0])
-        raise FileFormatError(f"{path}, line {lines[k]}: columns 1 to 3, 5 to 7, 9 to 11 are not a rotation matrix")
+        raise FileFormatError(f"{name}, line {lines[k]}: columns 1 to 3, 5 to 7, 9 to 11 are not a rotation matrix")
     full = np.tile(np.eye(4), (len(matrices), 1, 1))
     full[:, :3] = matrices
     return SE3.from_matrix(full)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from unifg.files.contents import LIMITS, Limits
 from unifg.files.g2o import parse_g2o
 from unifg.files.tagged import TaggedFile
 from unifg.files.toro import parse_toro
@@ -12,15 +13,16 @@ from unifg.pose_graphs.pose_graph import PoseGraph
 __all__ = ["read_pose_graph"]
 
 
-def read_pose_graph(path: str | Path) -> PoseGraph:
+def read_pose_graph(path: str | Path, limits: Limits = LIMITS) -> PoseGraph:
     """Read a pose graph in the g2o or TORO format, told apart by their tags and not by the name of the file.
 
     Args:
         path: the file, gzipped or not.
+        limits: of what it may hold.
 
     Raises:
         FileFormatError: as `unifg.files.g2o.read_g2o` and `unifg.files.toro.read_toro`.
     """
-    file = TaggedFile.read(path)
+    file = TaggedFile.read(path, limits)
     toro = "VERTEX2" in file.texts or "VERTEX3" in file.texts
     return parse_toro(file) if toro else parse_g2o(file)

@@ -10,17 +10,23 @@ unknown, which is neither.
 from __future__ import annotations
 
 import math
+import reprlib
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
 
 from unifg.errors import FileFormatError, ModelError
+from unifg.files.contents import LIMITS, Limits, legible, read_text
 from unifg.typing import Array, BoolArray
+from unifg.whole import write_whole
 
 _DEFAULT_OCCUPIED, _DEFAULT_FREE = 0.65, 0.196
 # Values of ROS's own map_saver; 205 lies between the default thresholds.
+_WIDEST = 1e6  # of a map [m]
+_pillow = Lock()  # its limit of pixels is one for all threads
 _PIXEL_OCCUPIED, _PIXEL_FREE, _PIXEL_UNKNOWN = 0, 254, 205
 
 
@@ -101,7 +107,7 @@ class OccupancyMap:
         return np.array([[c, -s], [s, c]])
 
 
-def load_map(path: str | Path) -> OccupancyMap:
+def load_map(path: str | Path, limits: Limits = LIMITS) -> OccupancyMap:
     """Read a map from its YAML file and the image named in it.
 
     Modes ``trinary`` (the default) and ``scale`` are read; both give the same three classes here, because the
@@ -111,6 +117,7 @@ def load_map(path: str | Path) -> OccupancyMap:
 
     Args:
         path: the YAML file.
+        limits: of what it and its image may hold.
 
     Returns:
         The map, with row 0 at the bottom and the file's stem as its name.
@@ -119,30 +126,37 @@ def load_map(path: str | Path) -> OccupancyMap:
         FileFormatError: the YAML file or its image is missing, unreadable, or says something impossible.
     """
     path = Path(path)
-    header = _read_header(path)
-    resolution = _number(path, header, "resolution", None)
+    name, header = legible(path), _read_header(path, limits)
+    resolution = _number(name, header, "resolution", None)
     if resolution <= 0.0:
-        raise FileFormatError(f"{path}: resolution is {resolution}; it must be positive [m]")
-    origin = _origin(path, header)
-    occupied_threshold = _number(path, header, "occupied_thresh", _DEFAULT_OCCUPIED)
-    free_threshold = _number(path, header, "free_thresh", _DEFAULT_FREE)
+        raise FileFormatError(f"{name}: resolution is {resolution}; it must be positive [m]")
+    origin = _origin(name, header)
+    occupied_threshold = _number(name, header, "occupied_thresh", _DEFAULT_OCCUPIED)
+    free_threshold = _number(name, header, "free_thresh", _DEFAULT_FREE)
     if not 0.0 <= free_threshold <= occupied_threshold <= 1.0:
         raise FileFormatError(
-            f"{path}: free_thresh {free_threshold} and occupied_thresh {occupied_threshold} must satisfy "
+            f"{name}: free_thresh {free_threshold} and occupied_thresh {occupied_threshold} must satisfy "
             "0 <= free_thresh <= occupied_thresh <= 1"
         )
-    mode = str(header.get("mode", "trinary")).lower()
+    mode = header.get("mode", "trinary")
+    mode = mode.lower() if isinstance(mode, str) else reprlib.repr(mode)
     if mode == "raw":
-        raise FileFormatError(f"{path}: mode 'raw' is not supported; save the map again in mode 'trinary'")
+        raise FileFormatError(f"{name}: mode 'raw' is not supported; save the map again in mode 'trinary'")
     if mode not in ("trinary", "scale"):
-        raise FileFormatError(f"{path}: unknown mode {mode!r}; expected 'trinary' or 'scale'")
+        raise FileFormatError(f"{name}: unknown mode {mode!r}; expected 'trinary' or 'scale'")
     if header.get("negate", 0) not in (0, 1):  # True and False compare equal to 1 and 0
-        raise FileFormatError(f"{path}: negate is {header['negate']!r}; it must be 0 or 1")
+        raise FileFormatError(f"{name}: negate is {reprlib.repr(header['negate'])}; it must be 0 or 1")
 
     image = header.get("image")
     if not isinstance(image, str) or not image:
-        raise FileFormatError(f"{path}: 'image' is {image!r}; it must name the image beside the YAML file")
-    grey, visible = _read_image(path, path.parent / image)
+        raise FileFormatError(f"{name}: 'image' is {reprlib.repr(image)}; it must name the image beside the YAML file")
+    grey, visible = _read_image(name, path.parent / image, limits)
+    width = resolution * max(grey.shape)
+    if width > _WIDEST or max(map(abs, origin)) > 1e12 * resolution:
+        raise FileFormatError(
+            f"{name}: {grey.shape[1]} x {grey.shape[0]} cells of {resolution:g} m at {origin} are no map of a place; "
+            "the resolution is the side of a cell [m]"
+        )
     probability = (grey if header.get("negate", 0) else 255.0 - grey) / 255.0
     return OccupancyMap(
         occupied=np.ascontiguousarray(((probability > occupied_threshold) & visible)[::-1]),
@@ -166,13 +180,13 @@ def save_map(path: str | Path, occupancy: OccupancyMap) -> None:
     pixels[occupancy.occupied] = _PIXEL_OCCUPIED
     height, width = occupancy.shape
     image = path.with_suffix(".pgm")
-    image.write_bytes(f"P5\n{width} {height}\n255\n".encode("ascii") + pixels[::-1].tobytes())
+    write_whole(image, f"P5\n{width} {height}\n255\n".encode("ascii") + pixels[::-1].tobytes())
     x, y, yaw = (float(value) for value in occupancy.origin)
-    path.write_text(
+    write_whole(
+        path,
         f'image: "{image.name}"\nmode: trinary\nresolution: {_yaml_float(occupancy.resolution)}\n'
         f"origin: [{_yaml_float(x)}, {_yaml_float(y)}, {_yaml_float(yaw)}]\nnegate: 0\n"
         f"occupied_thresh: {_DEFAULT_OCCUPIED}\nfree_thresh: {_DEFAULT_FREE}\n",
-        encoding="utf-8",
     )
 
 
@@ -182,38 +196,53 @@ def _yaml_float(value: float) -> str:
     return text if "e" not in text or "." in text else text.replace("e", ".0e")
 
 
-def _read_header(path: Path) -> dict[str, Any]:
+def _read_header(path: Path, limits: Limits) -> dict[str, Any]:
     try:
         import yaml
     except ImportError as error:
         raise ImportError("reading a ROS map needs PyYAML: pip install 'unifg[scenarios]'") from error
+    name = legible(path)
     try:
-        header = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise FileFormatError(f"{path}: no such file; give the YAML file of a ROS map") from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise FileFormatError(f"{path}: not readable as YAML ({error}); give the YAML file, not the image") from error
+        text = read_text(path, limits)
+    except FileFormatError as error:
+        raise FileFormatError(f"{error}; give the YAML file of a ROS map, not its image") from error
+    try:
+        depth = 0
+        for event in yaml.parse(text, Loader=yaml.SafeLoader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > limits.depth or isinstance(event, yaml.AliasEvent):
+                what = "nested too deeply" if depth > limits.depth else "an alias, of which a map has none"
+                raise FileFormatError(f"{name}, line {event.start_mark.line + 1 if event.start_mark else 1}: {what}")
+        header = yaml.safe_load(text)
+    except FileFormatError:
+        raise
+    except Exception as error:  # beside its own, PyYAML lets out what dates, numbers and tags that are none raise
+        kind = "" if isinstance(error, yaml.YAMLError) else f"{type(error).__name__}: "
+        raise FileFormatError(f"{name}: not readable as YAML ({kind}{error})") from error
     if not isinstance(header, dict):
-        raise FileFormatError(f"{path}: expected lines 'key: value' (image, resolution, ...), found {header!r}")
+        found = reprlib.repr(header)
+        raise FileFormatError(f"{name}: expected lines 'key: value' (image, resolution, ...), found {found}")
     for key in ("image", "resolution", "origin"):
         if key not in header:
-            raise FileFormatError(f"{path}: the key {key!r} is missing; a map needs image, resolution, origin")
+            raise FileFormatError(f"{name}: the key {key!r} is missing; a map needs image, resolution, origin")
     return header
 
 
-def _number(path: Path, header: dict[str, Any], key: str, default: float | None) -> float:
+def _number(name: str, header: dict[str, Any], key: str, default: float | None) -> float:
     value = _to_float(header.get(key, default))
     if value is None:
-        raise FileFormatError(f"{path}: {key} is {header[key]!r}; it must be a finite number")
+        raise FileFormatError(f"{name}: {key} is {reprlib.repr(header[key])}; it must be a finite number")
     return value
 
 
-def _origin(path: Path, header: dict[str, Any]) -> tuple[float, float, float]:
+def _origin(name: str, header: dict[str, Any]) -> tuple[float, float, float]:
     entries = header["origin"]
     values = [_to_float(entry) for entry in entries] if isinstance(entries, list) else []
     numbers = [value for value in values if value is not None]
     if len(values) != 3 or len(numbers) != 3:
-        raise FileFormatError(f"{path}: origin is {entries!r}; it must be [x, y, yaw] in metres and radians")
+        raise FileFormatError(
+            f"{name}: origin is {reprlib.repr(entries)}; it must be [x, y, yaw] in metres and radians"
+        )
     return numbers[0], numbers[1], numbers[2]
 
 
@@ -223,29 +252,42 @@ def _to_float(value: object) -> float | None:
         return None
     try:
         number = float(value)
-    except ValueError:
+    except (ValueError, OverflowError):
         return None
     return number if math.isfinite(number) else None
 
 
-def _read_image(path: Path, image: Path) -> tuple[Array, BoolArray]:
+def _read_image(name: str, image: Path, limits: Limits) -> tuple[Array, BoolArray]:
     """Grey values (H, W) in 0..255, top row first, and which pixels are not fully transparent."""
     try:
         from PIL import Image, UnidentifiedImageError
     except ImportError as error:
         raise ImportError("reading a map's image needs Pillow: pip install 'unifg[scenarios]'") from error
+    where = f"{legible(image)} (named in {name})"
     try:
-        with Image.open(image) as picture:
-            kind = picture.mode
+        with _opened(Image, image) as picture:
+            kind, (width, height) = picture.mode, picture.size
+            if width * height > limits.pixels:
+                raise FileFormatError(f"{where}: {width} x {height} pixels: limits=Limits(pixels=...) reads more")
             if kind not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
-                raise FileFormatError(f"{image} (named in {path}): pixel kind {kind!r}; save as 8-bit grey or RGB")
+                raise FileFormatError(f"{where}: pixel kind {kind!r}; save as 8-bit grey or RGB")
             pixels = np.asarray(picture.convert("RGBA"), dtype=np.uint8)
+    except FileFormatError:
+        raise
     except FileNotFoundError as error:
-        raise FileFormatError(f"{path}: the image {image} does not exist; put it beside the YAML") from error
+        raise FileFormatError(f"{name}: the image {legible(image)} does not exist; put it beside the YAML") from error
     except UnidentifiedImageError as error:
-        raise FileFormatError(f"{image} (named in {path}): not an image that Pillow can read") from error
-    except (OSError, SyntaxError, ValueError) as error:
-        if isinstance(error, FileFormatError):
-            raise
-        raise FileFormatError(f"{image} (named in {path}): damaged image ({error})") from error
+        raise FileFormatError(f"{where}: not an image that Pillow can read") from error
+    except Exception as error:  # Pillow's readers let out whatever a damaged image makes them stumble over
+        raise FileFormatError(f"{where}: damaged image ({type(error).__name__}: {error})") from error
     return pixels[..., :3].sum(axis=-1, dtype=np.int64) / 3.0, pixels[..., 3] > 0
+
+
+def _opened(pillow: Any, path: Path) -> Any:
+    """An image whose size nobody has judged yet."""
+    with _pillow:
+        most, pillow.MAX_IMAGE_PIXELS = pillow.MAX_IMAGE_PIXELS, None
+        try:
+            return pillow.open(path)
+        finally:
+            pillow.MAX_IMAGE_PIXELS = most

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import gzip
 import logging
+import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unifg.errors import FileFormatError
+from unifg.files.contents import LIMITS, Limits, legible, read_text
 from unifg.typing import Array, IntArray
 
 __all__ = [
@@ -22,17 +23,16 @@ __all__ = [
     "distinct",
     "from_triangle",
     "positions_of",
-    "read_bytes",
+    "report_isolated",
     "report_skipped",
     "triangle_names",
     "upper_triangle",
-    "write_text",
 ]
 
 logger = logging.getLogger("unifg")
 
 _EXACT = float(2**53)  # whole numbers up to here are exact in float64
-_GZIP = b"\x1f\x8b"
+_WHOLE = re.compile(r"[+-]?[0-9]+")
 
 
 @dataclass(frozen=True)
@@ -59,29 +59,24 @@ class TaggedFile:
     """Lines of a file by their first word; comments and empty lines are gone.
 
     Attributes:
-        path: the file, for messages.
+        path: name of the file, for messages.
         texts: what follows the tag, line by line.
         lines: numbers of these lines, from 1.
     """
 
-    path: Path
+    path: str
     texts: dict[str, list[str]] = field(default_factory=dict)
     lines: dict[str, list[int]] = field(default_factory=dict)
 
     @classmethod
-    def read(cls, path: str | Path) -> TaggedFile:
+    def read(cls, path: str | Path, limits: Limits = LIMITS) -> TaggedFile:
         """Read a text file, gzipped or not.
 
         Raises:
-            FileFormatError: the file is missing or is no text.
+            FileFormatError: the file is missing, is no text, or exceeds a limit.
         """
-        path = Path(path)
-        try:
-            text = read_bytes(path).decode("utf-8")
-        except UnicodeDecodeError as error:
-            raise FileFormatError(f"{path}: cannot be read as text ({error})") from error
-        found = cls(path)
-        for number, line in enumerate(text.split("\n"), start=1):
+        found = cls(legible(path))
+        for number, line in enumerate(read_text(path, limits).split("\n"), start=1):
             words = line.split(None, 1)
             if not words or words[0].startswith("#"):
                 continue
@@ -143,12 +138,11 @@ class TaggedFile:
         for text, line in zip(texts, self.lines[tag], strict=True):
             for name, word in zip(fields, text.split(), strict=True):
                 try:
-                    value = float(word)
+                    value = float(word if word.isascii() and "_" not in word else "none")  # 1_000 is for programs
                 except ValueError:
                     raise self.refuse(line, f"{tag}: field {name} is {word!r}, not a number") from None
                 if not np.isfinite(value):
                     raise self.refuse(line, f"{tag}: field {name} is {word}, not a finite number")
-        # Python reads some words that the C parser does not, such as 1_000.
         raise FileFormatError(f"{self.path}: a number of the {tag} lines is written in an unusual way")
 
     def _integers(self, tag: str, texts: list[str], count: int, fields: list[str]) -> NDArray[np.int64]:
@@ -157,7 +151,7 @@ class TaggedFile:
         for text, line in zip(texts, self.lines[tag], strict=True):
             words = text.split(None, count)[:count]
             for name, word in zip(fields, words, strict=False):
-                if not word.lstrip("+-").isdecimal() or not -(2**63) <= int(word) < 2**63:
+                if not _WHOLE.fullmatch(word) or not -(2**63) <= int(word) < 2**63:
                     raise self.refuse(line, f"{tag}: field {name} is {word!r}, not an integer of 64 bits")
             rows.append([int(word) for word in words])
         return np.array(rows, dtype=np.int64).reshape(-1, count)
@@ -201,26 +195,19 @@ def distinct(file: TaggedFile, identifiers: NDArray[np.int64], lines: IntArray) 
     return places
 
 
-def read_bytes(path: Path) -> bytes:
-    """The content of a file, unpacked when it is gzipped.
+def report_isolated(file: TaggedFile, what: str, identifiers: NDArray[np.int64], used: IntArray) -> None:
+    """One warning that names vertices which nothing has measured.
 
-    Raises:
-        FileFormatError: the file is missing, unreadable, or a damaged archive.
+    Args:
+        file: for the message.
+        what: they are.
+        identifiers: (n,) of all.
+        used: positions of those that something speaks of.
     """
-    try:
-        content = path.read_bytes()
-        return gzip.decompress(content) if content.startswith(_GZIP) else content
-    except FileNotFoundError as error:
-        raise FileFormatError(f"{path}: no such file") from error
-    except (OSError, EOFError, ValueError) as error:
-        raise FileFormatError(f"{path}: cannot be read ({error})") from error
-
-
-def write_text(path: Path, text: str) -> Path:
-    """Write text, gzipped when the name ends in ``.gz``; the same text gives the same bytes."""
-    data = text.encode("ascii")
-    path.write_bytes(gzip.compress(data, mtime=0) if path.suffix == ".gz" else data)
-    return path
+    lonely = np.setdiff1d(np.arange(len(identifiers)), used)
+    if len(lonely):
+        first = ", ".join(map(str, identifiers[lonely[:5]].tolist())) + (", ..." if len(lonely) > 5 else "")
+        logger.warning("%s: nothing has measured %d of the %ss: %s", file.path, len(lonely), what, first)
 
 
 def report_skipped(file: TaggedFile, known: set[str]) -> dict[str, int]:

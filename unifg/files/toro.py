@@ -18,16 +18,17 @@ from pathlib import Path
 import numpy as np
 
 from unifg.errors import FileFormatError
+from unifg.files.contents import LIMITS, Limits, write_text
 from unifg.files.tagged import (
     TaggedFile,
     decimal_lines,
     distinct,
     from_triangle,
     positions_of,
+    report_isolated,
     report_skipped,
     triangle_names,
     upper_triangle,
-    write_text,
 )
 from unifg.lie import SE3, SO3
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph
@@ -40,20 +41,21 @@ _PLANAR_ORDER = [0, 1, 3, 5, 2, 4]  # where the row-by-row entries xx xy xt yy y
 _TO_ROWS = [0, 1, 4, 2, 5, 3]  # ... and TORO's xx xy yy tt xt yt in the row-by-row list
 
 
-def read_toro(path: str | Path) -> PoseGraph:
+def read_toro(path: str | Path, limits: Limits = LIMITS) -> PoseGraph:
     """Read a pose graph; gzipped files are unpacked.
 
     Lines with other tags, such as ``EQUIV``, are counted in ``skipped`` and named in one warning.
 
     Args:
         path: the file.
+        limits: of what it may hold.
 
     Raises:
         FileFormatError: the file is missing or holds no pose, mixes planar and spatial poses, or a line (named in the
             message) has the wrong number of fields, is not made of finite numbers, repeats a vertex or refers to one
             that is not there.
     """
-    return parse_toro(TaggedFile.read(path))
+    return parse_toro(TaggedFile.read(path, limits))
 
 
 def parse_toro(file: TaggedFile) -> PoseGraph:
@@ -75,6 +77,7 @@ def parse_toro(file: TaggedFile) -> PoseGraph:
         information = from_triangle(edges.numbers[:, 6:], 6)
     places = distinct(file, vertices.integers[:, 0], vertices.lines)
     first, second = (positions_of(file, places, edges.integers[:, k], edges.lines, "pose") for k in (0, 1))
+    report_isolated(file, "pose", vertices.integers[:, 0], np.concatenate([first, second]))
     return PoseGraph(vertices.integers[:, 0], poses, Edges(first, second, measured, information), skipped=skipped)
 
 

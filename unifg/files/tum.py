@@ -6,18 +6,23 @@ Exactly eight fields separated by single blanks, no trailing blank, the quaterni
 
 from __future__ import annotations
 
+import logging
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from unifg.errors import FileFormatError
+from unifg.files.contents import LIMITS, Limits, legible, read_text, write_text
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["Trajectory", "read_tum", "write_tum"]
 
 _FIELDS = ("t", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
-_SMALLEST_NORM = 1e-6  # below it a quaternion says nothing about a rotation
+_SMALLEST_NORM, _LARGEST_NORM = 1e-6, 1e6  # of a quaternion that says something about a rotation
+
+logger = logging.getLogger("unifg")
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,15 +76,17 @@ def write_tum(path: str | Path, time: ArrayLike, poses: ArrayLike) -> Path:
         rows = np.column_stack([times, array[:, :2], zero, zero, zero, np.sin(half), np.cos(half)])
     rows = np.round(rows, 9) + 0.0  # the sum turns -0.0 into 0.0
     lines = [" ".join(f"{value:.9f}" for value in row) for row in rows.tolist()]
-    path.write_text("".join(line + "\n" for line in lines), encoding="ascii", newline="\n")
-    return path
+    return write_text(path, "".join(line + "\n" for line in lines))
 
 
-def read_tum(path: str | Path) -> Trajectory:
+def read_tum(path: str | Path, limits: Limits = LIMITS) -> Trajectory:
     """Read a trajectory; empty lines and lines starting with ``#`` are skipped, quaternions are normalised.
 
+    Times that run backwards are named in one warning.
+
     Args:
-        path: the file.
+        path: the file, gzipped or not.
+        limits: of what it may hold.
 
     Returns:
         The trajectory, in the order of the file.
@@ -88,19 +95,17 @@ def read_tum(path: str | Path) -> Trajectory:
         FileFormatError: the file is missing, or a line (named in the message) is not eight finite numbers
             with a usable quaternion.
     """
-    path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise FileFormatError(f"{path}: no such file; give a trajectory in the TUM format") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileFormatError(f"{path}: cannot be read as text ({error})") from error
-    rows = [
-        _parse(f"{path}, line {number}", line)
-        for number, line in enumerate(text.splitlines(), start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
+    name, rows, lines = legible(path), [], []
+    for number, line in enumerate(read_text(path, limits).split("\n"), start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            rows.append(_parse(f"{name}, line {number}", line))
+            lines.append(number)
     table = np.array(rows, dtype=np.float64).reshape(-1, len(_FIELDS))
+    back = np.flatnonzero(np.diff(table[:, 0]) < 0.0)
+    if len(back):
+        logger.warning(
+            "%s, line %d: time runs backwards, here and %d times more", name, lines[back[0] + 1], len(back) - 1
+        )
     return Trajectory(table[:, 0], table[:, 1:4], table[:, 4:])
 
 
@@ -119,7 +124,7 @@ def _parse(place: str, line: str) -> list[float]:
         if not np.isfinite(value):
             raise FileFormatError(f"{place}: field {name} is {word}, not a finite number")
         values.append(value)
-    norm = float(np.linalg.norm(values[4:]))
-    if norm < _SMALLEST_NORM:
+    norm = math.hypot(*values[4:])
+    if not _SMALLEST_NORM <= norm <= _LARGEST_NORM:
         raise FileFormatError(f"{place}: the quaternion {' '.join(words[4:])} has norm {norm:g}; expected one")
     return values[:4] + [value / norm for value in values[4:]]

@@ -22,6 +22,7 @@ from unifg.typing import Array
 logger = logging.getLogger("unifg")
 LONGEST = 1 << 15  # numbers in the points of one call, which should fit into a cache with all that becomes of them
 SHORTEST = 4  # batches in a call that are worth it
+LOOKED_AT = 1000  # factors, one by one, after a function has raised
 FLOAT64 = np.dtype(np.float64)
 ALIKE = 1e-12  # relative difference that another order of summation may make
 
@@ -70,6 +71,19 @@ class Batched:
                 name the term.
         """
         return self._vetted(self.fill(points))
+
+    def culprit(self, points: Sequence[Array], count: int) -> int | None:
+        """The first of many factors for which the function raises by itself; None where it raises for none of them."""
+        for factor in range(min(count, LOOKED_AT)):
+            one = [point if len(point) == 1 else point[factor : factor + 1] for point in points]
+            arguments = self.fill(one)
+            for place in self._each:
+                arguments[place] = arguments[place][factor : factor + 1]
+            try:
+                self.function(*arguments)
+            except Exception:
+                return factor
+        return None
 
     def require_clean(self, points: Sequence[Array]) -> None:
         """Call the function once, and refuse one that changes its arguments.

@@ -302,7 +302,7 @@ def _parts(function: Any, seen: set[int], of_file: Callable[[str], str]) -> Iter
         found = python.__globals__.get(name)
         if isinstance(found, int | float | str | tuple | np.ndarray):  # constants are compiled in
             yield f"{name} = {_constant(found)}"
-        candidates = [getattr(found, n, None) for n in code.co_names] if isinstance(found, ModuleType) else [found]
+        candidates = [vars(found).get(n) for n in code.co_names] if isinstance(found, ModuleType) else [found]
         for callee in candidates:
             if is_compiled(callee):
                 yield from _parts(callee, seen, of_file)

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from unifg.errors import GraphError
+from unifg.errors import GraphError, place_error
 from unifg.kernels.batched import FLOAT64, Batched, changes
 from unifg.kernels.differences import (
     Directions,
@@ -384,7 +384,22 @@ class CompiledTerm:
 
     def residual(self, values: Values) -> Array:
         """(n, m) residuals, zero where inactive, not whitened; (n,) for a scalar cost."""
-        return self._masked(self._checked(self._batched.at(self.points(values))))
+        points = self.points(values)
+        try:
+            found = self._batched.at(points)
+        except Exception as error:
+            self._place(error, points)
+            raise
+        return self._masked(self._checked(found))
+
+    def _place(self, error: Exception, points: list[Array]) -> None:
+        """Say of an error of the user's function which factor raises it."""
+        if getattr(error, "index", None) is not None:
+            return
+        factor = self._batched.culprit(points, self.count)
+        if factor is not None:
+            first = self.gathers[0].selection
+            place_error(error, first.family.name, int(first.indices[factor % len(first)]), factor)
 
     def jacobians(self, values: Values, numerical: bool = False, search: bool = False) -> list[Array]:
         """One (n, m, d_k) array per variable argument, zero where inactive.
@@ -397,7 +412,11 @@ class CompiledTerm:
         attached = self.term.residual.search if search and self.term.residual.search else self._jacobian
         points = self.points(values)
         if attached is None or numerical:
-            blocks = slopes(self._batched, self._directions, points)
+            try:
+                blocks = slopes(self._batched, self._directions, points)
+            except Exception as error:
+                self._place(error, points)
+                raise
         else:
             found = attached(*self._batched.fill(points))
             blocks = blocks_of(self.name, found, self.term.arguments, self.count, self.size)

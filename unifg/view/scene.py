@@ -26,6 +26,7 @@ from unifg.view.members import Position
 from unifg.view.page import Label, Plot, View
 from unifg.view.recording import recorded
 from unifg.view.solutions import Recipe, recipe_of
+from unifg.whole import write_whole
 
 __all__ = ["Scene"]
 
@@ -255,7 +256,7 @@ class Scene(Content, Canvas):
             ViewError: nothing is drawn, or meshcat is not installed.
         """
         path = Path(path)
-        path.write_text(self.html(), encoding="utf-8", newline="\n")
+        write_whole(path, self.html())
         return path
 
     def live(self, port: int = 7000) -> Live:
