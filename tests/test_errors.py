@@ -180,7 +180,7 @@ def test_an_error_of_a_function_says_where_and_keeps_what_was_reached() -> None:
     x = graph.variables("x", fg.Rn(1), 5)
 
     def fragile(p: Array, z: Array) -> Array:
-        if np.any((p > 2.9) & (p < 5.6)):  # where the second step leads
+        if np.any(np.abs(p - 2.8) < 0.1):  # where the second step leads
             raise ZeroDivisionError("beyond what I know")
         return np.asarray(np.exp(0.5 * p) - z)
 
@@ -193,4 +193,4 @@ def test_an_error_of_a_function_says_where_and_keeps_what_was_reached() -> None:
     assert notes[1] == "at factor 3, whose first variable is x[3]"
     reached = raised.value.reached  # type: ignore[attr-defined]
     assert "`reached`" in notes[2] and reached.status is fg.Status.INTERRUPTED and reached.iterations >= 1
-    assert reached["x"][3, 0] > 5.6
+    assert reached["x"][3, 0] > 2.9
