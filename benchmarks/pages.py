@@ -74,6 +74,7 @@ PAGES = {
         Page("control-cases", "Control cases", "benchmarks.control_cases", hours=0.4),
         Page("own-functions", "Functions of one's own", "benchmarks.own_functions"),
         Page("claims", "What the backends claim, judged from outside", "benchmarks.claims", hours=0.2),
+        Page("reliability", "Reliability", "benchmarks.faults", hours=0.3),
         Page("navigation", "Drives, sequential coupling", "benchmarks.navigation", hours=0.05),
         Page("joint-drives", "Drives, joint coupling", "benchmarks.navigation", ("--coupling", "joint"), hours=0.06),
         Page("joint", "What the joint graph buys", "benchmarks.coupling", hours=0.8),

@@ -7,7 +7,7 @@ controls; how they meet is the coupling.
 from __future__ import annotations
 
 import logging
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -18,15 +18,16 @@ from unifg.horizon import Plan
 from unifg.machine.tally import counting
 from unifg.models import quadrotor
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
-from unifg.scenarios.flying.braking import braking_control
 from unifg.scenarios.flying.estimator import EstimatorSettings
 from unifg.scenarios.flying.flight_pilot import COUPLINGS, make_pilot
 from unifg.scenarios.flying.flight_settings import ControllerSettings
+from unifg.scenarios.flying.flight_watch import FlightWatch
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.options import count, option, share
 from unifg.scenarios.worlds.air import QuadrotorWorld
 from unifg.scenarios.worlds.conditions import draw_conditions
+from unifg.scenarios.worlds.faults import FLIGHT_FAULTS, Fault, FlightFaults, one_of
 from unifg.typing import Array
 
 __all__ = ["Flight", "FlightSettings", "run_flight"]
@@ -34,6 +35,7 @@ __all__ = ["Flight", "FlightSettings", "run_flight"]
 SCENARIO = "quadrotor-mpc"
 REACHED_DISTANCE = 0.3  # [m], by belief and truth
 REACHED_SPEED = 0.5  # [m/s], by belief and truth
+SLOWEST_SHARE = 0.05  # of the speed of the reference; at rest nothing is planned
 COLLISIONS = 3  # with so many a flight is given up
 
 logger = logging.getLogger("unifg")
@@ -53,6 +55,7 @@ class FlightSettings:
         time_limit: after which a flight is given up [s].
         estimator: of the past; its association is the flight's.
         controller: of the future; its avoidance and horizon are the flight's.
+        faults: what goes wrong; may be repeated.
     """
 
     solver: str = "ipm"
@@ -63,6 +66,9 @@ class FlightSettings:
     time_limit: float = 60.0
     estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
     controller: ControllerSettings = field(default_factory=ControllerSettings)
+    faults: tuple[Fault, ...] = option(
+        (), text=one_of(FLIGHT_FAULTS), metavar="KIND@SECONDS[:DURATION]", flag="fault", many=True
+    )
 
     def __post_init__(self) -> None:
         """Refuse a time that cannot be flown.
@@ -88,6 +94,7 @@ class FlightSettings:
             "window": self.estimator.window.length,
             "horizon": self.controller.horizon,
             "controller": asdict(self.controller),
+            "faults": [str(fault) for fault in self.faults],
         }
 
 
@@ -125,10 +132,13 @@ class Flight:
             settings.coupling, settings.solver, found.layout, believed, found.nominal, settings.estimator,
             settings.controller,
         )  # fmt: skip
+        self.faults, self.watch = FlightFaults(settings.faults, settings.seed), FlightWatch(settings.controller.dt)
+        self._speed = self.pilot.controller.guide.settings
+        self._wind = self.world.parameters.wind
         if not rehearsal:
             avoidance, association = settings.controller.avoidance, settings.estimator.association
             kind = SCENARIO, settings.coupling, settings.solver, avoidance, association, settings.movers > 0
-            rehearse(kind, lambda: Flight(settings, rehearsal=True))
+            rehearse(kind, lambda: Flight(replace(settings, faults=()), rehearsal=True))
 
     def run(self, progress: Progress) -> FlightLog:
         """Fly to the target, or until it is no use."""
@@ -137,9 +147,25 @@ class Flight:
             FlightLog, layout=world.layout, settings=settings.summary(), dt=dt, parameters_true=world.parameters.packed
         )
         self._control: Array | None = None
-        self._reached = False
+        self._reached = self._landed = False
+        self._health: list[str] = []
+        self._causes: list[str] = []
         interrupted = run_ticks(round(settings.time_limit / dt), lambda number: self._tick(recorder), progress)
-        return recorder.finish(collisions=world.collisions, reached=self._reached, interrupted=interrupted)
+        return recorder.finish(
+            collisions=world.collisions, reached=self._reached, interrupted=interrupted, health=self._health,
+            causes=self._causes, outcome=self._outcome(interrupted), dropped=dict(self.watch.door.dropped),
+        )  # fmt: skip
+
+    def _outcome(self, interrupted: bool) -> str:
+        """What has become of the flight, in words."""
+        cause = self.watch.verdict.cause
+        if self._reached or interrupted:
+            return "reached" if self._reached else "interrupted"
+        if self._landed:
+            return f"landed: {cause}"
+        if self.world.collisions >= COLLISIONS:
+            return "given up after collisions"
+        return "timed out" + (f": {cause}" if cause else "")
 
     def _tick(self, recorder: Recorder[FlightLog]) -> tuple[float, str] | None:
         """Decide and fly; None when the target is reached or the flight is given up."""
@@ -148,7 +174,12 @@ class Flight:
         self._reached = self._arrived(world.state) and self._arrived(self.pilot.belief.state)
         if self._reached:
             return None
-        world.step(self._control, self.settings.controller.dt)
+        now, (gust_x, gust_y) = world.time, self.faults.wind(world.time)
+        world.parameters = replace(world.parameters, wind=(self._wind[0] + gust_x, self._wind[1] + gust_y))
+        world.step(self.faults.control(self._control, now), self.settings.controller.dt)
+        self._landed = self.watch.lands and world.state[2] <= 0.0
+        if self._landed:
+            return None
         if world.collisions >= COLLISIONS:
             return None
         target, start = world.layout.target, world.layout.start
@@ -157,15 +188,28 @@ class Flight:
 
     def _decide(self, recorder: Recorder[FlightLog]) -> Array:
         """Sense, estimate, plan and record; the control (4,) to be flown."""
-        pilot, world, reading = self.pilot, self.world, self.world.sense()
+        pilot, world, watch = self.pilot, self.world, self.watch
+        reading = watch.look(self.faults.reading(world.sense(), world.time), world.time, self._control, pilot.belief)
+        verdict, guide = watch.verdict, pilot.controller.guide
+        guide.settings = replace(self._speed, speed=max(verdict.share, SLOWEST_SHARE) * self._speed.speed)
         plan: Plan | None = None
         with counting() as new:
             try:
                 plan = pilot.tick(reading, self._control)
             except (UnifgError, ArithmeticError, ValueError) as error:  # a robot in the air has to go on
                 logger.warning("the tick at %.2f s failed, the vehicle brakes: %s", world.time, error)
+        if self.faults.hold("solver-timeout", world.time):
+            plan = None
+        watch.planned(plan is not None and not plan.emergency)
         belief, settings = pilot.belief, self.settings.controller
-        control = braking_control(belief.state, belief.parameters, *settings.box) if plan is None else plan.control
+        if plan is None or verdict.rests or watch.lands:
+            plan, control = None, watch.hover(belief, *settings.box)
+            pilot.controller.loop.abandon()
+            pilot.controller.loop.applied = control.copy()
+        else:
+            control = plan.control
+        self._health.append(verdict.health.value)
+        self._causes.append(verdict.cause)
         marks = belief.landmarks
         recorder.add(
             truth=world.state,

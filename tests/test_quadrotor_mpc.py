@@ -20,6 +20,7 @@ from unifg.scenarios.commands import flights as results
 from unifg.scenarios.commands.catalogue import SCENARIOS
 from unifg.scenarios.episode import Progress
 from unifg.scenarios.flight import Flight, FlightSettings, run_flight
+from unifg.scenarios.flying import flight_watch
 from unifg.scenarios.flying.flight_pilot import COUPLINGS
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics, state_errors
@@ -232,7 +233,7 @@ def test_collisions_are_counted_and_many_end_the_flight(monkeypatch: pytest.Monk
     def fall(*given: object) -> Array:
         return np.zeros(4)
 
-    monkeypatch.setattr(episode, "braking_control", fall)
+    monkeypatch.setattr(flight_watch, "braking_control", fall)
     logs = []
     for most in (1, 3):
         monkeypatch.setattr(episode, "COLLISIONS", most)

@@ -11,18 +11,25 @@ from typing import Any
 import numpy as np
 import pytest
 
+from unifg.models import quadrotor
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.driving.drive_signals import RAMPS, DriveSignals
 from unifg.scenarios.driving.last_stop import LastStop
 from unifg.scenarios.driving.relocalise import PORTION, Found, Relocaliser
+from unifg.scenarios.flight import Flight, FlightSettings
+from unifg.scenarios.flying.flight_watch import FlightWatch
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import episode_metrics
+from unifg.scenarios.log.flight_metrics import flight_metrics
 from unifg.scenarios.navigation import Episode, NavigationSettings, askew
+from unifg.scenarios.seeing.belief import Belief, Landmarks
 from unifg.scenarios.seeing.readings import Reading, Scan
 from unifg.scenarios.supervision.door import Door
 from unifg.scenarios.supervision.supervisor import RISE, STEADY, Health, Ramp, Supervisor
+from unifg.scenarios.worlds.air import QuadrotorWorld
 from unifg.scenarios.worlds.building import building_map
-from unifg.scenarios.worlds.faults import DRIVE_FAULTS, Fault, one_of
+from unifg.scenarios.worlds.faults import DRIVE_FAULTS, FLIGHT_FAULTS, Fault, one_of
+from unifg.scenarios.worlds.layouts import corridor
 from unifg.scenarios.worlds.plane import World
 from unifg.typing import Array
 
@@ -395,3 +402,79 @@ def test_a_tick_that_fails_stops_the_robot_and_not_the_record(monkeypatch: pytes
     log = episode.run(stop)
     assert log.ticks == 10 and not log.control.any()
     assert log.cause[-1] == "the tick failed: Singular matrix" and log.health[-1] == "degraded"
+
+
+# ------------------------------------------------------------------- the quadrotor
+
+
+def believed(spread: float = 1e-4) -> Belief:
+    """A vehicle that flies at 1 m/s, 1.5 m above the floor."""
+    state = np.array([0.0, 0.0, 1.5, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    return Belief(state, spread * np.eye(9), quadrotor.Parameters(), np.zeros(7), Landmarks.none())
+
+
+def test_a_vehicle_that_sees_nothing_stops_in_time_and_lands_after_a_while() -> None:
+    watch, dt, applied = FlightWatch(0.05), 0.05, np.array([0.0, 0.0, 0.0, 9.81])
+    for tick in range(10):
+        watch.look(reading(), tick * dt, applied, believed())
+    assert watch.verdict.cause == ""
+    blind = reading(ids=np.zeros(0, int), bearings=np.zeros(0), ranges=np.zeros(0), radii=np.zeros(0),
+                    kinds=np.zeros(0, int), moving=np.zeros(0, bool))  # fmt: skip
+    rested = landed = 0.0
+    for tick in range(1, 200):
+        watch.look(blind, 0.5 + tick * dt, applied, believed())
+        rested = rested or (tick * dt if watch.verdict.rests else 0.0)
+        landed = landed or (tick * dt if watch.lands else 0.0)
+    assert rested == pytest.approx(0.2) and watch.verdict.health is Health.LOST
+    assert watch.verdict.cause == "nothing is seen"
+    assert 1.5 < landed < 2.5
+    least, most = np.array([-4.0, -4.0, -2.0, 2.0]), np.array([4.0, 4.0, 2.0, 20.0])
+    still = replace(believed(), state=np.array([0.0, 0.0, 1.5, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    assert watch.hover(still, least, most)[3] < 9.81, "it sinks"
+    assert FlightWatch(dt).hover(still, least, most)[3] == pytest.approx(9.81)
+
+
+@pytest.mark.parametrize(
+    ("changed", "cause"),
+    [
+        ({"ids": np.array([0, 1, 7]) + 100}, ""),
+        ({"rates": np.full(3, np.nan)}, "no inertial unit"),
+        ({"ranges": np.full(3, np.inf)}, "nothing is seen: sightings that cannot be"),
+    ],
+)
+def test_readings_say_what_is_the_matter(changed: dict[str, Any], cause: str) -> None:
+    watch = FlightWatch(0.05)
+    for tick in range(20):
+        watch.look(reading(**(changed if tick else {})), 0.05 * tick, np.zeros(4), believed())
+    assert watch.verdict.cause == cause
+
+
+def test_a_detector_that_sees_ghosts_is_not_followed() -> None:
+    watch = FlightWatch(0.05)
+    for tick in range(8):
+        watch.look(reading(ids=np.array([0, 1, 50 + 10 * tick]) + tick), 0.05 * tick, np.zeros(4), believed())
+    assert watch.verdict.rests and watch.verdict.cause == "the detector sees what was not there before"
+    lost = FlightWatch(0.05)
+    for tick in range(3):
+        lost.look(reading(), 0.05 * tick, np.zeros(4), believed(4.0))
+    assert lost.verdict.health is Health.LOST and "decimetres" in lost.verdict.cause
+    lost.look(None, 0.2, None, believed(math.nan))
+    assert lost.verdict.rests and lost.door.dropped["detector: nothing came"] == 1
+
+
+def test_a_flight_without_its_detector_hovers() -> None:
+    fault = one_of(FLIGHT_FAULTS)("detector-lost@0.5")
+    log = Flight(FlightSettings(faults=(fault,), time_limit=1.6)).run(lambda done, text: None)
+    speed = np.linalg.norm(log.truth[:, 7:], axis=1)
+    assert log.health[11] == "ok" and log.health[14] == "degraded" and log.collisions == 0
+    assert speed[-1] < 0.5 * speed[:16].max() and log.outcome == "timed out: nothing is seen"
+    assert flight_metrics(log)["causes"] == {"nothing is seen": log.causes.count("nothing is seen")}
+
+
+def test_touching_the_floor_softly_is_a_landing() -> None:
+    layout = corridor(0)
+    for speed, touched in ((0.5, 0), (1.5, 1)):
+        start = np.concatenate([layout.start[:2], [0.05, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -speed]])
+        world = QuadrotorWorld(layout, 0, start=start)
+        world.step([0.0, 0.0, 0.0, quadrotor.GRAVITY], 0.2)
+        assert world.state[2] < 0.01 and world.collisions == touched

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from unifg.files.tum import write_tum
 from unifg.scenarios import navigation
@@ -12,7 +10,7 @@ from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.commands.watching import Announce, watching_ticks
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import episode_metrics
-from unifg.scenarios.log.metrics import table, write_metrics
+from unifg.scenarios.log.metrics import health, table, write_metrics
 from unifg.scenarios.show.drive_plot import overview
 from unifg.scenarios.show.drive_scene import drive_frame, drive_scene, drive_stage
 from unifg.style.figures import write_figure
@@ -85,12 +83,3 @@ def summary(log: EpisodeLog) -> str:
         ("worst bound violation", f"{m['max_bound_violation']:.1e}"),
     )
     return table(rows)
-
-
-def health(m: Mapping[str, Any]) -> str:
-    """How well a robot was, and what was the matter longest."""
-    ticks = [f"{count} ticks {state}" for state, count in m["health"].items() if count and state != "ok"]
-    if not ticks:
-        return "ok throughout"
-    causes = sorted(m["causes"], key=lambda cause: -m["causes"][cause])[:2]
-    return f"{', '.join(ticks)} ({'; '.join(causes)})"

@@ -10,7 +10,7 @@ from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.commands.watching import Announce, watching_ticks
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics, has_estimate
-from unifg.scenarios.log.metrics import table, write_metrics
+from unifg.scenarios.log.metrics import health, table, write_metrics
 from unifg.scenarios.show.flight_plot import control, estimates, overview
 from unifg.scenarios.show.flight_scene import flight_frame, flight_scene, flight_stage
 from unifg.style.figures import write_figure
@@ -74,6 +74,9 @@ def summary(log: FlightLog) -> str:
         ("scenario", f"{settings.get('scenario', 'quadrotor')}, {m['layout']}"),
         ("solver, coupling, seed", ", ".join(words)),
         ("target", target + stopped),
+        ("outcome", "" if m["outcome"] in ("reached", "interrupted") else m["outcome"]),
+        ("health", health(m) if log.health else ""),
+        ("samples not let in", ", ".join(f"{count} {what}" for what, count in m["dropped_samples"].items())),
         ("collisions", f"{m['collisions']}"),
         ("flown", f"{m['path_length_m']:.2f} m in {m['duration_s']:.2f} s, {m['ticks']} ticks"),
         ("speed", f"mean {m['mean_speed_m_per_s']:.2f} m/s, max {m['max_speed_m_per_s']:.2f}"),

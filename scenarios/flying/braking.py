@@ -15,10 +15,12 @@ ATTITUDE_TIME = 0.12  # [s] in which an attitude is to be reached
 DELAY = 0.2  # [s] until the vehicle leans against its motion
 
 
-def braking_control(state: Array, parameters: quadrotor.Parameters, least: Array, most: Array) -> Array:
-    """The control (4,) between limits that slows down a vehicle in a state (10,) and then lets it hover."""
+def braking_control(
+    state: Array, parameters: quadrotor.Parameters, least: Array, most: Array, sink: float = 0.0
+) -> Array:
+    """The control (4,) between limits that slows a vehicle in a state (10,) down to hover, or to ``sink`` [m/s]."""
     rotation, velocity = state[3:7], state[7:10]
-    wanted = -velocity / VELOCITY_TIME
+    wanted = -(velocity + np.array([0.0, 0.0, sink])) / VELOCITY_TIME
     flat = float(np.hypot(*wanted[:2]))
     wanted[:2] *= min(1.0, DECELERATION / max(flat, 1e-9))
     wanted[2] = np.clip(wanted[2], -LIFT, LIFT)

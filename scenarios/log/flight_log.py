@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from unifg.whole import beside
 
 __all__ = ["FlightLog", "LandmarkRow"]
 
-_VERSION = 1
+_VERSION = 2
 
 
 class LandmarkRow(NamedTuple):
@@ -62,6 +62,10 @@ class FlightLog:
         collisions: distinct contact events of the flight.
         reached: the target was reached.
         interrupted: the user stopped the flight before its end.
+        health: what the supervisor makes of the vehicle at each tick: "ok", "degraded" or "lost"; empty without one.
+        causes: why it is not well.
+        outcome: what has become of the flight, in words.
+        dropped: samples that were not let in, by what was wrong with them.
     """
 
     layout: Layout
@@ -71,6 +75,10 @@ class FlightLog:
     collisions: int
     reached: bool
     interrupted: bool = False
+    health: list[str] = field(default_factory=list)
+    causes: list[str] = field(default_factory=list)
+    outcome: str = ""
+    dropped: dict[str, int] = field(default_factory=dict)
 
     truth: Array = column("m, 1, m/s", 10)
     believed: Array = column("m, 1, m/s", 10)
@@ -168,7 +176,18 @@ class FlightLog:
         )
 
 
-_WORDS = ("settings", "dt", "statuses", "collisions", "reached", "interrupted")
+_WORDS = (
+    "settings",
+    "dt",
+    "statuses",
+    "collisions",
+    "reached",
+    "interrupted",
+    "health",
+    "causes",
+    "outcome",
+    "dropped",
+)
 _LAYOUT_ARRAYS = ("start", "target", "cylinders", "walls", "size")
 _ROW_SHAPES: dict[str, tuple[int, ...]] = {
     "pasts": (3,), "seen": (), "landmarks_ids": (), "landmarks_means": (2,), "landmarks_covariances": (2, 2),

@@ -21,6 +21,7 @@ from unifg.whole import write_whole
 __all__ = [
     "collision_words",
     "errors",
+    "health",
     "iterations",
     "spread",
     "statistics",
@@ -102,3 +103,12 @@ def table(rows: Iterable[tuple[str, str]]) -> str:
     shown = [(name, value) for name, value in rows if value]
     width = max(len(name) for name, _ in shown)
     return "\n".join(f"{name:<{width}}  {value}" for name, value in shown)
+
+
+def health(m: Mapping[str, Any]) -> str:
+    """How well a robot was, and what was the matter longest."""
+    ticks = [f"{count} ticks {state}" for state, count in m["health"].items() if count and state != "ok"]
+    if not ticks:
+        return "ok throughout"
+    causes = sorted(m["causes"], key=lambda cause: -m["causes"][cause])[:2]
+    return f"{', '.join(ticks)} ({'; '.join(causes)})"

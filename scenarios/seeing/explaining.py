@@ -60,7 +60,22 @@ def explained(distance_map: DistanceMap, scan: Scan, pose: Array) -> Explained:
     ranges, bearing = scan.ranges[beams], scan.angles[beams] + pose[2]
     points = pose[:2] + ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
     give = THRESHOLD + GROWTH * ranges
-    return Explained(points, ranges, beams, distance_map.distance(points) - give, give)
+    excess = distance_map.distance(points) - give
+    beyond = np.hypot(
+        *(points - _clamped(distance_map, points)).T
+    )  # of the map's edge, where the field goes on as it is
+    return Explained(points, ranges, beams, np.where(beyond > give, beyond, excess), give)
+
+
+def _clamped(distance_map: DistanceMap, points: Array) -> Array:
+    """The places on the map nearest to points (n, 2) [m]."""
+    height, width = distance_map.values.shape
+    x, y, yaw = distance_map.origin
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[cosine, -sine], [sine, cosine]])
+    inside = np.clip((points - (x, y)) @ turn, 0.0, np.array([width, height]) * distance_map.resolution)
+    clamped: Array = inside @ turn.T + (x, y)
+    return clamped
 
 
 class PointWatch:

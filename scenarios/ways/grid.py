@@ -50,6 +50,11 @@ class _Clearance:
             self.grid = self.grid.copy()
         for x, y, radius in self.discs:
             self._lower_around(x, y, radius)
+        self.passable: BoolArray = occupancy.free
+
+    def restrict(self, least: float) -> None:
+        """Enter no cell where the smoothed field of :class:`SmoothField`, which a controller keeps to, is lower."""
+        self.passable = self.occupancy.free & (smoothed(self.field.values) >= least)
 
     def _lower_around(self, x: float, y: float, radius: float) -> None:
         reach = (radius + 2.0) / self.occupancy.resolution  # beyond two metres no inflation asks
@@ -91,7 +96,7 @@ class _Clearance:
 
     def open_cells(self, level: float) -> BoolArray:
         """Cells (H, W) that may be entered at this inflation."""
-        return self.occupancy.free & (self.grid >= level)
+        return self.passable & (self.grid >= level)
 
     def centres(self, cells: IntArray) -> Array:
         """World positions (n, 2) [m] of the centres of cells (n, 2) given as row, column."""
@@ -160,6 +165,8 @@ def plan(
     least = robot_radius if clearance_least is None else max(clearance_least, robot_radius)
     preferred = max(robot_radius + _COMFORT if clearance_preferred is None else clearance_preferred, least)
 
+    if least > robot_radius:
+        clearance.restrict(least)
     steps = math.ceil((preferred - least) / _LEVEL_STEP - 1e-9)
     for level in np.linspace(preferred, least, max(2, steps + 1)):
         route = _connected(clearance, start_pose[:2], goal_pose[:2], float(level), robot_radius)
@@ -169,8 +176,8 @@ def plan(
         raise ScenarioError(
             f"planner: no way from ({start_pose[0]:.2f}, {start_pose[1]:.2f}) to "
             f"({goal_pose[0]:.2f}, {goal_pose[1]:.2f}) through the free space of map "
-            f"{occupancy.name!r} for a robot of radius {robot_radius} m; choose another goal, or a map "
-            " without the wall, gap or unknown area between them"
+            f"{occupancy.name!r} for a robot of radius {robot_radius} m that keeps {least - robot_radius:.2f} m from "
+            "walls; choose another goal, or a map without the wall, gap or unknown area between them"
         )
     if level < preferred - 1e-9:
         _log.info("planner: inflation lowered from %.2f m to %.2f m to find a way", preferred, level)
@@ -183,6 +190,14 @@ def plan(
         points = _shorten(clearance, resample(points, SPACING), float(level), robot_radius, stride)
     points = _smooth(clearance, resample(points, SPACING), float(level), preferred, robot_radius)
     return headed(_settle(clearance, resample(points, SPACING), float(level)), float(goal_pose[2]))
+
+
+def smoothed(values: Array) -> Array:
+    """Values (H, W) of the quadratic B-splines over a grid at the middles of its cells, its border repeated."""
+    weights = np.array([0.125, 0.75, 0.125])
+    across = ndimage.correlate1d(values, weights, axis=0, mode="nearest")
+    found: Array = ndimage.correlate1d(across, weights, axis=1, mode="nearest")
+    return found
 
 
 def path_exists(

@@ -40,6 +40,9 @@ UP = np.array([0.0, 0.0, quadrotor.GRAVITY])
 
 _ARRIVED = 1e-9  # [m]
 _WORLD_TAG = 53  # keeps the noise apart from the layouts of the same seed
+SOFT = 0.8
+"""Speed at which a vehicle may touch the floor [m/s]: a landing is no collision."""
+
 _FLOOR = -1  # owner of contacts with the floor; those of things are their ids, those of walls follow
 
 
@@ -162,7 +165,7 @@ class QuadrotorWorld:
         """Keep a state (10,) above the floor."""
         if state[2] <= 0.0:
             if not self._space.touches(_FLOOR):
-                self._space.begin(_FLOOR)
+                self._space.begin(_FLOOR, counts=float(np.linalg.norm(state[7:10])) > SOFT)
             state[2], state[9] = 0.0, max(state[9], 0.0)
         elif self._space.touches(_FLOOR):
             self._space.separate(_FLOOR)

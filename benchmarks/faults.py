@@ -1,0 +1,144 @@
+"""The table of faults in docs/reliability.md: what robots do when something goes wrong, fault by fault.
+
+    python -m benchmarks.faults [--seeds 0:5] [--only FAULT ...] [--workers K] [--fresh] [--report]
+
+Drives along the corridor of the shipped building and flights through the corridor of cylinders, each with one fault from
+second 2 (flights 3) on: for two seconds, after which a robot is to go on, and for good, where it is to stop or to go on
+as well as it can. Counted are drives and flights that ended by name, contacts, and exceptions; none may be raised. Every
+finished one is a line of out/benchmarks/faults.jsonl.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import product
+
+from benchmarks import runs
+from benchmarks.report import command, machine, publish, table
+from benchmarks.runs import Row
+from unifg.scenarios.flight import FlightSettings, run_flight
+from unifg.scenarios.log.drive_metrics import episode_metrics
+from unifg.scenarios.log.flight_metrics import flight_metrics
+from unifg.scenarios.navigation import NavigationSettings, run_navigation
+from unifg.scenarios.worlds.faults import DRIVE_FAULTS, FLIGHT_FAULTS, Fault
+
+SEEDS = range(5)
+ROBOTS = {"drive": DRIVE_FAULTS, "flight": FLIGHT_FAULTS}
+BEGIN = {"drive": 2.0, "flight": 3.0}  # [s]
+DURATIONS = (2.0, 1000.0)  # [s]; the second one for good
+GUST_TIMES = (0.5, 2.0)  # [s]; nobody flies on against a gale for good
+START, GOAL = (6.5, 14.0, 0.0), (13.5, 14.1, 0.0)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One episode with one fault."""
+
+    robot: str
+    fault: str
+    duration: float
+    seed: int
+
+
+def episode(case: Case) -> Row:
+    """Run one; an exception is what is looked for, and kept."""
+    fault = Fault(case.fault, BEGIN[case.robot], case.duration)
+    try:
+        if case.robot == "drive":
+            drive = NavigationSettings(start=START, goals=(GOAL,), obstacles=1, seed=case.seed, faults=(fault,))
+            log = run_navigation(drive)
+            m = episode_metrics(log)
+            said = [k for k, health in enumerate(log.health) if health != "ok"]
+            outcome, first = log.outcomes[0], float(log.time[said[0]]) if said else None
+        else:
+            flight = run_flight(FlightSettings(seed=case.seed, time_limit=30.0, faults=(fault,)))
+            m = flight_metrics(flight)
+            said = [k for k, health in enumerate(flight.health) if health != "ok"]
+            outcome, first = flight.outcome, float(flight.time[said[0]]) if said else None
+    except Exception as error:
+        return {"raised": f"{type(error).__name__}: {error}"}
+    return {
+        "outcome": outcome, "collisions": m["collisions"], "causes": m["causes"], "first": first,
+        "clearance": m["min_clearance_m"], "dropped": sum(m["dropped_samples"].values()),
+    }  # fmt: skip
+
+
+def cases(seeds: Iterable[int], only: Iterable[str]) -> list[Case]:
+    """All of them."""
+    found = []
+    for robot, faults in ROBOTS.items():
+        for fault, seed in product(faults, seeds):
+            times = GUST_TIMES if fault == "gust" else DURATIONS
+            found += [Case(robot, fault, time, seed) for time in times if fault in only]
+    return found
+
+
+def named(row: Row) -> str:
+    """The cause that was named longest."""
+    causes: dict[str, int] = row.get("causes", {})
+    return max(causes, key=lambda cause: causes[cause]) if causes else "-"
+
+
+def render(rows: list[Row]) -> str:
+    """The table, and the sums above it."""
+    order = {
+        (robot, fault): (k, n) for k, (robot, faults) in enumerate(ROBOTS.items()) for n, fault in enumerate(faults)
+    }
+    groups: dict[tuple[str, str, float], list[Row]] = {}
+    for row in sorted(rows, key=lambda row: (*order[row["robot"], row["fault"]], row["duration"], row["seed"])):
+        groups.setdefault((row["robot"], row["fault"], row["duration"]), []).append(row)
+    lines = []
+    for (robot, fault, duration), mine in groups.items():
+        ended = [row for row in mine if "outcome" in row]
+        words = Counter(named(row) for row in ended)
+        begun = [row["first"] - BEGIN[robot] for row in ended if row["first"] is not None]
+        lines.append(
+            (
+                robot, fault, "for good" if duration >= DURATIONS[1] else f"{duration:g} s", str(len(mine)),
+                str(sum(row["outcome"] == "reached" for row in ended)),
+                str(sum(row["outcome"] != "reached" for row in ended)),
+                str(sum(row["collisions"] for row in ended)), str(len(mine) - len(ended)),
+                "; ".join(f"{word} ({count})" if len(words) > 1 else word for word, count in words.most_common(2)),
+                f"{max(begun):.2f}" if begun else "-",
+            )
+        )  # fmt: skip
+    ended = [row for row in rows if "outcome" in row]
+    sums = (
+        f"{len(rows)} episodes with a fault: {len(rows) - len(ended)} exceptions, "
+        f"{sum(row['collisions'] > 0 for row in ended)} episodes with a contact, "
+        f"{sum(row['outcome'] == 'reached' for row in ended)} that went on to the goal, "
+        f"{sum(row['outcome'] != 'reached' for row in ended)} that ended elsewhere, by name."
+    )
+    head = (
+        "robot", "fault", "lasts", "episodes", "reached", "stopped", "contacts", "exceptions", "cause named",
+        "at most after [s]",
+    )  # fmt: skip
+    contacts = [
+        f"`{row['robot']}`, {row['fault']}, {row['duration']:g} s, seed {row['seed']}: "
+        f"{row['collisions']} contacts, {row['outcome']}"
+        for row in ended
+        if row["collisions"]
+    ]
+    listed = "\n".join(f"- {line}" for line in contacts)
+    parts = [sums, table(head, lines, text=3), *([f"Episodes with contacts:\n\n{listed}"] if contacts else [])]
+    return "\n\n".join([*parts, machine("numpy", "scipy", "pymunk")])
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run what is missing, then write the table; 0 only if nothing was raised."""
+    parser = command(__doc__)
+    runs.options(parser)
+    parser.add_argument("--only", nargs="+", default=[*DRIVE_FAULTS, *FLIGHT_FAULTS], metavar="FAULT")
+    parser.add_argument("--seeds", type=runs.seeds, default=SEEDS, metavar="FIRST:END", help="fewer are no page")
+    chosen = parser.parse_args(arguments)
+    rows = runs.episodes("faults", episode, cases(chosen.seeds, chosen.only), chosen)
+    rows = [row for row in rows if row["seed"] in chosen.seeds]
+    complete = len(rows) == len(cases(SEEDS, [*DRIVE_FAULTS, *FLIGHT_FAULTS]))
+    publish("reliability", render(rows), {row["code"] for row in rows}, docs=complete)
+    return 0 if not any("raised" in row for row in rows) else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,99 @@
+"""What tells the quadrotor's supervisor that something is the matter, and what is flown instead of a plan then.
+
+A vehicle that may not go on hovers, by what it still measures; one that cannot go on for long lands where it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+
+import numpy as np
+
+from unifg.scenarios.flying.braking import braking_control
+from unifg.scenarios.seeing.belief import Belief
+from unifg.scenarios.seeing.readings import Reading
+from unifg.scenarios.supervision.door import Door
+from unifg.scenarios.supervision.supervisor import Health, Ramp, Supervisor, Verdict
+from unifg.typing import Array
+
+__all__ = ["RAMPS", "FlightWatch"]
+
+RAMPS: Mapping[str, Ramp] = {
+    "sight": Ramp("nothing is seen", 0.1, 0.2, lost=1.0),  # [s] since the last sighting that came in
+    "spread": Ramp("where it is, is known to decimetres only", 0.25, 0.6, lost=0.9),  # [m]
+    "plan": Ramp("no plan", 0.25, 1.0, least=0.3),  # [s] since the last
+    "strangers": Ramp("the detector sees what was not there before", 6.0, 12.0),  # landmarks that are new, lately
+    "inertial": Ramp("no inertial unit", 0.1, 0.5, least=0.3),  # [s]
+}
+"""By signal."""
+
+LATELY = 0.5  # [s] in which strangers are counted
+HOVER = 4.0  # [s] for which a vehicle that may not go on, or has no plan, hovers before it lands
+BLIND_HOVER = 1.5  # [s] for which one that does not know where it is does: it drifts
+SINK = 0.6  # [m/s] of a landing
+
+
+class FlightWatch:
+    """Looks at readings, judges, and flies where nothing is planned.
+
+    Attributes:
+        door: what readings have to pass.
+        supervisor: how fast the vehicle may fly.
+        lands: whether it is to land.
+    """
+
+    def __init__(self, dt: float) -> None:
+        """Begin with nothing the matter."""
+        self.door, self.supervisor = Door(), Supervisor(RAMPS)
+        self.lands = False
+        self._dt = dt
+        self._sight = self._plan = self._inertial = self._resting = 0.0
+        self._known: set[int] = set()
+        self._strangers: deque[int] = deque(maxlen=round(LATELY / dt))
+        self._first = True
+
+    @property
+    def verdict(self) -> Verdict:
+        """The last one."""
+        return self.supervisor.verdict
+
+    def look(self, reading: Reading | None, now: float, applied: Array | None, belief: Belief) -> Reading:
+        """Let a reading in, and judge with the belief of the tick before.
+
+        Args:
+            reading: as it arrived.
+            now: [s].
+            applied: (4,) control since the last tick; None at the first one.
+            belief: after the last tick.
+        """
+        seen = self.door.reading(reading, now, np.zeros(4) if applied is None else applied)
+        names = set(seen.ids[~seen.moving].tolist())
+        self._sight = 0.0 if len(names) else self._sight + self._dt
+        self._strangers.append(0 if self._first else len(names - self._known))
+        self._known |= names
+        self._first = False
+        self._inertial = self._inertial + self._dt if "inertial unit" in self.door.refused else 0.0
+        spread = float(np.linalg.eigvalsh(belief.covariance[:3, :3])[-1]) if _finite(belief) else math.inf
+        signals = {
+            "sight": self._sight, "spread": math.sqrt(max(spread, 0.0)), "plan": self._plan,
+            "strangers": float(sum(self._strangers)), "inertial": self._inertial,
+        }  # fmt: skip
+        verdict = self.supervisor.judge(signals, {"sight": self.door.refused.get("detector", "")})
+        waits = verdict.rests or self._plan > RAMPS["plan"].ends
+        self._resting = self._resting + self._dt if waits else 0.0
+        self.lands = self.lands or self._resting > (BLIND_HOVER if verdict.health is Health.LOST else HOVER)
+        return seen
+
+    def planned(self, sound: bool) -> None:
+        """Whether the tick has a plan of its own."""
+        self._plan = 0.0 if sound else self._plan + self._dt
+
+    def hover(self, belief: Belief, least: Array, most: Array) -> Array:
+        """The control (4,) of a vehicle that brakes and hovers, or lands."""
+        return braking_control(belief.state, belief.parameters, least, most, SINK if self.lands else 0.0)
+
+
+def _finite(belief: Belief) -> bool:
+    return bool(np.isfinite(belief.covariance).all() and np.isfinite(belief.state).all())
