@@ -2,10 +2,10 @@
 
     python -m benchmarks.faults [--seeds 0:5] [--only FAULT ...] [--workers K] [--fresh] [--report]
 
-Drives along the corridor of the shipped building and flights through the corridor of cylinders, each with one fault from
-second 2 (flights 3) on: for two seconds, after which a robot is to go on, and for good, where it is to stop or to go on
-as well as it can. Counted are drives and flights that ended by name, contacts, and exceptions; none may be raised. Every
-finished one is a line of out/benchmarks/faults.jsonl.
+Drives along the corridor of the shipped building and flights through the corridor of cylinders, each with one fault
+from second 2 (flights 3) on: for two seconds, after which a robot is to go on, and for good, where it is to stop or to
+go on as well as it can. Counted are drives and flights that ended by name, contacts, and exceptions; none may be raised.
+Every finished one is a line of out/benchmarks/faults.jsonl.
 """
 
 from __future__ import annotations
