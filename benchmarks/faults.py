@@ -4,8 +4,8 @@
 
 Drives along the corridor of the shipped building and flights through the corridor of cylinders, each with one fault
 from second 2 (flights 3) on: for two seconds, after which a robot is to go on, and for good, where it is to stop or to
-go on as well as it can. Counted are drives and flights that ended by name, contacts, and exceptions; none may be raised.
-Every finished one is a line of out/benchmarks/faults.jsonl.
+go on as well as it can. Counted are drives and flights that ended by name, contacts, and exceptions; none may be
+raised. Every finished one is a line of out/benchmarks/faults.jsonl.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from itertools import product
 
 from benchmarks import runs
 from benchmarks.report import command, machine, publish, table
-from benchmarks.runs import Row
+from unifg.scenarios.campaigns.comparison import Row
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.log.flight_metrics import flight_metrics

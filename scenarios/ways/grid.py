@@ -1,4 +1,4 @@
-"""Global paths: Dijkstra on the inflated grid, shortened and smoothed until an MPC can follow the headings.
+"""Global paths: A* on the inflated grid, shortened and smoothed until an MPC can follow the headings.
 
 Only cells known to be free whose signed distance reaches the inflation are entered, and a diagonal step needs
 both cells beside it: the interpolated clearance then never falls below the inflation anywhere between the
@@ -12,12 +12,12 @@ import logging
 import math
 
 import numpy as np
-from scipy import ndimage, sparse
-from scipy.sparse import csgraph
+from scipy import ndimage
 
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
-from unifg.models.distance_map import DistanceMap
+from unifg.machine.jit import compiled
+from unifg.models.distance_map import DistanceMap, bilinear
 from unifg.scenarios.ways.polyline import headed, resample
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
@@ -182,13 +182,13 @@ def plan(
     if level < preferred - 1e-9:
         _log.info("planner: inflation lowered from %.2f m to %.2f m to find a way", preferred, level)
 
-    chain = _dijkstra(clearance, *route, robot_radius)
+    chain = _cheapest(clearance, *route, robot_radius)
     points = np.vstack([start_pose[:2], clearance.centres(chain), goal_pose[:2]])
     # Short lines first, then long ones between points further apart: together they undo the eight directions
     # of the grid.
     for stride in (1, 5):
         points = _shorten(clearance, resample(points, SPACING), float(level), robot_radius, stride)
-    points = _smooth(clearance, resample(points, SPACING), float(level), preferred, robot_radius)
+    points = _smooth(clearance, resample(points, SPACING), preferred)
     return headed(_settle(clearance, resample(points, SPACING), float(level)), float(goal_pose[2]))
 
 
@@ -272,7 +272,7 @@ def _cost(distance: Array, robot_radius: float) -> Array:
     return 1.0 + _PENALTY * lacking * lacking
 
 
-def _dijkstra(
+def _cheapest(
     clearance: _Clearance,
     cells: BoolArray,
     first: tuple[int, int],
@@ -284,36 +284,86 @@ def _dijkstra(
     corner = np.array([rows[0], columns[0]])
     part = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
     cells = cells[part]
-    number = np.full(cells.shape, -1, dtype=np.int32)
-    number[cells] = np.arange(np.count_nonzero(cells), dtype=np.int32)
     cost = _cost(clearance.grid[part], robot_radius)
-
-    square = cells[:-1, :-1] & cells[:-1, 1:] & cells[1:, :-1] & cells[1:, 1:]
-    low, high, every = slice(None, -1), slice(1, None), slice(None)
-    sources, targets, lengths = [], [], []
-    for a, b, allowed, length in (
-        ((every, low), (every, high), cells[:, :-1] & cells[:, 1:], 1.0),
-        ((low, every), (high, every), cells[:-1] & cells[1:], 1.0),
-        ((low, low), (high, high), square, math.sqrt(2.0)),
-        ((low, high), (high, low), square, math.sqrt(2.0)),
-    ):
-        sources.append(number[a][allowed])
-        targets.append(number[b][allowed])
-        lengths.append(0.5 * length * (cost[a][allowed] + cost[b][allowed]))
-    count = int(number.max()) + 1
-    i, j, weight = np.concatenate(sources), np.concatenate(targets), np.concatenate(lengths)
-    graph = sparse.csr_array(
-        (np.concatenate([weight, weight]), (np.concatenate([i, j]), np.concatenate([j, i]))),
-        shape=(count, count),
-    )
-    source, target = (int(number[cell[0] - corner[0], cell[1] - corner[1]]) for cell in (first, last))
-    # Searching from the goal makes the chain of predecessors run from start to goal.
-    _, before = csgraph.dijkstra(graph, indices=target, return_predecessors=True)
-    chain = [source]
-    while chain[-1] != target:
+    source, target = (np.array(cell) - corner for cell in (first, last))
+    before = _search(cells, cost, source, target)
+    chain = [int(source[0] * cells.shape[1] + source[1])]
+    end = int(target[0] * cells.shape[1] + target[1])
+    while chain[-1] != end:
         chain.append(int(before[chain[-1]]))
-    found: IntArray = np.argwhere(cells)[chain] + corner
+    found: IntArray = np.column_stack(np.divmod(chain, cells.shape[1])) + corner
     return found
+
+
+@compiled
+def _search(cells: BoolArray, cost: Array, source: IntArray, target: IntArray) -> IntArray:
+    """Predecessor of every cell on the cheapest chain from ``target``, flat, as far as the way to ``source`` needs.
+
+    Hart, Nilsson and Raphael's A* with the cheapest that eight directions allow; cells cost one per side at least. The
+    search runs from the target, so that the chain of predecessors runs from start to goal.
+    """
+    height, width = cells.shape
+    before = np.full(height * width, -1, dtype=np.int64)
+    spent = np.full(height * width, np.inf)
+    done = np.zeros(height * width, dtype=np.bool_)
+    keys, places = np.empty(4 * height * width + 16), np.empty(4 * height * width + 16, dtype=np.int64)
+    goal = source[0] * width + source[1]
+    begin = target[0] * width + target[1]
+    spent[begin] = 0.0
+    keys[0], places[0], size = 0.0, begin, 1
+    while size > 0:
+        here = places[0]
+        size -= 1
+        key, place, at = keys[size], places[size], 0
+        while True:  # the last one sinks from the top of the heap
+            child = 2 * at + 1
+            if child >= size:
+                break
+            if child + 1 < size and keys[child + 1] < keys[child]:
+                child += 1
+            if keys[child] >= key:
+                break
+            keys[at], places[at], at = keys[child], places[child], child
+        keys[at], places[at] = key, place
+        if done[here]:
+            continue
+        done[here] = True
+        if here == goal:
+            break
+        row, column = here // width, here % width
+        for k in range(9):
+            i, j = row + k // 3 - 1, column + k % 3 - 1
+            if i < 0 or i >= height or j < 0 or j >= width or not cells[i, j]:
+                continue
+            there = i * width + j
+            if done[there] or not (cells[row, j] and cells[i, column]):
+                continue
+            length = math.sqrt(2.0) if i != row and j != column else 1.0
+            total = spent[here] + 0.5 * length * (cost[row, column] + cost[i, j])
+            if total >= spent[there] or size + 1 >= len(keys):
+                continue
+            spent[there], before[there] = total, here
+            away, aside = abs(i - source[0]), abs(j - source[1])
+            key = total + max(away, aside) + (math.sqrt(2.0) - 1.0) * min(away, aside)
+            at, size = size, size + 1
+            while at > 0 and keys[(at - 1) // 2] > key:
+                keys[at], places[at] = keys[(at - 1) // 2], places[(at - 1) // 2]
+                at = (at - 1) // 2
+            keys[at], places[at] = key, there
+    return before
+
+
+@compiled
+def _nearest(table: Array, discs: Array, x: float, y: float) -> tuple[float, float, float]:
+    """Clearance at a point, and its gradient there."""
+    distance, slope_x, slope_y = bilinear(table, x, y)
+    for k in range(len(discs)):
+        across, along = x - discs[k, 0], y - discs[k, 1]
+        norm = math.hypot(across, along)
+        if norm - discs[k, 2] < distance:
+            distance = norm - discs[k, 2]
+            slope_x, slope_y = across / max(norm, 1e-9), along / max(norm, 1e-9)
+    return distance, slope_x, slope_y
 
 
 def _shorten(clearance: _Clearance, points: Array, level: float, robot_radius: float, stride: int) -> Array:
@@ -324,42 +374,107 @@ def _shorten(clearance: _Clearance, points: Array, level: float, robot_radius: f
     # The stubs from start and goal to the grid may be nearer to walls than the inflation; lines beside them
     # may be too.
     floor = np.minimum(clearance.at(points), level)
-    kept, anchor = [0], 0
-    while anchor < len(points) - 1:
-        ends = np.minimum(anchor + stride * np.arange(1, _LOOKAHEAD + 1), len(points) - 1)
-        line = points[ends] - points[anchor]
-        length = np.hypot(line[:, 0], line[:, 1])
-        fractions = np.linspace(0.0, 1.0, 2 * math.ceil(length.max() / clearance.occupancy.resolution) + 1)
-        samples = points[anchor] + fractions[None, :, None] * line[:, None, :]
-        distance = clearance.at(samples)
-        allowed = np.minimum(floor[anchor], floor[ends])
-        good = np.all((distance >= allowed[:, None] - 1e-9) & clearance.free(samples), axis=1)
-        price = length * _cost(distance, robot_radius).mean(axis=1)
-        good &= price <= 1.001 * (spent[ends] - spent[anchor]) + 1e-9
-        anchor = int(ends[np.flatnonzero(good)[-1]]) if good.any() else anchor + 1  # the path itself
-        kept.append(anchor)
-    return points[kept]
+    kept = _straightened(
+        clearance.field.table, clearance.occupancy.free, clearance.discs, points, spent, floor, stride, robot_radius
+    )
+    shorter: Array = points[kept]
+    return shorter
 
 
-def _smooth(clearance: _Clearance, points: Array, level: float, preferred: float, robot_radius: float) -> Array:
+@compiled
+def _straightened(
+    table: Array,
+    free: BoolArray,
+    discs: Array,
+    points: Array,
+    spent: Array,
+    floor: Array,
+    stride: int,
+    robot_radius: float,
+) -> IntArray:
+    """Which of points (n, 2) are left: from each the farthest that a good line leads to."""
+    last = len(points) - 1
+    kept, count, anchor = np.zeros(last + 1, dtype=np.int64), 1, 0
+    while anchor < last:
+        found = anchor + 1  # the path itself
+        for k in range(_LOOKAHEAD, 0, -1):
+            end = min(anchor + stride * k, last)
+            if k > 1 and end == min(anchor + stride * (k - 1), last):
+                continue
+            if _good_line(table, free, discs, points, spent, floor, anchor, end, robot_radius):
+                found = end
+                break
+        anchor = found
+        kept[count] = anchor
+        count += 1
+    return kept[:count]
+
+
+@compiled
+def _good_line(
+    table: Array,
+    free: BoolArray,
+    discs: Array,
+    points: Array,
+    spent: Array,
+    floor: Array,
+    begin: int,
+    end: int,
+    robot_radius: float,
+) -> bool:
+    """Whether a straight line keeps the clearance of its ends, stays on free cells, and costs no more."""
+    across, along = points[end, 0] - points[begin, 0], points[end, 1] - points[begin, 1]
+    length, allowed, total = math.hypot(across, along), min(floor[begin], floor[end]) - 1e-9, 0.0
+    pieces = max(1, 2 * math.ceil(length * math.hypot(table[0], table[3])))  # half a cell each
+    for k in range(pieces + 1):
+        x, y = points[begin, 0] + k / pieces * across, points[begin, 1] + k / pieces * along
+        column = math.floor(table[0] * x + table[1] * y + table[2])
+        row = math.floor(table[3] * x + table[4] * y + table[5])
+        if row < 0 or row >= free.shape[0] or column < 0 or column >= free.shape[1] or not free[row, column]:
+            return False
+        distance = _nearest(table, discs, x, y)[0]
+        if distance < allowed:
+            return False
+        lacking = min(max((robot_radius + _WIDE - distance) / _WIDE, 0.0), 1.0)
+        total += 1.0 + _PENALTY * lacking * lacking
+    return length * total / (pieces + 1) <= 1.001 * (spent[end] - spent[begin]) + 1e-9
+
+
+def _smooth(clearance: _Clearance, points: Array, preferred: float) -> Array:
     """Diffuse the corners away; no point moves nearer to a wall unless it keeps the preferred clearance."""
-    points = points.copy()
-    distance, gradient = clearance.with_gradient(points)
-    for _ in range(_SMOOTHING_SWEEPS if len(points) > 2 else 0):
-        step = np.zeros_like(points)
-        step[1:-1] = 0.25 * (points[2:] - 2.0 * points[1:-1] + points[:-2])
-        # Near walls only the part of the step that does not approach them is kept.
-        slope = np.einsum("ij,ij->i", gradient, step)
-        near = (distance <= preferred + 0.01) & (slope < 0.0)
-        square = np.maximum(np.einsum("ij,ij->i", gradient, gradient), 1e-12)
-        step -= np.where(near, slope / square, 0.0)[:, None] * gradient
-        trial = points + step
-        trial_distance, trial_gradient = clearance.with_gradient(trial)
-        accepted = (trial_distance >= np.minimum(distance, preferred) - 1e-12) & clearance.free(trial)
-        points[accepted] = trial[accepted]
-        distance = np.where(accepted, trial_distance, distance)
-        gradient = np.where(accepted[:, None], trial_gradient, gradient)
+    points = np.ascontiguousarray(points)
+    if len(points) > 2:
+        _diffuse(clearance.field.table, clearance.occupancy.free, clearance.discs, points, preferred, _SMOOTHING_SWEEPS)
     return points
+
+
+@compiled
+def _diffuse(table: Array, free: BoolArray, discs: Array, points: Array, preferred: float, sweeps: int) -> None:
+    """Sweeps over points (n, 2), in place; near walls only the part of a step that does not approach them is kept."""
+    count = len(points)
+    known = np.empty((count, 3))
+    for i in range(count):
+        known[i, 0], known[i, 1], known[i, 2] = _nearest(table, discs, points[i, 0], points[i, 1])
+    before = np.empty_like(points)
+    for _ in range(sweeps):
+        before[:] = points
+        for i in range(1, count - 1):
+            step_x = 0.25 * (before[i + 1, 0] - 2.0 * before[i, 0] + before[i - 1, 0])
+            step_y = 0.25 * (before[i + 1, 1] - 2.0 * before[i, 1] + before[i - 1, 1])
+            distance, slope_x, slope_y = known[i]
+            slope = slope_x * step_x + slope_y * step_y
+            if distance <= preferred + 0.01 and slope < 0.0:
+                slope /= max(slope_x * slope_x + slope_y * slope_y, 1e-12)
+                step_x, step_y = step_x - slope * slope_x, step_y - slope * slope_y
+            x, y = before[i, 0] + step_x, before[i, 1] + step_y
+            column = math.floor(table[0] * x + table[1] * y + table[2])
+            row = math.floor(table[3] * x + table[4] * y + table[5])
+            if row < 0 or row >= free.shape[0] or column < 0 or column >= free.shape[1] or not free[row, column]:
+                continue
+            trial, trial_x, trial_y = _nearest(table, discs, x, y)
+            if trial >= min(distance, preferred) - 1e-12:
+                points[i, 0], points[i, 1] = x, y
+                known[i, 0], known[i, 1], known[i, 2] = trial, trial_x, trial_y
 
 
 def _settle(clearance: _Clearance, points: Array, level: float) -> Array:
