@@ -437,7 +437,8 @@ def _good_line(
             return False
         lacking = min(max((robot_radius + _WIDE - distance) / _WIDE, 0.0), 1.0)
         total += 1.0 + _PENALTY * lacking * lacking
-    return length * total / (pieces + 1) <= 1.001 * (spent[end] - spent[begin]) + 1e-9
+    most = 1.001 * (spent[end] - spent[begin]) + 1e-9
+    return bool(length * total / (pieces + 1) <= most)
 
 
 def _smooth(clearance: _Clearance, points: Array, preferred: float) -> Array:
