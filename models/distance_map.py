@@ -24,6 +24,7 @@ from unifg.typing import Array, ArrayLike, BoolArray
 
 HEADER = 8  # numbers in front of the cells of a table
 RING = 2  # cells repeated around the grid
+PIECE, BESIDE = 2048, 512  # cells to a side that are measured at once, and beyond them
 
 
 class DistanceMap:
@@ -48,7 +49,7 @@ class DistanceMap:
         Raises:
             ModelError: values are not a finite (H, W) grid, or the resolution is not positive.
         """
-        self.values: Array = np.ascontiguousarray(values, dtype=np.float64)
+        self.values: Array = np.asarray(values, dtype=np.float64)
         self.resolution = float(resolution)
         pose = np.asarray(origin, dtype=np.float64).ravel()
         if self.values.ndim != 2 or self.values.size == 0 or not np.all(np.isfinite(self.values)):
@@ -64,7 +65,14 @@ class DistanceMap:
         offset = [-cosine * pose[0] - sine * pose[1], sine * pose[0] - cosine * pose[1]]
         header = [cosine, sine, offset[0], -sine, cosine, offset[1], width, height]
         # Repeated border values make the field constant across the border: clamping needs no masks.
-        self.table: Array = np.concatenate([header, np.pad(self.values, RING, mode="edge").ravel()])
+        self.table: Array = np.empty(HEADER + (height + 2 * RING) * (width + 2 * RING))
+        self.table[:HEADER] = header
+        around = self.table[HEADER:].reshape(height + 2 * RING, width + 2 * RING)
+        inner = slice(RING, -RING)
+        around[inner, inner] = self.values
+        around[:RING, inner], around[-RING:, inner] = self.values[0], self.values[-1]
+        around[:, :RING], around[:, -RING:] = around[:, RING, None], around[:, -RING - 1, None]
+        self.values = around[inner, inner]  # kept once: a large map is most of what a robot remembers
 
     @classmethod
     def from_occupancy(
@@ -89,10 +97,9 @@ class DistanceMap:
             raise ModelError(f"distance map: cap {cap!r} must be positive [m]")
         if mask.all() or not mask.any():
             return cls(np.full(mask.shape, -limit if mask.all() else limit), resolution, origin)
-        outside = np.asarray(ndimage.distance_transform_edt(~mask), dtype=np.float64)
-        inside = np.asarray(ndimage.distance_transform_edt(mask), dtype=np.float64)
-        values = np.where(mask, 0.5 - inside, outside - 0.5) * resolution
-        return cls(np.clip(values, -limit, limit), resolution, origin)
+        values = _signed_cells(mask)
+        values *= resolution
+        return cls(np.clip(values, -limit, limit, out=values), resolution, origin)
 
     def distance(self, points: Array) -> Array:
         """Interpolated signed distance.
@@ -116,6 +123,39 @@ class DistanceMap:
             has a kink, the derivative is that of the side with larger coordinates.
         """
         return _bilinear(self.table, points)
+
+
+def _signed_cells(mask: BoolArray) -> Array:
+    """(H, W) signed distance to the nearest surface, in cells; piece by piece where the grid is large.
+
+    The transform needs some forty bytes for a cell. A piece is measured with its surroundings; a distance found in them
+    that is no longer than they are wide is that of the whole grid, and where one is longer they are widened.
+    """
+    height, width = mask.shape
+    if mask.size <= PIECE * PIECE:
+        return _signed_piece(mask)
+    values = np.empty(mask.shape)
+    for row in range(0, height, PIECE):
+        for column in range(0, width, PIECE):
+            reach = BESIDE
+            while True:
+                top, left = max(0, row - reach), max(0, column - reach)
+                bottom, right = min(height, row + PIECE + reach), min(width, column + PIECE + reach)
+                part = mask[top:bottom, left:right]
+                whole = (bottom - top, right - left) == mask.shape
+                if whole or (part.any() and not part.all()):
+                    found = _signed_piece(part)[row - top : row - top + PIECE, column - left : column - left + PIECE]
+                    if whole or float(np.abs(found).max()) <= reach - 0.5:
+                        break
+                reach *= 2
+            values[row : row + PIECE, column : column + PIECE] = found
+    return values
+
+
+def _signed_piece(mask: BoolArray) -> Array:
+    outside = np.asarray(ndimage.distance_transform_edt(~mask), dtype=np.float64)
+    inside = np.asarray(ndimage.distance_transform_edt(mask), dtype=np.float64)
+    return np.where(mask, 0.5 - inside, outside - 0.5)
 
 
 @compiled
