@@ -153,10 +153,9 @@ def together(sheets: Sequence[Sheet]) -> str:
             simulated += float(sheet.column(DURATION, combination).sum())
             drives += len(sheet.outcomes[combination])
             runs[len(sheet.outcomes[combination])] += 1
-    seconds = sum(sheet.seconds for sheet in sheets)
-    say = [
-        f"{drives} drives of {min(runs, default=0)} to {max(runs, default=0)} runs a leg and coupling (the paper: {RUNS} a leg)."
-    ]
+    seconds = sum(sheet.cpu_seconds for sheet in sheets)
+    least, most = min(runs, default=0), max(runs, default=0)
+    say = [f"{drives} drives, {least} to {most} of each leg and coupling (the paper: {RUNS} of each leg)."]
     if all(spreads.values()):
         length, duration = spreads[LENGTH], spreads[DURATION]
         say.append(
@@ -164,9 +163,10 @@ def together(sheets: Sequence[Sheet]) -> str:
             f"0.85 %), at most {max(length):.2f} % (1.43 %; 1.74 %), and {np.mean(duration):.2f} % of the duration "
             f"(1.88 %; 3.56 %), at most {max(duration):.2f} % (3.74 %; 11.99 %)."
         )
+    factor = simulated / max(seconds, 1e-9)
     say.append(
-        f"{simulated / 3600.0:.2f} h were driven in {seconds / 3600.0:.2f} h, {simulated / max(seconds, 1e-9):.1f} times "
-        "real time (the paper: 12 h for Table I)."
+        f"{simulated / 3600.0:.2f} h were driven in {seconds / 3600.0:.2f} h of a processor, {factor:.1f} times real "
+        "time (the paper: 12 h for Table I)."
     )
     return " ".join(say)
 

@@ -52,7 +52,8 @@ class Sheet:
         keys: likewise.
         values: of every measure that is a number, by combination and seed.
         failures: what did not go well, in the order of the file.
-        seconds: of all episodes together, on their machines.
+        seconds: of all episodes together, by the clocks of their machines.
+        cpu_seconds: the same by their processors.
         others: rows that were left out because other code ran them.
         unreadable: lines that hold no row.
     """
@@ -71,6 +72,7 @@ class Sheet:
     values: dict[str, dict[Combination, dict[Seed, float]]] = field(default_factory=dict)
     failures: list[Failure] = field(default_factory=list)
     seconds: float = 0.0
+    cpu_seconds: float = 0.0
     others: int = 0
     unreadable: int = 0
 
@@ -134,6 +136,7 @@ def _take(sheet: Sheet, key: str, row: Mapping[str, Any], failures: dict[str, Fa
     sheet.outcomes.setdefault(combination, {})[seed] = outcome
     sheet.keys[combination, seed] = key
     sheet.seconds += float(row.get("seconds", 0.0))
+    sheet.cpu_seconds += float(row.get("cpu_seconds", 0.0))
     metrics = row.get("metrics") or {}
     for found in sheet.values.values():
         found.get(combination, {}).pop(seed, None)  # of an earlier row of the same episode

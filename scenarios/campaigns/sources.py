@@ -131,6 +131,7 @@ class Sources:
             elif not (
                 (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant))
                 or (isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__")
+                or (isinstance(node, ast.FunctionDef) and node.name == "__dir__")
             ):
                 return {}
         return origins
