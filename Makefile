@@ -14,6 +14,7 @@
 #   make mutants  change decisions one at a time and see whether a test notices (hours; FILES='scenarios/driving/drive_past.py')
 #   make examples run all scripts of examples/ and draw the pictures of docs/examples.md again
 #   make offsets  solve the same problems with their worlds moved by up to 5000 km (minutes)
+#   make docs     build the site with the reference of all public names into out/site, every link checked
 #   make fences   run the shell commands shown in README.md and docs/
 #   make clean    remove everything made here
 #
@@ -31,7 +32,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Matrices here are small: more threads per process only make the processes wait for each other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: kernels help demo test fuzz test-lowest processes lint types bench results stale release-check mutants fences clean offsets examples
+.PHONY: docs kernels help demo test fuzz test-lowest processes lint types bench results stale release-check mutants fences clean offsets examples
 .DELETE_ON_ERROR:
 
 help:
@@ -88,6 +89,10 @@ offsets: $(VENV)/ready
 examples: $(VENV)/ready
 	$(BIN)/python docs/images/draw_examples.py
 
+docs: $(VENV)/ready-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo out/site/readme.html
+
 fences: $(VENV)/ready
 	$(BIN)/python docs/check_shell_fences.py
 
@@ -118,6 +123,11 @@ $(VENV)-lowest/ready: pyproject.toml tests/lowest.py
 $(VENV)/ready-dev: $(VENV)/ready
 	@echo "Installing ruff and mypy into $(VENV)"
 	@$(PIP) install --editable ".[scenarios,dev]"
+	@touch $@
+
+$(VENV)/ready-docs: $(VENV)/ready
+	@echo "Installing the tools of the site into $(VENV)"
+	@$(PIP) install --editable ".[scenarios,docs]"
 	@touch $@
 
 $(VENV)/ready-bench: $(VENV)/ready

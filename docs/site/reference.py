@@ -1,0 +1,134 @@
+"""Pages that are made: README, changelog, scripts, and a reference of every public name from the docstrings.
+
+There is a page for each public module, with an entry for each name that it lists or, where it lists none, defines.
+Nothing is imported: sources are read, so the site is built where nothing but its own tools is installed.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from functools import cache
+from inspect import cleandoc
+from pathlib import Path
+
+CHECKOUT = Path(__file__).resolve().parent.parent.parent
+ROOMS = ("unifg", "unifg.solvers", "unifg.horizon", "unifg.smoothing", "unifg.pose_graphs", "unifg.view", "unifg.lie")
+"""Their names are public where they are listed."""
+SHELVES = ("unifg.models", "unifg.files")
+"""Their modules are."""
+ALONE = ("unifg.errors", "unifg.answers.status", "unifg.answers.solver", "unifg.solvers.names")
+MOVED = {"](../README.md": "](readme.md", "](../CHANGELOG.md": "](changelog.md", "](../examples/": "](examples/"}
+"""Links out of the folder of pages, and where they lead on the site."""
+
+
+def pages() -> dict[str, str]:
+    """Text of every page that is made, by its address."""
+    made = {name.lower(): _from_above(CHECKOUT / name) for name in ("README.md", "CHANGELOG.md")}
+    made["license.md"] = f"# License\n\n{(CHECKOUT / 'LICENSE').read_text()}"
+    made["CITATION.cff"] = (CHECKOUT / "CITATION.cff").read_text()
+    made |= {f"examples/{path.name}": path.read_text() for path in sorted((CHECKOUT / "examples").glob("[!_]*.py"))}
+    for module, names in public().items():
+        entries = "\n".join(entry(module, name) for name in names)
+        made[f"api/{module}.md"] = f"# {module}\n\n{summary(module)}\n\n{entries}"
+    listed = "\n".join(f"- [{module}]({module}.md): {summary(module)}" for module in public())
+    made["api/index.md"] = f"# Reference\n\nEvery public name, by the module it is imported from.\n\n{listed}\n"
+    return made
+
+
+@cache
+def public() -> dict[str, list[str]]:
+    """Public names by module."""
+    shelved = [f"{shelf}.{path.stem}" for shelf in SHELVES for path in sorted(folder(shelf).glob("[!_]*.py"))]
+    found = {module: names_of(module) for module in (*ROOMS, *shelved, *ALONE)}
+    return {module: names for module, names in found.items() if names}
+
+
+def folder(module: str) -> Path:
+    """Where the files of a package are."""
+    return CHECKOUT.joinpath(*module.split("."))
+
+
+@cache
+def tree_of(module: str) -> ast.Module:
+    """What a module says."""
+    path = folder(module)
+    return ast.parse((path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text())
+
+
+def names_of(module: str) -> list[str]:
+    """What a module lists, or the public names that it defines."""
+    tree = tree_of(module)
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
+            listed: list[str] = ast.literal_eval(node.value)
+            return listed
+    return [name for name in _defined(tree) if not name.startswith("_")]
+
+
+def summary(module: str) -> str:
+    """First paragraph of a module's docstring."""
+    text = ast.get_docstring(tree_of(module))
+    if not text:
+        raise ValueError(f"{module} has no docstring")
+    return text.split("\n\n")[0].replace("\n", " ")
+
+
+def entry(module: str, name: str) -> str:
+    """What the reference says of a name: its docstring, or the text that a residual was given for ``help``."""
+    text = told(module, name)
+    return f"::: {module}.{name}\n" if text is None else f"## {name}\n\n{_markdown(text)}\n"
+
+
+def told(module: str, name: str) -> str | None:
+    """The text that a residual was given; None for what is no residual."""
+    values = {}
+    for node in tree_of(module).body:
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("unifg"):
+            for alias in node.names:
+                if (alias.asname or alias.name) == name:
+                    return told(node.module, alias.name)
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            values[node.targets[0].id] = node.value
+    value = values.get(name)
+    if not isinstance(value, ast.Call) or ast.unparse(value.func) not in ("residual", "ManifoldResidual"):
+        return None
+    given = [*value.args, *(keyword.value for keyword in value.keywords)]
+    followed = [values.get(part.id, part) if isinstance(part, ast.Name) else part for part in given]
+    texts = [part.value for part in followed if isinstance(part, ast.Constant) and isinstance(part.value, str)]
+    return cleandoc(max(texts, key=len)) if texts else None
+
+
+def _from_above(path: Path) -> str:
+    """A page that lies beside this folder, its links led to the pages of the site."""
+    text = path.read_text().replace("](docs/", "](").replace('src="docs/', 'src="')
+    return text.replace("](CHANGELOG.md", "](changelog.md").replace("](LICENSE", "](license.md")
+
+
+def _defined(tree: ast.Module) -> Iterator[str]:
+    """Classes, functions but for compiled loops, and residuals."""
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef):
+            yield node.name
+        elif isinstance(node, ast.FunctionDef):
+            if not any("compiled" in ast.unparse(decorator) for decorator in node.decorator_list):
+                yield node.name
+        elif isinstance(node, ast.Assign) and isinstance(node.value, ast.Call):
+            if ast.unparse(node.value.func) in ("residual", "ManifoldResidual"):
+                yield ast.unparse(node.targets[0])
+
+
+def _markdown(text: str) -> str:
+    """Sections of a docstring as bold lines, code of its examples as code."""
+    lines: list[str] = []
+    for line in text.replace("``", "`").split("\n"):
+        if line in ("Args:", "Returns:", "Raises:"):
+            lines.append(f"\n**{line[:-1]}**\n")
+        else:
+            lines.append(line.replace("    ", "- ", 1) if _item(line) else line)
+    return "\n".join(lines)
+
+
+def _item(line: str) -> bool:
+    """Whether a line begins the description of an argument."""
+    return line.startswith("    ") and not line.startswith("     ") and ":" in line
