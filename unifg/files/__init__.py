@@ -8,6 +8,7 @@ from types import ModuleType as _ModuleType
 
 __all__ = [
     "carmen",
+    "contents",
     "g2o",
     "kitti",
     "pose_graph",
