@@ -182,7 +182,8 @@ def velocity_extended(h: Barrier, distance: Barrier, gamma: float, *, p: slice =
 
     Args:
         h: barrier on positions.
-        distance: that grows or shrinks, on positions; h itself where h is in metres.
+        distance: that grows or shrinks, on positions; h itself where h is in metres and certain. A standard deviation
+            is a root, without a slope where it is zero.
         gamma: of the velocity, not negative: [s] with h in metres, [s/m^2] with :func:`inverse`.
         p: where positions stand in a state; those of a quadrotor.
         v: where velocities in the world's axes do.

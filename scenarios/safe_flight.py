@@ -22,10 +22,12 @@ from unifg.scenarios.episode import Progress, run_ticks, silent
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.safe_log import SafeLog
 from unifg.scenarios.options import count, not_negative, option, positive
+from unifg.scenarios.safety.cascade import CascadeSettings, Track
 from unifg.scenarios.safety.flatness import TUNED, FlatnessController, Gains, flat_flight
-from unifg.scenarios.safety.keeper import TRACKING, Decision, Keeper, KeeperSettings, Obstacles, Reading
+from unifg.scenarios.safety.keeper import TRACKING, Decision, Keeper, KeeperSettings, Obstacles, Reading, Terminal
 from unifg.scenarios.safety.one_step import FilterSettings, filtered
 from unifg.scenarios.safety.pace import Pace
+from unifg.scenarios.safety.sightings import Sightings, SightingSettings
 from unifg.scenarios.safety.situations import Kind, Situation, situation
 from unifg.scenarios.safety.spline_planner import SplinePath, SplineSettings, around
 from unifg.scenarios.safety.state_filter import FilterStatistics, StateFilter
@@ -37,8 +39,9 @@ from unifg.typing import Array
 
 __all__ = ["CONTROLLERS", "Controller", "Knowledge", "SafeFlight", "SafeSettings", "flights", "run_safe_flights"]
 
-Controller = Literal["barrier", "flatness", "filter", "spline"]
+Controller = Literal["barrier", "flatness", "filter", "cascade", "spline"]
 Knowledge = Literal["estimated", "books"]
+Sight = Literal["exact", "noisy"]
 CONTROLLERS: tuple[Controller, ...] = get_args(Controller)
 
 _TAG = 72  # keeps the noise apart from other numbers of the same seed
@@ -76,8 +79,10 @@ class SafeSettings:
         gamma: of the velocity in a second barrier [s], as published [s/m^2]; may be repeated.
         reading: barriers that decay from node to node, or as they are published.
         speed: of the path at its fastest [m/s]; may be repeated.
-        controller: who decides: a plan with barriers, flatness, flatness with a filter of one step, or flatness along a
-            spline that was planned before; may be repeated.
+        controller: who decides: a plan with barriers, flatness, flatness with a filter of one step, such a filter
+            below a plan that is made now and then, or flatness along a spline that was planned before; may be repeated.
+        terminal: whether plans have to end at rest.
+        sight: whether obstacles are seen where they are and as fast as they are, or with noise and without velocity.
         knowledge: "estimated" mass and drag with prediction of what is pending, or what is in the "books" without.
         seed: of sizes, places, phases and noise; without one, the case as it is described.
         solver: one of `unifg.solvers.names.CONSTRAINED`.
@@ -92,6 +97,8 @@ class SafeSettings:
         gains: of the controller by flatness where it predicts; where it does not it has those of a new `Gains`, for
             these need the prediction.
         filter: numbers of the filter of one step.
+        cascade: how it shares the work with a plan above it.
+        sighting: numbers of noisy looks at obstacles, and of who believes them.
         spline: numbers of the planner by splines.
         keeper: numbers of the controller by barriers.
         tracking: the same where nothing is in the way and it predicts.
@@ -107,6 +114,8 @@ class SafeSettings:
     reading: Reading = option("decay")
     speed: tuple[float, ...] | None = option(None, text=positive, metavar="V", many=True)
     controller: tuple[Controller, ...] | None = option(None, choices=CONTROLLERS, many=True)
+    terminal: Terminal = option("none")
+    sight: Sight = option("exact")
     knowledge: Knowledge = option("estimated")
     seed: int | None = option(None, text=count, metavar="S")
     solver: str = "ipm"
@@ -119,6 +128,8 @@ class SafeSettings:
     true_loops: Loops = field(default_factory=lambda: Loops(22.0, 0.025, 0.012))
     gains: Gains = TUNED
     filter: FilterSettings = field(default_factory=FilterSettings)
+    cascade: CascadeSettings = field(default_factory=CascadeSettings)
+    sighting: SightingSettings = field(default_factory=SightingSettings)
     spline: SplineSettings = field(default_factory=SplineSettings)
     keeper: KeeperSettings = field(default_factory=KeeperSettings)
     tracking: KeeperSettings = TRACKING
@@ -160,9 +171,10 @@ class SafeFlight:
         self.situation, self.label = about, label
         self._known = {
             "case": about.kind, "controller": controller, "alpha_per_s": barriers[0], "gamma": barriers[1],
-            "reading": s.reading, "speed_m_per_s": speed, "knowledge": s.knowledge, "seed": s.seed, "solver": s.solver,
+            "reading": s.reading, "terminal": s.terminal, "sight": s.sight, "speed_m_per_s": speed,
+            "knowledge": s.knowledge, "seed": s.seed, "solver": s.solver,
         }  # fmt: skip
-        noise, shake = np.random.default_rng([_TAG, s.seed or 0]).spawn(2)
+        noise, shake, self._blur = np.random.default_rng([_TAG, s.seed or 0]).spawn(3)
         self._noise, self._shake = noise, Disturbances(s.disturbance, shake)
         truth = replace(s.books, parameters=s.truth, loops=s.true_loops)
         start = flat_flight(about.path.at(np.zeros(1)), s.truth)[0][0]
@@ -172,6 +184,8 @@ class SafeFlight:
         self.filter = StateFilter(s.believed, s.dt) if estimating else None
         path = self._spline() if controller == "spline" else about.path
         self.pace = Pace(path, s.patience * speed)
+        noisy = s.sight == "noisy" and len(about.bodies) > 0
+        self.sightings = Sightings(s.sighting, self._bodies(0.0)) if noisy else None
         self._decide = self._deciders(controller, barriers, s.faster * speed)
 
     def _deciders(
@@ -179,10 +193,13 @@ class SafeFlight:
     ) -> Callable[[Array, Obstacles], Decision]:
         s, link = self.settings, self.settings.books.loops.link
         estimating = self.weighing is not None
-        if controller == "barrier":
-            slots, (alpha, gamma) = min(s.keeper.slots, len(self.situation.bodies)), barriers
-            weights = s.tracking if estimating and not slots else s.keeper
-            numbers = replace(weights, alpha=alpha, gamma=gamma, reading=s.reading, speed=limit, slots=slots)
+        if controller in ("barrier", "cascade"):
+            blind = controller == "cascade" and not s.cascade.barriers
+            slots, (alpha, gamma) = 0 if blind else min(s.keeper.slots, len(self.situation.bodies)), barriers
+            weights = s.tracking if estimating and not len(self.situation.bodies) else s.keeper
+            numbers = replace(
+                weights, alpha=alpha, gamma=gamma, reading=s.reading, speed=limit, slots=slots, terminal=s.terminal
+            )
             frame = s.books if estimating else replace(s.books, loops=replace(s.books.loops, gain=np.inf))
             keeper, lead = Keeper(numbers, frame, s.dt, self.weighing, s.solver), link + s.dt if estimating else 0.0
 
@@ -192,11 +209,30 @@ class SafeFlight:
                 gust = fade[:, None] * self._air[3:]
                 return keeper.decide(start, self.pace.at(lead + keeper.nodes), seen, lead, gust)
 
-            return plan
+            if controller == "barrier":
+                return plan
         gains = s.gains if estimating else Gains()
         flat = FlatnessController(gains, s.books.least, s.books.most)
         ahead = s.books.loops.delay + s.dt if estimating else 0.0
         numbers_of_filter = replace(s.filter, alpha=barriers[0])
+        if controller == "cascade":
+            track = Track(s.cascade.every)
+
+            def filter_below(now: Array, seen: Obstacles) -> Decision:
+                begin, status, steps, places = time.thread_time(), "last plan", 0, now[None, :3]
+                if track.due():
+                    above = plan(now, seen)
+                    status, steps = above.status, above.iterations
+                    if keeper.states is not None:
+                        track.lay(lead + keeper.nodes, keeper.states[:, [0, 1, 2, 7, 8, 9]])
+                state, p = self.model.ahead(now, ahead, self._air)[0], self._windy
+                flown = track.at(track.ticks * s.dt + ahead, self.pace.at)
+                acceleration, slack = filtered(flat.wanted(state, flown), state, seen, ahead, numbers_of_filter)
+                control = flat.steer(state, acceleration, flown.jerk[0], p)
+                elapsed = 1e3 * (time.thread_time() - begin)
+                return Decision(control, places, status, steps, slack, p.mass, np.array(p.drag), elapsed)
+
+            return filter_below
 
         def follow(now: Array, seen: Obstacles) -> Decision:
             begin, slack = time.thread_time(), 0.0
@@ -238,12 +274,20 @@ class SafeFlight:
 
     def see(self) -> tuple[Array, Obstacles]:
         """State (10,) and obstacles as they are seen now."""
-        s, now = self.settings, np.array([self.plant.time])
+        s = self.settings
         sigma = np.repeat(s.seen, 3) * self._noise.standard_normal(9)
         state = quadrotor.STATE.retract(self.plant.state[None], sigma[None])[0]
+        truth = self._bodies(self.plant.time)
+        if self.sightings is None:
+            return state, truth
+        blurred = truth.position + s.sighting.noise * self._blur.standard_normal(truth.position.shape)
+        return state, self.sightings.see(self.plant.time, blurred)
+
+    def _bodies(self, now: float) -> Obstacles:
+        """Obstacles as they are."""
         bodies = self.situation.bodies
-        place, velocity = (part[0] for part in bodies.at(now))
-        return state, Obstacles(place, velocity, self._keep, bodies.upright, bodies.falls)
+        place, velocity = (part[0] for part in bodies.at(np.array([now])))
+        return Obstacles(place, velocity, self._keep, bodies.upright, bodies.falls)
 
     @property
     def _keep(self) -> Array:
@@ -314,9 +358,9 @@ def flights(settings: SafeSettings) -> list[SafeFlight]:
     for speed in speeds:
         about = situation(s.case, speed, s.seed)
         for controller in controllers:
-            barriers = controller in ("barrier", "filter") and len(about.bodies) > 0
+            barriers = controller in ("barrier", "filter", "cascade") and len(about.bodies) > 0
             alphas = all_alphas if barriers else all_alphas[:1]
-            gammas = all_gammas if barriers and controller == "barrier" else all_gammas[:1]
+            gammas = all_gammas if barriers and controller in ("barrier", "cascade") else all_gammas[:1]
             for alpha, gamma in itertools.product(alphas, gammas):
                 told = [f"{speed:g} m/s"] * (len(speeds) > 1) + [controller] * (len(controllers) > 1)
                 told += [f"alpha {alpha:g}"] * (len(alphas) > 1) + [f"gamma {gamma:g}"] * (len(gammas) > 1)

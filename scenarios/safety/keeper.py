@@ -26,7 +26,7 @@ import numpy as np
 
 import unifg as fg
 from unifg.models import quadrotor, quadrotor_loops
-from unifg.models.barriers import Barrier, Flow, condition, decay, velocity_extended
+from unifg.models.barriers import Barrier, Flow, accelerated, condition, decay, velocity_extended
 from unifg.models.keeping import Form, Kept, keep
 from unifg.scenarios.safety.flatness import FlatnessController, Gains, flat_flight
 from unifg.scenarios.safety.weighing import Weighing
@@ -35,9 +35,10 @@ from unifg.scenarios.worlds.body_rate import Airframe
 from unifg.solvers.names import backend
 from unifg.typing import Array, BoolArray, IntArray
 
-__all__ = ["TRACKING", "Decision", "Keeper", "KeeperSettings", "Obstacles"]
+__all__ = ["TRACKING", "Decision", "Keeper", "KeeperSettings", "Obstacles", "Terminal"]
 
 Reading: TypeAlias = Literal["decay", "published"]
+Terminal: TypeAlias = Literal["none", "rest"]
 
 TOLERANCE = 1e-4  # of the KKT test, in a loop that goes on
 FAR = 1e3  # where obstacles are that are not there [m]
@@ -66,6 +67,7 @@ class KeeperSettings:
         gamma: of the velocity in a second barrier, none if zero [s]; as published [s/m^2].
         reading: "decay" from node to node, or the hinge on h' + alpha h as it is "published".
         form: of the barriers by decay.
+        terminal: where a plan has to end: anywhere, or at rest.
         position, attitude, velocity: weights at each node [1/m^2, 1, s^2/m^2], in proportion to the step before it and
             as they are for one of the greatest length.
         rate, thrust: weights of the controls less those of the path in each step [s^2, 1/N^2], alike.
@@ -85,6 +87,7 @@ class KeeperSettings:
     gamma: float = 0.0
     reading: Reading = "decay"
     form: Form = "slack"
+    terminal: Terminal = "none"
     position: float = 20.0
     attitude: float = 2.0
     velocity: float = 2.0
@@ -118,6 +121,8 @@ class Obstacles:
         keep: (M,) distance of the vehicle's centre to be kept from each centre or axis [m].
         upright: (M,) cylinders.
         falls: (M,) thrown balls.
+        doubt: (M, 3) what k standard deviations of the distance are, squared: at once, times the time, and times its
+            square [m^2, m^2/s, m^2/s^2]; None for obstacles whose place and velocity are known.
     """
 
     position: Array
@@ -125,6 +130,18 @@ class Obstacles:
     keep: Array
     upright: BoolArray
     falls: BoolArray
+    doubt: Array | None = None
+
+    @property
+    def doubts(self) -> Array:
+        """(M, 3) of :attr:`doubt`, zeros where there is none."""
+        return np.zeros((len(self.keep), 3)) if self.doubt is None else self.doubt
+
+    def off(self, later: Array) -> Array:
+        """(n, M) distance to be kept ``later`` (n,) [s], with what is uncertain [m]."""
+        t = later[:, None, None] ** np.arange(3)
+        kept: Array = self.keep + np.sqrt(np.sum(self.doubts * t, axis=2))
+        return kept
 
     def at(self, later: Array) -> Array:
         """(n, M, 3) where they are expected ``later`` (n,) [s]: at constant velocity, or falling."""
@@ -137,7 +154,7 @@ class Obstacles:
         """(n, M) distances of places (n, 3) from where they are expected ``later`` (n,), beyond what is to be kept."""
         away = places[:, None, :] - self.at(later)
         away[:, self.upright, 2] = 0.0
-        beyond: Array = np.linalg.norm(away, axis=2) - self.keep
+        beyond: Array = np.linalg.norm(away, axis=2) - self.off(later)
         return beyond
 
     def nearest(self, place: Array, count: int, later: float = 0.0) -> Obstacles:
@@ -147,12 +164,14 @@ class Obstacles:
 
     def these(self, order: IntArray, count: int) -> Obstacles:
         """Some of them, in an order; with others far away if there are fewer than ``count``."""
-        parts = self.position[order], self.velocity[order], self.keep[order], self.upright[order], self.falls[order]
+        every: tuple[Any, ...] = self.position, self.velocity, self.keep, self.upright, self.falls, self.doubts
+        parts = [part[order] for part in every]
         missing = count - len(order)
         if not missing:
             return Obstacles(*parts)
-        blank = np.full((missing, 3), FAR), np.zeros((missing, 3)), np.ones(missing), np.zeros(missing, dtype=bool)
-        return Obstacles(*(np.concatenate([p, b]) for p, b in zip(parts, (*blank, blank[3]), strict=True)))
+        far, none, one = np.full((missing, 3), FAR), np.zeros((missing, 3)), np.ones(missing)
+        blank = far, none, one, one < 0.0, one < 0.0, none
+        return Obstacles(*(np.concatenate([p, b]) for p, b in zip(parts, blank, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -181,8 +200,25 @@ class Decision:
     milliseconds: float
 
 
-def clearance(p: Array, t: Array, centre: Array, velocity: Array, fall: Array, keep: Array, flat: Array) -> Array:
-    """(n, M) distance beyond what is to be kept from what goes straight on, or falls [m].
+def apart(p: Array, centre: Array, keep: Array, flat: Array) -> Array:
+    """(n, M) distance of p (n, 3) from centres (M, 3) or (n, M, 3) beyond what is to be kept; see :func:`clearance`."""
+    away = (p[:, None, :] - centre) * flat
+    distance: Array = np.sqrt((away * away).sum(axis=2)) - keep
+    return distance
+
+
+_MOVING = accelerated(apart, many=True)
+
+
+def expected(p: Array, t: Array, *seen: Array) -> Array:
+    """(n, M) the same of :func:`clearance` where nothing is in doubt: how fast this grows is how fast they part."""
+    return _MOVING(p, t, *seen[:-1])
+
+
+def clearance(
+    p: Array, t: Array, centre: Array, velocity: Array, fall: Array, keep: Array, flat: Array, doubt: Array
+) -> Array:
+    """(n, M) distance beyond what is to be kept from what goes straight on, or falls, and is not quite known [m].
 
     Args:
         p: (n, 3) positions [m].
@@ -192,18 +228,19 @@ def clearance(p: Array, t: Array, centre: Array, velocity: Array, fall: Array, k
         fall: (M, 3) acceleration of those that fall [m/s^2].
         keep: (M,) distance to be kept [m].
         flat: (M, 3) ones, with a zero at the height of upright cylinders.
+        doubt: (M, 3) as :attr:`Obstacles.doubt`.
     """
-    s = np.reshape(t, (-1, 1, 1))
-    away = (p[:, None, :] - centre - s * velocity - 0.5 * s * s * fall) * flat
-    distance: Array = np.sqrt((away * away).sum(axis=2)) - keep
-    return distance
+    s = np.reshape(t, (-1, 1))
+    unsure = np.sqrt(doubt[:, 0] + s * doubt[:, 1] + s * s * doubt[:, 2])
+    left: Array = _MOVING(p, t, centre, velocity, fall, keep, flat) - unsure
+    return left
 
 
 def inverse_clearance(
-    p: Array, t: Array, centre: Array, velocity: Array, fall: Array, keep: Array, flat: Array
+    p: Array, t: Array, centre: Array, velocity: Array, fall: Array, keep: Array, *rest: Any
 ) -> Array:
     """(n, M) ``1/keep - 1/distance`` of the same [1/m] (eq. 15)."""
-    found: Array = 1.0 / keep - 1.0 / (keep + clearance(p, t, centre, velocity, fall, keep, flat))
+    found: Array = 1.0 / keep - 1.0 / (keep + clearance(p, t, centre, velocity, fall, keep, *rest))
     return found
 
 
@@ -221,6 +258,7 @@ class Keeper:
         settings: the numbers.
         airframe: as it is believed.
         nodes: when the nodes of a plan are, from its begin [s].
+        states: (N + 1, 17) of the last plan; None before there is one.
     """
 
     def __init__(
@@ -292,6 +330,8 @@ class Keeper:
         graph.bound(u, lower=airframe.least, upper=airframe.most, name="limits")
         self._allowed = graph.data("allowed speed", np.full(n, s.speed), each=True)
         self._speed = keep(graph, slower, ahead.v, self._allowed, obstacles=["speed"], weight=SPEEDING, name="speed")
+        if s.terminal == "rest":
+            graph.bound(x[-1].v, lower=0.0, upper=0.0, name="rest")
         self.kept: list[Kept] = []
         if s.slots:
             self._state_barriers(graph, steps)
@@ -306,6 +346,7 @@ class Keeper:
         self._warm = hurried.prepare(graph)
         self._guess: fg.Guess | None = None
         self._applied = quadrotor.hover(airframe.parameters)
+        self.states: Array | None = None
         self._plan: tuple[Array, Array] | None = None  # places and controls of the last plan
         self._age = 0  # of it [ticks]
         self._looked_at: list[int] = []
@@ -321,13 +362,14 @@ class Keeper:
             "fall": blank,
             "keep": np.ones(m),
             "flat": blank + 1.0,
+            "doubt": blank,
         }
         self._seen = {name: graph.data(name, value) for name, value in things.items()}
         seen = tuple(self._seen.values())
         if s.reading == "published":
             h: Barrier = inverse_clearance
             lost = _of_states(h)
-            held = velocity_extended(h, clearance, s.gamma) if s.gamma > 0.0 else lost
+            held = velocity_extended(h, expected, s.gamma) if s.gamma > 0.0 else lost
             asked = condition(held, s.alpha, quadrotor_loops.STATE, _flow(self.airframe), as_published=True, lost=lost)
             self.kept = [
                 keep(graph, asked, x[:-1], self.u, self._since, *seen, obstacles=m, form="hinge", weight=s.hinge)
@@ -336,7 +378,7 @@ class Keeper:
         ends = x[:-1].p, x[1:].p, self._since, steps, *seen
         self.kept = [keep(graph, decay(clearance, s.alpha), *ends, obstacles=m, form=s.form, weight=s.slack)]
         if s.gamma > 0.0:
-            held = velocity_extended(clearance, clearance, s.gamma)
+            held = velocity_extended(clearance, expected, s.gamma)
             states = x[:-1], x[1:], self._since, steps, *seen
             name = "velocity barrier"
             self.kept.append(
@@ -369,7 +411,7 @@ class Keeper:
             flat = np.ones((s.slots, 3))
             flat[near.upright, 2] = 0.0
             fall = np.array([0.0, 0.0, -quadrotor.GRAVITY]) * near.falls[:, None]
-            given = near.position, near.velocity, fall, near.keep, flat
+            given = near.position, near.velocity, fall, near.keep, flat, near.doubts
             data |= {self._since: later + self.nodes[:-1], **dict(zip(self._seen.values(), given, strict=True))}
         first, guess = self._plan is None, self._guess
         if guess is None:
@@ -381,6 +423,7 @@ class Keeper:
         found = all(np.isfinite(part).all() for part in numbers) and solution.violation < KEPT
         status, slack = solution.status.name.lower(), 0.0
         if found:
+            self.states = numbers[0]
             self._plan, self._age, self._guess = (
                 (numbers[0][:, :3], numbers[1]),
                 0,

@@ -68,7 +68,7 @@ def filtered(
     normal = away / distance[:, None]
     rate = np.sum(normal * speed, axis=1)
     bend = (np.sum(speed * speed, axis=1) - rate * rate) / distance - np.sum(normal * fall, axis=1)
-    least = -(bend + (s.alpha + s.beta) * rate + s.alpha * s.beta * (distance - near.keep))
+    least = -(bend + (s.alpha + s.beta) * rate + s.alpha * s.beta * (distance - near.off(np.array([later]))[0]))
     weights = np.concatenate([np.ones(3), np.full(count, s.price)])
     box = np.array([s.level, s.level, s.vertical])
     found = qpsolvers.solve_qp(
