@@ -351,7 +351,7 @@ class Episode:
             bound_violation=plan.excess,
             clearance=world.clearance(),
             goal_index=self._goal,
-            emergency=plan.emergency,
+            emergency=plan.emergency and plan.source != STOPPED,
             rescued=plan.rescued,
             health=verdict.health.value,
             cause=verdict.cause,

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from unifg.errors import ScenarioError
+from episodes import episode
+from unifg.errors import FileFormatError, ScenarioError
 from unifg.files.ros_map import OccupancyMap, save_map
 from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.scenarios import navigation
+from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
 from unifg.scenarios.seeing.explaining import PointWatch, explained, thinned
@@ -143,3 +146,44 @@ def test_thinning_keeps_one_point_of_a_square() -> None:
     kept = thinned(points, 0.25)
     assert len(kept) == 16 and all((points == row).all(axis=1).any() for row in kept)
     assert len(thinned(np.zeros((0, 2)), 0.25)) == 0
+
+
+# ------------------------------------------------------------------------ the log
+
+
+def test_a_drive_is_stored_so_that_others_can_read_it(tmp_path: Path) -> None:
+    log = episode(12)
+    path = tmp_path / "drive.npz"
+    log.save(path)
+    with np.load(path, allow_pickle=False) as file:  # as any program does
+        about = json.loads(str(file["about"]))
+        assert about["units"]["control"] == "m/s, rad/s" and about["kind"] == "unifg drive log 1"
+        assert file["control"].shape == (12, 2) and file["health"][-1] == "degraded"
+        assert file["route_lengths"].sum() == len(file["route"])
+    again = EpisodeLog.load(path)
+    for name, value in vars(log).items():
+        other = getattr(again, name)
+        if name == "occupancy":
+            assert np.array_equal(value.occupied, other.occupied) and value.origin == other.origin
+        elif isinstance(value, np.ndarray):
+            assert value.dtype == other.dtype and np.array_equal(value, other, equal_nan=value.dtype.kind == "f"), name
+        elif isinstance(value, list) and value and isinstance(value[0], np.ndarray):
+            assert all(np.array_equal(a, b) for a, b in zip(value, other, strict=True)), name
+        else:
+            assert value == other, name
+
+
+def test_files_that_are_no_drive_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "drive.npz"
+    episode(3).save(path)
+    whole = path.read_bytes()
+    for content in (b"", b"not a file", whole[: len(whole) // 2]):
+        path.write_bytes(content)
+        with pytest.raises(FileFormatError, match="is no unifg drive log 1"):
+            EpisodeLog.load(path)
+    with np.errstate(all="ignore"):
+        np.savez(path, about=np.array('{"kind": "something else", "units": {}}'))
+    with pytest.raises(FileFormatError, match="is no unifg drive log 1"):
+        EpisodeLog.load(path)
+    with pytest.raises(FileFormatError):
+        EpisodeLog.load(tmp_path / "nothing.npz")

@@ -27,7 +27,7 @@ from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.navigation import NavigationSettings
 from unifg.scenarios.options import add_options, option, pose, positive, settings_of
 
-FILES = ("scene.html", "overview.png", "metrics.json", "trajectory.tum", "estimate.tum")
+FILES = ("scene.html", "overview.png", "metrics.json", "trajectory.tum", "estimate.tum", "drive.npz")
 
 Progress = Callable[[float, str], None]
 

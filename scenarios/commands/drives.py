@@ -36,15 +36,15 @@ def run(settings: navigation.NavigationSettings, progress: Progress, announce: A
 
 
 def write_results(folder: Path, log: EpisodeLog) -> list[Path]:
-    """Write scene, picture, metrics and both trajectories of an episode.
+    """Write scene, picture, metrics, log and both trajectories of an episode.
 
     Args:
         folder: existing folder; files of the same names are replaced.
         log: an episode of at least one tick.
 
     Returns:
-        The files written: ``scene.html``, ``overview.png``, ``metrics.json``, ``trajectory.tum`` (the truth) and
-        ``estimate.tum``.
+        The files written: ``scene.html``, ``overview.png``, ``metrics.json``, ``trajectory.tum`` (the truth),
+        ``estimate.tum`` and ``drive.npz``, which `EpisodeLog.load` reads.
 
     Raises:
         ViewError: the episode has no tick.
@@ -53,9 +53,11 @@ def write_results(folder: Path, log: EpisodeLog) -> list[Path]:
     metrics = write_metrics(folder / "metrics.json", episode_metrics(log))
     trajectory = write_tum(folder / "trajectory.tum", log.time, log.true_pose)
     estimate = write_tum(folder / "estimate.tum", log.time, log.estimate)
+    stored = folder / "drive.npz"
+    log.save(stored)
     picture = write_figure(folder / "overview.png", overview(log), 130)
     scene = drive_scene(log).save(folder / "scene.html")
-    return [scene, picture, metrics, trajectory, estimate]
+    return [scene, picture, metrics, trajectory, estimate, stored]
 
 
 def summary(log: EpisodeLog) -> str:

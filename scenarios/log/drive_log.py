@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from unifg.errors import FileFormatError
 from unifg.files.ros_map import OccupancyMap
 from unifg.scenarios.log.columns import column, ragged, words
+from unifg.scenarios.log.stored import load_columns, save_columns
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["EpisodeLog"]
@@ -154,3 +157,39 @@ class EpisodeLog:
         """(K, 3) the obstacles at the beginning."""
         first: Array = self.obstacles[0]
         return first
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write everything to one ``.npz`` file; see :mod:`unifg.scenarios.log.stored`."""
+        occupancy = self.occupancy
+        known = {name: getattr(self, name) for name in _KNOWN} | {
+            "map_occupied": occupancy.occupied,
+            "map_free": occupancy.free,
+            "map_resolution": occupancy.resolution,
+            "map_origin": list(occupancy.origin),
+            "map_name": occupancy.name,
+        }
+        save_columns(path, self, _KIND, known)
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> EpisodeLog:
+        """Read a file written by :meth:`save`.
+
+        Raises:
+            FileFormatError: if the file is no log of a drive.
+        """
+        found, known = load_columns(path, EpisodeLog, _KIND)
+        try:
+            parts = (known.pop(f"map_{name}") for name in ("occupied", "free", "resolution", "origin", "name"))
+            occupied, free, resolution, origin, name = parts
+            occupancy = OccupancyMap(occupied, free, resolution, tuple(origin), name)
+            known["control_limits"] = tuple(known["control_limits"])
+            return EpisodeLog(occupancy=occupancy, **known, **found)
+        except (KeyError, TypeError, ValueError) as error:
+            raise FileFormatError(f"{os.fspath(path)} is no {_KIND}: {error}") from error
+
+
+_KIND = "unifg drive log 1"
+_KNOWN = (
+    "path", "goals", "start", "dt", "robot_radius", "solver", "coupling", "seed", "scan_angles", "collisions",
+    "reached", "obstacle_moving", "control_limits", "scenario", "interrupted", "outcomes", "dropped", "faults",
+)  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -115,9 +116,23 @@ def plot_controls(log: EpisodeLog, ax: tuple[Axes, Axes] | None = None) -> tuple
         axes.step(log.time, values, where="post", color=css("robot"), lw=1.1)
         axes.set_ylim(-1.18 * limit, 1.18 * limit)
         over_time(log, axes, title, label)
+    _trouble(log, both[0])
     if float(log.control[:, 0].min()) >= 0.0:  # it never reversed: show the half that was used
         both[0].set_ylim(-0.08 * log.control_limits[0], 1.18 * log.control_limits[0])
     return both
+
+
+def _trouble(log: EpisodeLog, ax: Axes) -> None:
+    """Shade the time in which the robot could not rely on everything, and say what was the matter longest."""
+    health = np.array(log.health)
+    for state, colour in (("degraded", "moving"), ("lost", "robot")):
+        steps = np.diff(np.concatenate([[0], (health == state).astype(np.int8), [0]]))
+        for begin, end in zip(np.flatnonzero(steps == 1), np.flatnonzero(steps == -1), strict=True):
+            ax.axvspan(begin * log.dt, end * log.dt, color=css(colour), alpha=0.18, lw=0)
+    causes = Counter(cause for cause in log.cause if cause)
+    if causes:
+        states = " and ".join(state for state in ("degraded", "lost") if state in log.health)
+        ax.set_title(f"Forward speed; {states}: {causes.most_common(1)[0][0]}", fontsize=8)
 
 
 def _obstacles(log: EpisodeLog, ax: Axes) -> None:
@@ -164,6 +179,7 @@ def _poses(log: EpisodeLog, ax: Axes) -> None:
 def _title(log: EpisodeLog) -> str:
     m = episode_metrics(log)
     stopped = ", interrupted" if log.interrupted else ""
+    stopped += "".join(f", {words}" for words in log.outcomes if words != "reached")
     return (
         f"{log.scenario} on {log.occupancy.name}: {m['goals_reached']} of {m['goals']} goals reached, "
         f"{collision_words(log.collisions)}{stopped}  |  {m['path_length_m']:.1f} m in {m['duration_s']:.1f} s  |  "

@@ -14,7 +14,7 @@ from unifg.errors import ViewError
 from unifg.lie import SE2
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import episode_metrics
-from unifg.scenarios.log.metrics import collision_words
+from unifg.scenarios.log.metrics import collision_words, health
 from unifg.typing import Array, IntArray
 from unifg.view import Frame, Part, Scene, shapes
 
@@ -42,12 +42,16 @@ def drive_scene(log: EpisodeLog) -> Scene:
         drive_frame(scene.frame(), log, tick, min(log.ticks, _FRAMES))
     m = episode_metrics(log)
     stopped = ", interrupted by the user" if m["interrupted"] else ""
-    scene.outcome = f"{m['goals_reached']} of {m['goals']} goals reached, {collision_words(m['collisions'])}{stopped}"
+    missed = "".join(f"; {words}" for words in m["outcomes"] if words != "reached")
+    scene.outcome = (
+        f"{m['goals_reached']} of {m['goals']} goals reached, {collision_words(m['collisions'])}{stopped}{missed}"
+    )
     scene.good = m["succeeded"]
     scene.facts |= {
         "driven": f"{m['path_length_m']:.1f} m in {m['duration_s']:.1f} s",
         "closest approach": f"{max(0.0, m['min_clearance_m']):.2f} m",
         "localisation error": f"{100 * m['localisation_error_m']['mean']:.1f} cm on average",
+        "health": health(m),
         "odometry error": f"{m['odometry_error_m']['max']:.2f} m at worst",
     }
     return scene
@@ -218,6 +222,7 @@ def _say(frame: Frame, log: Any, tick: int) -> None:
     error = float(np.hypot(*(log.estimate[tick] - log.true_pose[tick])[:2]))
     clearance, stored = float(log.clearance[tick]), bool(log.emergency[tick])
     spent = f"{log.localise_ms[tick]:.1f} ms, {log.plan_ms[tick]:.1f} ms"
+    whole = log.perceive_ms[tick] + log.route_ms[tick] + log.localise_ms[tick] + log.plan_ms[tick]
     deviations = 100.0 * np.sqrt(np.linalg.eigvalsh(log.covariance[tick][:2, :2])[[1, 0]])
     status = log.status[tick].replace("_", " ")
     frame.readout("speed", f"{log.control[tick][0]:.2f} m/s")
@@ -225,9 +230,14 @@ def _say(frame: Frame, log: Any, tick: int) -> None:
     frame.readout("goal", f"{log.goal_index[tick] + 1} of {len(log.goals)}")
     frame.readout("localisation error", f"{100 * error:.1f} cm")
     frame.readout("believed \u03c3", f"{deviations[0]:.1f} and {deviations[1]:.1f} cm")
+    well = log.health[tick] == "ok"
+    frame.readout("health", log.health[tick] + (f": {log.cause[tick]}" if log.cause[tick] else ""), alarm=not well)
+    if any(log.faults):
+        frame.readout("fault", log.fault[tick] or "none yet")
     frame.readout("clearance", f"{clearance:.2f} m" if np.isfinite(clearance) else "\u2013")
     frame.readout("contacts", str(int(log.contacts[tick])), alarm=bool(log.contacts[tick]))
     frame.readout("localise, plan", spent + " (compiled)" * bool(log.compiled[tick]), alarm=bool(log.compiled[tick]))
+    frame.readout("whole tick", f"{whole:.1f} ms")
     frame.readout("plan", status + ": stored one driven" * stored, alarm=stored)
     frame.readout("iterations of it", str(int(log.plan_iterations[tick])))
     frame.value("localise + plan", float(log.solve_ms[tick]))
