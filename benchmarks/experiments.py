@@ -3,7 +3,7 @@
     python -m benchmarks.experiments [--runs N] [--workers K] [--report] [--any-code]
 
 The campaigns are benchmarks/campaigns/department.toml (his Table I) and factory.toml (Table II); what is on file in
-out/benchmarks/campaigns is not repeated. Thirty runs a leg with two couplings take about five hours of one core.
+out/benchmarks/campaigns is not repeated. Thirty runs a leg with two couplings take some three hours of one core.
 """
 
 from __future__ import annotations

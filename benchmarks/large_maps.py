@@ -1,6 +1,7 @@
 """Maps as large as the paper's robots had, and one of five hundred metres, drawn from a few numbers and a seed.
 
-    python -m benchmarks.large_maps     draws the maps of benchmarks/campaigns again
+    python -m benchmarks.large_maps                  draws the maps of benchmarks/campaigns again
+    python -m benchmarks.large_maps --measure 500    what a map of 500 m costs: time of the processor, and memory
 
 Bazzana et al. 2022 drive 30 times along eight legs of their department (Table I: four of about 170 m, two of 91, two
 of 18) and four legs of a factory-like map (Table II: 154, 87, 142 and 131 m). Neither map is published with
@@ -11,13 +12,22 @@ of aisles between racks with gates and one strip of rooms. Furniture is random, 
 from __future__ import annotations
 
 import math
+import resource
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.report import command
+from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, save_map
+from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.ways.grid import plan
+from unifg.scenarios.ways.polyline import path_length
+from unifg.scenarios.worlds.rectangles import wall_rectangles
 from unifg.typing import BoolArray
 
 CAMPAIGNS = Path(__file__).resolve().parent / "campaigns"
@@ -245,8 +255,40 @@ def _machines(drawing: Drawing, x0: float, y0: float, x1: float, y1: float) -> I
             yield Room(round(float(x) + 6.6, 2), round(float(y) + 6.6, 2), 0.0)
 
 
-def main() -> int:
-    """Draw the maps of the campaigns."""
+def measured(side: float) -> Iterator[str]:
+    """Draw a town, measure its distances, find its walls' rectangles and a way from one end to the other."""
+    began = time.process_time()
+
+    def told(what: str) -> str:
+        nonlocal began
+        took, began = time.process_time() - began, time.process_time()
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+        return f"{what}: {took:.1f} s of the processor, at most {peak:.2f} GB so far"
+
+    occupancy, rooms = town(side)
+    yield told(f"{occupancy.occupied.size / 1e6:.1f} million cells, {occupancy.free.sum() / 1e6:.1f} of them free")
+    field = DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+    yield told("distance field")
+    yield told(f"{len(wall_rectangles(occupancy.occupied))} rectangles of walls")
+    standing = [room for room in rooms if field.distance(np.array([room.x, room.y])) > 0.3]
+    for first, last in product(standing[:6], standing[:-7:-1]):
+        try:  # furniture shuts some rooms
+            path = plan(occupancy, field, (first.x, first.y), (last.x, last.y, 0.0), robot_radius=0.17)
+        except ScenarioError:
+            continue
+        yield told(f"a way of {path_length(path):.0f} m")
+        return
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Draw the maps of the campaigns, or measure a large one."""
+    parser = command(__doc__)
+    parser.add_argument("--measure", type=float, metavar="SIDE", help="of a town [m]; draws no map of the campaigns")
+    options = parser.parse_args(arguments)
+    if options.measure is not None:
+        for line in measured(options.measure):
+            print(line, flush=True)
+        return 0
     CAMPAIGNS.mkdir(exist_ok=True)
     for draw in (department, factory):
         occupancy, _ = draw()
