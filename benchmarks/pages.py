@@ -87,6 +87,7 @@ PAGES = {
         Page("quadrotor-joint", "One graph that estimates and flies", "benchmarks.quadrotor_pull", hours=0.15),
         Page("quadrotor-mpc", "Scenario: quadrotor-mpc", "benchmarks.quadrotor_flights", hours=1.5),
         Page("barriers", "Control barrier functions", "benchmarks.guarded_flights", hours=0.15),
+        Page("horizon-and-velocity", "What horizon and velocity buy", "benchmarks.horizon_and_velocity", hours=0.35),
         Page("benchmarks", "Benchmarks", "benchmarks.elimination"),
     )
 }
