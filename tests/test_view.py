@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
+import shutil
 import subprocess
 import sys
 import threading
@@ -15,6 +17,7 @@ import pytest
 
 import unifg as fg
 from scenes import check_offline, commands_of, data_of, tracks_of, without_viewer
+from unifg import view
 from unifg.errors import GraphError, ViewError
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
@@ -442,3 +445,14 @@ def test_what_is_no_covariance_and_no_rotation_is_refused() -> None:
             scene.poses("p", [[0.0, 0.0, 0.0, *quaternion]])
     scene.covariances("c", np.zeros((1, 2)), [[[1.0, 1.0], [1.0, 1.0 - 1e-12]]])  # but for rounding
     scene.poses("p", [[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node runs what the page says")
+def test_numbers_beside_plots_keep_their_zeros() -> None:
+    """110 cm are no 11 cm."""
+    page = (Path(view.__file__).parent / "page.html").read_text(encoding="utf-8")
+    (stated,) = re.findall(r"const short = .*?;\n", page, re.DOTALL)
+    shown = {110.0: "110", 100.0: "100", 0.7: "0.7", 0.69512: "0.695", 0.0: "0", 1234.0: "1230", 2e4: "2.0e+4"}
+    asked = f"{stated}console.log({list(shown)}.map(short).join(' '))"
+    found = subprocess.run(["node", "-e", asked], capture_output=True, text=True, check=True)
+    assert found.stdout.split() == list(shown.values())
