@@ -323,3 +323,33 @@ def test_manhattan_3500_pose_by_pose(shared_data: Path) -> None:
     assert len(smoother) == len(graph.edges) + 1
     smoother.update(iterations=2)
     assert smoother.cost == pytest.approx(68.9574391, rel=1e-5)
+
+
+def test_ill_conditioning_is_named_as_what_it_is() -> None:
+    """First guesses that are 2.7 rad off, one after the other: all poses are determined, and the numbers are not."""
+    smoother = fg.Incremental()
+    x = smoother.variables("x", fg.SE2)
+    smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.1)
+    smoother.update({x: np.zeros(3)})
+    with pytest.raises(fg.GraphError, match=r"^x\[\d+\] is determined by its factors, but lost to rounding: .*guesses"):
+        for k in range(1, 1500):
+            smoother.minimize(fg.between, x[k - 1], x[k], [1.0, 0.0, 0.01], sigma=0.1)
+            smoother.update({x: fg.SE2.compose(smoother.estimate(x[-1])[0], np.array([1.0, 0.0, 2.7]))})
+
+
+@pytest.mark.parametrize("kind", ["incremental", "fixed lag"])
+def test_what_is_not_determined_is_still_named_so(kind: str) -> None:
+    """Beside many poses that are: too few rows, and a loop of poses that nothing holds in place."""
+    for adrift in (1, 3):
+        smoother: Any = fg.Incremental() if kind == "incremental" else fg.FixedLag(5)
+        x, y = smoother.variables("x", fg.SE2), smoother.variables("y", fg.SE2)
+        smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.1)
+        smoother.update({x: np.zeros(3)})
+        for k in range(1, 12):
+            smoother.minimize(fg.between, x[k - 1], x[k], [1.0, 0.0, 0.1], sigma=0.1)
+            smoother.update({x: fg.SE2.compose(smoother.estimate(x[-1])[0], np.array([1.0, 0.0, 0.1]))})
+        for k in range(adrift):
+            smoother.minimize(fg.between, y[k], y[(k + 1) % (adrift + 1)], [1.0, 0.0, 0.1], sigma=0.1)
+        smoother.minimize(fg.between, y[adrift], y[0], [-adrift, 0.0, 0.0], sigma=0.1)
+        with pytest.raises(fg.GraphError, match=r"^y\[\d\] is not determined by its factors"):
+            smoother.update({y: np.zeros((adrift + 1, 3)) + np.arange(adrift + 1)[:, None] * [1.0, 0.0, 0.1]})

@@ -21,6 +21,7 @@ from unifg.smoothing.families import GrowingFamily
 from unifg.smoothing.queries import add_factors, add_variables, estimates, joint_covariance, total_cost
 from unifg.smoothing.state import MADE, PART, SLOT, TYPE, Records, State, empty_state
 from unifg.smoothing.tree import give_up
+from unifg.smoothing.undetermined import enough
 from unifg.smoothing.update import begin, renew, update_tree
 from unifg.turns import Turn, in_turn
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
@@ -310,9 +311,16 @@ class Smoother:
         if failed >= 0:
             family = self._order[int(state.variables["family"][failed])]
             member = int(state.variables["member"][failed])
+            why = (
+                "is determined by its factors, but lost to rounding: the problem is too ill-conditioned where it is "
+                "linear now, as after first guesses that are radians off, or with weights many orders apart. Begin "
+                "again with better guesses, or solve the whole as a fg.Graph"
+                if enough(state, failed)
+                else "is not determined by its factors: it, or something it is tied to, needs a "
+                "prior or another measurement. The factors are kept; add what is missing and update again"
+            )
             raise GraphError(
-                f"{family.name}[{member}] is not determined by its factors: it, or something it is tied to, needs a "
-                "prior or another measurement. The factors are kept; add what is missing and update again",
+                f"{family.name}[{member}] {why}",
                 family=family.name,
                 index=member,
             )
