@@ -24,9 +24,10 @@ from unifg.scenarios.flying.flight_settings import ControllerSettings
 from unifg.scenarios.flying.flight_watch import FlightWatch
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.flight_log import FlightLog
-from unifg.scenarios.options import count, option, share
+from unifg.scenarios.options import count, not_negative, option, positive, share
 from unifg.scenarios.worlds.air import QuadrotorWorld
 from unifg.scenarios.worlds.conditions import draw_conditions
+from unifg.scenarios.worlds.disturbance import DisturbanceModel
 from unifg.scenarios.worlds.faults import FLIGHT_FAULTS, Fault, FlightFaults, one_of
 from unifg.typing import Array
 
@@ -52,6 +53,8 @@ class FlightSettings:
         seed: of everything random.
         movers: number of moving discs.
         mass_error: by which the mass is believed wrong at the start, relative, in [0, 1).
+        speed: cruise [m/s]; None for that of the controller's guide.
+        gusts: factor on the standard deviation of the gusts, which the robot is not told.
         time_limit: after which a flight is given up [s].
         estimator: of the past; its association is the flight's.
         controller: of the future; its avoidance and horizon are the flight's.
@@ -63,6 +66,8 @@ class FlightSettings:
     seed: int = option(0, metavar="S")
     movers: int = option(0, text=partial(count, most=200), metavar="K")
     mass_error: float = option(0.05, text=share, metavar="E")
+    speed: float | None = option(None, text=positive, metavar="M/S")
+    gusts: float = option(1.0, text=not_negative, metavar="FACTOR")
     time_limit: float = 60.0
     estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
     controller: ControllerSettings = field(default_factory=ControllerSettings)
@@ -90,12 +95,20 @@ class FlightSettings:
             "avoidance": self.controller.avoidance,
             "movers": self.movers,
             "mass_error": self.mass_error,
+            "gusts": self.gusts,
             "time_limit": self.time_limit,
             "window": self.estimator.window.length,
             "horizon": self.controller.horizon,
-            "controller": asdict(self.controller),
+            "controller": asdict(self.flown),
             "faults": [str(fault) for fault in self.faults],
         }
+
+    @property
+    def flown(self) -> ControllerSettings:
+        """Of the controller, at the speed that was asked for."""
+        if self.speed is None:
+            return self.controller
+        return replace(self.controller, guide=replace(self.controller.guide, speed=self.speed))
 
 
 def run_flight(settings: FlightSettings, progress: Progress | None = None) -> FlightLog:
@@ -125,12 +138,14 @@ class Flight:
         """Draw the world and wake the pilot, and rehearse unless this is a rehearsal."""
         self.settings = settings
         self.conditions = found = draw_conditions(settings.seed, settings.mass_error)
-        self.world = QuadrotorWorld(found.layout, settings.seed, found.true, settings.movers)
+        calm = DisturbanceModel()
+        gusty = replace(calm, gust=tuple(settings.gusts * sigma for sigma in calm.gust))
+        self.world = QuadrotorWorld(found.layout, settings.seed, found.true, settings.movers, disturbance=gusty)
         error = settings.estimator.state_sigma * found.deviation
         believed = quadrotor.STATE.retract(self.world.state[None], error[None])[0]
         self.pilot = make_pilot(
             settings.coupling, settings.solver, found.layout, believed, found.nominal, settings.estimator,
-            settings.controller,
+            settings.flown,
         )  # fmt: skip
         self.faults, self.watch = FlightFaults(settings.faults, settings.seed), FlightWatch(settings.controller.dt)
         self._speed = self.pilot.controller.guide.settings

@@ -18,6 +18,7 @@ from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.driving.stopping import followed, stopped
 from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.seeing.tracks import Tracks
+from unifg.scenarios.ways.follow import PathFollower
 from unifg.scenarios.ways.polyline import polyline_distance
 from unifg.scenarios.worlds.plane import World
 from unifg.solvers import SQP
@@ -51,8 +52,8 @@ def tracks(
 
 
 def ahead(pose: Array = OPEN, way: Array | None = None) -> Array:
-    """A straight reference from a pose, of a robot that begins at rest, if nothing else is said."""
-    way = SETTINGS.stations(0.0) if way is None else way
+    """A straight reference from a pose."""
+    way = SETTINGS.stations if way is None else way
     heading = pose[2]
     return np.column_stack(
         [pose[0] + way * np.cos(heading), pose[1] + way * np.sin(heading), np.full(len(way), heading)]
@@ -326,7 +327,7 @@ def test_braking_keeps_the_path_and_the_accelerations(controller: Controller) ->
     """From full speed, in a turn: as hard as the base can, along the path of the last plan, and then rest."""
     s, pose = SETTINGS, OPEN.copy()
     for _ in range(6):
-        reference = followed(pose, controller.loop.applied, np.column_stack([s.pace(1.0), 0.6 * s.pace(1.0)]), s.dt)
+        reference = followed(pose, controller.loop.applied, np.column_stack([s.pace, 0.6 * s.pace]), s.dt)
         before = controller.loop.applied
         plan = controller.plan(pose, reference, tracks())
         assert not plan.emergency
@@ -346,6 +347,33 @@ def test_braking_keeps_the_path_and_the_accelerations(controller: Controller) ->
     assert np.all(changes <= s.most + 1e-9)
     assert np.all(changes[:-2, 0] >= 0.9 * s.most[0])  # as hard as it can
     assert controller.plan(pose, reference, tracks()).states[-1] == pytest.approx(pose)
+
+
+def test_the_reference_brakes_to_rest_at_the_end() -> None:
+    s = replace(SETTINGS, accelerations=(1.0, 2.1), speed=0.8)
+    assert np.all(s.pace[:23] == 0.8)
+    assert -np.diff(s.pace[22:]) == pytest.approx(0.1) and s.pace[-1] == pytest.approx(0.1)
+    assert np.diff(s.stations)[:23] == pytest.approx(0.08)
+    assert s.stations[-1] == pytest.approx(0.1 * (23 * 0.8 + 0.05 * sum((15, 13, 11, 9, 7, 5, 3))))
+
+
+@pytest.mark.parametrize("side", [-0.12, 0.12])
+@pytest.mark.parametrize("heading", [0.7, -0.7])
+def test_a_robot_beside_its_goal_does_not_put_off_what_it_has_to_do(
+    controller: Controller, side: float, heading: float
+) -> None:
+    """The reference begins anew every tick; where it lets the robot stay for a while, the robot stays for ever."""
+    goal = OPEN + np.array([0.0, 0.0, 0.1])
+    pose = goal + np.array([0.1, side, heading])
+    path = np.column_stack([np.linspace(-1.0, 0.0, 21) + OPEN[0], np.full(21, OPEN[1]), np.full(21, heading)])
+    path[:, 1] += (path[:, 0] - OPEN[0]) * np.tan(heading)
+    path[-1] = goal
+    follower, reached = PathFollower(path), 0.0
+    for _ in range(60):
+        reference, reached = follower.reference(pose, controller.stations(), reached)
+        before = controller.loop.applied
+        pose = followed(pose, before, controller.plan(pose, reference, tracks()).control[None], SETTINGS.dt)[1]
+    assert np.hypot(*(pose - goal)[:2]) < 0.1 and abs(pose[2] - goal[2]) < 0.1
 
 
 def test_after_a_failure_the_guess_is_the_way_out_until_it_is_forgotten(controller: Controller) -> None:

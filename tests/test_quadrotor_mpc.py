@@ -365,3 +365,14 @@ def test_the_exit_status_says_whether_it_arrived(
     only_a_moment(monkeypatch, lambda log: replace(log, reached=True, collisions=collisions))
     monkeypatch.setattr(results, "write_results", lambda folder, log: [])
     assert command.main(["run", "quadrotor-mpc", "--seed", str(SEED), "--out", str(tmp_path)]) == status
+
+
+def test_speed_and_gusts_are_settings_of_a_flight() -> None:
+    """A speed reaches guide and summary, gusts the world alone; without them a flight is what it was."""
+    usual, quick = Flight(FlightSettings(seed=SEED)), Flight(FlightSettings(seed=SEED, speed=1.2, gusts=3.0))
+    assert quick.pilot.controller.settings.guide.speed == 1.2
+    assert quick.settings.summary()["controller"]["guide"]["speed"] == 1.2
+    assert usual.pilot.controller.settings == FlightSettings().controller
+    calm = usual.world.disturbance_model.gust
+    assert quick.world.disturbance_model.gust == pytest.approx([3.0 * sigma for sigma in calm])
+    assert replace(quick.world.disturbance_model, gust=calm) == usual.world.disturbance_model

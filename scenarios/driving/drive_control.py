@@ -60,8 +60,8 @@ class Controller:
         )  # fmt: skip
 
     def stations(self) -> Array:
-        """(N + 1,) how far ahead along the path the reference is [m], which begins at the speed of now."""
-        return self.settings.stations(max(float(self.loop.applied[0]), 0.0))
+        """(N + 1,) how far ahead along the path the reference is [m]."""
+        return self.settings.stations
 
     def plan(self, pose: Array, reference: Array, tracks: Tracks, covariance: Array | None = None) -> Plan:
         """Decide the next control.

@@ -84,17 +84,22 @@ class ControllerSettings:
         scaled: Array = np.array(sigma) / np.sqrt(self.control_weight)
         return scaled
 
-    def pace(self, speed: float) -> Array:
-        """(N,) speeds at the ends of the steps of one who drives on at ``speed``, his limit, and rests at the end."""
-        up, down = np.arange(1.0, self.horizon + 1), np.arange(self.horizon, 0.0, -1.0)
-        most = float(self.most[0])
-        pace: Array = np.minimum(np.minimum(speed + most * up, most * down), min(self.speed, self.box[1][0]))
+    @property
+    def pace(self) -> Array:
+        """(N,) speeds at the ends of the steps of one who drives at full speed and comes to rest at the end [m/s]."""
+        braking = float(self.most[0]) * np.arange(self.horizon, 0.0, -1.0)
+        pace: Array = np.minimum(braking, min(self.speed, self.box[1][0]))
         return pace
 
-    def stations(self, speed: float) -> Array:
-        """(N + 1,) how far he comes [m]."""
-        pace = self.pace(speed)
-        means = 0.5 * (np.concatenate([[speed], pace[:-1]]) + pace)
+    @property
+    def stations(self) -> Array:
+        """(N + 1,) how far he comes [m].
+
+        He does not begin at the speed of now: from rest, a reference that first stays where it is, with the heading of
+        the path, would let a robot beside its goal put off for ever the turn that it needs.
+        """
+        pace = self.pace
+        means = 0.5 * (np.concatenate([pace[:1], pace[:-1]]) + pace)
         return np.concatenate([[0.0], np.cumsum(self.dt * means)])
 
     @property
