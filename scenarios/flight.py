@@ -138,8 +138,9 @@ class Flight:
         """Draw the world and wake the pilot, and rehearse unless this is a rehearsal."""
         self.settings = settings
         self.conditions = found = draw_conditions(settings.seed, settings.mass_error)
-        calm = DisturbanceModel()
-        gusty = replace(calm, gust=tuple(settings.gusts * sigma for sigma in calm.gust))
+        calm, k = DisturbanceModel(), settings.gusts
+        x, y, z = calm.gust
+        gusty = replace(calm, gust=(k * x, k * y, k * z))
         self.world = QuadrotorWorld(found.layout, settings.seed, found.true, settings.movers, disturbance=gusty)
         error = settings.estimator.state_sigma * found.deviation
         believed = quadrotor.STATE.retract(self.world.state[None], error[None])[0]
