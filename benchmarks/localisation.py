@@ -1,6 +1,6 @@
 """The localisation graph beside an adaptive Monte Carlo localiser, on the same scans and wheels.
 
-    python -m benchmarks.localisation [--seeds 200:206] [--workers K] [--fresh] [--report]
+    python -m benchmarks.localisation [--seeds 200:204] [--workers K] [--fresh] [--report]
 
 A drive through the building (:mod:`benchmarks.routes`) is recorded once per seed; both localisers are given its scans
 and its odometry, so they differ in nothing else. Then the same with a wrong start, a start that is not known at all, a
@@ -35,7 +35,7 @@ from unifg.scenarios.rivals.monte_carlo import MonteCarlo, MonteCarloSettings
 from unifg.scenarios.seeing.readings import Scan
 from unifg.typing import Array
 
-SEEDS = range(200, 206)
+SEEDS = range(200, 204)
 DT = 0.1
 OBSTACLES = 3
 LOG = "intel-corrected.log.gz"
@@ -46,20 +46,20 @@ OFFSETS = {"start 0.5 m, 0.3 rad wrong": (0.5, 0.3), "start 1 m, 0.5 rad wrong":
 MOVED = {"a quarter of the furniture moved": 0.25, "all furniture moved": 1.0}
 UNKNOWN, CARRIED, DRIVEN = "start unknown", "carried elsewhere", "as driven"
 INTEL = "real log"
-DEFAULT_NOISE = (0.2, 0.2, 0.2, 0.2)
-RECOVERING = MonteCarloSettings(slow=0.001, fast=0.1, noise=DEFAULT_NOISE)  # as the package says where it is wanted
+# The package's documentation says so where recovery is wanted; and so large a building takes more particles.
+RECOVERING = MonteCarloSettings(slow=0.001, fast=0.1, particles=(2000, 20000))
 PAPER = (
     "Bazzana et al. report 0.087 +- 0.023 m and 0.022 +- 0.027 rad for their graph, 0.090 +- 0.023 m and 0.014 +- "
     "0.019 rad for AMCL, in ROS stage with a lidar, a map and wheels that the paper does not state."
 )
 
-Tick: TypeAlias = tuple[Scan, Array | None, Array]
+Tick: TypeAlias = tuple[Scan | None, Array | None, Array]
 """A scan, the odometry (2,) since the one before, and the true pose (3,)."""
 VARIANTS = {
     "AMCL, all beams": MonteCarloSettings(),
     "AMCL, 60 beams": MonteCarloSettings(beams=60),
     "AMCL, recovery": RECOVERING,
-    "AMCL, default noise": MonteCarloSettings(noise=DEFAULT_NOISE),
+    "AMCL, wheels trusted": MonteCarloSettings(noise=(0.01, 0.01, 0.01, 0.01)),
 }
 
 
@@ -89,9 +89,9 @@ class Listening:
     def __init__(self, inner: Estimator) -> None:
         """Listen to another one."""
         self.inner = inner
-        self.heard: list[tuple[Scan, Array | None]] = []
+        self.heard: list[tuple[Scan | None, Array | None]] = []
 
-    def update(self, scan: Scan, odometry: Array | None, dt: float) -> None:
+    def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
         """Note and hand on."""
         self.heard.append((scan, None if odometry is None else np.array(odometry)))
         self.inner.update(scan, odometry, dt)
@@ -100,6 +100,15 @@ class Listening:
     def iterations(self) -> int:
         """Of the other."""
         return self.inner.iterations
+
+    @property
+    def refused(self) -> str:
+        """Of the other."""
+        return self.inner.refused
+
+    def reset(self, pose: Array, sigma: Array) -> None:
+        """Of the other."""
+        self.inner.reset(pose, sigma)
 
     @property
     def pose(self) -> Array:
@@ -169,7 +178,9 @@ def measure(job: Drive) -> Row:
     occupancy, ticks = recorded(job.seed)
     rng = np.random.default_rng([job.seed, 3])
     truth, sigma = ticks[0][2], np.array(INITIAL_SIGMA)
-    beams, results = len(ticks[0][0].angles), {}
+    first = ticks[0][0]
+    assert first is not None
+    beams, results = len(first.angles), {}
 
     def run(
         condition: str, names: Sequence[str], given: OccupancyMap, pose: Array, how: Array, part: list[Tick]
@@ -183,7 +194,7 @@ def measure(job: Drive) -> Row:
 
     usual = ("graph", "AMCL, all beams", "AMCL, 60 beams")
     believed = truth + sigma * rng.standard_normal(3)
-    run(DRIVEN, (*usual, "AMCL, default noise"), occupancy, believed, sigma, ticks)
+    run(DRIVEN, (*usual, "AMCL, wheels trusted"), occupancy, believed, sigma, ticks)
     for condition, (way, turn) in OFFSETS.items():
         aside = rng.uniform(-math.pi, math.pi)
         off = np.array([way * math.cos(aside), way * math.sin(aside), turn * rng.choice([-1.0, 1.0])])
@@ -239,7 +250,7 @@ def real_ticks(angles: Array, ranges: Array, poses: Array, rng: np.random.Genera
 
     Wheels tell each with 5 % of scale error, drawn once, and 2 % of noise.
     """
-    scale, blind = 1.0 + 0.05 * rng.standard_normal(2), Scan(angles, np.full(len(angles), np.nan))
+    scale = 1.0 + 0.05 * rng.standard_normal(2)
     ticks: list[Tick] = []
     for k, (row, pose) in enumerate(zip(ranges, poses, strict=True)):
         wheels: Array | None = None
@@ -249,7 +260,7 @@ def real_ticks(angles: Array, ranges: Array, poses: Array, rng: np.random.Genera
             first = math.atan2(y, x) if way > LEAST_WAY else 0.0
             moves = np.array([[0.0, first], [way, 0.0], [0.0, float(wrap_angle(turn - first))]]) / DT
             told = moves * (scale + 0.02 * rng.standard_normal((3, 2)))
-            ticks += [(blind, part, np.full(3, np.nan)) for part in told[:2]]
+            ticks += [(None, part, np.full(3, np.nan)) for part in told[:2]]
             wheels = told[2]
         ticks.append((Scan(angles, row), wheels, pose))
     return ticks
@@ -266,7 +277,7 @@ def real_log() -> Row:
     sigma = np.array(INITIAL_SIGMA)
     return {
         f"{INTEL}|{name}": summary(replayed(made(name, occupancy, poses[1], sigma, len(angles), 0), ticks))
-        for name in ("graph", "AMCL, all beams", "AMCL, 60 beams", "AMCL, default noise")
+        for name in ("graph", "AMCL, all beams", "AMCL, 60 beams", "AMCL, wheels trusted")
     }
 
 
@@ -330,7 +341,7 @@ def paired(drives: Sequence[Row]) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Measure and write."""
     parser = command(__doc__)
-    parser.add_argument("--seeds", type=runs.seeds, default=SEEDS, help="recordings (default: 200:206)")
+    parser.add_argument("--seeds", type=runs.seeds, default=SEEDS, help="recordings (default: 200:204)")
     runs.options(parser)
     chosen = parser.parse_args(arguments)
     jobs = [Drive(seed) for seed in chosen.seeds] + [Drive(-1)]

@@ -171,7 +171,14 @@ class Episode:
         self._right, self._drawn = (self.occupancy, self.distance_map), drawn
         self.pilot = self._pilot(believed, sigma)
         if not rehearsal:
-            kind = "navigation", settings.coupling, settings.solver, settings.planner, settings.localiser
+            kind = (
+                "navigation",
+                settings.coupling,
+                settings.solver,
+                settings.planner,
+                settings.localiser,
+                control.avoidance,
+            )
             rehearse(kind, lambda: Episode(replace(settings, faults=()), rehearsal=True))
 
     def _pilot(self, pose: Array, sigma: Array) -> Pilot[Any]:

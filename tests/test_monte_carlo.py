@@ -21,7 +21,6 @@ from unifg.typing import Array
 SIGMA = np.array([0.1, 0.1, 0.05])
 START = np.array([1.5, 1.5, 0.0])
 OWN = MonteCarloSettings(beams=40)
-ROAMING = replace(OWN, noise=(0.2, 0.2, 0.2, 0.2))  # few particles have to find what they seek
 
 
 @functools.cache
@@ -79,7 +78,7 @@ def test_between_updates_the_wheels_carry_the_estimate() -> None:
 
 
 def test_from_everywhere_it_finds_itself_with_many_particles_first() -> None:
-    own = localiser(replace(ROAMING, particles=(500, 4000)))
+    own = localiser(replace(OWN, particles=(500, 4000)))
     own.everywhere()
     free = flat()[1].distance(own.particles[:, :2])
     assert free.min() > -0.03 and len(own.particles) == 4000
@@ -100,7 +99,7 @@ def test_a_kidnapped_robot_is_found_only_with_particles_drawn_anywhere() -> None
     elsewhere = np.array([4.5, 2.8, 2.0])
     errors = {}
     for slow, fast in ((0.0, 0.0), (0.05, 0.5)):
-        own = localiser(replace(ROAMING, slow=slow, fast=fast, particles=(1500, 4000)))
+        own = localiser(replace(OWN, slow=slow, fast=fast, particles=(1500, 4000)))
         drive(own, 20)
         world = World(flat()[0], elsewhere, (), np.random.default_rng(5), lidar=LidarModel(beams=60))
         odometry = np.zeros(2)

@@ -17,6 +17,7 @@ from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.scenarios.driving.drive_parts import Clearance, Drive, Following, Limits, Motion, WayOut, predicted
 from unifg.scenarios.driving.drive_past import robot
 from unifg.scenarios.driving.drive_settings import SECOND, ControllerSettings, backend
+from unifg.scenarios.driving.repulsion import Repulsion
 from unifg.scenarios.driving.stopping import evasions, followed, stopped
 from unifg.scenarios.seeing.tracks import Tracks
 from unifg.typing import Array
@@ -50,7 +51,7 @@ class Controller:
             ControlCost(s.weighted(s.control_sigma), s.weighted(s.rate_sigma), wanted=lambda now: now.given.wanted),
             Motion(s),
             Limits(s),
-            Clearance(s, self.field),
+            Repulsion(s, self.field) if s.avoidance in ("potential", "vortex") else Clearance(s, self.field),
         ]
         self.loop = Loop(
             robot(s.dt) if window is None else window.robot, s.horizon, terms, solver=backend(solver, s),

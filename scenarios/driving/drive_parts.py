@@ -178,10 +178,14 @@ def along(spread: Array, directions: Array) -> Array:
 def wall_limits(s: ControllerSettings, field: SmoothField, way_out: Array, reference: Array, spread: Array) -> Array:
     """(N, 1) least distances to walls, as far as the way out keeps them.
 
-    They are wider by what the estimate (2, 2) may be off towards the wall that is nearest along the reference.
+    They are wider by what the estimate (2, 2) may be off towards the wall that is nearest along the reference. With
+    ``avoidance="barrier"`` what is left of the distance may shrink at the rate ``approach``, too.
     """
     _, slopes = field.distance_and_gradient(reference[1:, :2])
     least = s.robot_radius + s.wall_clearance + s.sigmas * along(spread, slopes)
+    if s.avoidance == "barrier":
+        spare = np.maximum(float(field.distance(way_out[:1, :2])[0]) - least, 0.0)
+        least = least + spare * share(s.approach, s.dt * np.arange(1, s.horizon + 1))
     limits: Array = np.minimum(least, field.distance(way_out[1:, :2]))[:, None]
     return limits
 
@@ -203,7 +207,7 @@ def disc_limits(
 
     They are wider by what the estimate (2, 2) may be off towards a disc. A disc that has ever moved is kept off by what
     it can travel in the meantime, up to a limit, and what is left of the gap is a barrier that may shrink at the rate
-    ``approach`` from now on.
+    ``approach`` from now on; with ``avoidance="barrier"`` that holds for every disc.
     """
     stages = s.dt * np.arange(1, s.horizon + 1)[:, None]
     kept = np.hypot(*np.moveaxis(way_out[1:, None, :2] - centres, 2, 0)) - tracks.radius
@@ -211,7 +215,8 @@ def disc_limits(
     walk = np.maximum(np.hypot(*tracks.velocity.T), s.mover_speed)
     allowance = np.where(movers, np.minimum(walk * stages, s.mover_allowance), 0.0)
     least = s.robot_radius + s.disc_clearance + s.sigmas * along(spread, now) + allowance
-    spare = np.where(movers, np.maximum(np.hypot(*now.T) - tracks.radius - least, 0.0), 0.0)
+    guarded = movers | (s.avoidance == "barrier")
+    spare = np.where(guarded, np.maximum(np.hypot(*now.T) - tracks.radius - least, 0.0), 0.0)
     # A little nearer is allowed, or a robot beside a disc could not even turn its nose past it; not so to a disc
     # that moves.
     squeezed = np.minimum(kept, np.maximum(kept - s.squeeze, s.robot_radius + s.squeeze))

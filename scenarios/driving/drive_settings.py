@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import unifg as fg
+from unifg.errors import ScenarioError
 from unifg.scenarios.options import option, positive
 from unifg.solvers import names
 from unifg.typing import Array
@@ -17,6 +18,9 @@ PENALTY = 3e4  # of the augmented Lagrangian; the automatic one is stiffer than 
 SECOND = "ipm"
 """Who is asked, from the way out, when a backend finds no plan. Its own failures it makes good from there itself, more
 often than others, and within some 7 ms where an SQP takes 15 to 70 ms and an augmented Lagrangian 6 to 36 ms."""
+
+AVOIDANCES = ("clearance", "barrier", "potential", "vortex")
+SEARCH = 5  # iterations with the tangent vector
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,10 @@ class ControllerSettings:
         mover_allowance: most that is added to the clearance from discs that have ever moved [m].
         mover_margin: added to the soft margin around such discs [m].
         approach: rate at which the gap to such a disc may close, alpha of its barrier [1/s].
+        avoidance: of walls and discs: "clearance" as a constraint, with a barrier to discs that have ever moved;
+            "barrier", the same with a barrier to everything; "potential" as a cost (Bazzana et al., eq. 9) and no
+            constraint; "vortex", that potential, searched with his tangent vector.
+        potential_sigma: of the potential's error; its weight is the inverse square.
         squeeze: how much nearer than at rest a plan may pass a standing disc where the clearance is violated [m].
         margin: distance of the hull below which the soft costs begin [m].
         margin_sigma: [m].
@@ -71,6 +79,8 @@ class ControllerSettings:
     mover_allowance: float = 0.15
     mover_margin: float = 0.3
     approach: float = -math.log(0.88) / 0.1
+    avoidance: str = option("clearance", choices=AVOIDANCES)
+    potential_sigma: float = 0.2
     squeeze: float = 0.03
     margin: float = 0.2
     margin_sigma: float = 0.1
@@ -78,6 +88,11 @@ class ControllerSettings:
     tolerance: float = 1e-4
     step_tolerance: float = 3e-3
     feasible: float = 5e-4
+
+    def __post_init__(self) -> None:
+        """Refuse an unknown way of avoiding things."""
+        if self.avoidance not in AVOIDANCES:
+            raise ScenarioError(f"unknown avoidance '{self.avoidance}': choose {', '.join(AVOIDANCES)}")
 
     def weighted(self, sigma: tuple[float, ...]) -> Array:
         """Standard deviations of costs of the controller, scaled by their common weight."""
@@ -132,4 +147,5 @@ def backend(name: str, settings: ControllerSettings, patience: int = 1) -> fg.So
         "alm": {**early, "max_iterations": 18 * patience, "penalty": PENALTY},
         "ipm": {**early, "max_iterations": 25 * patience, "hessian": "gauss-newton", "restoration": False},
     }
-    return names.backend(name, tolerance=settings.tolerance, **own.get(name, {}))
+    search = SEARCH if settings.avoidance == "vortex" else 0
+    return names.backend(name, tolerance=settings.tolerance, search_iterations=search, **own.get(name, {}))

@@ -5,10 +5,9 @@ likelihood field (table 6.3), and drawn anew, so many that the divergence from t
 they occupy, stays below a limit (table 8.4). Where short-term weights fall behind long-term ones, some are drawn
 anywhere on the map (table 8.3).
 
-Numbers are the defaults of ``nav2_amcl`` with two exceptions. That takes 60 beams, and this all that the other
-localiser takes. That believes that wheels err by 45 % of a way, and this by 10 %, twice what wheels with a scale error
-of 5 % do: on a real log with scans 2 m apart the former gets lost. Its beam skipping is here, too: once the cloud is
-small, a beam that few particles explain is left out, unless most beams are like that.
+Numbers are the defaults of ``nav2_amcl``, but for the beams, of which that takes 60 and this all that the other
+localiser takes. Its beam skipping is here, too: once the cloud is small, a beam that few particles explain is left out,
+unless most beams are like that.
 
 The estimate is the mean of the heaviest cluster of neighbouring cells, as in that package.
 """
@@ -62,7 +61,7 @@ class MonteCarloSettings:
     divergence: float = 0.05
     quantile: float = 2.33
     cell: float = 0.5
-    noise: tuple[float, float, float, float] = (0.01, 0.01, 0.01, 0.01)
+    noise: tuple[float, float, float, float] = (0.2, 0.2, 0.2, 0.2)
     hit: float = 0.5
     random: float = 0.5
     sigma: float = 0.2
