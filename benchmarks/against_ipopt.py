@@ -160,7 +160,7 @@ class Ours:
         return self.solution[self.x], self.solution[self.u]
 
     def again_from(self, instance: Instance, earlier: Ours) -> None:
-        """Solve a moved instance from the answer, multipliers and all, of the unmoved one."""
+        """Solve a moved instance from the answer of the unmoved one."""
         self.state(instance)
         guess = fg.Guess({self.x: earlier.solution[earlier.x], self.u: earlier.solution[earlier.u]})
         self.guess = guess

@@ -88,6 +88,8 @@ PAGES = {
         Page("quadrotor-mpc", "Scenario: quadrotor-mpc", "benchmarks.quadrotor_flights", hours=1.5),
         Page("barriers", "Control barrier functions", "benchmarks.guarded_flights", hours=0.15),
         Page("horizon-and-velocity", "What horizon and velocity buy", "benchmarks.horizon_and_velocity", hours=0.35),
+        Page("localisation", "Localisation beside Monte Carlo", "benchmarks.localisation", hours=0.15),
+        Page("ipopt", "Beside IPOPT", "benchmarks.against_ipopt", hours=0.1),
         Page("benchmarks", "Benchmarks", "benchmarks.elimination"),
     )
 }
