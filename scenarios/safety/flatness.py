@@ -82,7 +82,7 @@ class Gains:
         return cls((a, b), (c, d), e, f)
 
 
-TUNED = Gains((161.0, 412.0), (26.2, 16.4), 52.4, 2.0)
+TUNED = Gains((225.0, 644.0), (32.8, 25.6), 65.5, 2.0)
 """What ``python -m benchmarks.flight_tuning --controller flatness`` finds, from the gains of a new :class:`Gains`."""
 
 
