@@ -7,8 +7,8 @@ goes along one number after the other, up and down by a factor that shrinks when
     factors 1.6, then 1.25 (gains), 3, then 1.6 (weights); at most six rounds each; a step must help by half a percent
 
 Every step that helps is printed. Of the weights only ratios count: the first stays. The numbers stand in
-``flatness.TUNED``, after 128 evaluations, and in ``keeper.TRACKING``, after 105, some of either by hand; no neighbour of
-either is better by a percent then.
+``flatness.TUNED``, after 128 evaluations, and in ``keeper.TRACKING``, after 105, some of either by hand; no neighbour
+of either is better by a percent then.
 """
 
 from __future__ import annotations

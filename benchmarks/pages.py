@@ -90,6 +90,7 @@ PAGES = {
         Page("horizon-and-velocity", "What horizon and velocity buy", "benchmarks.horizon_and_velocity", hours=0.35),
         Page("localisation", "Localisation beside Monte Carlo", "benchmarks.localisation", hours=0.15),
         Page("ipopt", "Beside IPOPT", "benchmarks.against_ipopt", hours=0.1),
+        Page("safety", "Flight that must keep its distance", "benchmarks.safe_campaign", hours=0.6),
         Page("benchmarks", "Benchmarks", "benchmarks.elimination"),
     )
 }

@@ -11,7 +11,7 @@ from unifg.errors import ScenarioError
 from unifg.scenarios.safe_flight import SafeSettings, flights
 from unifg.scenarios.safety.keeper import Obstacles
 from unifg.scenarios.safety.one_step import FilterSettings, filtered
-from unifg.scenarios.safety.oracle import Authority, escape, exists
+from unifg.scenarios.safety.oracle import Authority, Threat, escape, exists, exists_among
 from unifg.scenarios.safety.spline_planner import SplineSettings, around
 from unifg.scenarios.ways.flat_path import Line
 
@@ -174,3 +174,23 @@ def test_where_the_oracle_says_yes_an_acceleration_that_is_held_escapes_whatever
             worst = np.minimum(worst, np.linalg.norm(place, axis=2).min(axis=1))
         assert worst.max() >= 0.4 - 1e-9
     assert seen > 5
+
+
+def test_one_way_out_has_to_serve_against_all() -> None:
+    authority, still = Authority(delay=0.1), np.zeros(3)
+    coming = Threat(np.array([3.0, 0.0, 0.1]), np.array([-6.0, 0.0, 0.0]), 0.4)
+    assert exists_among([], authority) == "yes"
+    assert exists_among([coming], authority) == exists(coming.away, coming.speed, 0.4, authority) == "yes"
+    level = [Threat(np.array([0.0, side, 0.0]), still, 0.25, upright=True) for side in (-0.3, 0.3)]
+    assert exists_among([coming, *level], authority) == "yes"  # upwards, between two pillars
+    lid = Threat(np.array([0.0, 0.0, -0.3]), still, 0.25)
+    floor = Threat(np.array([0.0, 0.0, 0.3]), still, 0.25)
+    assert exists_among([coming, *level, lid, floor], authority) == "unknown"  # each by itself could be escaped
+    late = Threat(np.array([0.5, 0.0, 0.0]), np.array([-5.0, 0.0, 0.0]), 0.4)
+    assert exists_among([late, *level], authority) == "no"
+    gone = replace(late, until=0.01)
+    assert exists_among([gone], authority) == "yes"
+    falling = Threat(np.array([0.0, 0.0, 0.6]), np.array([0.0, 0.0, 3.0]), 0.4, pull=np.array([0.0, 0.0, -9.81]))
+    assert exists_among([falling], authority) == "yes"
+    bent = replace(coming, bend=20.0)
+    assert exists_among([bent], authority) == "unknown"

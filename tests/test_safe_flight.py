@@ -274,6 +274,22 @@ def test_the_filter_knows_better_than_the_sensors_and_how_well() -> None:
     assert np.sqrt(np.square(misses).mean(0)[9:11]).max() < 0.07  # the gust itself has 0.1
 
 
+def test_what_the_plan_comes_near_to_is_looked_at_and_keeps_its_place() -> None:
+    """Two pillars beside the vehicle, one farther away on its way, in a plan that can look at two."""
+    places = np.array([[-3.0, 1.6, 0.0], [-3.0, -1.7, 0.0], [-1.4, 0.1, 0.0], [3.0, 3.0, 0.0]])
+    still, upright = np.zeros((4, 3)), np.ones(4, dtype=bool)
+    all_four = Obstacles(places, still, np.full(4, 0.5), upright, ~upright)
+    plans, start = keeper(slots=2), np.array([-3.0, 0.0, 1.5, 1.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0])
+    looped = np.concatenate([start, np.zeros(7)])
+    assert set(plans._nearest(looped, all_four, 0.0).tolist()) == {2, 0}
+    before = plans._looked_at.copy()
+    moved = looped + np.array([1.5, -1.5, *np.zeros(15)])
+    assert plans._nearest(moved, all_four, 0.0).tolist() == [2 if k == 2 else 1 for k in before]
+    plans = keeper(slots=2)
+    decide(plans, start, 1.0, all_four)
+    assert all_four.clearance(plans._plan[0], plans.nodes)[:, 2].min() > 0.0  # type: ignore[index]
+
+
 def test_the_nearest_are_looked_at_and_falling_ones_fall() -> None:
     rng = np.random.default_rng(0)
     places = rng.uniform(-5.0, 5.0, (20, 3))
