@@ -91,6 +91,7 @@ PAGES = {
         Page("localisation", "Localisation beside Monte Carlo", "benchmarks.localisation", hours=0.15),
         Page("ipopt", "Beside IPOPT", "benchmarks.against_ipopt", hours=0.1),
         Page("safety", "Flight that must keep its distance", "benchmarks.safe_campaign", hours=0.6),
+        Page("endurance", "Long runs", "benchmarks.endurance", hours=0.2),
         Page("benchmarks", "Benchmarks", "benchmarks.elimination"),
     )
 }
