@@ -18,7 +18,8 @@ import numpy as np
 from benchmarks import runs
 from benchmarks.report import command, listing, machine, publish
 from benchmarks.routes import drawn
-from unifg.scenarios.campaigns.comparison import Read, Row, against, where
+from unifg.scenarios.campaigns.comparison import Row, where
+from unifg.scenarios.campaigns.comparison import interval as bootstrap
 from unifg.scenarios.campaigns.comparison import share as rate
 from unifg.scenarios.driving.drive_settings import AVOIDANCES, ControllerSettings
 from unifg.scenarios.log.drive_metrics import episode_metrics
@@ -62,7 +63,6 @@ def render(rows: Sequence[Row]) -> str:
     """Markdown."""
     speeds = sorted({row["speed"] for row in where(rows)})
     groups = {(f"{speed:g}", how): where(rows, speed=speed, avoidance=how) for speed in speeds for how in AVOIDANCES}
-    base = {how: where(rows, avoidance=how) for how in AVOIDANCES}
 
     def interval(some: list[Row]) -> str:
         low, high = rate(sum(row["success"] for row in some), len(some))
@@ -82,18 +82,32 @@ def render(rows: Sequence[Row]) -> str:
         "emergency ticks": of("emergencies", 1.0, 0),
         "plan [ms]": of("plan", 1.0, 1),
     }
-    succeeded: Read = lambda row: float(row["success"])  # noqa: E731
-    told = "; ".join(f"{how} {against(base[how], base[BASE], succeeded)}" for how in AVOIDANCES if base[how])
+    told = "; ".join(
+        f"{how} {difference(rows, how)}" for how in AVOIDANCES if how != BASE and where(rows, avoidance=how)
+    )
     refused = [row for row in rows if "error" in row]
     parts = [
         machine("numpy", "scipy", "pymunk"),
         listing(["speed [m/s]", "avoidance"], groups, columns),
         "Durations, clearances, ticks and times are medians over routes, the interval of the rate is Wilson's.",
-        f"Share of drives that succeed, at all speeds, and the interval of its difference to `{BASE}` by bootstrap "
-        f"over the drives of the same seeds: {told}.",
+        f"Success less that of `{BASE}`, a mean over routes of what both drove, with a bootstrap interval over routes: "
+        f"{told}.",
         f"Refused: {len(refused)}." if refused else "",
     ]
     return "\n\n".join(part for part in parts if part)
+
+
+def difference(rows: Sequence[Row], how: str) -> str:
+    """Success less that of the base: a route's mean over the speeds that both drove, then the mean over routes."""
+    both = {(row["seed"], row["speed"]): row["success"] for row in where(rows, avoidance=BASE)}
+    apart: dict[int, list[float]] = {}
+    for row in where(rows, avoidance=how):
+        if (row["seed"], row["speed"]) in both:
+            change = float(row["success"]) - float(both[row["seed"], row["speed"]])
+            apart.setdefault(row["seed"], []).append(change)
+    means = np.array([np.mean(changes) for changes in apart.values()])
+    low, high = bootstrap(means)
+    return f"{means.mean():+.2f} ({low:+.2f} .. {high:+.2f})"
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -89,6 +89,7 @@ PAGES = {
         Page("barriers", "Control barrier functions", "benchmarks.guarded_flights", hours=0.15),
         Page("horizon-and-velocity", "What horizon and velocity buy", "benchmarks.horizon_and_velocity", hours=0.35),
         Page("localisation", "Localisation beside Monte Carlo", "benchmarks.localisation", hours=0.15),
+        Page("avoidance", "Ways of avoiding things", "benchmarks.crossing", hours=0.25),
         Page("ipopt", "Beside IPOPT", "benchmarks.against_ipopt", hours=0.1),
         Page("safety", "Flight that must keep its distance", "benchmarks.safe_campaign", hours=0.6),
         Page("endurance", "Long runs", "benchmarks.endurance", hours=0.2),

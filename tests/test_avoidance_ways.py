@@ -35,7 +35,7 @@ def standing(x: float, y: float, radius: float) -> Tracks:
 
 def ahead(settings: ControllerSettings) -> Array:
     """A straight reference."""
-    way = settings.stations(0.0)
+    way = settings.stations
     return np.column_stack([PLACE[0] + way, np.full(len(way), PLACE[1]), np.zeros(len(way))])
 
 
