@@ -122,18 +122,18 @@ class Workers(Executor):
             worker.end()
 
     def _started(self) -> _Worker:
-        for left in reversed(range(STARTS)):
-            if self._killed:
-                raise WorkerDied("stopped")
+        tries = 0
+        while not self._killed:
             try:
                 return _Worker(self._ready)
             except WorkerDied as error:
-                if not left:
+                tries += 1
+                if tries == STARTS:
                     raise WorkerNotStarted(
                         f"no worker can be started: {error}; a script that starts workers keeps what it does below "
                         "`if __name__ == '__main__':`"
                     ) from None
-        raise AssertionError
+        raise WorkerDied("stopped")
 
 
 class _Worker:
