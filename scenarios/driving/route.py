@@ -33,7 +33,8 @@ NEAR_GOAL = 0.5  # [m] of path left, where turning on the spot is normal
 STANDING_GAP = 0.01  # [m] a planned path needs around its start
 PATIENCE = 5  # ticks between two repairs
 ANYWHERE = 15  # ticks between two searches of the whole map
-CLOSED = 60  # ticks for which no way is to be had at all, after which there is none
+CLOSED = 60  # ticks for which no way is to be had at all since the goal came nearer, after which there is none
+VAIN = 6  # of those ticks that a detour counts which does not lead nearer
 STALLED = 400  # ticks without coming nearer to the goal, after which there is no use
 FRESH_STARTS = 3  # ways round about, on each of which the goal may be farther off again
 
@@ -155,17 +156,15 @@ class Route:
         room = np.hypot(offsets[..., 0], offsets[..., 1]) - standing.radius
         blocked = (room < self._radius + self._disc_gap).any(axis=1)
         if not blocked.any():
-            self._closed = 0
             return False
         self._rest = PATIENCE
         last = float(arc[ahead][np.flatnonzero(blocked)[-1]])
         if self._detour(pose, min(last + REJOIN, float(arc[-1])), standing, ALLOWANCE):
-            self._closed = 0
+            self._closed += VAIN  # unless the goal comes nearer on it
             return True
         staying = ~standing.mover
         closed = (room[:, staying] < self._radius + self._disc_gap).any(axis=1)
         if not closed.any():  # what has moved may go on: where it alone is in the way, the robot waits
-            self._closed = 0
             return False
         return self._round_about(pose, standing.at(staying), self.path[ahead][np.flatnonzero(closed)[0], :2])
 
@@ -175,7 +174,6 @@ class Route:
         if self._since_anywhere >= ANYWHERE:
             self._since_anywhere = 0
             if self._detour(pose, float(SPACING * len(self.path)), staying, ALLOWANCE, everywhere=True):
-                self._closed = 0
                 return True
         if self._closed > CLOSED:
             self.blocked = Blocked(place.copy(), self._radius + self._wall_gap)
@@ -185,7 +183,7 @@ class Route:
         """Give up a goal that has not come nearer for long."""
         left = float(SPACING * len(self.path)) - self._reached
         if left < self._nearest - CRUMB:
-            self._nearest, self._stalled = left, 0
+            self._nearest, self._stalled, self._closed = left, 0, 0
             return
         self._stalled += 1
         if self._stalled > STALLED:
