@@ -57,6 +57,7 @@ import json, sys
 from dataclasses import replace
 from unifg.machine.tally import counting
 from unifg.scenarios import flight, navigation
+from unifg.scenarios.worlds.faults import Fault
 
 ticks = 0
 def progress(done, text):
@@ -74,10 +75,61 @@ coupling = sys.argv[2]
 if sys.argv[1] == "drive":
     run = navigation.Episode(navigation.NavigationSettings(obstacles=2, coupling=coupling))
 else:
-    run = flight.Flight(flight.FlightSettings(movers=1, coupling=coupling))
+    dt = flight.FlightSettings().controller.dt  # with a watch that slows, lands and hovers
+    faults = Fault("detector-false", 2 * dt), Fault("detector-lost", 4 * dt), Fault("solver-timeout", 13 * dt)
+    run = flight.Flight(flight.FlightSettings(movers=1, coupling=coupling, faults=faults))
 with counting() as new:
     log = run.run(progress)
 print(json.dumps([int(log.emergency.sum()), log.compiled.tolist(), new.compiled, new.generated, new.read]))
+"""
+
+
+# What a tick may turn to, one after the other, on maps as others hand them in: one of them locked, and a wide one.
+TURNS = """
+import json
+from dataclasses import replace
+import numpy as np
+from unifg.machine.tally import counting
+from unifg.scenarios import navigation
+from unifg.scenarios.seeing.tracks import Tracks
+from unifg.scenarios.worlds.faults import Fault
+
+def discs(place, velocity, mover):
+    found = Tracks.of_movers(place[None, :2], np.array([velocity]), np.array([0.2]))
+    return replace(found, mover=np.array([mover]))
+
+def progress(done, text):
+    global ticks
+    if text == "done":
+        return
+    ticks += 1
+    pilot, route = run.pilot, run.legs[0]
+    if ticks == 3:  # something stands on the path: round it, nearby and on the whole map
+        ahead = route.path[60]
+        turns.append(route.repair(pilot.pose, discs(ahead, (0.0, 0.0), False)))
+        turns.append(route._detour(pilot.pose, 1e9, discs(ahead, (0.0, 0.0), False), 0.04, everywhere=True))
+    if ticks == 5:  # something comes from the front
+        heading = np.array([np.cos(pilot.pose[2]), np.sin(pilot.pose[2])])
+        near = pilot.pose[:2] + 0.7 * heading
+        turns.append(pilot.controller._way_out(pilot.pose, discs(near, tuple(-0.6 * heading), True)).evades)
+    if ticks == 7:  # something is right before the hull
+        near = replace(run.world.scan(), ranges=np.full(len(run.world.scan().ranges), 0.2))
+        turns.append(bool(pilot.last_stop.control(pilot.driven, pilot.driven, near)[0] < pilot.driven[0]))
+    if ticks == 9:  # the way it came, to let a mover pass
+        route._retreat(pilot.pose)
+    if pilot.relocated:
+        relocated.append(ticks)
+    if ticks == 300 or relocated and ticks > relocated[0] + 5:
+        raise KeyboardInterrupt
+
+ticks, turns, relocated = 0, [], []
+settings = navigation.NavigationSettings(faults=(Fault("kidnapped", 1.0),))
+run = navigation.Episode(settings)
+for mask in (run.occupancy.free, run.occupancy.occupied):
+    mask.setflags(write=False)
+with counting() as new:
+    log = run.run(progress)
+print(json.dumps([turns, relocated, int(log.compiled.sum()), new.compiled, new.generated, new.read]))
 """
 
 
@@ -124,3 +176,12 @@ def test_no_tick_compiles_though_solves_fail(what: str, coupling: str) -> None:
     emergencies, columns, *new = found
     assert emergencies >= 3
     assert new == [[], [], []] and columns == [0] * 16
+
+
+def test_no_tick_compiles_whatever_it_turns_to() -> None:
+    """A route repaired nearby and on the whole map, a step aside, the last stop, a way back, a robot found again."""
+    found = said(TURNS)
+    assert isinstance(found, list)
+    turned, relocated, columns, *new = found
+    assert turned == [True] * 4 and relocated
+    assert new == [[], [], []] and columns == 0

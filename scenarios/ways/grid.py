@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import logging
 import math
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from unifg.errors import ScenarioError
@@ -20,6 +22,8 @@ from unifg.machine.jit import compiled
 from unifg.models.distance_map import DistanceMap, bilinear
 from unifg.scenarios.ways.polyline import headed, resample
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
+
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 _log = logging.getLogger("unifg")
 
@@ -44,7 +48,9 @@ class _Clearance:
             )
         self.occupancy = occupancy
         self.field = distance_map
-        self.discs: Array = np.asarray([] if discs is None else discs, dtype=np.float64).reshape(-1, 3)
+        # Compiled for one layout: a part of a map, or what somebody else has locked, would be compiled for anew.
+        self.discs: Array = _plain(np.asarray([] if discs is None else discs, dtype=np.float64).reshape(-1, 3))
+        self.known: BoolArray = _plain(occupancy.free)
         self.grid: Array = distance_map.values
         if len(self.discs):
             self.grid = self.grid.copy()
@@ -120,6 +126,11 @@ class _Clearance:
             return None
         row_found, column_found = candidates[nearest[int(np.argmax(clear))]]
         return int(row_found), int(column_found)
+
+
+def _plain(array: NDArray[Scalar]) -> NDArray[Scalar]:
+    """The array, or a copy of it, row by row and to be written to."""
+    return np.require(array, requirements=["C", "W"])
 
 
 def plan(
@@ -284,9 +295,9 @@ def _cheapest(
     corner = np.array([rows[0], columns[0]])
     part = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
     cells = cells[part]
-    cost = _cost(clearance.grid[part], robot_radius)
+    cost = _plain(_cost(clearance.grid[part], robot_radius))
     source, target = (np.array(cell) - corner for cell in (first, last))
-    before = _search(cells, cost, source, target)
+    before = _search(_plain(cells), cost, source, target)
     chain = [int(source[0] * cells.shape[1] + source[1])]
     end = int(target[0] * cells.shape[1] + target[1])
     while chain[-1] != end:
@@ -375,7 +386,7 @@ def _shorten(clearance: _Clearance, points: Array, level: float, robot_radius: f
     # may be too.
     floor = np.minimum(clearance.at(points), level)
     kept = _straightened(
-        clearance.field.table, clearance.occupancy.free, clearance.discs, points, spent, floor, stride, robot_radius
+        clearance.field.table, clearance.known, clearance.discs, points, spent, floor, stride, robot_radius
     )
     shorter: Array = points[kept]
     return shorter
@@ -443,9 +454,8 @@ def _good_line(
 
 def _smooth(clearance: _Clearance, points: Array, preferred: float) -> Array:
     """Diffuse the corners away; no point moves nearer to a wall unless it keeps the preferred clearance."""
-    points = np.ascontiguousarray(points)
-    if len(points) > 2:
-        _diffuse(clearance.field.table, clearance.occupancy.free, clearance.discs, points, preferred, _SMOOTHING_SWEEPS)
+    points = _plain(points)
+    _diffuse(clearance.field.table, clearance.known, clearance.discs, points, preferred, _SMOOTHING_SWEEPS)
     return points
 
 
