@@ -161,3 +161,25 @@ def test_file_is_strict_sorted_and_stable(tmp_path: Path) -> None:
 
 def test_table_aligns_and_leaves_out_what_is_empty() -> None:
     assert table([("a", "1"), ("nothing", ""), ("long name", "2")]) == "a          1\nlong name  2"
+
+
+@dataclass
+class Way:
+    """A record with a path that lasts."""
+
+    path: list[Array] = ragged("m", 2, lasting=True)
+    seen: list[Array] = ragged("m", 2)
+
+
+def test_what_lasts_is_kept_once_and_copied_still() -> None:
+    recorder, path = Recorder(Way), np.array([[0.0, 1.0], [2.0, 3.0]])
+    for _ in range(2):
+        recorder.add(path=path, seen=path)
+    path[0, 0] = 5.0  # by whoever it belongs to
+    recorder.add(path=path, seen=path)
+    recorder.add(path=path[:1], seen=path[:1])
+    log = recorder.finish()
+    assert [len(row) for row in log.path] == [2, 2, 2, 1]
+    assert log.path[0] is log.path[1] and log.path[1] is not log.path[2]
+    assert [row[0, 0] for row in log.path] == [0.0, 0.0, 5.0, 5.0]
+    assert log.seen[0] is not log.seen[1]

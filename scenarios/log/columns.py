@@ -30,11 +30,13 @@ class Column:
         unit: of its numbers; "ms" is measured by a clock, "iterations" counts those of a solver.
         entry: what is kept of a value given at a tick, a copy.
         stack: the column, of the entries of all ticks.
+        lasting: whether entries are kept once for as long as they stay the same.
     """
 
     unit: str
     entry: Callable[[Any], Any]
     stack: Callable[[list[Any]], Any]
+    lasting: bool = False
 
 
 def column(unit: str = "", *shape: int | None, dtype: Any = np.float64) -> Any:
@@ -52,13 +54,22 @@ def column(unit: str = "", *shape: int | None, dtype: Any = np.float64) -> Any:
     return field(metadata={"column": Column(unit, entry, stack)})
 
 
-def ragged(unit: str = "", *shape: int, dtype: Any = np.float64, entry: Callable[[Any], Any] | None = None) -> Any:
-    """Declare a field with an array (n, *shape) per tick, n as it comes, or what ``entry`` makes of a value."""
+def ragged(
+    unit: str = "",
+    *shape: int,
+    dtype: Any = np.float64,
+    entry: Callable[[Any], Any] | None = None,
+    lasting: bool = False,
+) -> Any:
+    """Declare a field with an array (n, *shape) per tick, n as it comes, or what ``entry`` makes of a value.
+
+    A ``lasting`` one seldom changes: ticks in which it is the same share one array.
+    """
 
     def rows(value: Any) -> Any:
         return np.array(value, dtype=dtype).reshape(-1, *shape)
 
-    return field(metadata={"column": Column(unit, entry or rows, list)})
+    return field(metadata={"column": Column(unit, entry or rows, list, lasting)})
 
 
 def words() -> Any:
@@ -138,7 +149,9 @@ class Recorder(Generic[L]):
         if wrong := sorted(row.keys() ^ self._columns.keys()):
             raise ScenarioError(f"a tick of {self._log.__name__} needs every column once, look at: {', '.join(wrong)}")
         for name, value in row.items():
-            self._entries[name].append(self._columns[name].entry(value))
+            entries, kind = self._entries[name], self._columns[name]
+            entry = kind.entry(value)
+            entries.append(entries[-1] if kind.lasting and entries and np.array_equal(entries[-1], entry) else entry)
         watch = _watch.get()
         if watch is not None:
             watch(SoFar(self._log, self._known, self._entries))

@@ -75,7 +75,7 @@ class EpisodeLog:
     """Of the estimate, in its tangent space."""
     control: Array = column("m/s, rad/s", 2)
     """Commanded v and omega."""
-    route: list[Array] = ragged("m, m, rad", 3)
+    route: list[Array] = ragged("m, m, rad", 3, lasting=True)
     """The path to the present goal, as repaired so far."""
     horizon: Array = column("m, m, rad", None, 3)
     """Predicted poses."""
