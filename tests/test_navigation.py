@@ -83,6 +83,14 @@ def test_short_drive_reaches_its_goal(settings: NavigationSettings, solver: str)
 
 
 @pytest.mark.data
+@pytest.mark.parametrize("coupling", ["sequential", "joint"])
+def test_a_goal_that_looks_back_along_the_way_is_reached(coupling: str) -> None:
+    """The robot turns by half a circle where it arrives, within its accelerations, and does not rest before."""
+    log = run_navigation(replace(CORRIDOR, coupling=coupling, goals=((8.0, 14.0, np.pi),)))
+    assert log.succeeded and log.ticks < 80
+    assert abs(abs(log.true_pose[-1, 2]) - np.pi) < 0.2
+
+
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_turtlebot_world(shared_data: Path, solver: str) -> None:
     settings = NavigationSettings(
