@@ -25,6 +25,7 @@ from unifg.pose_graphs.certificate import Certificate, certify
 from unifg.pose_graphs.initialise import best_guess, chordal, lago, odometric
 from unifg.pose_graphs.judgement import Judgement, judge
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
+from unifg.pose_graphs.relaxation import admit
 from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.options import existing, option
 from unifg.scenarios.stopwatch import Stopwatch
@@ -154,6 +155,8 @@ def solve_file(settings: SolveSettings, progress: Progress = silent) -> SolvedGr
     if not len(read.edges) and not read.sightings:
         raise ScenarioError(f"{settings.file}: there is no edge in this file, and nothing to solve")
     loss = robust_loss(settings.robust, read.group.dim)
+    if settings.certify or settings.staircase:
+        admit(read)  # nobody should wait for a solve to be told
     if settings.init == "lago" and read.group.dim != 3:
         raise ScenarioError("--init lago is for planar pose graphs; use --init chordal")
     in_file = read.chi2(settings.residual)

@@ -185,6 +185,23 @@ def test_landmarks_and_known_poses_are_refused() -> None:
         certify(replace(graph, fixed_ids=(0, 5)))
 
 
+@pytest.mark.parametrize("name", GROUPS)
+def test_edges_without_information_say_nothing(name: str) -> None:
+    graph = ring(6, 1, GROUPS[name])
+    blind = graph.edges.information.copy()
+    blind[-1] = 0.0  # of the closure; the chain remains
+    chain = replace(graph, edges=replace(graph.edges, information=blind))
+    with np.errstate(all="raise"):
+        poses = chordal(chain)
+    kept = np.arange(len(graph.edges)) < len(graph.edges) - 1
+    np.testing.assert_allclose(poses, chordal(replace(graph, edges=graph.edges[kept])), atol=1e-9)
+    nothing = replace(graph, edges=replace(graph.edges, information=np.zeros_like(blind)))
+    certificate = certify(nothing)
+    assert certificate.certified and certificate.chi2 == certificate.gap == certificate.least_eigenvalue == 0.0
+    with pytest.raises(GraphError, match="not determined"):
+        chordal(nothing)
+
+
 def test_the_start_that_costs_least_is_taken() -> None:
     folded = solved(ring(20, 2))
     name, poses = best_guess(folded)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 
 import unifg as fg
 from scenes import commands_of, data_of
-from unifg.errors import ScenarioError
+from unifg.errors import GraphError, ScenarioError
 from unifg.files.g2o import read_g2o, write_g2o
 from unifg.files.toro import write_toro
 from unifg.files.tum import read_tum
@@ -156,6 +157,14 @@ def test_bad_files_are_messages(tmp_path: Path, capsys: pytest.CaptureFixture[st
         (tmp_path / "bad.g2o").write_text(text)
         assert command.main(["solve", str(tmp_path / "bad.g2o"), "--out", str(tmp_path)]) == 2
         assert message in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_what_cannot_be_certified_is_refused_before_it_is_solved(city: Path) -> None:
+    graph, said = read_g2o(city), list[str]()
+    known = write_g2o(city, replace(graph, fixed_ids=(0, 1)))
+    with pytest.raises(GraphError, match="two poses of one are known"):
+        solve_file(SolveSettings(known, certify=True), lambda _, text: said.append(text))
+    assert len(said) == 1  # that it was read
 
 
 def test_toro_files_and_landmarks(tmp_path: Path) -> None:

@@ -141,6 +141,8 @@ class _Judge:
         beyond = max(cost - float(np.trace(multipliers, axis1=1, axis2=2).sum()), 0.0)
         shift = 0.5 * tolerance / frames
         greatest = 1e3 * self.weight
+        if not self.weight > 0.0:  # every map costs nothing
+            return _Verdict(cost, 0.0, tolerance, 0.0, np.zeros((problem.count, dim + 1)))
         while not (system.factor(entries, shift * lifted) and system.definite):
             shift *= 10.0
             if not shift < greatest:

@@ -131,7 +131,8 @@ def chordal(pose_graph: PoseGraph) -> Array:
     measured = _rotations(group, edges.measured)
     angles = group.dim - dim
     precision = _marginal(edges.information, slice(dim, group.dim))
-    kappa = angles / np.trace(np.linalg.pinv(precision, hermitian=True), axis1=1, axis2=2)
+    spread = np.trace(np.linalg.pinv(precision, hermitian=True), axis1=1, axis2=2)
+    kappa = np.divide(angles, spread, out=np.zeros(len(edges)), where=spread > 0.0)  # an edge may not see rotations
     root = np.sqrt(kappa)[:, None, None]
     start = np.zeros((len(rotations), dim, dim))
     start[fixed] = np.swapaxes(rotations[fixed], 1, 2)  # blocks are rows of R, as columns

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc
 
+from unifg.language.inventory import counted
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
 from unifg.typing import Array, IntArray
 
@@ -69,12 +70,13 @@ class Judgement:
         if self.parts > 1:
             said.append(f"{self.parts} parts that nothing connects")
         if self.isolated:
-            said.append(f"{len(self.isolated)} poses without any measurement: {_some(self.isolated)}")
+            said.append(f"{counted(len(self.isolated), 'pose')} without any measurement: {_some(self.isolated)}")
         if len(self.blind):
-            said.append(f"{len(self.blind)} edges without information, the first in place {int(self.blind[0])}")
+            edges, first = counted(len(self.blind), "edge"), int(self.blind[0])
+            said.append(f"{edges} without information, the first in place {first}")
         if len(self.indefinite):
-            first = int(self.indefinite[0])
-            said.append(f"{len(self.indefinite)} edges with indefinite information, the first in place {first}")
+            edges, first = counted(len(self.indefinite), "edge"), int(self.indefinite[0])
+            said.append(f"{edges} with indefinite information, the first in place {first}")
         return said
 
 

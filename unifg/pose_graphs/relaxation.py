@@ -22,12 +22,25 @@ from unifg.pose_graphs.linear import BlockQuadratic
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.typing import Array, BoolArray, IntArray
 
-__all__ = ["Relaxation"]
+__all__ = ["Relaxation", "admit"]
 
 ISOTROPIC = 1e-6  # of the largest eigenvalue: information matrices are written with six digits
 ROUNDS = 100
 STILL = 1e-12  # of the cost, what a step must promise
 FRAME = 1e-9  # a bend of the quadratic below this share of its diagonal is damped
+
+
+def admit(pose_graph: PoseGraph) -> None:
+    """See that a graph can be stated in this form, which can be known before it is solved.
+
+    Raises:
+        GraphError: the graph has landmarks, or several poses of one part are known.
+    """
+    if len(pose_graph.landmarks):
+        raise GraphError("the chordal relaxation holds relative poses only: this graph has landmarks")
+    anchors, parts = pose_graph.anchors()[0], pose_graph.parts()
+    if len(np.unique(parts[anchors])) < len(anchors):
+        raise GraphError("the chordal relaxation moves every connected part freely: two poses of one are known")
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +80,9 @@ class Relaxation:
         Raises:
             GraphError: the graph has landmarks, or several poses of one part are known.
         """
-        if len(pose_graph.landmarks):
-            raise GraphError("the chordal relaxation holds relative poses only: this graph has landmarks")
         kept = pose_graph if used is None else replace(pose_graph, edges=pose_graph.edges[used])
         edges, anchors, parts = kept.edges, kept.anchors()[0], kept.parts()
-        if len(np.unique(parts[anchors])) < len(anchors):
-            raise GraphError("the chordal relaxation moves every connected part freely: two poses of one are known")
+        admit(kept)
         dim, angles = pose_graph.group.point_dim, pose_graph.group.dim - pose_graph.group.point_dim
         moving, turning = edges.information[:, :dim, :dim], edges.information[:, dim:, dim:]
         caveats = []
@@ -166,7 +176,7 @@ class Relaxation:
                 added = np.full(len(system.free) * size, damping)
                 if system.factorization.factor(entries, added) and system.factorization.definite:
                     step = -system.solve(gradient)
-                elif damping > 1e3 * scale:
+                elif not damping < 1e3 * scale:  # so, too, where no edge has a weight
                     return point
                 else:
                     damping = max(10.0 * damping, FRAME * scale)
