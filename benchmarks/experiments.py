@@ -155,7 +155,8 @@ def together(sheets: Sequence[Sheet]) -> str:
             runs[len(sheet.outcomes[combination])] += 1
     seconds = sum(sheet.cpu_seconds for sheet in sheets)
     least, most = min(runs, default=0), max(runs, default=0)
-    say = [f"{drives} drives, {least} to {most} of each leg and coupling (the paper: {RUNS} of each leg)."]
+    many = f"{least} to {most}" if least < most else str(most)
+    say = [f"{drives} drives, {many} of each leg and coupling in the tables (the paper: {RUNS} of each leg)."]
     if all(spreads.values()):
         length, duration = spreads[LENGTH], spreads[DURATION]
         say.append(
