@@ -6,6 +6,8 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from episodes import HORIZON, episode, room
 from scenes import check_offline, commands_of, data_of, tracks_of, without_viewer
 from unifg.errors import ViewError
 from unifg.scenarios.log.drive_log import EpisodeLog
+from unifg.scenarios.show import drive_plot
 from unifg.scenarios.show.drive_plot import overview, plot_controls, plot_localisation, plot_map
 from unifg.scenarios.show.drive_scene import drive_scene, scan_points
 from unifg.scenarios.show.panels import plot_clearance, plot_times
@@ -357,3 +360,13 @@ def test_times_stand_on_a_logarithmic_axis_and_ticks_that_compiled_are_marked(lo
 def test_plotted_error_is_the_error(log: EpisodeLog) -> None:
     line = plot_localisation(log).get_lines()[0]
     np.testing.assert_allclose(np.asarray(line.get_ydata()), 5.0)  # [cm]
+
+
+def test_the_headline_says_once_and_shortly_why_goals_were_missed(monkeypatch: pytest.MonkeyPatch) -> None:
+    numbers = {"goals_reached": 0, "goals": 2, "path_length_m": 3.1, "duration_s": 23.1}
+    monkeypatch.setattr("unifg.scenarios.show.drive_plot.episode_metrics", lambda _: numbers)
+    log: Any = SimpleNamespace(
+        scenario="navigation", occupancy=SimpleNamespace(name="hall"), collisions=0, interrupted=False,
+        outcomes=["lost: no beam came back"] * 2, solver="ipm", coupling="sequential", seed=0,
+    )  # fmt: skip
+    assert "no collision, lost  |" in drive_plot._title(log)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -132,7 +133,8 @@ def _trouble(log: EpisodeLog, ax: Axes) -> None:
     causes = Counter(cause for cause in log.cause if cause)
     if causes:
         states = " and ".join(state for state in ("degraded", "lost") if state in log.health)
-        ax.set_title(f"Forward speed; {states}: {causes.most_common(1)[0][0]}", fontsize=8)
+        said = f"Forward speed; {states}: {causes.most_common(1)[0][0]}"
+        ax.set_title(fill(said, 72), fontsize=8)
 
 
 def _obstacles(log: EpisodeLog, ax: Axes) -> None:
@@ -179,7 +181,9 @@ def _poses(log: EpisodeLog, ax: Axes) -> None:
 def _title(log: EpisodeLog) -> str:
     m = episode_metrics(log)
     stopped = ", interrupted" if log.interrupted else ""
-    stopped += "".join(f", {words}" for words in log.outcomes if words != "reached")
+    # The same thing may have ended every goal: said once, and by its first words, as a line is only so long.
+    missed = dict.fromkeys(words.partition(":")[0] for words in log.outcomes if words != "reached")
+    stopped += "".join(f", {words}" for words in missed)
     return (
         f"{log.scenario} on {log.occupancy.name}: {m['goals_reached']} of {m['goals']} goals reached, "
         f"{collision_words(log.collisions)}{stopped}  |  {m['path_length_m']:.1f} m in {m['duration_s']:.1f} s  |  "
