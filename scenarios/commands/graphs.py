@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -52,11 +53,9 @@ def write_results(folder: Path, solved: SolvedGraph) -> list[Path]:
     numbers = write_metrics(folder / "metrics.json", metrics(solved), sort_keys=False)
     if solved.settings.no_scene:
         return [graph, trajectory, numbers]
-    try:  # numbers need nothing but the library
-        import matplotlib  # noqa: F401
-        import meshcat  # noqa: F401
-    except ImportError as error:
-        logger.warning("no picture and no scene: they need %s: pip install 'unifg[view]'", error.name)
+    absent = [name for name in ("matplotlib", "meshcat") if find_spec(name) is None]
+    if absent:  # numbers need nothing but the library
+        logger.warning("no picture and no scene: they need %s: pip install 'unifg[view]'", absent[0])
         return [graph, trajectory, numbers]
     from unifg.scenarios.show.graph_plot import picture
     from unifg.scenarios.show.graph_scene import graph_scene
