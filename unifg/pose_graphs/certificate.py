@@ -129,7 +129,7 @@ class _Judge:
 
     def __call__(self, point: Array) -> _Verdict:
         problem, dim = self.problem, self.problem.dim
-        cost, multipliers = problem.cost(point), problem.multipliers(point, self.quadratic)
+        cost, multipliers = problem.cost(point), problem.multipliers(point)
         tolerance = self.relative * cost + ROUNDING * self.weight
         frames = dim * problem.count
         own = np.zeros((problem.count, dim + 1, dim + 1))

@@ -9,7 +9,7 @@ from unifg.elimination.symmetric import Symmetric, scatter
 from unifg.errors import GraphError
 from unifg.typing import Array, IntArray
 
-__all__ = ["BlockQuadratic", "block_least_squares"]
+__all__ = ["BlockQuadratic", "block_gradient", "block_least_squares"]
 
 
 class BlockQuadratic:
@@ -72,19 +72,22 @@ class BlockQuadratic:
         result += scatter(self._shared_places, shared.ravel(), self._size)
         return result
 
-    def gradient(self, by_first: Array, by_second: Array, error: Array) -> Array:
-        """(n, d, k) sum of A' e and B' e over the edges of every block, for errors (m, r, k)."""
-        real = self._real
-        total = np.zeros((self.count, self.dim, error.shape[2]))
-        np.add.at(total, self._first, np.swapaxes(by_first[real], 1, 2) @ error[real])
-        np.add.at(total, self._second, np.swapaxes(by_second[real], 1, 2) @ error[real])
-        return total
-
     def solve(self, right: Array) -> Array:
         """(free, d, k) solution for right-hand sides (free, d, k), once the factorisation has been made."""
         columns = right.reshape(len(self.free) * self.dim, -1)
         found = [self.factorization.solve(np.ascontiguousarray(column)) for column in columns.T]
         return np.stack(found, axis=1).reshape(right.shape)
+
+
+def block_gradient(
+    first: IntArray, second: IntArray, by_first: Array, by_second: Array, error: Array, count: int
+) -> Array:
+    """(count, d, k) sum of A' e and B' e over the edges of every block, for errors (m, r, k)."""
+    real = first != second
+    total = np.zeros((count, by_first.shape[2], error.shape[2]))
+    np.add.at(total, first[real], np.swapaxes(by_first[real], 1, 2) @ error[real])
+    np.add.at(total, second[real], np.swapaxes(by_second[real], 1, 2) @ error[real])
+    return total
 
 
 def block_least_squares(
@@ -113,7 +116,7 @@ def block_least_squares(
     if not len(system.free):
         return result
     error = by_first @ start[first] + by_second @ start[second] - target
-    gradient = system.gradient(by_first, by_second, error)
+    gradient = block_gradient(first, second, by_first, by_second, error, count)
     if not system.factorization.factor(system.entries(by_first, by_second)):
         raise GraphError("the first guess is not determined: an information matrix does not see some direction")
     result[system.free] -= system.solve(gradient[system.free])

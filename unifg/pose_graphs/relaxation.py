@@ -18,7 +18,7 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.lie import SO3
-from unifg.pose_graphs.linear import BlockQuadratic
+from unifg.pose_graphs.linear import BlockQuadratic, block_gradient
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -141,9 +141,10 @@ class Relaxation:
         """Sum of the squared errors: chi2 of the chordal residual."""
         return float(np.sum(self.errors(point) ** 2))
 
-    def multipliers(self, point: Array, quadratic: BlockQuadratic) -> Array:
+    def multipliers(self, point: Array) -> Array:
         """(n, d, d) Lambda_i = sym(G_i Y_i), multipliers of Y_i' Y_i = I, where G is half the gradient (eq. 106)."""
-        slope = quadratic.gradient(self.by_first, self.by_second, self.errors(point))[:, 1:]
+        errors = self.errors(point)
+        slope = block_gradient(self.first, self.second, self.by_first, self.by_second, errors, self.count)[:, 1:]
         product = slope @ np.swapaxes(point[:, 1:], 1, 2)
         return 0.5 * (product + np.swapaxes(product, 1, 2))
 
@@ -154,7 +155,6 @@ class Relaxation:
         damped.
         """
         rank, dim = point.shape[2], self.dim
-        plain = BlockQuadratic(self.first, self.second, self.count, dim + 1, np.zeros(0, dtype=np.intp))
         spins = [(i, k) for i in range(dim) for k in range(i)]
         size = rank + len(spins) + dim * (rank - dim)
         system = BlockQuadratic(self.first, self.second, self.count, size, self.anchors)
@@ -167,9 +167,9 @@ class Relaxation:
             J_first = (self.by_first @ flat[self.first]).reshape(shape)
             J_second = (self.by_second @ flat[self.second]).reshape(shape)
             error = self.errors(point).reshape(len(self.first), -1, 1)
-            gradient = system.gradient(J_first, J_second, error)[system.free]
+            gradient = block_gradient(self.first, self.second, J_first, J_second, error, self.count)[system.free]
             frames = basis[:, 1:]
-            bend = np.einsum("narq,nab,nbrs->nqs", frames, self.multipliers(point, plain), frames)
+            bend = np.einsum("narq,nab,nbrs->nqs", frames, self.multipliers(point), frames)
             entries = system.entries(J_first, J_second, -bend)
             step = None
             while step is None:
