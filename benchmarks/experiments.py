@@ -1,9 +1,12 @@
 """Bazzana's path lengths and durations again, on maps with legs as long as his. Writes docs/experiments.md.
 
-    python -m benchmarks.experiments [--runs N] [--workers K] [--report] [--any-code]
+    python -m benchmarks.experiments [--runs N] [--campaigns NAME ...] [--couplings NAME ...] [--workers K] [--report]
+        [--any-code]
 
-The campaigns are benchmarks/campaigns/department.toml (his Table I) and factory.toml (Table II); what is on file in
-out/benchmarks/campaigns is not repeated. Thirty runs a leg with two couplings take some three hours of one core.
+The campaigns are benchmarks/campaigns/department.toml (his Table I) and factory.toml (Table II), and for the same legs
+with other planners department-others.toml and factory-others.toml; what is on file in out/benchmarks/campaigns is not
+repeated, and all of it is on the page. Thirty runs a leg with two couplings take some three hours of one core, those of
+the four other planners some six.
 """
 
 from __future__ import annotations
@@ -19,15 +22,18 @@ from benchmarks.large_maps import CAMPAIGNS
 from benchmarks.report import OUT, command, machine, publish, table
 from unifg.scenarios.campaigns.account import differences
 from unifg.scenarios.campaigns.campaign import code_of_scenario, replay_command, run_campaign
-from unifg.scenarios.campaigns.comparison import interval
+from unifg.scenarios.campaigns.comparison import interval, share
 from unifg.scenarios.campaigns.document import Heading, Table, Words
 from unifg.scenarios.campaigns.performed import OK
-from unifg.scenarios.campaigns.sheet import Sheet, load
+from unifg.scenarios.campaigns.sheet import Combination, Sheet, load
 from unifg.scenarios.campaigns.statement import Statement, read
+from unifg.scenarios.driving.drive_pilot import COUPLINGS
 from unifg.typing import Array
 
 RUNS = 30
 LENGTH, DURATION = "path_length_m", "duration_s"
+CLEARANCE, CONTACTS, TICK = "min_clearance_m", "collisions", "tick_ms.p50"
+OTHERS = "-others"  # ends the name of the campaign of the same legs with other planners
 Pair = tuple[float, float]
 """Mean and standard deviation."""
 
@@ -63,17 +69,134 @@ PAPER: dict[str, dict[str, Reported]] = {
     },
 }
 TITLES = {"department": "Table I: eight legs of a department", "factory": "Table II: four legs of a factory"}
+CAMPAIGN_NAMES = (*PAPER, *(name + OTHERS for name in PAPER))
 
 
 def rendered(sheets: Mapping[str, Sheet]) -> str:
     """All tables, and what they say together."""
     parts = list[str]()
-    for name, sheet in sheets.items():
+    ours = {name: sheet for name, sheet in sheets.items() if name in PAPER}
+    for name, sheet in ours.items():
         parts += [f"### {TITLES[name]}", lengths(sheet, PAPER[name]), durations(sheet, PAPER[name]), *_compared(sheet)]
         parts += _failed(sheet)
-    parts.append(together(list(sheets.values())))
+    parts.append(together(list(ours.values())))
+    drives = [drive for name, sheet in sheets.items() for drive in drivers(sheet, name.removesuffix(OTHERS))]
+    if len({drive.planner for drive in drives}) > 1:
+        parts += ["### The same legs with other planners", beside(drives), leg_by_leg(drives)]
+        parts += [part for name, sheet in sheets.items() if name not in PAPER for part in _failed(sheet)]
     parts.append(machine("numpy", "scipy", "osqp", "piqp", "pymunk"))
     return "\n\n".join(parts)
+
+
+@dataclass(frozen=True)
+class Driver:
+    """A planner on a leg.
+
+    Attributes:
+        planner: its short name; of this library, the coupling.
+        leg: the table and the leg.
+        sheet: of its campaign.
+        combination: there.
+    """
+
+    planner: str
+    leg: str
+    sheet: Sheet
+    combination: Combination
+
+    def all(self, measure: str) -> Array:
+        """(n,) numbers of all drives that came to an end."""
+        return self.sheet.column(measure, self.combination)
+
+    def good(self, measure: str) -> Array:
+        """(n,) those of drives that succeeded."""
+        return self.sheet.column(measure, self.combination, OK)
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """How many drives, and how many succeeded."""
+        counts = self.sheet.counts(self.combination)
+        return counts.total(), counts[OK]
+
+
+def drivers(sheet: Sheet, name: str) -> list[Driver]:
+    """Who has driven which leg of a campaign."""
+    found = []
+    for combination in sheet.outcomes:
+        labels = dict(zip(sheet.axes, combination, strict=True))
+        planner = labels.get("planner", f"ours, {labels['coupling']}")
+        found.append(Driver(planner, f"{'I' if name == 'department' else 'II'} {labels['leg']}", sheet, combination))
+    return found
+
+
+def beside(drives: Sequence[Driver]) -> str:
+    """Every planner over all legs it has driven; extra time is the mean over pairs of leg and seed."""
+    head = (
+        "planner", "legs", "drives", "succeeded", "95 %", "contacts", "least clearance [mm]",
+        "its mean over drives [mm]", "std of length", "std of duration", "longer than ours by [s]", "tick [ms]",
+    )  # fmt: skip
+    rows, base = [], _times([drive for drive in drives if drive.planner == drives[0].planner])
+    for planner in dict.fromkeys(drive.planner for drive in drives):
+        mine = [drive for drive in drives if drive.planner == planner]
+        runs, good = np.sum([drive.counts for drive in mine], axis=0)
+        low, high = share(int(good), int(runs))
+        clearance, contacts = _pooled(mine, CLEARANCE), _pooled(mine, CONTACTS)
+        times = _times(mine)
+        extra = np.array([times[key] - base[key] for key in times if key in base])
+        rows.append((
+            planner, str(len(mine)), str(runs), str(good), f"{100 * low:.0f} .. {100 * high:.0f} %",
+            f"{contacts.sum():.0f}", f"{1e3 * clearance.min(initial=np.inf):.0f}", f"{1e3 * clearance.mean():.0f}",
+            _relative(mine, LENGTH), _relative(mine, DURATION),
+            "-" if mine[0].planner == drives[0].planner or len(extra) < 2 else
+            "{:.1f} ({:.1f} .. {:.1f})".format(extra.mean(), *interval(extra)),
+            f"{np.median(_pooled(mine, TICK)):.1f}",
+        ))  # fmt: skip
+    words = (
+        "Contacts and clearances are of all drives, the rest is of those that succeeded: spreads are means over legs, "
+        f"times are compared drive by drive with those of *{drives[0].planner}* on the same leg and seed, with a "
+        "bootstrap interval; a tick is the median over drives of their medians."
+    )
+    return f"{table(head, rows)}\n\n{words}"
+
+
+def leg_by_leg(drives: Sequence[Driver]) -> str:
+    """Every planner on every leg."""
+    head = (
+        "leg", "planner", "drives", "succeeded", "path length [m]", "duration [s]", "least clearance [mm]", "contacts",
+    )  # fmt: skip
+    rows = []
+    for leg in dict.fromkeys(drive.leg for drive in drives):
+        for drive in drives:
+            if drive.leg == leg:
+                runs, good = drive.counts
+                clearance = drive.all(CLEARANCE)
+                rows.append((
+                    leg, drive.planner, str(runs), str(good),
+                    _spread(drive.good(LENGTH)), _spread(drive.good(DURATION)),
+                    f"{1e3 * clearance.min():.0f}" if len(clearance) else "-", f"{drive.all(CONTACTS).sum():.0f}",
+                ))  # fmt: skip
+    return table(head, rows, 2)
+
+
+def _pooled(drives: Sequence[Driver], measure: str) -> Array:
+    return np.concatenate([np.zeros(0), *(drive.all(measure) for drive in drives)])
+
+
+def _relative(drives: Sequence[Driver], measure: str) -> str:
+    """Mean over legs of the standard deviation in per cent of the mean."""
+    found = [drive.good(measure) for drive in drives]
+    shares = [100.0 * float(values.std(ddof=1) / values.mean()) for values in found if len(values) > 1]
+    return f"{np.mean(shares):.2f} %" if shares else "-"
+
+
+def _times(drives: Sequence[Driver]) -> dict[tuple[str, int | None], float]:
+    """Durations of the drives that succeeded, by leg and seed."""
+    return {
+        (drive.leg, seed): duration
+        for drive in drives
+        for seed, duration in drive.sheet.values.get(DURATION, {}).get(drive.combination, {}).items()
+        if drive.sheet.outcomes[drive.combination][seed] == OK
+    }
 
 
 def lengths(sheet: Sheet, paper: Mapping[str, Reported]) -> str:
@@ -82,7 +205,7 @@ def lengths(sheet: Sheet, paper: Mapping[str, Reported]) -> str:
     rows = []
     for coupling, leg in sheet.outcomes:
         his, ros = paper[leg].length, paper[leg].ros_length
-        rows.append((*_begin(sheet, coupling, leg, LENGTH), "-" if his is None else _pair(his), _pair(ros)))
+        rows.append((*_begin(sheet, (coupling, leg), LENGTH), "-" if his is None else _pair(his), _pair(ros)))
     return table(head, rows, 2)
 
 
@@ -90,14 +213,15 @@ def durations(sheet: Sheet, paper: Mapping[str, Reported]) -> str:
     """Durations, likewise."""
     head = ("leg", "coupling", "runs", "succeeded", "duration [s]", "95 % interval", "paper: his [s]", "ROS [s]")
     rows = [
-        (*_begin(sheet, coupling, leg, DURATION), _pair(paper[leg].duration), _pair(paper[leg].ros_duration))
+        (*_begin(sheet, (coupling, leg), DURATION), _pair(paper[leg].duration), _pair(paper[leg].ros_duration))
         for coupling, leg in sheet.outcomes
     ]
     return table(head, rows, 2)
 
 
-def _begin(sheet: Sheet, coupling: str, leg: str, measure: str) -> tuple[str, ...]:
-    values, counts = sheet.column(measure, (coupling, leg)), sheet.counts((coupling, leg))
+def _begin(sheet: Sheet, combination: Combination, measure: str) -> tuple[str, ...]:
+    values, counts = sheet.column(measure, combination, OK), sheet.counts(combination)
+    coupling, leg = combination
     return leg, coupling, str(counts.total()), str(counts[OK]), _spread(values), _inside(values)
 
 
@@ -119,10 +243,17 @@ def _pair(pair: Pair) -> str:
 
 
 def _compared(sheet: Sheet) -> list[str]:
-    """The two couplings, pair by pair."""
+    """The two couplings, pair by pair, where both succeeded."""
     measures = [m for m in sheet.stated if m in sheet.values]
+    values = {
+        measure: {
+            combination: {seed: value for seed, value in found.items() if sheet.outcomes[combination][seed] == OK}
+            for combination, found in sheet.values[measure].items()
+        }
+        for measure in measures
+    }
     found = list[str]()
-    for block in differences(sheet, measures):
+    for block in differences(replace(sheet, values=values), measures):
         if isinstance(block, Words):
             found.append(block.text)
         elif isinstance(block, Table):
@@ -147,7 +278,7 @@ def together(sheets: Sequence[Sheet]) -> str:
     for sheet in sheets:
         for combination in sheet.outcomes:
             for measure, found in spreads.items():
-                values = sheet.column(measure, combination)
+                values = sheet.column(measure, combination, OK)
                 if len(values) > 1:
                     found.append(100.0 * float(values.std(ddof=1) / values.mean()))
             simulated += float(sheet.column(DURATION, combination).sum())
@@ -172,26 +303,35 @@ def together(sheets: Sequence[Sheet]) -> str:
     return " ".join(say)
 
 
-def _some(statement: Statement, runs: int) -> Statement:
-    """The first runs of a campaign."""
-    return replace(statement, seeds=statement.seeds[:runs])
+def _some(statement: Statement, runs: int, couplings: Sequence[str]) -> Statement:
+    """The first runs of a campaign, with some couplings."""
+    axes = [
+        replace(axis, values={label: axis.values[label] for label in axis.values if label in couplings})
+        if axis.name == "coupling" else axis
+        for axis in statement.axes
+    ]  # fmt: skip
+    return replace(statement, seeds=statement.seeds[:runs], axes=tuple(axes))
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Drive what is missing, then write the page."""
     parser = command(__doc__)
     parser.add_argument("--runs", type=int, default=RUNS, help="of each leg and coupling; the page says how many")
+    parser.add_argument("--campaigns", nargs="+", choices=CAMPAIGN_NAMES, default=CAMPAIGN_NAMES, help="to go on with")
+    parser.add_argument("--couplings", nargs="+", choices=COUPLINGS, default=COUPLINGS, help="of this library's drives")
     parser.add_argument("--workers", type=int, default=1, help="processes; times are those of one alone")
     parser.add_argument("--report", action="store_true", help="run nothing, write the tables from what is on file")
     parser.add_argument("--any-code", action="store_true", help="drives of earlier states of the code count, too")
     options = parser.parse_args(arguments)
     sheets = {}
-    for name in PAPER:
+    for name in CAMPAIGN_NAMES:
         folder = OUT / "campaigns" / name
-        if not options.report:
-            statement = _some(read(CAMPAIGNS / f"{name}.toml"), options.runs)
+        if not options.report and name in options.campaigns:
+            couplings = options.couplings if name in PAPER else COUPLINGS
+            statement = _some(read(CAMPAIGNS / f"{name}.toml"), options.runs, couplings)
             run_campaign(statement, folder, workers=options.workers, any_code=options.any_code)
-        sheets[name] = load(folder, options.any_code)
+        if folder.is_dir():
+            sheets[name] = load(folder, options.any_code, failed_too=True)
     codes = {sheet.code for sheet in sheets.values()}
     publish("experiments", rendered(sheets), None if codes == {code_of_scenario("navigation")} else codes)
     return 0

@@ -58,6 +58,36 @@ def rows(folder: Path) -> list[dict[str, Any]]:
 # ---------------------------------------------------------------- what is stated
 
 
+def test_a_file_may_extend_another(tmp_path: Path) -> None:
+    (tmp_path / "base.toml").write_text(
+        f'scenario = "{WALKS}"\nseeds = {{spawn = 3, from = 7}}\n[settings]\nshoes.size = 40\nshoes.grip = 0.5\n'
+        '[grid]\npace = [0.5, 1]\n[[grid.leg]]\nname = "A"\nway = [0, 1]\n'
+    )
+    (tmp_path / "more.toml").write_text(
+        'extends = "base.toml"\nseeds = {spawn = 2}\nsettings.shoes.grip = 1\ngrid.pace = [2]\n'
+    )
+    first, more = read(tmp_path / "base.toml"), read(tmp_path / "more.toml")
+    assert more.seeds == first.seeds[:2] and more.title == "more"
+    assert next((e.labels, e.settings) for e in more.episodes()) == (
+        {"pace": "2", "leg": "A"}, {"shoes.size": 40, "shoes.grip": 1, "pace": 2, "ways": [0, 1]},
+    )  # fmt: skip
+    same = stated(more.given, tmp_path)  # what the folder of a campaign keeps of it needs the file no longer
+    assert [e.key for e in same.episodes()] == [e.key for e in more.episodes()]
+    cases = (
+        ("loop", 'extends = "back.toml"', "extends itself: loop.toml, back.toml, loop.toml"),
+        ("back", 'extends = "loop.toml"', "extends itself"),
+        ("self", 'extends = "self.toml"', "extends itself: self.toml, self.toml"),
+        ("away", 'extends = "../base.toml"', "a file of the same folder"),
+        ("gone", 'extends = "nothing.toml"', "nothing.toml: cannot be read"),
+        ("odd", "extends = 3", "a file of the same folder, got 3"),
+    )
+    for name, text, _ in cases:
+        (tmp_path / f"{name}.toml").write_text(text)
+    for name, _, message in cases:
+        with pytest.raises(ScenarioError, match=message):
+            read(tmp_path / f"{name}.toml")
+
+
 def test_a_grid_is_every_combination_with_every_seed() -> None:
     legs = [{"name": "A", "ways": [[0, 1]], "shoes": {"size": 40}}, {"name": "B", "way": [0, 2]}]
     made = walks((3, 4), settings={"behaviour": "walk"}, grid={"pace": [0.5, 1], "leg": legs})
@@ -586,6 +616,22 @@ def test_a_report_of_nothing_yet(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError):
         run(walks(), tmp_path, executor=Watched(broken=True))
     assert "0 of 3 episodes" in write_report(tmp_path)[1].read_text()
+
+
+def test_no_campaign_is_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "a file").touch()
+    for folder, why in (
+        (tmp_path / "nowhere", "there is no such folder"),
+        (tmp_path / "a file", "campaign.json cannot be read"),
+        (tmp_path, "there is no campaign.json in it"),
+    ):
+        with pytest.raises(ScenarioError) as error:
+            campaigns.manifest_of(folder)
+        assert why in str(error.value) and "Errno" not in str(error.value)
+    for text, why in (("{", "campaign.json is damaged"), ("[]", "damaged"), ("{}", "entries are missing")):
+        (tmp_path / "campaign.json").write_text(text)
+        with pytest.raises(ScenarioError, match=why):
+            campaigns.manifest_of(tmp_path)
 
 
 def test_chance_of_differences() -> None:

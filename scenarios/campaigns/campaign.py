@@ -150,10 +150,14 @@ def manifest_of(folder: Path) -> dict[str, Any]:
         kept: dict[str, Any] = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
         if {"campaign", "base", "code", "axes", "bundles", "compare", "keys"} <= kept.keys():
             return kept
-        why = "entries are missing"
-    except (OSError, ValueError, AttributeError) as error:
-        why = str(error)
-    raise ScenarioError(f"{folder}: holds no campaign ({why})")
+        why = f"entries are missing in {MANIFEST}"
+    except FileNotFoundError:
+        why = f"there is no {MANIFEST} in it" if folder.is_dir() else "there is no such folder"
+    except OSError as error:
+        why = f"{MANIFEST} cannot be read: {error.strerror}"
+    except (ValueError, AttributeError) as error:
+        why = f"{MANIFEST} is damaged: {error}"
+    raise ScenarioError(f"{folder}: holds no campaign: {why}")
 
 
 def replay_command(folder: Path, key: str) -> str:

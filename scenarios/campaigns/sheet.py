@@ -76,9 +76,11 @@ class Sheet:
     others: int = 0
     unreadable: int = 0
 
-    def column(self, measure: str, combination: Combination) -> Array:
-        """(n,) numbers of a measure."""
-        return np.array(list(self.values[measure].get(combination, {}).values()))
+    def column(self, measure: str, combination: Combination, outcome: str | None = None) -> Array:
+        """(n,) numbers of a measure, of all episodes or of those that ended in one way."""
+        ends = self.outcomes.get(combination, {})
+        found = self.values.get(measure, {}).get(combination, {})
+        return np.array([value for seed, value in found.items() if outcome in (None, ends.get(seed))])
 
     def counts(self, combination: Combination) -> Counter[str]:
         """How episodes of a combination ended."""
@@ -96,12 +98,13 @@ class Sheet:
             yield from found.values()
 
 
-def load(folder: Path, any_code: bool = False) -> Sheet:
+def load(folder: Path, any_code: bool = False, failed_too: bool = False) -> Sheet:
     """Read a campaign, row by row.
 
     Args:
         folder: of the campaign.
         any_code: rows of all states of the code count, the later of two that are the same episode.
+        failed_too: numbers of failed episodes are kept even if the campaign's reports leave them out.
 
     Raises:
         ScenarioError: there is none.
@@ -111,7 +114,8 @@ def load(folder: Path, any_code: bool = False) -> Sheet:
     keys = set(kept["keys"])
     sheet = Sheet(
         folder, str(given.get("title", folder.name)), kept["axes"], kept["bundles"], kept["compare"],
-        list(given.get("measures", [])), bool(given.get("succeeded_only", False)), kept["code"], len(keys),
+        list(given.get("measures", [])), not failed_too and bool(given.get("succeeded_only", False)), kept["code"],
+        len(keys),
     )  # fmt: skip
     unreadable: list[int] = []
     failures: dict[str, Failure] = {}

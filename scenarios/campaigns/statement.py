@@ -18,6 +18,8 @@ An episode is one combination of the axes with one seed. All of it is stated by 
 
     [[grid.leg]]
     ...
+
+`extends = "other.toml"` begins with what another file of the same folder states; tables are laid over its tables.
 """
 
 from __future__ import annotations
@@ -150,13 +152,39 @@ def read(file: str | Path) -> Statement:
         ScenarioError: it cannot be read, or states what the scenario does not have.
     """
     path = Path(file)
+    return stated({"title": path.stem, **_written(path, ())}, path.resolve().parent, str(path))
+
+
+def _written(path: Path, before: tuple[str, ...]) -> dict[str, Any]:
+    """What a file holds, laid over what it extends.
+
+    Args:
+        path: of the file.
+        before: names of the files that extend it, the first one first.
+    """
     try:
         given = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read ({error.strerror})") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{path}: is no TOML: {error}") from None
-    return stated({"title": path.stem, **given}, path.resolve().parent, str(path))
+    if "extends" not in given:
+        return given
+    other, chain = given.pop("extends"), (*before, path.name)
+    if not isinstance(other, str) or other != Path(other).name:  # paths inside are relative to one folder
+        raise ScenarioError(f"{path}: `extends` must name a file of the same folder, got {other!r}")
+    if other in chain:
+        raise ScenarioError(f"{path}: extends itself: {', '.join((*chain, other))}")
+    return _laid_over(_written(path.with_name(other), chain), given)
+
+
+def _laid_over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Both mappings, table by table; what both state is that of the second."""
+    both = {**below, **above}
+    for name in below.keys() & above.keys():
+        if isinstance(below[name], Mapping) and isinstance(above[name], Mapping):
+            both[name] = _laid_over(below[name], above[name])
+    return both
 
 
 def stated(given: Mapping[str, Any], base: str | Path = ".", name: str = "campaign") -> Statement:

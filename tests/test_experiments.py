@@ -1,0 +1,90 @@
+"""The page of long legs: who drove what, of which drives a number is, and what is compared with what."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks.experiments import beside, drivers, leg_by_leg, rendered
+from benchmarks.large_maps import CAMPAIGNS
+from unifg.scenarios.campaigns.performed import FAILED, OK
+from unifg.scenarios.campaigns.sheet import Combination, Failure, Sheet
+from unifg.scenarios.campaigns.statement import read
+
+SEEDS = (1, 2, 3)
+LEGS = ["AC", "CB"]
+
+
+def sheet(name: str, drives: dict[Combination, list[tuple[str, float, float, int]]]) -> Sheet:
+    """A campaign of drives: outcome, duration [s], least clearance [m], contacts, for each seed."""
+    axes = {"coupling": ["sequential"], "leg": LEGS}
+    if name.endswith("others"):
+        axes["planner"] = ["teb"]
+    made = Sheet(Path(name), name, axes, ["leg"], ["coupling"], ["duration_s"], False, "now", 6)
+    for combination, found in drives.items():
+        made.outcomes[combination] = {seed: drive[0] for seed, drive in zip(SEEDS, found, strict=False)}
+        for k, measure in enumerate(("duration_s", "min_clearance_m", "collisions"), start=1):
+            column: dict[int | None, float] = {seed: float(drive[k]) for seed, drive in zip(SEEDS, found, strict=False)}
+            made.values.setdefault(measure, {})[combination] = column
+        durations = made.values["duration_s"][combination]
+        made.values.setdefault("path_length_m", {})[combination] = {seed: 10.0 * s for seed, s in durations.items()}
+        made.values.setdefault("tick_ms.p50", {})[combination] = dict.fromkeys(column, 2.0)
+    return made
+
+
+OURS = sheet(
+    "department",
+    {
+        ("sequential", "AC"): [(OK, 10.0, 0.1, 0), (OK, 12.0, 0.2, 0), (OK, 11.0, 0.2, 0)],
+        ("sequential", "CB"): [(OK, 20.0, 0.3, 0), (FAILED, 90.0, -0.001, 2), (OK, 22.0, 0.2, 0)],
+    },
+)
+THEIRS = sheet(
+    "department-others",
+    {
+        ("sequential", "AC", "teb"): [(OK, 13.0, 0.15, 0), (FAILED, 99.0, 0.01, 0), (OK, 15.0, 0.2, 0)],
+        ("sequential", "CB", "teb"): [(OK, 25.0, 0.1, 0), (OK, 26.0, 0.1, 1)],
+    },
+)
+
+
+def cells(text: str, *first: str) -> list[str]:
+    """Of the first line of a table that begins so."""
+    lines = ([cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines())
+    return next(line for line in lines if tuple(line[: len(first)]) == first)
+
+
+def test_planners_are_compared_over_what_both_have_driven() -> None:
+    drives = [*drivers(OURS, "department"), *drivers(THEIRS, "department")]
+    text = beside(drives)
+    ours, teb = cells(text, "ours, sequential"), cells(text, "teb")
+    assert ours[1:4] == ["2", "6", "5"] and teb[1:4] == ["2", "5", "4"]
+    assert ours[5:8] == ["2", "-1", "166"], "contacts and clearances are of failed drives, too"
+    assert teb[5:8] == ["1", "10", "112"]
+    # longer by 3 and 4 on AC, by 5 on CB, where the other seed failed with us
+    assert teb[10].startswith("4.0 (") and ours[10] == "-"
+    assert ours[9] == "7.91 %", "the mean over legs of std / mean, of successes: 1 / 11 and sqrt(2) / 21"
+
+
+def test_legs_say_who_drove_them() -> None:
+    text = leg_by_leg([*drivers(OURS, "department"), *drivers(THEIRS, "factory")])
+    assert cells(text, "I CB", "ours, sequential")[2:] == ["3", "2", "210.00 ± 14.14 (6.73 %)",
+                                                          "21.00 ± 1.41 (6.73 %)", "-1", "2"]  # fmt: skip
+    assert cells(text, "II AC", "teb")[2:4] == ["3", "2"]
+
+
+def test_a_page_without_other_planners_has_no_table_of_them() -> None:
+    alone = rendered({"department": OURS})
+    assert "other planners" not in alone and "| CB | sequential | 3 | 2 | 210.00 ± 14.14 (6.73 %)" in alone
+    both = rendered({"department": OURS, "department-others": THEIRS})
+    assert "### The same legs with other planners" in both
+    THEIRS.failures.append(Failure("abc", ("sequential", "AC", "teb"), 2, FAILED, "timed out"))
+    assert "AC, teb, seed 2: timed out; `unifg replay" in rendered({"department": OURS, "department-others": THEIRS})
+
+
+def test_others_drive_the_same_legs_on_the_same_seeds() -> None:
+    for name in ("department", "factory"):
+        ours, others = read(CAMPAIGNS / f"{name}.toml"), read(CAMPAIGNS / f"{name}-others.toml")
+        assert others.seeds == ours.seeds and others.fixed == ours.fixed
+        legs = [next(axis for axis in made.axes if axis.name == "leg") for made in (ours, others)]
+        assert legs[0] == legs[1]
+        assert {episode.settings["planner"] for episode in others.episodes()} == {"teb", "mppi", "dwa", "pursuit"}
