@@ -69,6 +69,7 @@ PAGES = {
         Page("smoothing", "Smoothing while driving", "benchmarks.incremental"),
         Page("iterations", "Iterations", "benchmarks.iterations"),
         Page("osqp", "What OSQP solves", "benchmarks.osqp_share", hours=0.05),
+        Page("choosing", "Choosing a solver, measured", "benchmarks.choosing", hours=0.08),
         Page("collection", "A collection of small problems", "benchmarks.collection"),
         Page("velocity-tracking", "Velocity tracking", "benchmarks.ecg2o"),
         Page("control-cases", "Control cases", "benchmarks.control_cases", hours=0.4),

@@ -1,6 +1,7 @@
 """The sources behind a measurement: those of this checkout, the measuring modules and the problems they share.
 
-What presents numbers or compiles ahead does not count, nor do peers: their versions stand on the pages.
+What presents numbers or compiles ahead does not count, nor do peers: their versions stand on the pages. Nor does what
+``fg.solve`` picks from, which ``import unifg`` brings along: who measures names the backends.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ SOURCES = Sources(
         "benchmarks": CHECKOUT / "benchmarks",
     },
     apart=(
-        "benchmarks.pages", "benchmarks.report", "benchmarks.sources", "unifg.warming",
+        "benchmarks.pages", "benchmarks.report", "benchmarks.sources", "unifg.warming", "unifg.solvers.choice",
         "unifg.scenarios.campaigns.journal", "unifg.scenarios.campaigns.workers",
         "unifg.scenarios.campaigns.dispatch", "unifg.scenarios.campaigns.sources",
     ),

@@ -1,13 +1,13 @@
 """unifg: robot estimation and robot control as one factor graph on Lie groups.
 
 import unifg as fg
-from unifg.solvers import SQP
 
 graph = fg.Graph()
 x = graph.variables("x", fg.SE2, 2)
 graph.fix(x[0], [0.0, 0.0, 0.0])
 graph.minimize(fg.between, x[0], x[1], [1.0, 0.0, 0.3], sigma=0.1)
-solution = SQP().solve(graph, {x: np.zeros((2, 3))})
+solution = fg.solve(graph, {x: np.zeros((2, 3))})
+print(solution.report())
 """
 
 from collections.abc import Callable as _Callable
@@ -67,6 +67,8 @@ try:
 except _metadata.PackageNotFoundError:  # running from a source tree that was never installed
     __version__ = "0.0.0"
 
+from unifg.solvers.choice import solve  # noqa: E402  # its folder is found by the lines above
+
 __all__ = [
     "DCS",
     "SE2",
@@ -124,6 +126,7 @@ __all__ = [
     "optimality",
     "prior",
     "residual",
+    "solve",
     "warmup",
     "wrap_angle",
 ]

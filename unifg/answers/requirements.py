@@ -27,12 +27,14 @@ def require(program: Program, solver: str, constraints: Constraints = "all", sca
     if constraints == "none" and program.constraint_terms:
         name = program.constraint_terms[0].name
         raise BackendError(
-            f"{solver} cannot take the constraint '{name}': use AugmentedLagrangian or SQP, or state it as a cost"
+            f"{solver} cannot take the constraint '{name}': use InteriorPoint, AugmentedLagrangian or SQP, or "
+            "`fg.solve`, which picks; or state it as a cost"
         )
     if not scalar_costs and program.scalar_terms:
         name = program.scalar_terms[0].name
         raise BackendError(
-            f"{solver} cannot take the scalar cost '{name}': it is not a square; use SQP, or state it as a residual"
+            f"{solver} cannot take the scalar cost '{name}': it is not a square; use InteriorPoint or SQP, or "
+            "state it as a residual"
         )
     if constraints != "equalities":
         return
@@ -42,5 +44,5 @@ def require(program: Program, solver: str, constraints: Constraints = "all", sca
         name, index = program.row_name(int(rows[0]))
         raise BackendError(
             f"{solver} cannot take the inequality '{name}' (factor {index}): it knows equalities only; use "
-            "InteriorPoint, SQP or AugmentedLagrangian"
+            "InteriorPoint, AugmentedLagrangian or SQP"
         )

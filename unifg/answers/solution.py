@@ -56,9 +56,11 @@ class Solution:
         solver: name of the backend.
         in_python: seconds of them spent in residuals that Python evaluates, see ``graph.check``.
         verdict: which measurements it believes, from solves that decide that.
+        picked: for what the backend was picked, where the caller named none.
     """
 
     in_python = 0.0
+    picked = ""
     verdict: Verdict[Solution] | None = None
 
     def __init__(
@@ -293,8 +295,9 @@ class Solution:
             else f"stationarity {self.stationarity:.1e}, violation {self.violation:.1e}, "
             f"complementarity {self.complementarity:.1e}"
         )
+        who = f"{self.solver} ({self.picked})" if self.picked else self.solver
         text = (
-            f"{self.solver}: {self.status.value} Cost {self.cost:.6g} after {self.iterations} iterations in "
+            f"{who}: {self.status.value} Cost {self.cost:.6g} after {self.iterations} iterations in "
             f"{1e3 * self.seconds:.1f} ms; {kkt}."
         )
         if self.worst is not None and self.violation > 0.0 and not self.converged:

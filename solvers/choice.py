@@ -1,0 +1,143 @@
+"""A backend for whoever names none: what a graph states decides, and a second one tries where the first ends without.
+
+The order is the measured one (docs/choosing.md): from cold guesses the damped Gauss-Newton method solves sums of
+squares, the interior point takes the fewest iterations as soon as there is a constraint or a scalar cost, and the
+augmented Lagrangian gets there from guesses that lead the interior point into a corner.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from unifg.answers.solution import AnyGuess, NotConverged, Solution
+from unifg.answers.solver import Callback, Solver
+from unifg.answers.status import Status
+from unifg.language.statement import Statement
+from unifg.language.variables import Data
+from unifg.program.program import Program, idle_program
+from unifg.solvers.augmented_lagrangian import AugmentedLagrangian
+from unifg.solvers.interior_point.method import InteriorPoint
+from unifg.solvers.least_squares import LevenbergMarquardt
+from unifg.solvers.sqp import SQP
+from unifg.typing import ArrayLike
+
+logger = logging.getLogger("unifg")
+
+ELSEWHERE = {
+    Status.ITERATION_LIMIT,
+    Status.STALLED,
+    Status.LOCALLY_INFEASIBLE,
+    Status.SINGULAR,
+    Status.NOT_FINITE,
+}
+"""Endings after which another method may get further from the same guess."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Who is to solve a graph, and why.
+
+    Attributes:
+        first: is tried.
+        second: is tried where the first ends without a solution.
+        reason: what about the graph decided, as it follows "picked for".
+    """
+
+    first: Solver
+    second: Solver
+    reason: str
+
+
+def choose(
+    graph: Statement,
+    data: Mapping[Data, ArrayLike] | None = None,
+    *,
+    tolerance: float = 1e-6,
+    time_limit: float = np.inf,
+    verbose: bool = False,
+) -> Choice:
+    """Pick backends by what a graph states with these data; arguments as for :func:`solve`.
+
+    Raises:
+        GraphError: when the graph or data is malformed.
+    """
+    program = idle_program(graph)
+    with program.turn:
+        program.bind(data or {})
+        reason, squares = _kind(program)
+    options = {"tolerance": tolerance, "time_limit": time_limit, "verbose": verbose}
+    point = InteriorPoint(**options)  # type: ignore[arg-type]  # each goes to the field of its name
+    if not (program.constraint_terms or program.scalar_terms):
+        return Choice(LevenbergMarquardt(**options), point, reason)  # type: ignore[arg-type]
+    other = AugmentedLagrangian if squares else SQP
+    return Choice(point, other(**options), reason)  # type: ignore[arg-type]
+
+
+def _kind(program: Program) -> tuple[str, bool]:
+    """What decides, in words, and whether all costs are squares."""
+    if program.scalar_terms:
+        return f"the scalar cost '{program.scalar_terms[0].name}'", False
+    if not program.constraint_terms:
+        return "least squares without constraints", True
+    limited = np.isfinite(program.lower) | np.isfinite(program.upper)
+    rows = np.flatnonzero(limited & ~program.equality)
+    if len(rows):
+        return f"the inequality '{program.row_name(int(rows[0]))[0]}'", True
+    return f"the equality '{program.constraint_terms[0].name}'", True
+
+
+def solve(
+    graph: Statement,
+    guess: AnyGuess,
+    *,
+    data: Mapping[Data, ArrayLike] | None = None,
+    check: bool = False,
+    callback: Callback | None = None,
+    tolerance: float = 1e-6,
+    time_limit: float = np.inf,
+    verbose: bool = False,
+) -> Solution:
+    """Solve once, with the backend that what the graph states asks for.
+
+    `LevenbergMarquardt` for least squares without constraints, `InteriorPoint` for everything else. Where it ends
+    without a solution, and not for want of time, another one begins at the same guess: `InteriorPoint` after the
+    first, after the second `AugmentedLagrangian`, or `SQP` where a cost is no square. The solution is that of the
+    second one if it converged, else that of the first. What was picked, and for what, stands in ``solution.picked`` and
+    ``solution.report()``, and goes to the logger ``unifg`` at level INFO. Control loops name a backend and
+    prepare it.
+
+    Args:
+        graph: the problem.
+        guess: values per family, ``{x: array, ...}``, or a guess or solution that carries multipliers too.
+        data: values of data for this solve; others keep their defaults.
+        check: raise instead of returning a solution that did not converge.
+        callback: called with every row of the history; returning True ends the solve.
+        tolerance: of the KKT test.
+        time_limit: seconds for both together.
+        verbose: log one line per iteration.
+
+    Raises:
+        GraphError: when the graph, guess or data is malformed.
+        NotConverged: with ``check=True``.
+    """
+    choice = choose(graph, data, tolerance=tolerance, time_limit=time_limit, verbose=verbose)
+    logger.info("picked %s for %s", choice.first.name, choice.reason)
+    solution = choice.first.solve(graph, guess, data=data, callback=callback)
+    solution.picked = f"picked for {choice.reason}"
+    left = time_limit - solution.seconds
+    if solution.status in ELSEWHERE and left > 0.0:
+        how = solution.status.name.lower().replace("_", " ")
+        logger.info("picked %s: %s ended as %s", choice.second.name, choice.first.name, how)
+        other = replace(choice.second, time_limit=left).solve(graph, guess, data=data, callback=callback)
+        if other.converged:
+            other.picked = f"{solution.picked}, after {choice.first.name} ended as {how}"
+            solution = other
+        else:
+            solution.picked += f"; {other.solver} ended as {other.status.name.lower().replace('_', ' ')}"
+    if check and not solution.converged:
+        raise NotConverged(solution)
+    return solution
