@@ -96,6 +96,26 @@ def test_wildfire_leaves_small_changes_alone() -> None:
     assert 0.0 < np.abs(fg.SE2.local(*estimates)).max() < 0.02
 
 
+def test_the_best_estimate_is_that_of_complete_back_substitution() -> None:
+    """However little is passed on from update to update, and without a trace in the smoother."""
+    found = []
+    for wildfire in (0.0, 0.2):
+        smoother = Incremental(relinearize=np.inf, wildfire=wildfire)
+        x = smoother.variables("x", fg.SE2)
+        for k, statements in enumerate(drive(fg.SE2, np.random.default_rng(7), 80)):
+            for function, variables, parameters, sigma in statements:
+                smoother.minimize(function, *[x[i] for i in variables], *parameters, sigma=sigma)
+            smoother.update({x: np.array([0.3 * k, 0.0, 0.02 * k])})
+        found.append((smoother.estimate(x), smoother.estimate(x, best=True)))
+        np.testing.assert_array_equal(smoother.estimate(x), found[-1][0])
+        some = smoother.estimate(x[[70, 3, 3, 41]], best=True)
+        np.testing.assert_allclose(some, found[-1][1][[70, 3, 3, 41]], rtol=0.0, atol=1e-14)
+    (full, best), (rough, corrected) = found
+    np.testing.assert_allclose(best, full, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(corrected, full, rtol=0.0, atol=1e-9)
+    assert np.abs(rough - full).max() > 1e-6  # or the test has shown nothing
+
+
 @numba.njit  # type: ignore[untyped-decorator]
 def seen_at(pose: Array, point: Array, measured: Array, r: Array) -> None:
     """A point seen from a pose, in the frame of the pose."""

@@ -372,3 +372,124 @@ def test_what_is_no_least_squares_is_refused(method: str) -> None:
     x = smoother.variables("x", fg.Rn(1))
     with pytest.raises(GraphError, match=rf"FixedLag\.{method}: .* or solve the whole as a fg\.Graph"):
         getattr(smoother, method)(x[0])
+
+
+def kinds() -> dict[str, tuple[Any, tuple[Any, ...], dict[str, Any]]]:
+    """Statements of a single factor: function, numbers of its arguments, options."""
+    full = np.diag([4.0, 9.0, 25.0]) + 0.5
+    return {
+        "information": (fg.between, (STEP,), {"information": full}),
+        "turned information": (fg.between, (STEP,), {"information": np.asfortranarray(full)}),
+        "one sigma": (fg.between, (STEP,), {"sigma": 0.1}),
+        "three sigmas": (fg.between, (STEP,), {"sigma": np.array([0.1, 0.2, 0.3])}),
+        "neither": (fg.between, (STEP,), {}),
+        "loss": (fg.between, (STEP,), {"sigma": 0.1, "robust": fg.Huber(1.0), "name": "own"}),
+        "traced": (lambda a, b, z: (b - a) - z, (STEP,), {"sigma": 0.1}),
+        "traced with a constant": (lambda a, b, z, k: k * (b - a) - z, (STEP, np.array([2.0])), {"sigma": 0.1}),
+        "by Python": (lambda a, b, z: np.vectorize(float)(b - a) - z, (STEP,), {"sigma": 0.1}),
+    }
+
+
+@pytest.mark.parametrize("kind", kinds())
+def test_the_second_of_a_kind_says_what_the_first_would_have_said(kind: str) -> None:
+    """Stated one by one, or each by a smoother that sees its kind for the first time: the same numbers."""
+    function, numbers, options = kinds()[kind]
+    rng, staged = np.random.default_rng(0), []
+    smoother = Incremental()
+    x = smoother.variables("x", fg.SE2)
+    for k in range(3):
+        given = tuple(number + 0.1 * rng.standard_normal(number.shape) for number in numbers)
+        weight = {
+            name: value * (1.0 + k) if name in ("sigma", "information") else value for name, value in options.items()
+        }
+        fresh = Incremental()
+        y = fresh.variables("x", fg.SE2)
+        smoother.minimize(function, x[k], x[k + 1], *given, **weight)
+        fresh.minimize(function, y[k], y[k + 1], *given, **weight)
+        staged.append((smoother._staged[-1], fresh._staged[-1]))
+    for ours, theirs in staged:
+        assert (ours.kind, ours.members, ours.name) == (theirs.kind, theirs.members, theirs.name)
+        np.testing.assert_array_equal(ours.data, theirs.data)
+        assert (ours.term is None) == (theirs.term is None)
+    assert bool(smoother._types._kinds) == (kind != "by Python")
+
+
+@pytest.mark.parametrize(
+    ("numbers", "options", "words"),
+    [
+        ((np.array([1.0, np.nan, 0.0]),), {"sigma": 0.1}, "not finite"),
+        ((np.array([1.0, 0.0]),), {"sigma": 0.1}, "shape"),
+        ((STEP,), {"sigma": -0.1}, "must be positive"),
+        ((STEP,), {"sigma": np.inf}, "must be positive"),
+        ((STEP,), {"sigma": np.array([0.1, 0.0, 0.1])}, "must be positive"),
+        ((STEP,), {"sigma": np.array([0.1, 0.1])}, "sigma has shape"),
+        ((STEP,), {"sigma": np.array([0.1, np.nan, 0.1])}, "must be positive"),
+        ((STEP,), {"information": np.triu(np.ones((3, 3)))}, "symmetric"),
+        ((STEP,), {"information": -np.eye(3)}, "negative eigenvalue"),
+        ((STEP,), {"information": np.eye(2)}, "information has shape"),
+        ((STEP,), {"information": np.eye(3), "sigma": 0.1}, "not both"),
+    ],
+)
+def test_the_second_of_a_kind_is_refused_as_the_first(
+    numbers: tuple[Any, ...], options: dict[str, Any], words: str
+) -> None:
+    smoother = Incremental()
+    x = smoother.variables("x", fg.SE2)
+    for weight in ({"sigma": 0.1}, {"sigma": np.full(3, 0.1)}, {"information": np.eye(3)}):
+        for k in range(2):
+            smoother.minimize(fg.between, x[k], x[k + 1], STEP, **weight)
+    with pytest.raises(GraphError, match=words):
+        smoother.minimize(fg.between, x[2], x[3], *numbers, **options)
+    assert len(smoother._staged) == 6
+
+
+def test_singular_information_counts_also_the_second_time() -> None:
+    smoother = Incremental()
+    x = smoother.variables("x", fg.SE2)
+    for information in (np.eye(3), np.diag([1.0, 0.0, 1.0])):
+        smoother.minimize(fg.between, x[0], x[1], STEP, information=information)
+    np.testing.assert_allclose(smoother._staged[1].data[0, 3:].reshape(3, 3) ** 2, np.diag([1.0, 0.0, 1.0]), atol=1e-15)
+
+
+def test_kinds_differ_by_family_component_and_what_a_function_reaches() -> None:
+    """Nothing is taken for a kind that it only resembles; and what a function reads from outside counts as it is."""
+    smoother = Incremental()
+    x, y = smoother.variables("x", fg.SE2), smoother.variables("y", fg.SE2)
+    pair = smoother.variables("pair", fg.Product(a=fg.SE2, b=fg.SE2))
+    reached = np.array([1.0, 2.0, 3.0])
+
+    def own(a: Array, b: Array) -> Array:
+        r: Array = b - a - reached
+        return r
+
+    for _ in range(2):
+        for ends in ((x[0], x[1]), (x[0], y[1]), (pair[0].a, pair[1].a), (pair[0].a, pair[1].b)):
+            smoother.minimize(fg.between, *ends, STEP, sigma=0.1)
+    first = smoother._staged[:4]
+    for one, again in zip(first, smoother._staged[4:], strict=True):
+        assert (one.kind, one.families, one.members) == (again.kind, again.families, again.members)
+    assert len({(item.kind, *[family.name for family in item.families]) for item in first}) == 4
+    smoother.minimize(own, x[0], x[1], sigma=0.1)
+    reached[:] = 0.7
+    smoother.minimize(own, x[0], x[1], sigma=0.1)
+    smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.1)
+    smoother.minimize(fg.prior, x[1], np.ones(3), sigma=1e3)
+    smoother.minimize(own, x[0], x[1], sigma=1e-3)
+    smoother._staged = smoother._staged[8:9] + smoother._staged[9:]  # the first says 1, 2, 3; the others 0.7
+    smoother.update({x: np.zeros((2, 3))}, iterations=8)
+    np.testing.assert_allclose(smoother.estimate(x[1])[0], 0.7, atol=1e-2)
+
+
+def test_a_copy_states_its_own_factors() -> None:
+    smoother = Incremental()
+    x = smoother.variables("x", fg.SE2)
+    smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.1)
+    smoother.minimize(fg.between, x[0], x[1], STEP, sigma=0.1)
+    smoother.update({x: np.zeros((2, 3))})
+    other = copy.deepcopy(smoother)
+    for one in (smoother, other):
+        own = one.families["x"]
+        one.minimize(fg.between, own[1], own[2], STEP, sigma=0.1)
+        one.update({own: np.zeros(3)})
+    np.testing.assert_allclose(other.estimate(other.families["x"]), smoother.estimate(x), atol=1e-12)
+    assert len(smoother) == len(other) == 3

@@ -32,11 +32,13 @@ from unifg.program.columns import Columns
 from unifg.program.term import CompiledTerm
 from unifg.program.traced import Trace, reach_of_value
 from unifg.smoothing.families import GrowingFamily
-from unifg.smoothing.state import BY_PYTHON
+from unifg.smoothing.repeated import Key, Kind, key_of, numbers_of
+from unifg.smoothing.state import BY_PYTHON, TYPE
 from unifg.typing import Array, BoolArray, IntArray
 
 REMEMBERED = 256  # kinds of statements
 PLAIN: Form = (QUADRATIC, 0.0, 0.0)
+FIELD = {name: place for place, name in enumerate(TYPE.names or ())}
 NOBODY = np.zeros(0, dtype=np.int64)
 
 
@@ -85,10 +87,11 @@ class Types:
         self.scratch = 8
         self._numbers: dict[tuple[Any, ...], int] = {}  # by kernels, which are kept: compiled code has their addresses
         self._kernels: dict[tuple[Any, ...], tuple[Kernel, Residual, Trace | None]] = {}
+        self._kinds: dict[Key, Kind] = {}  # of single factors
 
     def __getstate__(self) -> dict[str, Any]:
         """Copy without what is found by the ids of objects, which are others in a copy."""
-        return {**self.__dict__, "_kernels": {}}
+        return {**self.__dict__, "_kernels": {}, "_kinds": {}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """The kernels of a copy stand elsewhere."""
@@ -107,11 +110,56 @@ class Types:
         active: Any,
         given: str | None,
     ) -> Staged:
-        """Check a statement and lay out its numbers.
+        """Lay out the numbers of a statement, which is checked unless one more factor of a kind is stated.
 
         Raises:
             GraphError: naming the term and what does not fit.
         """
+        key = key_of(function, arguments, sigma, information, robust, given) if active is None else None
+        kind = self._kinds.get(key) if key is not None else None
+        if kind is not None:
+            data = numbers_of(kind, arguments, sigma, information)
+            if data is not None:
+                members: list[IntArray | int] = [int(arguments[place].indices[0]) for place in kind.variables]
+                return Staged(kind.number, kind.families, members, data, kind.name)
+        staged, trace = self._looked_at(function, arguments, sigma, information, robust, active, given)
+        if key is not None and staged.term is None and (trace is None or not trace.reached):
+            self._learn(key, function, arguments, staged, trace)
+        return staged
+
+    def _learn(
+        self, key: Key, function: AnyResidual, arguments: tuple[Any, ...], staged: Staged, trace: Trace | None
+    ) -> None:
+        """Keep what the next factor of its kind needs."""
+        taken = tuple(range(len(arguments))) if trace is None else trace.taken
+        variables = tuple([place for place in taken if isinstance(arguments[place], Selection)])
+        if len(variables) != len(staged.families) or (trace is not None and _compiled_in(trace, arguments)):
+            return
+        parameters, at = [], 0
+        for place in taken:
+            if place not in variables:
+                parameters.append((place, at, at + arguments[place].size))
+                at += arguments[place].size
+        row = self.fields[staged.kind]
+        whitening, size = int(row[FIELD["whitening"]]), int(row[FIELD["rows"]])
+        if len(self._kinds) >= REMEMBERED:
+            self._kinds.clear()
+        self._kinds[key] = Kind(
+            staged.kind, staged.families, variables, tuple(parameters), whitening, size, at, staged.data.shape[1],
+            staged.name, function, trace,
+        )  # fmt: skip
+
+    def _looked_at(
+        self,
+        function: AnyResidual,
+        arguments: tuple[Any, ...],
+        sigma: Parameter | None,
+        information: Parameter | None,
+        robust: Loss | None,
+        active: Any,
+        given: str | None,
+    ) -> tuple[Staged, Trace | None]:
+        """Check a statement and lay out its numbers; what was traced comes with them."""
         wrapped = complete(function, arguments, given)
         name = given or wrapped.name
         if sigma is not None and information is not None:
@@ -138,7 +186,7 @@ class Types:
                 rest = np.zeros((count, 0))
                 kind = self._kind(None, (0, 0, 0, term.size), selections, (), *PLAIN)
                 staged = Staged(kind, families, members, rest, name, term, np.arange(count))
-                return _active(staged, active)
+                return _active(staged, active), None
             known = term.kernel, wrapped, term.trace
             if term.trace is None or not _compiled_in(term.trace, normal):
                 self._remember(key, known)
@@ -170,7 +218,7 @@ class Types:
             raise GraphError(f"term '{name}': a parameter of factor {index} is not finite", term=name, index=index)
         counts = data.shape[1] - whitener.shape[1], data.shape[1], whitening, size
         kind = self._kind(kernel, counts, selections, shapes, *form)
-        return _active(Staged(kind, families, members, data, name), active)
+        return _active(Staged(kind, families, members, data, name), active), trace
 
     def _remember(self, key: tuple[Any, ...], known: tuple[Kernel, Residual, Trace | None]) -> None:
         """Keep what the next statement of its kind needs; functions made anew for each are not kept for ever."""

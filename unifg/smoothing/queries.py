@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.elimination.ordering import filled
 from unifg.machine.jit import compiled
 from unifg.machine.vectors import Address
 from unifg.smoothing.linear import cost_of, length_of, retract
-from unifg.smoothing.memory import grown, more, take_list, take_numbers
+from unifg.smoothing.memory import found, grown, more, take_list, take_numbers
 from unifg.smoothing.state import BY_PYTHON, FRESH, SLOTS_MAX, opened
 from unifg.smoothing.tree import paths
 from unifg.typing import Array, IntArray
@@ -24,7 +25,7 @@ def add_variables(
     values: Array,
     stamps: Array,
     out: IntArray,
-) -> Array:
+) -> Array | None:
     """Add one variable for each row of values; writes their numbers and returns a longer arena of floats, or nothing.
 
     Args:
@@ -70,13 +71,13 @@ def add_variables(
         for i in range(length - storage - 3 * dim):
             numbers[at + storage + 3 * dim + i] = values[k, i] if i < storage else 0.0
         out[k] = v
-    return longer
+    return found(longer)
 
 
 @compiled
 def add_factors(
     memory: Address, kind: int, touched: IntArray, data: Array, batch: int, items: IntArray
-) -> tuple[IntArray, Array]:
+) -> tuple[IntArray | None, Array | None]:
     """Add factors of one type and return longer arenas, or nothing.
 
     Args:
@@ -115,7 +116,7 @@ def add_factors(
             variables[v].link = f * SLOTS_MAX + s
         factor.next = counters.new_factors
         counters.new_factors = f
-    return more_lists, more_numbers
+    return found(more_lists), found(more_numbers)
 
 
 @compiled
@@ -130,6 +131,47 @@ def estimates(memory: Address, chosen: IntArray, points: bool, out: Array) -> No
                 out[k * storage + i] = state.numbers[value + i]
         else:
             retract(memory, v, out, k * storage)
+
+
+@compiled
+def full_steps(memory: Address, chosen: IntArray, out: Array) -> None:
+    """Steps of some variables by back-substitution from their roots down, whatever was passed on before.
+
+    Args:
+        memory: address of the description of the smoother's arrays.
+        chosen: variables.
+        out: receives their steps, one after the other.
+    """
+    state = opened(memory)
+    variables, cliques, lists, numbers = state.variables, state.cliques, state.lists, state.numbers
+    offset, rows = paths(memory, chosen)
+    steps, known, way, at = np.empty(rows), filled(len(offset), 0), filled(len(offset), 0), 0
+    for k in range(len(chosen)):
+        c, height = variables[chosen[k]].clique, 0
+        while c >= 0 and known[c] == 0:
+            known[c], way[height] = 1, c
+            height += 1
+            c = cliques[c].parent
+        while height > 0:
+            height -= 1
+            clique = cliques[way[height]]
+            width, top = clique.pivot_rows, offset[way[height]]
+            for i in range(width - 1, -1, -1):
+                row = clique.front + i * clique.stride
+                total, column = numbers[row + clique.size], width
+                for j in range(i + 1, width):
+                    total -= numbers[row + j] * steps[top + j]
+                for q in range(clique.list + clique.pivots, clique.list + clique.count):
+                    v = lists[q]
+                    below = offset[variables[v].clique] + variables[v].place
+                    for d in range(variables[v].dim):
+                        total -= numbers[row + column] * steps[below + d]
+                        column += 1
+                steps[top + i] = total / numbers[row + i]
+        v = chosen[k]
+        for d in range(variables[v].dim):
+            out[at] = steps[offset[variables[v].clique] + variables[v].place + d]
+            at += 1
 
 
 @compiled

@@ -18,16 +18,24 @@ from unifg.machine.borrow import described
 from unifg.smoothing.batched import Batch, Batches, move_by_python
 from unifg.smoothing.factors import Parts, Staged, Types
 from unifg.smoothing.families import GrowingFamily
-from unifg.smoothing.queries import add_factors, add_variables, estimates, joint_covariance, total_cost
-from unifg.smoothing.state import MADE, PART, SLOT, TYPE, Records, State, empty_state
+from unifg.smoothing.queries import (
+    add_factors,
+    add_variables,
+    estimates,
+    full_steps,
+    joint_covariance,
+    total_cost,
+)
+from unifg.smoothing.state import MADE, PART, PLACE, SLOT, TYPE, Records, State, empty_state
 from unifg.smoothing.tree import give_up
 from unifg.smoothing.undetermined import enough
 from unifg.smoothing.update import begin, renew, update_tree
 from unifg.turns import Turn, in_turn
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
-NONE = np.empty(0, dtype=np.int64)
-ENDS = ("variable_end", "factor_end", "clique_end")
+FIRST_MADE = PLACE[MADE[0]]
+VARIABLE_END, FACTOR_END, CLIQUE_END = PLACE["variable_end"], PLACE["factor_end"], PLACE["clique_end"]
+UPDATES, SCRATCH = PLACE["updates"], PLACE["scratch"]
 
 
 class Effort(NamedTuple):
@@ -196,13 +204,28 @@ class Smoother:
             f"squares: {instead}, or solve the whole as a fg.Graph"
         )
 
-    def estimate(self, variable: Variable) -> Array:
+    @in_turn
+    def estimate(self, variable: Variable, *, best: bool = False) -> Array:
         """(n, storage) estimates of a family or selection.
 
+        Args:
+            variable: a family, or some of its members.
+            best: substitute back fully, from the roots of the tree down, however little of a change ``wildfire`` would
+                have passed on; takes time proportional to the tree above the members, and changes nothing.
+
         Raises:
-            GraphError: when a member has no value, or was marginalised.
+            GraphError: when a member has no value, or was marginalised, or the last update failed.
         """
-        return self._values(variable, False)
+        if not best:
+            return self._values(variable, False)
+        self._require_solved()
+        selection = as_selection(variable)
+        rows, manifold = self._rows(selection), selection.family.manifold
+        steps = np.empty(len(rows) * manifold.dim)
+        full_steps(self._memory, rows, steps)
+        points = self._values(selection.family[selection.indices], True)
+        out: Array = np.atleast_2d(manifold.retract(points, steps.reshape(len(rows), manifold.dim)))
+        return out if selection.component is None else out[:, selection.storage]
 
     def linearization_point(self, variable: Variable) -> Array:
         """(n, storage) points at which the factors of a family or selection are linear now."""
@@ -267,7 +290,7 @@ class Smoother:
             numbers = add_variables(
                 self._memory, *family.parts, family.manifold.dim, family.number, family.count, array, stamps, out
             )
-            self._move(NONE, numbers)
+            self._move(None, numbers)
             family.grow(out)
         for item in self._staged:
             touched = _touched(item)
@@ -279,7 +302,7 @@ class Smoother:
             self._solve()
 
     def _effort(self) -> Effort:
-        return Effort(*self._state.counters[list(MADE)][0].tolist())
+        return Effort(*self._counts[FIRST_MADE : FIRST_MADE + len(MADE)].tolist())
 
     def _stamps(self, family: GrowingFamily, count: int, time: float | None) -> Array:
         """Ages of new members; they matter only where the order is chronological."""
@@ -295,7 +318,7 @@ class Smoother:
     def _solve(self) -> None:
         """One pass over the tree."""
         state = self._state
-        now = self.relinearize if (state.counters["updates"][0] + 1) % self.every == 0 else np.inf
+        now = self.relinearize if (int(self._counts[UPDATES]) + 1) % self.every == 0 else np.inf
         rest = self.relinearize, self.wildfire, self._chronological
         if self._batches:
             chain = begin(self._memory, now)
@@ -378,9 +401,8 @@ class Smoother:
 
     def _reserve(self, variables: int, factors: int) -> None:
         """Make the tables long enough; arenas grow by themselves."""
-        state = self._state
-        counters = state.counters
-        variable_end, factor_end, clique_end = (int(counters[end][0]) for end in ENDS)
+        state, counts = self._state, self._counts.tolist()
+        variable_end, factor_end, clique_end = counts[VARIABLE_END], counts[FACTOR_END], counts[CLIQUE_END]
         grown: dict[str, Any] = {}
         if variable_end + variables > len(state.variables):
             grown["variables"] = longer(state.variables, variable_end + variables)
@@ -397,21 +419,22 @@ class Smoother:
         if self._written < len(self._types.fields):
             self._written = len(self._types.fields)
             state.types[: self._written] = np.array(self._types.fields, dtype=TYPE)
-        counters["scratch"] = self._types.scratch
+        self._counts[SCRATCH] = self._types.scratch
 
-    def _move(self, lists: IntArray, numbers: Array) -> None:
+    def _move(self, lists: IntArray | None, numbers: Array | None) -> None:
         """Keep arenas that have grown."""
-        if len(lists) or len(numbers):
+        if lists is not None or numbers is not None:
             self._hold(
                 self._state._replace(
-                    lists=lists if len(lists) else self._state.lists,
-                    numbers=numbers if len(numbers) else self._state.numbers,
+                    lists=self._state.lists if lists is None else lists,
+                    numbers=self._state.numbers if numbers is None else numbers,
                 )
             )
 
     def _hold(self, state: State) -> None:
         """Keep the arrays, and their description for compiled code."""
         self._state, self._words[:] = state, described(state)
+        self._counts = state.counters.view(np.int64)
 
     def _rows(self, selection: Selection, term: str = "") -> IntArray:
         """Rows of the selected members.

@@ -125,6 +125,7 @@ COUNTERS = _record(
     *MADE,
     "scratch",  # numbers that a factor needs while it is evaluated
 )
+PLACE = {name: place for place, name in enumerate(COUNTERS.names or ())}  # all are integers
 CHAINS = (
     "variable_free", "factor_free", "clique_free", "new_variables", "new_factors", "candidates", "priors", "failed",
 )  # fmt: skip

@@ -14,7 +14,7 @@ from unifg.machine.jit import compiled
 from unifg.machine.vectors import Address
 from unifg.smoothing.cliques import add_child, add_factor, begin_clique, eliminate_clique, substitute
 from unifg.smoothing.linear import linearize
-from unifg.smoothing.memory import grown, length_of_front, more
+from unifg.smoothing.memory import found, grown, length_of_front, more
 from unifg.smoothing.state import LINEAR, SLOTS_MAX, opened
 from unifg.smoothing.tree import dissolve, give_up, mark_factor, move_points, sort_by_age
 from unifg.typing import Array, IntArray
@@ -23,7 +23,7 @@ from unifg.typing import Array, IntArray
 @compiled
 def update_tree(
     memory: Address, relinearize: float, limit: float, threshold: float, chronological: bool
-) -> tuple[int, IntArray, Array]:
+) -> tuple[int, IntArray | None, Array | None]:
     """Bring tree and steps up to date with the factors: :func:`begin`, then :func:`renew`."""
     return renew(memory, begin(memory, relinearize), limit, threshold, chronological)
 
@@ -55,7 +55,7 @@ def begin(memory: Address, relinearize: float) -> int:
 @compiled
 def renew(
     memory: Address, chain: int, limit: float, threshold: float, chronological: bool
-) -> tuple[int, IntArray, Array]:
+) -> tuple[int, IntArray | None, Array | None]:
     """Dissolve a chain of cliques, order and eliminate what they held anew, and find the steps.
 
     Args:
@@ -74,7 +74,7 @@ def renew(
     members, orphans = dissolve(memory, chain, update)
     n = len(members)
     if n == 0:
-        return -1, more_lists, more_numbers
+        return -1, found(more_lists), found(more_numbers)
     inside = _whole_factors(memory, members, update)
     pool, pointer = _elements(memory, orphans, inside)
     weight, given, last = np.empty(n, np.int64), np.empty(n if chronological else 0, np.int64), 0
@@ -150,7 +150,7 @@ def renew(
         failed = eliminate_clique(memory, clique, x, pivots, signs)
         if failed >= 0:
             give_up(memory, failed)
-            return failed, more_lists, more_numbers
+            return failed, found(more_lists), found(more_numbers)
         if parent[k] >= 0:
             p = slot_of[parent[k]]
             clique.parent, clique.sibling = p, cliques[p].child
@@ -160,7 +160,7 @@ def renew(
     counters.substituted = n
     for k in range(len(orphans)):
         counters.substituted += _descend(memory, orphans[k], threshold, limit, update)
-    return -1, more_lists, more_numbers
+    return -1, found(more_lists), found(more_numbers)
 
 
 @compiled
