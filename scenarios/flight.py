@@ -148,7 +148,9 @@ class Flight:
             settings.coupling, settings.solver, found.layout, believed, found.nominal, settings.estimator,
             settings.flown,
         )  # fmt: skip
-        self.faults, self.watch = FlightFaults(settings.faults, settings.seed), FlightWatch(settings.controller.dt)
+        self.faults = FlightFaults(settings.faults, settings.seed)
+        self.watch = FlightWatch(settings.controller.dt, settings.estimator.parameters_sigma(found.nominal))
+        self.pilot.pushed = self.watch.pushed
         self._speed = self.pilot.controller.guide.settings
         self._wind = self.world.parameters.wind
         if not rehearsal:
@@ -164,12 +166,10 @@ class Flight:
         )
         self._control: Array | None = None
         self._reached = self._landed = False
-        self._health: list[str] = []
-        self._causes: list[str] = []
         interrupted = run_ticks(round(settings.time_limit / dt), lambda number: self._tick(recorder), progress)
         return recorder.finish(
-            collisions=world.collisions, reached=self._reached, interrupted=interrupted, health=self._health,
-            causes=self._causes, outcome=self._outcome(interrupted), dropped=dict(self.watch.door.dropped),
+            collisions=world.collisions, reached=self._reached, interrupted=interrupted,
+            outcome=self._outcome(interrupted), dropped=dict(self.watch.door.dropped),
         )  # fmt: skip
 
     def _outcome(self, interrupted: bool) -> str:
@@ -193,7 +193,7 @@ class Flight:
         now, (gust_x, gust_y) = world.time, self.faults.wind(world.time)
         world.parameters = replace(world.parameters, wind=(self._wind[0] + gust_x, self._wind[1] + gust_y))
         world.step(self.faults.control(self._control, now), self.settings.controller.dt)
-        self._landed = self.watch.lands and world.state[2] <= 0.0
+        self._landed = self.watch.lands and world.grounded
         if self._landed:
             return None
         if world.collisions >= COLLISIONS:
@@ -224,8 +224,6 @@ class Flight:
             pilot.controller.loop.applied = control.copy()
         else:
             control = plan.control
-        self._health.append(verdict.health.value)
-        self._causes.append(verdict.cause)
         marks = belief.landmarks
         recorder.add(
             truth=world.state,
@@ -244,6 +242,9 @@ class Flight:
             statuses="failed" if plan is None else plan.status.name.lower().replace("_", " "),
             clearance=world.clearance(),
             emergency=plan is None or plan.emergency,
+            health=verdict.health.value,
+            causes=verdict.cause,
+            fault=self.faults.names(world.time),
         )
         return control
 

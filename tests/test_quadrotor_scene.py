@@ -85,6 +85,9 @@ def flight(ticks: int = 24, *, estimated: bool = True, movers: int = 1, reached:
             statuses="converged",
             clearance=1.0 + 0.01 * (k - 12) ** 2,
             emergency=estimated and k in (5, 6),
+            health=("degraded" if k == 7 else "ok") if estimated else "",
+            causes="nothing is seen" if estimated and k == 7 else "",
+            fault="",
         )
     return recorder.finish(collisions=0, reached=reached)
 

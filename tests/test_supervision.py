@@ -6,6 +6,7 @@ import argparse
 import functools
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,19 +16,25 @@ from unifg.models import quadrotor
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.driving.drive_signals import RAMPS, DriveSignals
 from unifg.scenarios.driving.last_stop import LastStop
+from unifg.scenarios.driving.motor_lag import MotorLag
 from unifg.scenarios.driving.relocalise import PORTION, Found, Relocaliser
 from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.flying.flight_watch import FlightWatch
+from unifg.scenarios.flying.unmodelled import Unmodelled
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import episode_metrics
+from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics
 from unifg.scenarios.navigation import Episode, NavigationSettings, askew
 from unifg.scenarios.seeing.belief import Belief, Landmarks
 from unifg.scenarios.seeing.readings import Reading, Scan
+from unifg.scenarios.show.flight_plot import control
+from unifg.scenarios.show.flight_scene import flight_scene
 from unifg.scenarios.supervision.door import Door
 from unifg.scenarios.supervision.supervisor import RISE, STEADY, Health, Ramp, Supervisor
 from unifg.scenarios.worlds.air import QuadrotorWorld
 from unifg.scenarios.worlds.building import building_map
+from unifg.scenarios.worlds.drivetrain import Drivetrain, Wheels
 from unifg.scenarios.worlds.faults import DRIVE_FAULTS, FLIGHT_FAULTS, Fault, one_of
 from unifg.scenarios.worlds.layouts import corridor
 from unifg.scenarios.worlds.plane import World
@@ -36,6 +43,8 @@ from unifg.typing import Array
 BEAMS = 360
 ANGLES = -np.pi + 2.0 * np.pi * np.arange(BEAMS) / BEAMS
 DT = 0.1
+MOST = np.array([0.25, 0.32])  # changes of the velocities in a tick [m/s, rad/s]
+SPREAD = np.array([0.08, 0.1, 0.1, 0.1, 0.5, 0.5, 0.3])  # of parameters that nobody estimates
 
 
 def scan(ranges: Any = 3.0, time: float = 1.0, seed: int = 0) -> Scan:
@@ -174,6 +183,14 @@ def test_a_lost_robot_rests_until_all_has_been_well_for_a_while() -> None:
     assert supervisor.verdict.health is Health.OK and supervisor.verdict.cause == ""
 
 
+def test_a_robot_that_was_lost_goes_on_though_something_else_slows_it_down() -> None:
+    supervisor = Supervisor({"age": Ramp("no scan", 0.1, 0.3, lost=1.0), "slip": Ramp("slips", 0.2, 0.4, least=0.5)})
+    lost = [supervisor.judge({"age": 1.0, "slip": 9.0}) for _ in range(2)][-1]
+    found = [supervisor.judge({"age": 0.0, "slip": 9.0}) for _ in range(STEADY)][-1]
+    assert lost.health is Health.LOST and found.health is Health.DEGRADED
+    assert found.share == RISE and found.cause == "slips"
+
+
 def note(signals: DriveSignals, asked: Array, did: Array, wheels: Array, pose: Array, corrected: bool = True) -> Array:
     """A tick in which the robot ``did`` something; the pose it leads to."""
     heading = np.array([math.cos(pose[2]), math.sin(pose[2])])
@@ -187,7 +204,7 @@ def note(signals: DriveSignals, asked: Array, did: Array, wheels: Array, pose: A
 
 def test_wheels_that_slip_are_told_from_wheels_that_do_not_obey() -> None:
     asked = np.array([1.0, 0.0])
-    slipping, dead, late = DriveSignals(DT), DriveSignals(DT), DriveSignals(DT)
+    slipping, dead, late = (DriveSignals(DT, MOST) for _ in range(3))
     here = there = elsewhere = np.array([2.0, 1.0, 0.5])
     commands = [np.array([min(1.0, 0.25 * k), 0.0]) for k in range(12)]
     for k in range(8):
@@ -201,7 +218,7 @@ def test_wheels_that_slip_are_told_from_wheels_that_do_not_obey() -> None:
 
 
 def test_wheels_that_did_not_obey_are_given_time_twice_as_long_every_time() -> None:
-    signals, pose = DriveSignals(DT), np.zeros(3)
+    signals, pose = DriveSignals(DT, MOST), np.zeros(3)
     stopped = np.zeros(2)
     waits = []
     for _ in range(2):
@@ -213,6 +230,35 @@ def test_wheels_that_did_not_obey_are_given_time_twice_as_long_every_time() -> N
             count += 1
         waits.append(count)
     assert waits[1] == pytest.approx(2 * waits[0], abs=2) and waits[0] * DT == pytest.approx(2.0, abs=0.3)
+
+
+def following(lag: float, asked: Array, scale: float = 1.0) -> MotorLag:
+    """Motors that were asked for velocities (n, 2), and wheels that follow with a lag [s] and are noisy."""
+    motors, wheels = MotorLag(DT, MOST), Wheels(Drivetrain(lag=lag))
+    noise = 0.02 * np.random.default_rng(1).standard_normal(asked.shape)
+    for told, wrong in zip(asked, noise, strict=True):
+        wheels.tell((float(told[0]), float(told[1])))
+        motors.note(told, np.array(wheels.advance(DT)) * (scale + wrong))
+    return motors
+
+
+def test_motors_that_follow_late_are_named_and_wheels_of_the_wrong_size_are_not() -> None:
+    start = np.column_stack([np.minimum(1.0, 0.25 * np.arange(1, 13)), np.zeros(12)])
+    turns = np.column_stack([np.full(60, 0.8), 0.8 * np.sin(0.4 * np.arange(60))])
+    for asked in (start, turns):
+        assert following(0.0, asked).seconds == 0.0
+        for scale in (0.9, 1.1):
+            assert following(0.0, asked, scale).seconds == 0.0 and following(0.0, asked, scale).evidence < 4.0
+    assert following(0.3, start).seconds == pytest.approx(0.3, abs=0.1)
+    assert following(0.3, turns).seconds == pytest.approx(0.3, abs=0.1)
+    steady = following(0.3, np.tile([1.0, 0.0], (20, 1)))
+    assert steady.seconds > 0.0, "the start told it"
+    for _ in range(120):
+        steady.note(np.array([1.0, 0.0]), np.array([1.0, 0.0]))
+    assert steady.seconds == 0.0, "what nothing confirms is forgotten"
+    for _ in range(3):
+        steady.note(np.array([0.0, 0.0]), None)
+    assert steady.seconds == 0.0, "wheels that say nothing accuse nobody"
 
 
 # ----------------------------------------------------------------- the last stop
@@ -407,6 +453,9 @@ def test_a_tick_that_fails_stops_the_robot_and_not_the_record(monkeypatch: pytes
 # ------------------------------------------------------------------- the quadrotor
 
 
+HOVERED = np.array([0.0, 0.0, 0.0, 9.81])  # control
+
+
 def believed(spread: float = 1e-4) -> Belief:
     """A vehicle that flies at 1 m/s, 1.5 m above the floor."""
     state = np.array([0.0, 0.0, 1.5, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
@@ -414,7 +463,7 @@ def believed(spread: float = 1e-4) -> Belief:
 
 
 def test_a_vehicle_that_sees_nothing_stops_in_time_and_lands_after_a_while() -> None:
-    watch, dt, applied = FlightWatch(0.05), 0.05, np.array([0.0, 0.0, 0.0, 9.81])
+    watch, dt, applied = FlightWatch(0.05, SPREAD), 0.05, np.array([0.0, 0.0, 0.0, 9.81])
     for tick in range(10):
         watch.look(reading(), tick * dt, applied, believed())
     assert watch.verdict.cause == ""
@@ -431,7 +480,7 @@ def test_a_vehicle_that_sees_nothing_stops_in_time_and_lands_after_a_while() -> 
     least, most = np.array([-4.0, -4.0, -2.0, 2.0]), np.array([4.0, 4.0, 2.0, 20.0])
     still = replace(believed(), state=np.array([0.0, 0.0, 1.5, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
     assert watch.hover(still, least, most)[3] < 9.81, "it sinks"
-    assert FlightWatch(dt).hover(still, least, most)[3] == pytest.approx(9.81)
+    assert FlightWatch(dt, SPREAD).hover(still, least, most)[3] == pytest.approx(9.81)
 
 
 @pytest.mark.parametrize(
@@ -443,32 +492,95 @@ def test_a_vehicle_that_sees_nothing_stops_in_time_and_lands_after_a_while() -> 
     ],
 )
 def test_readings_say_what_is_the_matter(changed: dict[str, Any], cause: str) -> None:
-    watch = FlightWatch(0.05)
+    watch = FlightWatch(0.05, SPREAD)
     for tick in range(20):
-        watch.look(reading(**(changed if tick else {})), 0.05 * tick, np.zeros(4), believed())
+        watch.look(reading(**(changed if tick else {})), 0.05 * tick, HOVERED, believed())
     assert watch.verdict.cause == cause
 
 
 def test_a_detector_that_sees_ghosts_is_not_followed() -> None:
-    watch = FlightWatch(0.05)
+    watch = FlightWatch(0.05, SPREAD)
     for tick in range(8):
-        watch.look(reading(ids=np.array([0, 1, 50 + 10 * tick]) + tick), 0.05 * tick, np.zeros(4), believed())
+        watch.look(reading(ids=np.array([0, 1, 50 + 10 * tick]) + tick), 0.05 * tick, HOVERED, believed())
     assert watch.verdict.rests and watch.verdict.cause == "the detector sees what was not there before"
-    lost = FlightWatch(0.05)
+    lost = FlightWatch(0.05, SPREAD)
     for tick in range(3):
-        lost.look(reading(), 0.05 * tick, np.zeros(4), believed(4.0))
+        lost.look(reading(), 0.05 * tick, HOVERED, believed(4.0))
     assert lost.verdict.health is Health.LOST and "decimetres" in lost.verdict.cause
     lost.look(None, 0.2, None, believed(math.nan))
     assert lost.verdict.rests and lost.door.dropped["detector: nothing came"] == 1
 
 
-def test_a_flight_without_its_detector_hovers() -> None:
+def felt(force: Array, thrust: float = 9.81, count: int = 3, **changed: Any) -> Unmodelled:
+    """Forces (3,) beyond those of a vehicle at rest, felt for some ticks."""
+    found = Unmodelled(SPREAD)
+    belief = replace(believed(), parameters_sigma=np.full(7, 0.01), **changed)
+    at_rest = replace(belief, state=np.concatenate([belief.state[:7], np.zeros(3)]))
+    for _ in range(count):
+        found.note(np.array([0.0, 0.0, thrust]) + force, thrust, at_rest)
+    return found
+
+
+def test_what_pushes_is_told_from_what_is_missing() -> None:
+    usual = felt(np.array([0.2, -0.1, 0.2]))
+    assert not usual.push.any() and usual.missing == 0.0 and 0.5 < usual.score < 3.0
+    gust = felt(np.array([0.0, 4.0, 0.3]))
+    assert gust.push == pytest.approx([0.0, 4.0], abs=1e-9) and gust.missing == 0.0
+    assert not felt(np.array([0.0, 4.0, 0.0]), count=2).push.any(), "two ticks may be chance"
+    weak = felt(np.array([0.1, 0.0, -0.981]))
+    assert weak.missing == pytest.approx(0.1) and not weak.push.any()
+    unsure = felt(np.array([0.0, 0.0, -0.981]), parameters=quadrotor.Parameters())
+    assert unsure.missing > 0.0
+    blank = Unmodelled(SPREAD)
+    for _ in range(3):
+        blank.note(np.array([0.0, 0.0, 8.9]), 9.81, believed())
+    assert blank.missing == 0.0, "a mass that is known to eight per cent explains it"
+    blank.note(np.full(3, np.nan), 9.81, believed())
+    assert blank.score == 0.0
+    turned = np.array([0.0, 0.0, 1.5, math.cos(0.5), 0.0, 0.0, math.sin(0.5), 0.0, 0.0, 0.0])
+    eastern = felt(np.array([4.0 * math.cos(1.0), -4.0 * math.sin(1.0), 0.0]), state=turned)
+    assert eastern.push == pytest.approx([4.0, 0.0], abs=1e-9), "in the world, not in the body"
+
+
+def test_what_pushes_is_flown_against_at_once() -> None:
+    watch, least, most = FlightWatch(0.05, SPREAD), np.array([-4.0, -4.0, -2.0, 2.0]), np.array([4.0, 4.0, 2.0, 20.0])
+    belief = replace(believed(), parameters_sigma=np.full(7, 0.01))
+    still = replace(belief, state=np.concatenate([belief.state[:7], np.zeros(3)]))
+    assert watch.pushed(still) is still
+    for tick in range(4):
+        pushed = reading(force=np.array([0.0, 4.0 if tick else 0.0, 9.81]))
+        watch.look(pushed, 0.05 * tick, np.array([0.0, 0.0, 0.0, 9.81]), still)
+    assert watch.verdict.cause == "a gust pushes" and watch.verdict.share < 1.0
+    assert watch.pushed(still).parameters.wind == pytest.approx((0.0, 4.0), abs=0.01)
+    assert watch.hover(still, least, most)[0] > 1.0, "it leans against it"
+
+
+def test_a_landing_is_broken_off_when_all_is_well_again_but_not_near_the_floor() -> None:
+    for height, lands in ((1.5, False), (0.4, True)):
+        watch, here = FlightWatch(0.05, SPREAD), believed()
+        here.state[2] = height
+        for tick in range(60):
+            watch.look(None, 0.05 * tick, HOVERED, here)
+        assert watch.lands
+        for tick in range(60, 80):
+            watch.look(reading(), 0.05 * tick, HOVERED, here)
+        assert watch.verdict.health is not Health.LOST and watch.lands is lands
+
+
+def test_a_flight_without_its_detector_hovers_and_its_pictures_say_why(tmp_path: Path) -> None:
     fault = one_of(FLIGHT_FAULTS)("detector-lost@0.5")
     log = Flight(FlightSettings(faults=(fault,), time_limit=1.6)).run(lambda done, text: None)
     speed = np.linalg.norm(log.truth[:, 7:], axis=1)
     assert log.health[11] == "ok" and log.health[14] == "degraded" and log.collisions == 0
     assert speed[-1] < 0.5 * speed[:16].max() and log.outcome == "timed out: nothing is seen"
     assert flight_metrics(log)["causes"] == {"nothing is seen": log.causes.count("nothing is seen")}
+    assert log.fault[9] == "" and log.fault[10:] == ["detector-lost"] * (log.ticks - 10)
+    scene = flight_scene(log)
+    assert scene.facts["health"].endswith("(nothing is seen)") and scene.outcome.endswith("timed out: nothing is seen")
+    figure = control(log)
+    assert any("nothing is seen" in ax.get_title("left") for part in figure.subfigs for ax in part.axes)
+    log.save(path := tmp_path / "flight.npz")
+    assert FlightLog.load(path).causes == log.causes
 
 
 def test_touching_the_floor_softly_is_a_landing() -> None:

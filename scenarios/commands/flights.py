@@ -75,7 +75,7 @@ def summary(log: FlightLog) -> str:
         ("solver, coupling, seed", ", ".join(words)),
         ("target", target + stopped),
         ("outcome", "" if m["outcome"] in ("reached", "interrupted") else m["outcome"]),
-        ("health", health(m) if log.health else ""),
+        ("health", health(m) if any(log.health) else ""),
         ("samples not let in", ", ".join(f"{count} {what}" for what, count in m["dropped_samples"].items())),
         ("collisions", f"{m['collisions']}"),
         ("flown", f"{m['path_length_m']:.2f} m in {m['duration_s']:.2f} s, {m['ticks']} ticks"),

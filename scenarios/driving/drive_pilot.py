@@ -151,7 +151,7 @@ class Pilot(Generic[PlannerT]):
         self.share, self.relocated, self.slowed, self.planless = 1.0, False, False, False
         self.driven = np.zeros(2)
         self._map, self._search = distance_map, Relocaliser(occupancy, distance_map, s.robot_radius)
-        self._signals = DriveSignals(s.dt)
+        self._signals = DriveSignals(s.dt, s.most)
         self._pause, self.search_said = 0, ""
         self._awake = False
         self._first: Scan | None = None

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from unifg.lie import wrap_angle
+from unifg.scenarios.driving.motor_lag import MotorLag
 from unifg.scenarios.supervision.supervisor import Ramp
 from unifg.typing import Array
 
@@ -21,6 +22,7 @@ RAMPS: Mapping[str, Ramp] = {
     "plan": Ramp("no plan", 0.45, 1.0, least=0.3),  # [s] since the last; at rest there is nothing to plan from
     "tick": Ramp("ticks take longer than they last", 1.0, 3.0, least=0.3),  # durations of a tick
     "wheels": Ramp("the robot does not do what it is told", 0.3, 0.5),  # share
+    "lag": Ramp("the motors follow late", 0.05, 0.3, least=0.5),  # [s]; half as fast, braking is as short as without
     "slip": Ramp("the wheels slip", 0.25, 0.6, least=0.4),  # share of the way
     "odometry": Ramp("no odometry", 0.15, 1.0, least=0.3),  # [s]
 }
@@ -37,11 +39,16 @@ HOLD = 2.0  # [s] for which wheels are not trusted again, twice as long every ti
 
 
 class DriveSignals:
-    """The signals of one drive, tick by tick."""
+    """The signals of one drive, tick by tick.
 
-    def __init__(self, dt: float) -> None:
-        """Begin with nothing the matter."""
+    Attributes:
+        motors: how late they follow.
+    """
+
+    def __init__(self, dt: float, most: Array) -> None:
+        """Begin with nothing the matter, in a base whose velocities change by at most (2,) in a tick."""
         self._dt = dt
+        self.motors = MotorLag(dt, most)
         self._fix = self._plan = self._odometry = self._took = 0.0
         self._share, self._spread = 1.0, 0.0
         self._asked: deque[Array] = deque([np.zeros(2)], maxlen=LATELY)
@@ -83,6 +90,7 @@ class DriveSignals:
             return
         self._odometry = 0.0 if trusted else self._odometry + self._dt
         self._asked.append(asked)
+        self.motors.note(asked, wheels if trusted else None)
         done = [wheels if trusted else asked]
         if corrected and self._fixed is not None:  # what it has done, whatever the wheels say
             turned = wrap_angle(pose[2] - self._fixed[2])
@@ -126,6 +134,7 @@ class DriveSignals:
             "plan": self._plan,
             "tick": self._took / self._dt,
             "wheels": HELD if self._held else self._distrust(),
+            "lag": self.motors.seconds,
             "slip": slip,
             "odometry": self._odometry,
         }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from unifg.errors import ScenarioError
@@ -30,6 +31,7 @@ class Pilot:
         tracker: of what moves.
         belief: after the last tick; that of the joint solve, if there is one.
         alone: what the estimator alone says of the last tick.
+        pushed: the belief to plan with, of what is estimated: with what pushes just now and is in no model.
         clock: how long the stages of the last tick took: estimate, with the tracks, and plan.
     """
 
@@ -39,6 +41,7 @@ class Pilot:
         self.tracker = LineTracker(association=estimator.settings.association)
         self.belief: Belief = estimator.belief()
         self.alone = self.belief
+        self.pushed: Callable[[Belief], Belief] = _as_it_is
         self.clock = Stopwatch()
         self.clock.seconds = {"estimate": 0.0, "plan": 0.0}
 
@@ -53,10 +56,16 @@ class Pilot:
         self.belief = self.alone = self.estimator.update(reading, control)
         movers = self.tracker.update(reading, self.alone.state)
         self.clock.split("estimate")
-        plan = self.controller.plan(self.alone, movers)
+        given = self.pushed(self.alone)
+        plan = self.controller.plan(given, movers)
         self.clock.split("plan")
-        self.belief = self.controller.belief
+        told = self.controller.belief
+        self.belief = self.alone if told is given else told
         return plan
+
+
+def _as_it_is(belief: Belief) -> Belief:
+    return belief
 
 
 def make_pilot(

@@ -17,7 +17,7 @@ from unifg.whole import beside
 
 __all__ = ["FlightLog", "LandmarkRow"]
 
-_VERSION = 2
+_VERSION = 3
 
 
 class LandmarkRow(NamedTuple):
@@ -62,8 +62,6 @@ class FlightLog:
         collisions: distinct contact events of the flight.
         reached: the target was reached.
         interrupted: the user stopped the flight before its end.
-        health: what the supervisor makes of the vehicle at each tick: "ok", "degraded" or "lost"; empty without one.
-        causes: why it is not well.
         outcome: what has become of the flight, in words.
         dropped: samples that were not let in, by what was wrong with them.
     """
@@ -75,8 +73,6 @@ class FlightLog:
     collisions: int
     reached: bool
     interrupted: bool = False
-    health: list[str] = field(default_factory=list)
-    causes: list[str] = field(default_factory=list)
     outcome: str = ""
     dropped: dict[str, int] = field(default_factory=dict)
 
@@ -109,6 +105,12 @@ class FlightLog:
     """True where no new plan was to be had and a stored one was flown."""
     clearance: Array = column("m")
     """Distance from the hull to the nearest obstacle or the floor."""
+    health: list[str] = words()
+    """What the supervisor makes of the vehicle: "ok", "degraded" or "lost"; "" without one."""
+    causes: list[str] = words()
+    """Why it is not well."""
+    fault: list[str] = words()
+    """What was made to go wrong just then."""
 
     @property
     def ticks(self) -> int:
@@ -185,6 +187,7 @@ _WORDS = (
     "interrupted",
     "health",
     "causes",
+    "fault",
     "outcome",
     "dropped",
 )

@@ -54,4 +54,7 @@ def course_log(course: Course) -> FlightLog:
         statuses=[c.solution.status.name] * count,
         emergency=np.zeros(count, dtype=bool),
         clearance=c.layout.distance(states[:, :2]) - VEHICLE_RADIUS,
+        health=[""] * count,
+        causes=[""] * count,
+        fault=[""] * count,
     )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +9,7 @@ import numpy as np
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors
 from unifg.scenarios.log.metrics import collision_words
-from unifg.scenarios.show.panels import over_time, plot_clearance, plot_times
+from unifg.scenarios.show.panels import over_time, plot_clearance, plot_times, shade_trouble
 from unifg.style.colours import INK, css
 from unifg.style.figures import dashes, discs, ground, headline, new_axes, new_figure, word
 from unifg.typing import Array
@@ -117,24 +115,10 @@ def plot_controls(log: EpisodeLog, ax: tuple[Axes, Axes] | None = None) -> tuple
         axes.step(log.time, values, where="post", color=css("robot"), lw=1.1)
         axes.set_ylim(-1.18 * limit, 1.18 * limit)
         over_time(log, axes, title, label)
-    _trouble(log, both[0])
+    shade_trouble(both[0], log.dt, log.health, log.cause, "Forward speed")
     if float(log.control[:, 0].min()) >= 0.0:  # it never reversed: show the half that was used
         both[0].set_ylim(-0.08 * log.control_limits[0], 1.18 * log.control_limits[0])
     return both
-
-
-def _trouble(log: EpisodeLog, ax: Axes) -> None:
-    """Shade the time in which the robot could not rely on everything, and say what was the matter longest."""
-    health = np.array(log.health)
-    for state, colour in (("degraded", "moving"), ("lost", "robot")):
-        steps = np.diff(np.concatenate([[0], (health == state).astype(np.int8), [0]]))
-        for begin, end in zip(np.flatnonzero(steps == 1), np.flatnonzero(steps == -1), strict=True):
-            ax.axvspan(begin * log.dt, end * log.dt, color=css(colour), alpha=0.18, lw=0)
-    causes = Counter(cause for cause in log.cause if cause)
-    if causes:
-        states = " and ".join(state for state in ("degraded", "lost") if state in log.health)
-        said = f"Forward speed; {states}: {causes.most_common(1)[0][0]}"
-        ax.set_title(fill(said, 72), fontsize=8)
 
 
 def _obstacles(log: EpisodeLog, ax: Axes) -> None:

@@ -233,7 +233,7 @@ def _say(frame: Frame, log: Any, tick: int) -> None:
     well = log.health[tick] == "ok"
     frame.readout("health", log.health[tick] + (f": {log.cause[tick]}" if log.cause[tick] else ""), alarm=not well)
     if any(log.faults):
-        frame.readout("fault", log.fault[tick] or "none yet")
+        frame.readout("fault", log.fault[tick] or "none now")
     frame.readout("clearance", f"{clearance:.2f} m" if np.isfinite(clearance) else "\u2013")
     frame.readout("contacts", str(int(log.contacts[tick])), alarm=bool(log.contacts[tick]))
     frame.readout("localise, plan", spent + " (compiled)" * bool(log.compiled[tick]), alarm=bool(log.compiled[tick]))

@@ -18,7 +18,7 @@ from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import PARAMETERS, estimated_parameters, has_estimate, state_errors
 from unifg.scenarios.log.metrics import collision_words
 from unifg.scenarios.show.flight_scene import SIGMAS, first_sights, sensor_reach
-from unifg.scenarios.show.panels import over_time, plot_clearance, plot_times
+from unifg.scenarios.show.panels import over_time, plot_clearance, plot_times, shade_trouble
 from unifg.scenarios.worlds.air import VEHICLE_RADIUS
 from unifg.style.colours import GREY, INK, css
 from unifg.style.figures import dashes, discs, ground, headline, key_of, new_axes, new_figure
@@ -76,7 +76,8 @@ def overview(log: FlightLog) -> Figure:
             plot_moment(log, tick, ax=ax, legend=False).label_outer()
         figure.legend(*key_of(grid.flat), loc="outside lower center", ncols=6)
         reached = "target reached" if log.reached else "target not reached"
-        headline(figure, _title(log, f"{reached}, {collision_words(log.collisions)}"))
+        how = "" if log.outcome in ("", "reached", "interrupted") else f", {log.outcome}"
+        headline(figure, _title(log, f"{reached}, {collision_words(log.collisions)}{how}"))
     return figure
 
 
@@ -176,7 +177,8 @@ def plot_moment(log: FlightLog, tick: int, ax: Axes | None = None, *, legend: bo
     ground(ax, log.layout.size[0] - _MARGIN, log.layout.size[1] + _MARGIN)
     speed = float(np.linalg.norm(log.truth[tick, 7:]))
     stored = ", stored plan flown" if log.emergency[tick] else ""
-    ax.set_title(f"{log.time[tick]:.1f} s, {speed:.1f} m/s, height {log.truth[tick, 2]:.1f} m{stored}")
+    said = f"{log.time[tick]:.1f} s, {speed:.1f} m/s, height {log.truth[tick, 2]:.1f} m{stored}"
+    ax.set_title(said + (f"\n{log.health[tick]}: {log.causes[tick]}" if log.causes[tick] else ""))
     if legend:
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=4)
     return ax
@@ -286,7 +288,9 @@ def plot_speed(log: FlightLog, ax: Axes | None = None) -> Axes:
     speed = np.linalg.norm(log.truth[:, 7:], axis=1)
     ax.plot(log.time, speed, color=css("robot"), lw=1.4)
     ax.set_ylim(0.0, 1.12 * max(float(speed.max()), 0.1))
-    return over_time(log, ax, f"Speed, at most {speed.max():.2f} m/s", "[m/s]")
+    over_time(log, ax, f"Speed, at most {speed.max():.2f} m/s", "[m/s]")
+    shade_trouble(ax, log.dt, log.health, log.causes, f"Speed, at most {speed.max():.2f} m/s")
+    return ax
 
 
 def plot_height(log: FlightLog, ax: Axes | None = None) -> Axes:

@@ -15,7 +15,7 @@ import numpy as np
 from unifg.errors import ViewError
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics, has_estimate
-from unifg.scenarios.log.metrics import collision_words
+from unifg.scenarios.log.metrics import collision_words, health
 from unifg.scenarios.worlds.air import VEHICLE_RADIUS
 from unifg.scenarios.worlds.bearing_range import SensorModel
 from unifg.typing import Array
@@ -46,11 +46,13 @@ def flight_scene(log: FlightLog) -> Scene:
         flight_frame(scene, scene.frame(), log, tick)
     reached = "target reached" if m["reached"] else f"{m['target_distance_m']:.1f} m short of the target"
     stopped = ", interrupted by the user" if m["interrupted"] else ""
-    scene.outcome, scene.good = f"{reached}, {collision_words(log.collisions)}{stopped}", m["succeeded"]
+    how = "" if log.outcome in ("", "reached", "interrupted") else f"; {log.outcome}"
+    scene.outcome, scene.good = f"{reached}, {collision_words(log.collisions)}{stopped}{how}", m["succeeded"]
     scene.facts |= {
         "seed": "" if settings.get("seed") is None else str(settings["seed"]),
         "flown": f"{m['path_length_m']:.1f} m in {m['duration_s']:.1f} s",
         "closest approach": f"{max(0.0, m['min_clearance_m']):.2f} m",
+        "health": health(m) if any(log.health) else "",
         "position error": "" if error is None else f"{100 * error['rms']:.1f} cm rms",
         "estimate + plan": f"{tick_ms['p50']:.1f} ms median" if tick_ms["max"] > 0.0 else "",
     }
@@ -246,6 +248,11 @@ def _say(frame: Frame, log: Any, tick: int, estimated: bool) -> None:
     truth, clearance = log.truth[tick], float(log.clearance[tick])
     frame.readout("speed", f"{np.linalg.norm(truth[7:]):.2f} m/s")
     frame.readout("height", f"{truth[2]:.2f} m")
+    if log.health[tick]:
+        state, cause = log.health[tick], log.causes[tick]
+        frame.readout("health", state + (f": {cause}" if cause else ""), alarm=state != "ok")
+    if log.settings.get("faults"):
+        frame.readout("fault", log.fault[tick] or "none now")
     frame.readout("clearance", f"{clearance:.2f} m" if np.isfinite(clearance) else "\u2013")
     frame.readout("thrust", f"{log.controls[tick][3]:.1f} N")
     frame.value("clearance", clearance)

@@ -5,7 +5,9 @@ Panels over time take any log with time, clearance and marks on ticks that had t
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -24,6 +26,7 @@ __all__ = [
     "plot_convergence",
     "plot_times",
     "shade_distance",
+    "shade_trouble",
 ]
 
 
@@ -53,6 +56,27 @@ def over_time(log: Timed, ax: Axes, title: str, y: str) -> Axes:
     for begin, end in zip(np.flatnonzero(steps == 1), np.flatnonzero(steps == -1), strict=True):
         ax.axvspan(begin * log.dt, end * log.dt, color="#000000", alpha=0.12, lw=0)
     return face(ax, title, y)
+
+
+def shade_trouble(ax: Axes, dt: float, health: Sequence[str], causes: Sequence[str], what: str) -> None:
+    """Shade the time in which a robot could not rely on everything; the title says what was the matter longest.
+
+    Args:
+        ax: axes over time.
+        dt: duration of a tick [s].
+        health: "ok", "degraded" or "lost" for every tick.
+        causes: why it was not well, "" where it was.
+        what: is drawn, for the title.
+    """
+    states = np.array(health)
+    for state, colour in (("degraded", "moving"), ("lost", "robot")):
+        steps = np.diff(np.concatenate([[0], (states == state).astype(np.int8), [0]]))
+        for begin, end in zip(np.flatnonzero(steps == 1), np.flatnonzero(steps == -1), strict=True):
+            ax.axvspan(begin * dt, end * dt, color=css(colour), alpha=0.18, lw=0)
+    named = Counter(cause for cause in causes if cause)
+    if named:
+        found = " and ".join(state for state in ("degraded", "lost") if state in health)
+        ax.set_title(fill(f"{what}; {found}: {named.most_common(1)[0][0]}", 72), fontsize=8)
 
 
 def plot_clearance(log: Timed, ax: Axes | None = None) -> Axes:

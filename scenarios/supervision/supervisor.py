@@ -15,7 +15,7 @@ from enum import Enum
 __all__ = ["Health", "Ramp", "Supervisor", "Verdict"]
 
 RISE = 0.1  # of the speed that comes back in a tick
-STEADY = 5  # good ticks in a row, after which a robot that was lost is not
+STEADY = 5  # ticks in a row in which nothing says that it is lost, after which a robot that was is not
 PERSISTENT = 2  # bad ticks in a row that make one lost
 
 
@@ -100,7 +100,9 @@ class Supervisor:
         allowed = shares.get(worst, 1.0)
         lost = [name for name, value in signals.items() if not value < self.ramps[name].lost]
         self._bad = self._bad + 1 if lost else 0
-        self._good = 0 if allowed < 1.0 else self._good + 1
+        # What can make it lost has to be well; what only slows it down may last.
+        placed = all(shares[name] >= 1.0 for name in signals if math.isfinite(self.ramps[name].lost))
+        self._good = self._good + 1 if placed else 0
         before = self.verdict
         is_lost = self._bad >= PERSISTENT or (before.health is Health.LOST and self._good < STEADY)
         if is_lost:

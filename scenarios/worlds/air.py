@@ -57,6 +57,7 @@ class QuadrotorWorld:
         sensor_model: noise and reach of the sensors.
         disturbance_model: statistics of the disturbances.
         movers: what moves.
+        grounded: whether the vehicle has touched the floor in the last step.
     """
 
     def __init__(
@@ -92,6 +93,7 @@ class QuadrotorWorld:
         sensor_rng, disturbance_rng, mover_rng = np.random.default_rng([_WORLD_TAG, seed]).spawn(3)
         self.movers = random_movers(layout, movers, mover_rng) if isinstance(movers, int) else tuple(movers)
         self._disturbances = Disturbances(self.disturbance_model, disturbance_rng)
+        self.grounded = False
         self._state = _start_state(layout, start)
         self._rates, self._force = np.zeros(3), SO3.act(SO3.inverse(self._state[3:7]), UP)
         self._space = space = Space(self._state[:2], VEHICLE_RADIUS)
@@ -149,6 +151,7 @@ class QuadrotorWorld:
             path.append(self._state)
         self._rates = sum(rates, np.zeros(3)) / len(rates)
         self._force = felt_force(np.array(path), np.array(rates), dt / len(rates))
+        self.grounded = any(state[2] <= 0.0 for state in path[1:])
 
     def _collide(self, flown: Array, pause: float) -> Array:
         """Let the disc follow the integrator as far as it can; the state (10,) that is left."""

@@ -1,0 +1,84 @@
+"""Do the motors follow as the data sheet says? An innovation test: what the wheels did, against models of it.
+
+A bank of models is told what the base is told. One follows at once, within its accelerations; the others with a lag of
+first order besides. Each tick leaves, for each of them, half the difference between the squared normalised residuals of
+the first model and its own: the logarithm of their likelihood ratio. Sums that fade over some seconds and never fall
+below zero (Page's test, Biometrika 41 (1954)) name a lag where they exceed a threshold. A base that goes on steadily
+says nothing, as all models agree then.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from unifg.typing import Array
+
+__all__ = ["MotorLag"]
+
+LAGS = np.array([0.0, 0.1, 0.2, 0.3, 0.5])  # [s]
+THRESHOLD = 8.0  # of the logarithm of a likelihood ratio
+MOST = 30.0  # that is kept of it
+MEMORY = 5.0  # [s] over which it fades
+SCALE = 0.06  # relative standard deviation of what wheels say of their velocities
+FLOOR = np.array([0.02, 0.05])  # the same at rest [m/s, rad/s]
+OUTLIER = 9.0  # a squared normalised residual counts as no more than this
+
+
+class MotorLag:
+    """Watches the wheels of one base."""
+
+    def __init__(self, dt: float, most: Array) -> None:
+        """Stand still.
+
+        Args:
+            dt: duration of a tick [s].
+            most: (2,) greatest changes of v and omega in a tick by the data sheet [m/s, rad/s].
+        """
+        self._dt, self._most = dt, most
+        self._follow = np.array([1.0 if lag == 0.0 else -math.expm1(-dt / lag) for lag in LAGS])[:, None]
+        self._velocities = np.zeros((len(LAGS), 2))
+        self._evidence = np.zeros(len(LAGS))
+
+    @property
+    def seconds(self) -> float:
+        """Time constant of the lag that is named [s]; 0 for none."""
+        best = int(np.argmax(self._evidence))
+        return float(LAGS[best]) if self._evidence[best] > THRESHOLD else 0.0
+
+    @property
+    def evidence(self) -> float:
+        """Of the lag that explains the wheels best, against none."""
+        return float(self._evidence.max())
+
+    def note(self, asked: Array, done: Array | None) -> None:
+        """Take in a tick.
+
+        Args:
+            asked: (2,) velocities asked for [m/s, rad/s].
+            done: (2,) mean velocities that the wheels have measured; None where they have not.
+        """
+        expected = self._advance(asked)
+        self._evidence *= math.exp(-self._dt / MEMORY)
+        if done is None:
+            return
+        sigma = FLOOR + SCALE * np.abs(expected[0])
+        squares = np.minimum(np.square((done - expected) / sigma), OUTLIER).sum(axis=1)
+        self._evidence = np.clip(self._evidence + 0.5 * (squares[0] - squares), 0.0, MOST)
+
+    def _advance(self, asked: Array) -> Array:
+        """Mean velocities (models, 2) over a tick."""
+        before = self._velocities
+        wanted = self._follow * (asked - before)
+        change = np.clip(wanted, -self._most, self._most)
+        self._velocities = before + change
+        # At once: a ramp that ends within the tick. With a lag: the exponential where it is not cut.
+        spent = np.divide(np.abs(change), self._most, out=np.zeros_like(change), where=self._most > 0.0)
+        ramp = self._velocities - 0.5 * spent * change
+        mean = np.where(
+            np.abs(wanted) <= self._most,
+            asked - wanted * (LAGS / self._dt)[:, None],
+            0.5 * (before + self._velocities),
+        )
+        return np.concatenate([ramp[:1], mean[1:]])
