@@ -33,7 +33,7 @@ from unifg.machine.tally import tally
 if sys.argv[2] == "sources":
     shipped.ARCHIVE = Path("none")
 from unifg.solvers import InteriorPoint
-text = Path("README.md").read_text(encoding="utf-8").split("```python")[1].split("for solver in")[0]
+text = Path("README.md").read_text(encoding="utf-8").split("```python")[2].split("for solver in")[0]
 exec(text)
 begin = time.process_time()
 for make in json.loads(sys.argv[1]):

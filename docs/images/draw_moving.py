@@ -22,10 +22,11 @@ from PIL import Image
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 HERE = Path(__file__).resolve().parent
-SIZE = (640, 360)
-FRAMES, SECONDS = 72, 9.0  # shown
-VIEW = "robot"  # of those the scene offers; the first where it has none of that name
-COLOURS = 96
+PAGE, SCALE = (640, 360), 1.25  # of a window so narrow that the panel takes no room
+SIZE = (800, 450)
+FRAMES, SECONDS = 90, 10.0  # shown
+VIEW = "overview"  # of those the scene offers; the first where it has none of that name
+COLOURS = 256
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 QUIET = ("--headless", "--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader",
          "--enable-unsafe-swiftshader", "--hide-scrollbars", "--remote-debugging-port=0")  # fmt: skip
@@ -43,7 +44,7 @@ async def film(scene: Path) -> list[Image.Image]:
     if browser is None:
         raise SystemExit("Chromium is needed to film a scene; none of these is there: " + ", ".join(BROWSERS))
     with tempfile.TemporaryDirectory() as home:
-        size = f"--window-size={SIZE[0]},{SIZE[1]}"
+        size = f"--window-size={PAGE[0]},{PAGE[1]}"
         process = subprocess.Popen(
             [browser, *QUIET, size, f"--user-data-dir={home}", scene.resolve().as_uri()],
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
@@ -80,7 +81,7 @@ async def _frames(talk: WebSocketClientConnection) -> list[Image.Image]:
             if answer.get("id") == number:
                 return answer["result"]
 
-    metrics = {"width": SIZE[0], "height": SIZE[1], "deviceScaleFactor": 1, "mobile": False}
+    metrics = {"width": PAGE[0], "height": PAGE[1], "deviceScaleFactor": SCALE, "mobile": False}
     await ask("Emulation.setDeviceMetricsOverride", **metrics)
     duration = None
     while duration is None:  # the page is still being read

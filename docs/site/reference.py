@@ -101,7 +101,7 @@ def told(module: str, name: str) -> str | None:
 
 def _from_above(path: Path) -> str:
     """A page that lies beside this folder, its links led to the pages of the site."""
-    text = path.read_text().replace("](docs/", "](").replace('src="docs/', 'src="')
+    text = path.read_text().replace("](docs/", "](").replace('src="docs/', 'src="').replace('srcset="docs/', 'srcset="')
     return text.replace("](CHANGELOG.md", "](changelog.md").replace("](LICENSE", "](license.md")
 
 
