@@ -6,6 +6,7 @@
 #   make processes    graphs and solutions in other processes, however these begin, with joblib and dask (a minute)
 #   make fuzz     mutated files for every reader, a minute each
 #   make lint     check style (ruff) and types (mypy)
+#   make performance  time what the library does against the record of the checkout; fails for a loss of 15 % (half a minute)
 #   make bench    measure everything again and rewrite the tables in docs/ (long)
 #   make results PAGE=control-cases    measure one page of docs/ again; without PAGE, list them
 #   make stale    name the pages of docs/ whose tables were measured on other sources
@@ -32,7 +33,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Matrices here are small: more threads per process only make the processes wait for each other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: docs kernels help demo test fuzz test-lowest processes lint types bench results stale release-check mutants fences clean offsets examples
+.PHONY: docs kernels performance help demo test fuzz test-lowest processes lint types bench results stale release-check mutants fences clean offsets examples
 .DELETE_ON_ERROR:
 
 help:
@@ -79,6 +80,9 @@ release-check: $(VENV)/ready
 
 kernels: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/unifg warmup --ship
+
+performance: $(VENV)/ready
+	$(ONE_THREAD) $(BIN)/unifg bench --quick --strict
 
 mutants: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/python -m benchmarks.mutants $(FILES)

@@ -5,8 +5,8 @@ its limits), 1 if not, 2 for arguments that cannot be served, 130 after an inter
 written all the same); SIGTERM interrupts, too.
 
 ``unifg campaign`` runs many episodes (0 if every one of them succeeded), ``unifg report`` says what came of them,
-``unifg replay`` shows one of them. What can be run stands in `unifg.scenarios.commands.catalogue`; only the scenario
-that is named is loaded.
+``unifg replay`` shows one of them. ``unifg doctor`` examines the installation, ``unifg bench`` times it. What can be
+run stands in `unifg.scenarios.commands.catalogue`; only the scenario that is named is loaded.
 """
 
 from __future__ import annotations
@@ -53,7 +53,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refuse(f"scenarios need {error.name}: pip install 'unifg[scenarios]'")
     except SystemExit as stop:  # argparse has said what is wrong, or has printed help
         return stop.code if isinstance(stop.code, int) else REFUSED
-    does = {"warmup": _warm_up, "campaign": _campaign, "report": _report, "replay": _replay}
+    does = {
+        "warmup": _warm_up, "campaign": _campaign, "report": _report, "replay": _replay, "doctor": _doctor,
+        "bench": _bench,
+    }  # fmt: skip
     try:
         return does.get(chosen.name, _run)(chosen)
     except UnifgError as error:
@@ -89,8 +92,25 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     other.add_argument("--check", action="store_true", help="say whether these are out of date; compile nothing")
     if list(words[:1]) == ["warmup"]:
         warm.set_defaults(module=import_module("unifg.scenarios.commands.warm"))
+    _add_examinations(commands)
     _add_campaigns(commands)
     return parser
+
+
+def _add_examinations(commands: Any) -> None:
+    """Whether all is well, and how fast."""
+    about = "Say whether all is well: versions, caches, threads, every backend on a problem with a known answer."
+    well = commands.add_parser("doctor", help="whether all is well", description=about, allow_abbrev=False)
+    well.set_defaults(name="doctor")
+    about = "Time what the library does beside a reference, and compare the ratios with a record."
+    fast = commands.add_parser("bench", help="how fast it is here", description=about, allow_abbrev=False)
+    fast.set_defaults(name="bench")
+    fast.add_argument("--quick", action="store_true", help="fewer rounds: less than a minute")
+    fast.add_argument("--against", type=Path, metavar="FILE", help="records to compare with (default: those of unifg)")
+    fast.add_argument("--record", type=Path, metavar="FILE", help="append what is measured to this file")
+    fast.add_argument(
+        "--strict", action="store_true", help="fail if a case is slower than the last record of such a machine"
+    )
 
 
 def _add_campaigns(commands: Any) -> None:
@@ -190,6 +210,38 @@ def _warm_up(chosen: argparse.Namespace) -> int:
         text = ", ".join(f"{count} functions {what}" for count, what in parts if count)
         print(f"{text or 'everything is there: found'} in {time.perf_counter() - began:.1f} s")
     return SUCCEEDED
+
+
+def _doctor(chosen: argparse.Namespace) -> int:
+    """Examine the installation."""
+    from unifg.scenarios.commands import doctor
+
+    with _progress_bar("doctor") as progress:
+        findings = list(doctor.examined(progress))
+    print(doctor.told(findings))
+    return FAILED if any(finding.good is False for finding in findings) else SUCCEEDED
+
+
+def _bench(chosen: argparse.Namespace) -> int:
+    """Time everything and compare it."""
+    from unifg.scenarios.commands import performance
+
+    records = performance.history(chosen.against or performance.HISTORY)
+    with _progress_bar("bench") as progress:
+        now = performance.measured(performance.QUICK if chosen.quick else performance.LONG, progress)
+    alike = performance.last(records, now.machine)
+    then = alike or performance.last(records)
+    rows = performance.compared(now, then) if then is not None else []
+    print(performance.told(now, rows))
+    if then is not None:
+        other = "" if alike else f"; another machine ({then.machine}), so factors say little"
+        print(f"\nmachine: {now.machine}\nrecord: unifg {then.version}, {then.when}{other}")
+    if chosen.record is not None:
+        performance.append(chosen.record, now)
+    slower = [row.name for row in rows if row.slower] if alike else []
+    if slower:
+        print(f"slower by more than {100 * (performance.SLOWER - 1):.0f} %: {', '.join(slower)}")
+    return FAILED if slower and chosen.strict else SUCCEEDED
 
 
 def _run(chosen: argparse.Namespace) -> int:

@@ -101,29 +101,7 @@ def solve(
     time_limit: float = np.inf,
     verbose: bool = False,
 ) -> Solution:
-    """Solve once, with the backend that what the graph states asks for.
-
-    `LevenbergMarquardt` for least squares without constraints, `InteriorPoint` for everything else. Where it ends
-    without a solution, and not for want of time, another one begins at the same guess: `InteriorPoint` after the
-    first, after the second `AugmentedLagrangian`, or `SQP` where a cost is no square. The solution is that of the
-    second one if it converged, else that of the first. What was picked, and for what, stands in ``solution.picked`` and
-    ``solution.report()``, and goes to the logger ``unifg`` at level INFO. Control loops name a backend and
-    prepare it.
-
-    Args:
-        graph: the problem.
-        guess: values per family, ``{x: array, ...}``, or a guess or solution that carries multipliers too.
-        data: values of data for this solve; others keep their defaults.
-        check: raise instead of returning a solution that did not converge.
-        callback: called with every row of the history; returning True ends the solve.
-        tolerance: of the KKT test.
-        time_limit: seconds for both together.
-        verbose: log one line per iteration.
-
-    Raises:
-        GraphError: when the graph, guess or data is malformed.
-        NotConverged: with ``check=True``.
-    """
+    """Do as ``fg.solve`` says."""
     choice = choose(graph, data, tolerance=tolerance, time_limit=time_limit, verbose=verbose)
     logger.info("picked %s for %s", choice.first.name, choice.reason)
     solution = choice.first.solve(graph, guess, data=data, callback=callback)

@@ -144,7 +144,12 @@ def test_wheel_holds_the_packages_and_nothing_else(source: Path, wheel: Path) ->
     maps = [path for kind in ("*.pgm", "*.yaml") for path in (source / "scenarios" / "worlds").glob(kind)]
     assert {path.suffix for path in maps} == {".pgm", ".yaml"}, "no map is shipped"
     expected |= {f"unifg/scenarios/worlds/{path.name}" for path in maps}
-    expected |= {"unifg/py.typed", "unifg/view/live.js", "unifg/view/page.html"}
+    expected |= {
+        "unifg/py.typed",
+        "unifg/view/live.js",
+        "unifg/view/page.html",
+        "unifg/scenarios/commands/performance.jsonl",
+    }
     if (source / "unifg" / "machine" / "kernels.zip").exists():  # what may be missing is compiled on the first use
         expected.add("unifg/machine/kernels.zip")
     assert {name for name in names if ".dist-info/" not in name} == expected

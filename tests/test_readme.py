@@ -1,4 +1,4 @@
-"""The first screen of README.md: a short example that prints what stands below it, and links that outlive a checkout."""
+"""The first screen of README.md: a short example that prints what stands below it, links that outlive a checkout."""
 
 from __future__ import annotations
 

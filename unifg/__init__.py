@@ -11,6 +11,7 @@ print(solution.report())
 """
 
 from collections.abc import Callable as _Callable
+from collections.abc import Mapping as _Mapping
 from importlib import metadata as _metadata
 from pathlib import Path as _Path
 
@@ -18,7 +19,9 @@ from unifg.answers.check import Finding, Report
 from unifg.answers.graph import Graph
 from unifg.answers.history import Iteration
 from unifg.answers.optimality import Optimality, optimality
+from unifg.answers.solution import AnyGuess as _AnyGuess
 from unifg.answers.solution import Guess, NotConverged, Solution
+from unifg.answers.solver import Callback as _Callback
 from unifg.answers.solver import Prepared, Solver
 from unifg.answers.status import Status
 from unifg.answers.verdict import Verdict
@@ -56,6 +59,7 @@ from unifg.lie import (
 )
 from unifg.machine.jit import compiled
 from unifg.smoothing import FixedLag, Incremental
+from unifg.typing import ArrayLike as _ArrayLike
 
 _HERE = _Path(__file__).resolve().parent
 # Where links are lost (Windows, some archives), a checkout finds its side folders beside this one.
@@ -66,8 +70,6 @@ try:
     __version__ = _metadata.version("unifg")
 except _metadata.PackageNotFoundError:  # running from a source tree that was never installed
     __version__ = "0.0.0"
-
-from unifg.solvers.choice import solve  # noqa: E402  # its folder is found by the lines above
 
 __all__ = [
     "DCS",
@@ -130,6 +132,47 @@ __all__ = [
     "warmup",
     "wrap_angle",
 ]
+
+
+def solve(
+    graph: Graph,
+    guess: _AnyGuess,
+    *,
+    data: _Mapping[Data, _ArrayLike] | None = None,
+    check: bool = False,
+    callback: _Callback | None = None,
+    tolerance: float = 1e-6,
+    time_limit: float = float("inf"),
+    verbose: bool = False,
+) -> Solution:
+    """Solve once, with the backend that what the graph states asks for.
+
+    `LevenbergMarquardt` for least squares without constraints, `InteriorPoint` for everything else. Where it ends
+    without a solution, and not for want of time, another one begins at the same guess: `InteriorPoint` after the
+    first, after the second `AugmentedLagrangian`, or `SQP` where a cost is no square. The solution is that of the
+    second one if it converged, else that of the first. What was picked, and for what, stands in ``solution.picked`` and
+    ``solution.report()``, and goes to the logger ``unifg`` at level INFO. Control loops name a backend and
+    prepare it.
+
+    Args:
+        graph: the problem.
+        guess: values per family, ``{x: array, ...}``, or a guess or solution that carries multipliers too.
+        data: values of data for this solve; others keep their defaults.
+        check: raise instead of returning a solution that did not converge.
+        callback: called with every row of the history; returning True ends the solve.
+        tolerance: of the KKT test.
+        time_limit: seconds for both together.
+        verbose: log one line per iteration.
+
+    Raises:
+        GraphError: when the graph, guess or data is malformed.
+        NotConverged: with ``check=True``.
+    """
+    from unifg.solvers import choice  # only who solves this way loads all backends
+
+    options = {"data": data, "check": check, "callback": callback}
+    numbers = {"tolerance": tolerance, "time_limit": time_limit, "verbose": verbose}
+    return choice.solve(graph, guess, **options, **numbers)  # type: ignore[arg-type]  # each as it is declared above
 
 
 def warmup(progress: _Callable[[float, str], object] | None = None) -> None:

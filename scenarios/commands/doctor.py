@@ -1,0 +1,215 @@
+"""Whether an installation is well: ``unifg doctor``.
+
+Versions, what is missing and for what; the caches of compiled functions, where they are, whether they can be written
+and are whole; threads; every backend on a problem with a known answer, and its time beside the recorded one.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+import unifg as fg
+from unifg import models, scenarios, solvers
+from unifg.elimination import fronts
+from unifg.errors import UnifgError
+from unifg.machine import shipped
+from unifg.machine.jit import folder_of
+from unifg.machine.objects import read_sealed
+from unifg.scenarios.commands import performance
+from unifg.scenarios.commands.outcome import Progress
+
+__all__ = ["Finding", "examined"]
+
+NEEDED = ("numpy", "scipy", "numba", "llvmlite", "osqp", "piqp", "qpsolvers")
+OPTIONAL = {  # package: what imports it, and what it is for
+    "matplotlib": ("matplotlib", "pictures: unifg[view]"),
+    "meshcat": ("meshcat", "scenes: unifg[view]"),
+    "pymunk": ("pymunk", "driving scenarios: unifg[scenarios]"),
+    "pillow": ("PIL", "maps and scenarios: unifg[scenarios]"),
+    "pyyaml": ("yaml", "ROS maps: unifg[scenarios]"),
+    "tqdm": ("tqdm", "progress: unifg[scenarios]"),
+    "casadi": ("casadi", "fg.from_casadi: unifg[casadi]"),
+    "distributed": ("distributed", "campaigns on clusters: unifg[campaign]"),
+}
+CORRECT = 1e-5  # of a cost, relative to max(1, cost)
+SECONDS = 2.0  # given to reading the cache
+REPEATS = 7
+SLOW = 2.0  # times the recorded ratio, from which a backend is called slow
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report.
+
+    Attributes:
+        part: heading it stands under.
+        text: what was found.
+        good: False where something is wrong; None where something could be better, or is of another kind.
+    """
+
+    part: str
+    text: str
+    good: bool | None = True
+
+
+def examined(progress: Progress) -> Iterator[Finding]:
+    """Look at everything, part by part."""
+    parts: tuple[tuple[str, Callable[[], Iterator[Finding]]], ...] = (
+        ("versions", _versions), ("caches", _caches), ("threads", _threads), ("backends", _backends),
+    )  # fmt: skip
+    for k, (name, look) in enumerate(parts):
+        progress(k / len(parts), name)
+        yield from look()
+    progress(1.0, "done")
+
+
+def _versions() -> Iterator[Finding]:
+    where = Path(fg.__file__).resolve().parent
+    yield Finding("versions", f"unifg {fg.__version__} in {where}")
+    yield Finding(
+        "versions", f"{platform.python_implementation()} {platform.python_version()} on {platform.platform()}"
+    )
+    missing = [name for name in NEEDED if _version(name) is None]
+    yield Finding("versions", ", ".join(f"{name} {_version(name)}" for name in NEEDED if name not in missing))
+    if missing:
+        yield Finding("versions", f"missing: {', '.join(missing)}; install unifg again", good=False)
+    there = [name for name, (module, _) in OPTIONAL.items() if find_spec(module) is not None]
+    if there:
+        yield Finding("versions", ", ".join(f"{name} {_version(name)}" for name in there))
+    for name, (_, purpose) in OPTIONAL.items():
+        if name not in there:
+            yield Finding("versions", f"{name} is not installed; it is for {purpose}", good=None)
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _caches() -> Iterator[Finding]:
+    folder = folder_of(fronts.factor)
+    if folder is None:
+        yield Finding(
+            "caches",
+            "no folder for compiled functions can be written: every process compiles anew; name one in NUMBA_CACHE_DIR",
+            good=False,
+        )
+    else:
+        yield from _cache(_roots(folder))
+    if shipped.archive().usable:
+        changed = shipped.outdated(Path(fg.__file__).resolve().parent.parent)
+        behind = f"; {len(changed)} files have changed since and are compiled instead" if changed else ""
+        yield Finding(
+            "caches", f"kernels that come half compiled fit this Python and Numba{behind}", not changed or None
+        )
+    else:
+        yield Finding(
+            "caches", "the kernels that come half compiled are of another Python, Numba or platform: a first use "
+            "compiles, which takes minutes once (`unifg warmup`)", good=None,
+        )  # fmt: skip
+
+
+def _roots(folder: Path) -> list[Path]:
+    """Below what the cache lies, when it keeps the functions of one file in a folder: the sources, or one place."""
+    rooms = [Path(next(iter(room.__path__))).resolve() for room in (fg, models, scenarios, solvers)]
+    if any(folder.is_relative_to(room) for room in rooms):
+        return rooms
+    return [Path(os.environ["NUMBA_CACHE_DIR"]) if "NUMBA_CACHE_DIR" in os.environ else folder.parent]
+
+
+def _cache(roots: list[Path]) -> Iterator[Finding]:
+    """Files of compiled functions below folders."""
+    files = sorted({file.resolve() for root in roots for file in root.rglob("*.code")})
+    writable = all(os.access(root if root.exists() else root.parent, os.W_OK) for root in roots)
+    size = sum(file.stat().st_size for file in files)
+    text = f"{len(files)} compiled functions, {size / 1e6:.0f} MB below {roots[0]}"
+    yield Finding("caches", f"{text}, {'writable' if writable else 'which cannot be written'}", writable)
+    began, read, damaged = time.monotonic(), 0, list[Path]()
+    for file in files:
+        if time.monotonic() - began > SECONDS:
+            break
+        read += 1
+        if read_sealed(file) is None:
+            damaged.append(file)
+    if damaged:
+        yield Finding("caches", f"{len(damaged)} of {read} damaged, to be compiled anew: {damaged[0]}", good=None)
+    elif read:
+        yield Finding("caches", f"{'all' if read == len(files) else read} of them read and whole")
+    else:
+        yield Finding("caches", "nothing is compiled yet: `unifg warmup` does it beforehand", good=None)
+
+
+def _threads() -> Iterator[Finding]:
+    affinity = getattr(os, "sched_getaffinity", None)
+    cores = f"{len(affinity(0))} of {os.cpu_count()}" if affinity else f"{os.cpu_count()}"
+    stated = ", ".join(f"{name}={value}" for name, value in performance.threads().items())
+    yield Finding("threads", f"{cores} cores for this process; {stated or 'no limit on threads of linear algebra'}")
+    if "OMP_NUM_THREADS" not in performance.threads():
+        yield Finding(
+            "threads", "matrices here are small: OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 spares what waits for others",
+            good=None,
+        )  # fmt: skip
+    if not getattr(sys, "_is_gil_enabled", lambda: True)():
+        yield Finding("threads", "this Python has no global lock, which nothing here has been tested with", good=None)
+
+
+def _backends() -> Iterator[Finding]:
+    """Every backend from nothing, and repeated beside the reference."""
+    try:
+        record = performance.last(performance.history())
+    except UnifgError:
+        record = None
+    for name, solve, right in performance.self_tests():
+        try:
+            began = time.perf_counter()
+            solution = solve()
+            first = time.perf_counter() - began
+        except Exception as error:  # whatever it is, the others are asked as well
+            yield Finding("backends", f"{name:8} {type(error).__name__}: {error}", good=False)
+            continue
+        off = abs(solution.cost - right) / max(1.0, right)
+        if not solution.converged or off > CORRECT:
+            said = f"{solution.status.name}, cost {solution.cost:.9g} for {right:.9g}"
+            yield Finding("backends", f"{name:8} wrong: {said}", good=False)
+            continue
+        ratio, milliseconds = _pace(solve)
+        text = f"{name:8} right; first {first:6.2f} s, then {milliseconds:6.2f} ms"
+        recorded = None if record is None else record.ratios.get(f"backend {name}")
+        factor = ratio / float(np.median(recorded)) if recorded else 1.0
+        text += f", {factor:.1f} times the recorded" if recorded else ""
+        yield Finding("backends", text, None if factor > SLOW else True)
+
+
+def _pace(solve: Callable[[], object]) -> tuple[float, float]:
+    """Ratio to the reference, and milliseconds of processor time: medians."""
+    ratios, times = list[float](), list[float]()
+    for _ in range(REPEATS):
+        before = performance.seconds(performance.reference)
+        times.append(performance.seconds(solve))
+        ratios.append(times[-1] / before)
+    return float(np.median(ratios)), 1e3 * float(np.median(times))
+
+
+def told(findings: list[Finding]) -> str:
+    """The report."""
+    lines, part = list[str](), ""
+    for finding in findings:
+        if finding.part != part:
+            part = finding.part
+            lines.append(f"{part}:")
+        lines.append(f"  {'  ' if finding.good else '! ' if finding.good is None else 'X '}{finding.text}")
+    wrong = sum(finding.good is False for finding in findings)
+    lines += ["", "all is well" if not wrong else f"{wrong} {'thing is' if wrong == 1 else 'things are'} wrong (X)"]
+    return "\n".join(lines)

@@ -1,0 +1,323 @@
+"""How fast this machine is at what the library does: ``unifg bench``.
+
+Milliseconds differ from machine to machine, and on a shared one from minute to minute. So every case is measured right
+after a reference that does the same everywhere, a little arithmetic in Python and a little in NumPy, both in processor
+time, and what counts is the ratio. A record is a line of a file: the ratios of all rounds, and the kind of machine.
+Against one of the same kind, a case is slower if the 95 % bootstrap interval of the ratio of its medians lies
+above `SLOWER`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+import unifg as fg
+from unifg.errors import ScenarioError
+from unifg.models import obstacles, unicycle
+from unifg.pose_graphs import manhattan
+from unifg.scenarios.commands.outcome import Progress
+from unifg.solvers.names import TABLE, backend
+from unifg.typing import Array
+
+__all__ = ["HISTORY", "SLOWER", "Case", "Record", "cases", "compared", "measured", "reference", "self_tests"]
+
+HISTORY = Path(__file__).with_name("performance.jsonl")
+SLOWER = 1.15  # times the recorded ratio
+QUICK, LONG = 21, 101  # rounds
+RESAMPLES = 2000
+
+Action: TypeAlias = Callable[[], object]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Something that is timed.
+
+    Attributes:
+        name: in tables and files.
+        action: some milliseconds long, ready to be called again and again.
+    """
+
+    name: str
+    action: Action
+
+
+@dataclass(frozen=True)
+class Record:
+    """What was measured once.
+
+    Attributes:
+        version: of unifg.
+        when: ISO date.
+        machine: kind: processor, Python and what compiles.
+        milliseconds: medians by case, and of the reference.
+        ratios: of every round to the reference, by case.
+    """
+
+    version: str
+    when: str
+    machine: str
+    milliseconds: dict[str, float]
+    ratios: dict[str, list[float]]
+
+    def line(self) -> str:
+        """As a file keeps it."""
+        rounded = {name: [round(value, 4) for value in row] for name, row in self.ratios.items()}
+        return json.dumps(asdict(self) | {"ratios": rounded})
+
+
+def machine() -> str:
+    """What has to be the same for two ratios to be compared."""
+    name = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        name = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass  # systems that tell otherwise, or nothing
+    python = (
+        f"{platform.python_implementation()} {platform.python_version_tuple()[0]}.{platform.python_version_tuple()[1]}"
+    )
+    return f"{platform.system()}, {name}, {python}, numpy {np.__version__}, numba {metadata.version('numba')}"
+
+
+def reference() -> float:
+    """A little of everything that a solve is made of, the same everywhere."""
+    total = 0.0
+    for k in range(12000):
+        total += (k % 7) * 0.5
+    matrix = np.eye(48) * 4.0 + np.add.outer(np.arange(48.0), np.arange(48.0)) / 48.0
+    for _ in range(12):
+        total += float(np.linalg.solve(matrix, matrix[0])[0])
+        total += float(np.sin(matrix).sum())
+    return total
+
+
+def self_tests() -> Iterator[tuple[str, Callable[[], fg.Solution], float]]:
+    """For every backend a problem it can take, of kernels that ship: name, solve, and the cost that is right."""
+    for name, entry in TABLE.items():
+        graph, guess, cost = (
+            _ring() if entry.made_by.constraints == "none" else _rim(entry.made_by.constraints == "all")
+        )
+        solver: Any = entry.made_by()
+        yield name, partial(solver.solve, graph, guess), cost
+
+
+def _ring() -> tuple[fg.Graph, dict[fg.Family, Array], float]:
+    """Eight poses on a circle that close without contradiction."""
+    graph, count = fg.Graph(), 8
+    x = graph.variables("x", fg.SE2, count)
+    step = np.array([1.0, 0.0, 2.0 * np.pi / count])
+    truth = [np.zeros(3)]
+    while len(truth) < count:
+        truth.append(fg.SE2.compose(truth[-1], step))
+    graph.fix(x[0], truth[0])
+    graph.minimize(fg.between, x[:-1], x[1:], step, sigma=0.1, robust=fg.TruncatedLeastSquares(3.0), name="steps")
+    graph.minimize(fg.between, x[-1], x[0], step, sigma=0.1, name="closure")
+    return graph, {x: 0.98 * np.array(truth)}, 0.0
+
+
+def _rim(inequality: bool) -> tuple[fg.Graph, dict[fg.Family, Array], float]:
+    """The pose on a disc, or on its rim, nearest to one outside."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE2, 1)
+    graph.minimize(fg.prior, x, [1.0, 1.0, 0.0], name="wish")
+    lower = -np.inf if inequality else 0.0
+    graph.constrain(obstacles.disc_clearance, x, [[0.0, 0.0]], [1.0], lower=lower, upper=0.0, name="rim")
+    return graph, {x: np.array([[0.6, 0.9, 0.1]])}, 0.5 * (np.sqrt(2.0) - 1.0) ** 2
+
+
+def cases() -> list[Case]:
+    """Everything that is timed; solves are run once beforehand, so nothing compiles later."""
+    found = [Case(f"backend {name}", solve) for name, solve, _ in self_tests()]
+    found += [Case(f"tick {name}", _tick(name)) for name in ("ipm", "alm", "sqp")]
+    found += [Case("pose graph", _poses()), Case("covariances", _covariances()), Case("smoothing", _smooth)]
+    found.append(Case("statement", _state))
+    for case in found:
+        case.action()
+    return found
+
+
+def _drive() -> tuple[fg.Graph, fg.Data, dict[fg.Family, Array]]:
+    """A unicycle that keeps off a disc."""
+    graph, nodes, dt = fg.Graph(), 30, 0.1
+    x, u = graph.variables("x", fg.SE2, nodes + 1), graph.variables("u", fg.Rn(2), nodes)
+    here = graph.data("here", [0.0, 0.0, 0.0])
+    graph.fix(x[0], here)
+    graph.minimize(fg.prior, x[1:], [2.5, 0.4, 0.0], sigma=1.0, name="goal")
+    graph.minimize(fg.prior, u, [0.0, 0.0], sigma=2.0, name="effort")
+    graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], dt, lower=0, upper=0, name="motion")
+    graph.constrain(obstacles.disc_clearance, x[1:], [[1.2, 0.1]], [0.3], lower=0, name="disc")
+    graph.bound(u, lower=-1.5, upper=1.5, name="limits")
+    controls = np.tile([0.8, 0.1], (nodes, 1))
+    return graph, here, {x: unicycle.rollout(np.zeros(3), controls, dt), u: controls}
+
+
+def _tick(name: str) -> Action:
+    """Five ticks from a solution, each a little ahead."""
+    graph, here, guess = _drive()
+    run = backend(name, tolerance=1e-4).prepare(graph)
+    start = run.solve(guess)
+
+    def ticks() -> None:
+        last: Any = start
+        for k in range(5):
+            last = run.solve(last, data={here: [0.02 * k, 0.01 * k, 0.0]})
+
+    return ticks
+
+
+def _poses() -> Action:
+    """A city of 300 poses by Levenberg and Marquardt."""
+    graph, _, guess = manhattan(300).pose_graph.graph()
+    run = backend("lm").prepare(graph)
+    return lambda: run.solve(guess)
+
+
+def _covariances() -> Action:
+    """The covariance of every pose of one."""
+    graph, x, guess = manhattan(300).pose_graph.graph()
+    run = backend("lm", max_iterations=2).prepare(graph)
+    return lambda: run.solve(guess).marginals(x)
+
+
+def _smooth() -> None:
+    """Fifteen updates of an incremental estimate."""
+    smoother = fg.Incremental()
+    x = smoother.variables("x", fg.SE2)
+    for k in range(15):
+        pose = [0.5 * k, 0.0, 0.0]
+        if k == 0:
+            smoother.minimize(fg.prior, x[0], pose, sigma=0.1)
+        else:
+            smoother.minimize(fg.between, x[k - 1], x[k], [0.5, 0.0, 0.0], sigma=0.1)
+        smoother.update({x: pose})
+
+
+def _state() -> None:
+    """A graph from its first line to its program."""
+    _drive()[0].compile()
+
+
+def measured(rounds: int, progress: Progress) -> Record:
+    """Time everything, in turn, each beside the reference."""
+    progress(0.0, "compiling")
+    found = cases()
+    rng = np.random.default_rng(0)
+    ratios: dict[str, list[float]] = {case.name: [] for case in found}
+    spent: dict[str, list[float]] = {name: [] for name in ("reference", *ratios)}
+    for k in range(rounds):
+        progress(k / rounds, f"round {k + 1} of {rounds}")
+        for index in rng.permutation(len(found)):
+            case = found[index]
+            before, took, after = seconds(reference), seconds(case.action), seconds(reference)
+            ratios[case.name].append(2.0 * took / (before + after))
+            spent[case.name].append(took)
+            spent["reference"] += [before, after]
+    progress(1.0, "done")
+    milliseconds = {name: round(1e3 * float(np.median(times)), 4) for name, times in spent.items()}
+    return Record(fg.__version__, datetime.now(UTC).date().isoformat(), machine(), milliseconds, ratios)
+
+
+def seconds(action: Action) -> float:
+    began = time.process_time()
+    action()
+    return time.process_time() - began
+
+
+def history(file: Path = HISTORY) -> list[Record]:
+    """Records on file, the oldest first.
+
+    Raises:
+        ScenarioError: for a line that is none.
+    """
+    try:
+        lines = file.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise ScenarioError(f"{file}: cannot be read ({error.strerror})") from error
+    try:
+        return [Record(**json.loads(line)) for line in lines if line.strip()]
+    except (ValueError, TypeError) as error:
+        raise ScenarioError(f"{file}: holds a line that is no record of `unifg bench` ({error})") from error
+
+
+def append(file: Path, record: Record) -> None:
+    """Add a record to a file.
+
+    Raises:
+        ScenarioError: when it cannot be written.
+    """
+    try:
+        with file.open("a", encoding="utf-8") as opened:
+            opened.write(record.line() + "\n")
+    except OSError as error:
+        raise ScenarioError(f"{file}: cannot be written ({error.strerror})") from error
+
+
+def last(records: list[Record], kind: str | None = None) -> Record | None:
+    """The newest record, of one kind of machine if that is named."""
+    return next((record for record in reversed(records) if kind in (None, record.machine)), None)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A case now and as it was.
+
+    Attributes:
+        name: of the case.
+        factor: of the median ratios, above one where it is slower now.
+        low, high: 95 % bootstrap interval of that.
+    """
+
+    name: str
+    factor: float
+    low: float
+    high: float
+
+    @property
+    def slower(self) -> bool:
+        """Whether there is no doubt about it."""
+        return self.low > SLOWER
+
+
+def compared(now: Record, then: Record) -> list[Comparison]:
+    """Every case that both have."""
+    rng, rows = np.random.default_rng(0), []
+    for name in now.ratios.keys() & then.ratios.keys():
+        new, old = np.array(now.ratios[name]), np.array(then.ratios[name])
+
+        def medians(values: Array) -> Array:
+            return np.asarray(np.median(rng.choice(values, (RESAMPLES, len(values))), axis=1))
+
+        low, high = np.quantile(medians(new) / medians(old), [0.025, 0.975])
+        rows.append(Comparison(name, float(np.median(new) / np.median(old)), float(low), float(high)))
+    return sorted(rows, key=lambda row: row.name)
+
+
+def told(now: Record, rows: list[Comparison]) -> str:
+    """A table: time, times the reference, and that over the record."""
+    beside = {row.name: row for row in rows}
+    lines = [f"{'case':18} {'ms':>9} {'x reference':>12}  over the record"]
+    for name, ratios in now.ratios.items():
+        row = beside.get(name)
+        against = "-" if row is None else f"{row.factor:.2f} ({row.low:.2f} to {row.high:.2f})"
+        mark = "  SLOWER" if row is not None and row.slower else ""
+        lines.append(f"{name:18} {now.milliseconds[name]:9.3f} {float(np.median(ratios)):12.3f}  {against}{mark}")
+    return "\n".join(lines)
+
+
+def threads() -> dict[str, str]:
+    """What decides how many threads linear algebra takes."""
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+    return {name: os.environ[name] for name in names if name in os.environ}
