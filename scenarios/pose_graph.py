@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from scipy.special import chdtri
 
 from unifg.answers.history import Iteration
 from unifg.answers.solution import Solution
@@ -22,7 +21,8 @@ from unifg.files.contents import legible
 from unifg.files.pose_graph import read_pose_graph
 from unifg.kernels.robust import DCS, Cauchy, Huber, Loss, TruncatedLeastSquares, Tukey
 from unifg.pose_graphs.certificate import Certificate, certify
-from unifg.pose_graphs.initialise import best_guess, chordal, lago, odometric
+from unifg.pose_graphs.information import REPAIRS, Repair, indefinite
+from unifg.pose_graphs.initialise import chordal, lago, odometric, starts
 from unifg.pose_graphs.judgement import Judgement, judge
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
 from unifg.pose_graphs.relaxation import admit
@@ -68,6 +68,8 @@ class SolveSettings:
             that costs least, but for the tree.
         residual: full logarithm, as GTSAM, or the chart of g2o; their optima differ in 3D.
         tolerance: "optimum", to all digits, or "map", until a step would lower the cost by less than 1e-5 of it.
+        repair_information: what to do about information matrices with negative eigenvalues: leave these measurements
+            out, or keep what is left without them. By default such a file is refused.
         max_iterations: before giving up.
         no_scene: leave out the scene and the picture, which take longer than the solve.
         certify: see whether another map could be better, by the dual of the chordal relaxation.
@@ -80,6 +82,7 @@ class SolveSettings:
     init: str = option(AUTO, choices=(AUTO, *GUESSES))
     residual: ResidualName = option("log")
     tolerance: Literal["optimum", "map"] = option("optimum")
+    repair_information: Repair | None = option(None, choices=REPAIRS)
     max_iterations: int = option(100, metavar="N")
     no_scene: bool = option(False)
     certify: bool = option(False)
@@ -94,9 +97,11 @@ class SolvedGraph:
         settings: what was asked.
         before: the graph at its first guess.
         after: the graph at the solution.
-        chi2: sum of r' Omega r, without losses: in the file, at the first guess, at the solution.
+        chi2: sum of r' Omega r, without losses: in the file, NaN where it has no poses, at the first guess, and at the
+            solution.
         solution: what the backend returned.
         loss: on the loop closures; None for none.
+        squared: (m,) r' Omega r of every edge at the solution.
         outliers: (m,) edges that the loss gives less than half of their weight.
         steps: (k, n, storage) poses of up to a dozen iterates, the first guess and the solution among them.
         step_numbers: (k,) iteration of each.
@@ -112,6 +117,7 @@ class SolvedGraph:
     chi2: tuple[float, float, float]
     solution: Solution
     loss: Loss | None
+    squared: Array
     outliers: BoolArray
     steps: Array
     step_numbers: list[int]
@@ -128,7 +134,7 @@ class SolvedGraph:
     @property
     def chi2_inliers(self) -> float:
         """chi2 at the solution without the outliers."""
-        return self.chi2[2] - float(self.after.squared_errors(self.settings.residual)[self.outliers].sum())
+        return self.chi2[2] - float(self.squared[self.outliers].sum())
 
     @property
     def interrupted(self) -> bool:
@@ -150,8 +156,11 @@ def solve_file(settings: SolveSettings, progress: Progress = silent) -> SolvedGr
     """
     clock = Stopwatch()
     progress(0.0, f"reading {legible(settings.file.name)}")
-    read = read_pose_graph(settings.file)
+    read = read_pose_graph(settings.file, repair=settings.repair_information)
     clock.split("read")
+    weights = [read.edges.information, *(seen.information for seen in read.sightings.values())]
+    if any(indefinite(information).any() for information in weights):
+        raise ScenarioError(f"{settings.file}: {'; '.join(read.remarks)}: --repair-information zero or project")
     if not len(read.edges) and not read.sightings:
         raise ScenarioError(f"{settings.file}: there is no edge in this file, and nothing to solve")
     loss = robust_loss(settings.robust, read.group.dim)
@@ -159,18 +168,22 @@ def solve_file(settings: SolveSettings, progress: Progress = silent) -> SolvedGr
         admit(read)  # nobody should wait for a solve to be told
     if settings.init == "lago" and read.group.dim != 3:
         raise ScenarioError("--init lago is for planar pose graphs; use --init chordal")
-    in_file = read.chi2(settings.residual)
     progress(0.05, f"first guess: {settings.init}")
     clock.start()
     if settings.init == AUTO:
-        begun, poses = best_guess(read, settings.residual, loss)
+        found = starts(read, settings.residual, loss)
+        best = min(found, key=lambda start: start.cost)
+        begun, before, in_file, at_start = best.name, read.with_poses(best.poses), found[0].chi2, best.chi2
     else:
-        begun, poses = settings.init, GUESSES[settings.init](read)
-    before = read.with_poses(poses)
+        begun, before, in_file = (
+            settings.init,
+            read.with_poses(GUESSES[settings.init](read)),
+            read.chi2(settings.residual),
+        )
+        at_start = in_file if begun == "file" else before.chi2(settings.residual)
     clock.split("initialise")
-    at_start = before.chi2(settings.residual)
     solve = _Solve(settings, loss, clock, progress)
-    solution, after, outliers = solve(before)
+    solution, after, squared, outliers = solve(before)
     certificate = None
     if (settings.certify or settings.staircase) and solution.status is not Status.INTERRUPTED:
         progress(0.95, "is another map better?")
@@ -178,14 +191,14 @@ def solve_file(settings: SolveSettings, progress: Progress = silent) -> SolvedGr
         certificate = certify(after, used=~outliers, staircase=settings.staircase)
         clock.split("certify")
         if certificate.rank > read.group.point_dim:
-            solution, after, outliers = solve(before.with_poses(certificate.poses))
+            solution, after, squared, outliers = solve(before.with_poses(certificate.poses))
     with suppress(KeyboardInterrupt):  # there is something to write
         progress(1.0, solution.status.name.lower().replace("_", " "))
     numbers, steps = solve.snapshots.chosen()
-    chi2 = (in_file, at_start, after.chi2(settings.residual))
+    chi2 = (in_file if read.placed else np.nan, at_start, float(squared.sum()) + after.seen_chi2())
     judgement = judge(replace(after, edges=after.edges[~outliers]), settings.residual)
     return SolvedGraph(
-        settings, before, after, chi2, solution, loss, outliers, steps, numbers, begun, judgement, certificate,
+        settings, before, after, chi2, solution, loss, squared, outliers, steps, numbers, begun, judgement, certificate,
         clock.seconds,
     )  # fmt: skip
 
@@ -197,8 +210,8 @@ class _Solve:
         self.settings, self.loss, self.clock, self.progress = settings, loss, clock, progress
         self.snapshots, self.before = _Snapshots(), 0
 
-    def __call__(self, begin: PoseGraph) -> tuple[Solution, PoseGraph, BoolArray]:
-        """The solution, the graph at it, and (m,) which edges the loss takes for outliers."""
+    def __call__(self, begin: PoseGraph) -> tuple[Solution, PoseGraph, Array, BoolArray]:
+        """The solution, the graph at it, (m,) its r' Omega r and which edges the loss takes for outliers."""
         settings, loss, clock = self.settings, self.loss, self.clock
         clock.start()
         graph, x, guess = begin.graph(robust=loss, residual=settings.residual)
@@ -224,7 +237,7 @@ class _Solve:
         weights = np.ones(len(errors)) if loss is None else np.asarray(loss.weight(errors))
         self.before += solution.iterations
         self.snapshots.add(self.before, after.poses)
-        return solution, after, (weights < OUTLIER_WEIGHT) & ~begin.edges.odometry
+        return solution, after, errors, (weights < OUTLIER_WEIGHT) & ~begin.edges.odometry
 
 
 def robust_loss(text: str | None, dim: int) -> Loss | None:
@@ -243,7 +256,7 @@ def robust_loss(text: str | None, dim: int) -> Loss | None:
     if name not in LOSSES:
         raise ScenarioError(f"--robust {text}: expected one of {', '.join(LOSSES)}, with :PARAMETER if you like")
     if ":" not in text:
-        return LOSSES[name](_DEFAULTS.get(name, float(chdtri(dim, 1.0 - _INLIERS)) ** 0.5))
+        return LOSSES[name](_DEFAULTS[name] if name in _DEFAULTS else _threshold(dim))
     try:
         value = float(parameter)
     except ValueError:
@@ -251,6 +264,13 @@ def robust_loss(text: str | None, dim: int) -> Loss | None:
     if not 0.0 < value < np.inf:
         raise ScenarioError(f"--robust {text}: {parameter!r} is not a positive number")
     return LOSSES[name](value)
+
+
+def _threshold(dim: int) -> float:
+    """The length of a whitened residual that a share of right measurements stays below."""
+    from scipy.special import chdtri  # slow to load, and seldom asked
+
+    return float(np.sqrt(chdtri(dim, 1.0 - _INLIERS)))
 
 
 class _Snapshots:

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.errors import FileFormatError
+from unifg.errors import FileFormatError, GraphError
 from unifg.files.g2o import read_g2o, write_g2o
 from unifg.files.pose_graph import read_pose_graph
 from unifg.files.toro import read_toro, write_toro
-from unifg.pose_graphs import Edges, PoseGraph, Sightings
+from unifg.pose_graphs import Edges, PoseGraph, Sightings, indefinite, sphere
 
 PLANAR = """\
 # two poses and a tree
@@ -153,8 +153,8 @@ def test_unknown_tags_are_counted_and_named_once(tmp_path: Path, caplog: pytest.
     with caplog.at_level(logging.WARNING, "unifg"):
         graph = read_g2o(write(tmp_path, text))
     assert graph.skipped == {"VERTEX_CAM": 2, "EDGE_SOMETHING": 1}
-    (record,) = caplog.records
-    assert "EDGE_SOMETHING (1), VERTEX_CAM (2)" in record.getMessage()
+    (said,) = [record.getMessage() for record in caplog.records if "tags are not read" in record.getMessage()]
+    assert "EDGE_SOMETHING (1), VERTEX_CAM (2)" in said
 
 
 @pytest.mark.parametrize(
@@ -278,3 +278,90 @@ def test_information_off_the_diagonal(shared_data: Path) -> None:
     for row in range(6):
         expected[row, row + 1 :] = expected[row + 1 :, row] = row + 1
     np.testing.assert_array_equal(graph.edges.information[0], expected)
+
+
+STEPS = "EDGE_SE2 {} {} 1 0 0.5 100 0 0 100 0 400\n"
+
+
+def test_measurements_alone_are_enough(tmp_path: Path) -> None:
+    text = "".join(STEPS.format(k, k + 1) for k in (12, 10, 11)) + "EDGE_SE2 10 13 9 9 0 1 0 0 1 0 1\n"
+    graph = read_g2o(write(tmp_path, text))
+    assert graph.ids.tolist() == [10, 11, 12, 13] and not graph.placed
+    assert graph.edges.odometry.tolist() == [True, True, True, False]
+    assert graph.poses[0].tolist() == [0, 0, 0]
+    np.testing.assert_allclose(graph.poses[1:3], [[1, 0, 0.5], [1 + np.cos(0.5), np.sin(0.5), 1.0]])
+    assert graph.squared_errors()[:3] == pytest.approx(0.0, abs=1e-20)
+    assert read_g2o(write_g2o(tmp_path / "again.g2o", graph)).placed
+    sim = sphere(3, 5).pose_graph
+    lines = [line for line in write_g2o(tmp_path / "s.g2o", sim).read_text().splitlines() if "VERTEX" not in line]
+    spatial = read_g2o(write(tmp_path, "\n".join(lines)))
+    np.testing.assert_allclose(
+        spatial.chi2(), sim.chi2(), rtol=1e-9
+    )  # the poses of a simulated graph are the same tree
+    toro = read_toro(write(tmp_path, "EDGE2 3 4 1 0 0.5 100 0 100 400 0 0\nEDGE2 4 5 1 0 0.5 100 0 100 400 0 0\n"))
+    assert toro.ids.tolist() == [3, 4, 5] and toro.poses[2, 2] == 1.0 and not toro.placed
+
+
+def test_landmarks_alone_hold_no_poses_together(tmp_path: Path) -> None:
+    seen = "EDGE_SE2_XY {} 9 1 0 1 0 1\n"
+    text = STEPS.format(0, 1) + STEPS.format(3, 4) + seen.format(1) + seen.format(3)
+    with pytest.raises(FileFormatError, match=r"no poses to start from, and pose 3 is connected .* landmarks"):
+        read_g2o(write(tmp_path, text))
+    with pytest.raises(FileFormatError, match="there is no landmark 9"):
+        read_g2o(write(tmp_path, STEPS.format(0, 1) + "EDGE_RANGE_SE2_XY 0 9 1 1\n"))  # nobody knows where
+    with pytest.raises(FileFormatError, match="vertex 1 is defined twice"):
+        read_g2o(write(tmp_path, STEPS.format(0, 1) + "EDGE_SE2_XY 0 1 1 0 1 0 1\n"))
+
+
+def test_tags_of_gtsam_hold_covariances(tmp_path: Path) -> None:
+    text = "ODOMETRY 0 1 1 0 0 0.01 0 0 0.04 0.01 0.25\nODOMETRY 1 3 1 0 0.5 0.01 0 0 0.04 0 0.25\n"
+    text += "LANDMARK 1 2 2 1 0.5 0 2\n"
+    graph = read_g2o(write(tmp_path, text))
+    assert graph.ids.tolist() == [0, 1, 3] and graph.landmark_ids.tolist() == [2] and graph.edges.odometry.all()
+    np.testing.assert_allclose(graph.landmarks, [[3.0, 1.0]])
+    covariance = np.array([[0.01, 0, 0], [0, 0.04, 0.01], [0, 0.01, 0.25]])
+    np.testing.assert_allclose(graph.edges.information[0], np.linalg.inv(covariance))
+    np.testing.assert_allclose(graph.sightings["point"].information[0], np.diag([2.0, 0.5]))
+    for line, message in (
+        ("LANDMARK 1 2 2 1 0.5 3 2\n", "line 4: LANDMARK: the covariance .* not positive definite"),
+        ("ODOMETRY 3 4 1 0 0 0 0 0 1 0 1\n", "line 4: ODOMETRY: the covariance"),
+    ):
+        with pytest.raises(FileFormatError, match=message):
+            read_g2o(write(tmp_path, text + line))
+
+
+def test_indefinite_information_is_named_and_repaired(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    text = STEPS.format(0, 1) + "EDGE_SE2 1 2 1 0 0.5 2 0 0 -1 0 3\n" + STEPS.format(2, 3)
+    path = write(tmp_path, text)
+    with caplog.at_level(logging.WARNING, "unifg"):
+        left = read_g2o(path)
+    assert "1 of 3 information matrices of edges are indefinite: line 2 (1 - 2)" in caplog.text
+    assert left.edges.information[1, 1, 1] == -1.0 and "repair='zero'" in left.remarks[0]
+    zero, kept = (read_g2o(path, repair=how) for how in ("zero", "project"))
+    assert not zero.edges.information[1].any() and "no say" in zero.remarks[0]
+    np.testing.assert_allclose(kept.edges.information[1], np.diag([2.0, 0.0, 3.0]), atol=1e-15)
+    np.testing.assert_array_equal(zero.edges.information[[0, 2]], left.edges.information[[0, 2]])
+    assert not indefinite(kept.edges.information).any()
+    clean = write(tmp_path, STEPS.format(0, 1))
+    assert read_g2o(clean, repair="zero").remarks == ()
+    with pytest.raises(GraphError, match="'zero' or 'project'"):
+        read_g2o(path, repair="remove")  # type: ignore[arg-type]
+
+
+def test_edges_that_may_not_be_meant_are_remarked(tmp_path: Path) -> None:
+    text = STEPS.format(0, 1) + STEPS.format(1, 2) + STEPS.format(1, 1) + STEPS.format(0, 1)
+    graph = read_g2o(write(tmp_path, text + "EDGE_SE2 0 1 1 0 0.6 100 0 0 100 0 400\n"))  # measured twice, and so kept
+    assert len(graph.edges) == 5
+    own, twice = graph.remarks
+    assert "1 edge joins its pose with itself, first in line 3 (1)" in own
+    assert "1 edge repeats another word by word, first in line 4 (0 - 1)" in twice
+
+
+def test_many_tags_and_lines_of_any_form(tmp_path: Path) -> None:
+    many = "".join(f"TAG{k} 1\nTAG{k % 7} 2\n" for k in range(90))
+    text = f"  # comment\n\n\t{PLANAR.strip()}\n{many}VERTEX_SE2\t99  1e0 +2. -.5e1"
+    graph = read_g2o(write(tmp_path, text))
+    assert graph.poses[-1].tolist() == [1.0, 2.0, -5.0]
+    assert sum(graph.skipped.values()) == 180 and graph.skipped["TAG0"] == 14 and graph.skipped["TAG89"] == 1
+    with pytest.raises(FileFormatError, match=r"field theta is '1\\xa02', not a number"):
+        read_g2o(write(tmp_path, "VERTEX_SE2 0 0 0 1\u00a02\n"))

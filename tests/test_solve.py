@@ -17,7 +17,7 @@ from unifg.errors import GraphError, ScenarioError
 from unifg.files.g2o import read_g2o, write_g2o
 from unifg.files.toro import write_toro
 from unifg.files.tum import read_tum
-from unifg.pose_graphs import PoseGraph, Sightings, manhattan, sphere
+from unifg.pose_graphs import Edges, PoseGraph, Sightings, manhattan, sphere
 from unifg.scenarios import command
 from unifg.scenarios.pose_graph import SolveSettings, robust_loss, solve_file
 
@@ -165,6 +165,62 @@ def test_what_cannot_be_certified_is_refused_before_it_is_solved(city: Path) -> 
     with pytest.raises(GraphError, match="two poses of one are known"):
         solve_file(SolveSettings(known, certify=True), lambda _, text: said.append(text))
     assert len(said) == 1  # that it was read
+
+
+def folded_loop(path: Path) -> Path:
+    """A square whose file has gone round once too often: where Gauss-Newton ends that begins there."""
+    side, count = 5, 20
+    heading = np.repeat(0.5 * np.pi * np.arange(4), side)
+    step = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    truth = np.column_stack([np.cumsum(step, axis=0) - step, heading])
+    first = np.arange(count)
+    measured = fg.SE2.between(truth, np.roll(truth, -1, axis=0))
+    measured = fg.SE2.retract(measured, 0.01 * np.random.default_rng(2).standard_normal((count, 3)))
+    edges = Edges(first, (first + 1) % count, measured, np.tile(np.diag([100.0, 100.0, 400.0]), (count, 1, 1)))
+    wound = 4.0 * np.pi * first / count
+    begun = np.column_stack([np.cos(wound), np.sin(wound), wound])
+    return write_g2o(path, PoseGraph(first, begun, edges))
+
+
+def test_a_folded_map_is_said_and_not_the_default(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, maps = folded_loop(tmp_path / "loop.g2o"), {}
+    for init in ("file", "auto"):
+        assert command.main(["solve", str(file), "--init", init, "--no-scene", "--out", str(tmp_path / init)]) == 0
+        maps[init] = numbers(tmp_path / init), capsys.readouterr().out
+    (folded, warned), (right, calm) = maps["file"], maps["auto"]
+    assert folded["degrees_of_freedom"] == right["degrees_of_freedom"] == 3
+    assert folded["chi2"] > 100.0 * right["chi2"] and right["init"] != "file"
+    assert "times as large as stated" in warned and "times as large" not in calm
+    assert "3 degrees of freedom" in warned and len(folded["worst_edges"]) == 5 and "worst edges" in warned
+    report = solve_file(SolveSettings(file, init="file")).solution.report()
+    assert "with 3 degrees of freedom: residuals are" in report and "largest: 'odometry', factor" in report
+    assert "largest" not in solve_file(SolveSettings(file)).solution.report()
+
+
+def test_measurements_alone_are_solved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write_g2o(tmp_path / "city.g2o", manhattan(120, 1).pose_graph)
+    reference = solve_file(SolveSettings(file)).chi2[2]
+    bare = tmp_path / "bare.g2o"
+    bare.write_text("".join(line for line in file.read_text().splitlines(True) if "VERTEX" not in line))
+    for init in ("auto", "file", "chordal"):
+        assert command.main(["solve", str(bare), "--init", init, "--no-scene", "--out", str(tmp_path / "out")]) == 0
+        assert numbers(tmp_path / "out")["chi2_file"] is None
+        assert numbers(tmp_path / "out")["chi2"] == pytest.approx(reference, rel=1e-9)
+        assert "it has no poses" in capsys.readouterr().out
+
+
+def test_indefinite_information_is_refused_or_repaired(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    graph = manhattan(60, 1).pose_graph
+    graph.edges.information[30, 1, 1] *= -1.0
+    file, out = write_g2o(tmp_path / "city.g2o", graph), tmp_path / "out"
+    assert command.main(["solve", str(file), "--no-scene", "--out", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert "1 of" in said and f"line {60 + 31} (30 - 31)" in said and "--repair-information zero or project" in said
+    for how, words in (("zero", "no say"), ("project", "negative eigenvalues were set to zero")):
+        options = ["--repair-information", how, "--no-scene", "--out", str(out)]
+        assert command.main(["solve", str(file), *options]) in (0, 1)
+        assert words in " ".join(numbers(out)["remarks"]) and words in capsys.readouterr().out
+    assert numbers(out)["converged"] is True
 
 
 def test_toro_files_and_landmarks(tmp_path: Path) -> None:

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from unifg.answers.fit import FAR
 from unifg.files.contents import legible
 from unifg.files.g2o import write_g2o
 from unifg.files.tum import write_tum
 from unifg.pose_graphs.certificate import Certificate
-from unifg.pose_graphs.judgement import FAR
 from unifg.scenarios import pose_graph
 from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.log.metrics import table, write_metrics
@@ -87,7 +87,7 @@ def metrics(solved: SolvedGraph) -> dict[str, Any]:
         "converged": solution.converged,
         "interrupted": solved.interrupted,
         "iterations": solution.iterations,
-        "chi2_file": in_file,
+        "chi2_file": in_file if graph.placed else None,
         "chi2_start": at_start,
         "chi2": at_end,
         "chi2_inliers": solved.chi2_inliers,
@@ -96,7 +96,7 @@ def metrics(solved: SolvedGraph) -> dict[str, Any]:
         "worst_edges_chi2": solved.judgement.worst_chi2.tolist(),
         "parts": solved.judgement.parts,
         "anchors_added": list(solved.judgement.anchors),
-        "remarks": solved.judgement.sentences(),
+        "remarks": [*graph.remarks, *solved.judgement.sentences()],
         "certificate": None if solved.certificate is None else _certificate(solved.certificate),
         "cost": solution.cost,
         "stationarity": solution.stationarity,
@@ -109,7 +109,7 @@ def metrics(solved: SolvedGraph) -> dict[str, Any]:
 
 def summary(solved: SolvedGraph) -> str:
     """The outcome as a table of two columns."""
-    numbers, verdict = metrics(solved), solved.solution.verdict
+    numbers, verdict, graph = metrics(solved), solved.solution.verdict, solved.after
     more = f", {numbers['landmarks']} landmarks" if numbers["landmarks"] else ""
     skipped = ", ".join(f"{tag} ({count})" for tag, count in numbers["skipped_lines"].items())
     milliseconds = {name: 1e3 * value for name, value in solved.seconds.items()}
@@ -123,7 +123,7 @@ def summary(solved: SolvedGraph) -> str:
         ("skipped lines", skipped),
         ("solver, residual", f"{numbers['solver']}, {numbers['residual']}"),
         ("robust loss", "" if solved.loss is None else f"{solved.loss}, on loop closures"),
-        ("chi2 in the file", f"{numbers['chi2_file']:.9g}"),
+        ("chi2 in the file", f"{numbers['chi2_file']:.9g}" if graph.placed else "it has no poses"),
         ("chi2 at the start", f"{numbers['chi2_start']:.9g} ({numbers['init']})"),
         ("chi2 at the end", f"{numbers['chi2']:.9g}, {numbers['degrees_of_freedom']} degrees of freedom"),
         ("without outliers", f"{numbers['chi2_inliers']:.9g}" if numbers["outliers"] else ""),

@@ -135,7 +135,7 @@ def _stage(row: Any) -> Any:
 
 def _ending(solved: SolvedGraph) -> str:
     """chi2 at the solution, apart from what the loss took for outliers."""
-    found = int(solved.outliers.sum())
+    found, freedom = int(solved.outliers.sum()), f"{solved.judgement.freedom} degrees of freedom"
     if not found:
-        return f"{solved.chi2[2]:.6g}, {solved.judgement.freedom} degrees of freedom"
-    return f"{solved.chi2_inliers:.6g} without {found} outlier{'' if found == 1 else 's'}"
+        return f"{solved.chi2[2]:.6g}, {freedom}"
+    return f"{solved.chi2_inliers:.6g}, {freedom}, without {found} outlier{'' if found == 1 else 's'}"

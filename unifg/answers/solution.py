@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from unifg.answers.covariance import Covariances
+from unifg.answers.fit import Fit, fit_of
 from unifg.answers.history import HEADER, FactorNorms, History, Iteration, factor_norms, line
 from unifg.answers.marginal import Variables, information, marginal_prior
 from unifg.answers.optimality import Optimality
@@ -131,6 +132,11 @@ class Solution:
         g = self._lin.constraints
         outside = np.maximum(g - self._upper, 0.0) - np.maximum(self._lower - g, 0.0)
         return factor_norms(self._program, self._lin, outside)
+
+    @property
+    def fit(self) -> Fit | None:
+        """Residuals against their weights, of unconstrained least squares with more rows than unknowns; else None."""
+        return fit_of(self._program, self._lin, self.residuals) if self._program.least_squares else None
 
     @property
     def worst(self) -> tuple[str, int] | None:
@@ -300,6 +306,8 @@ class Solution:
             f"{who}: {self.status.value} Cost {self.cost:.6g} after {self.iterations} iterations in "
             f"{1e3 * self.seconds:.1f} ms; {kkt}."
         )
+        if (fit := self.fit) is not None:
+            text += f" {fit.sentence()}."
         if self.worst is not None and self.violation > 0.0 and not self.converged:
             name, index = self.worst
             text += f" Largest violation: '{name}', factor {index}."

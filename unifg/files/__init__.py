@@ -9,8 +9,10 @@ from types import ModuleType as _ModuleType
 __all__ = [
     "carmen",
     "contents",
+    "decimals",
     "g2o",
     "kitti",
+    "measured",
     "pose_graph",
     "ros_map",
     "tagged",

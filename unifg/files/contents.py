@@ -9,6 +9,7 @@ from __future__ import annotations
 import gzip
 import io
 import os
+import stat
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from pathlib import Path
 from unifg.errors import FileFormatError
 from unifg.whole import write_whole
 
-__all__ = ["LIMITS", "Limits", "legible", "read_bytes", "read_text", "write_text"]
+__all__ = ["LIMITS", "Limits", "checked_text", "legible", "read_bytes", "read_text", "write_text"]
 
 _GZIP = b"\x1f\x8b"
 _ALLOWED = bytes([9, 10, 13, *range(32, 127), *range(128, 256)])
@@ -58,7 +59,9 @@ def read_bytes(path: str | os.PathLike[str], limits: Limits = LIMITS) -> bytes:
     most = limits.unpacked
     try:
         with open(path, "rb") as file:
-            content = file.read(most + 1)
+            status = os.fstat(file.fileno())
+            regular = stat.S_ISREG(status.st_mode)  # memory for what may come is asked for before anything comes
+            content = file.read(min(most, status.st_size) + 1 if regular else most + 1)
         if content.startswith(_GZIP):
             with gzip.GzipFile(fileobj=io.BytesIO(content)) as packed:
                 content = packed.read(most + 1)
@@ -80,7 +83,20 @@ def read_text(path: str | os.PathLike[str], limits: Limits = LIMITS) -> str:
         FileFormatError: as :func:`read_bytes`; also for what is no text, a control character, or a word beyond the
             limit of digits, each with its line.
     """
-    content = read_bytes(path, limits)
+    return checked_text(path, read_bytes(path, limits), limits)
+
+
+def checked_text(path: str | os.PathLike[str], content: bytes, limits: Limits = LIMITS) -> str:
+    """The text that bytes stand for; see :func:`read_text`.
+
+    Args:
+        path: the file they are from, for messages.
+        content: of the file, unpacked.
+        limits: of what a text may hold.
+
+    Raises:
+        FileFormatError: as :func:`read_text`.
+    """
 
     def refuse(place: int, what: str) -> FileFormatError:
         return FileFormatError(f"{legible(path)}, line {content.count(10, 0, place) + 1}: {what}")

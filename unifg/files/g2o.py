@@ -11,36 +11,44 @@
 ``EDGE_SE3_TRACKXYZ``    pose landmark parameter x y z and 6 numbers
 ``PARAMS_SE3OFFSET``     parameter x y z qx qy qz qw: place of the sensor of ``EDGE_SE3_TRACKXYZ`` on the body
 ``FIX``                  id ...: known vertices
+``BR``                   GTSAM: pose landmark bearing range and two standard deviations
+``ODOMETRY``             GTSAM: i j dx dy dtheta and the upper triangle of the *covariance*, row by row (6 numbers)
+``LANDMARK``             GTSAM: pose landmark x y and the upper triangle of the *covariance* (3 numbers)
 ======================== ================================================================================
 
-GTSAM's ``BR`` lines (pose landmark bearing range and two standard deviations) are read as well. Which *residual* an
-information matrix belongs to is not said in a file; see `unifg.pose_graphs.PoseGraph.graph`.
+Files without any vertex are read, too: the poses are those that the edges join, by rising identifiers, and start along
+a spanning tree of the edges. Which *residual* an information matrix belongs to is not said in a file; see
+`unifg.pose_graphs.PoseGraph.graph`.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unifg.errors import FileFormatError
 from unifg.files.contents import LIMITS, Limits, write_text
+from unifg.files.measured import Remarks, placed_along, vertices_of
 from unifg.files.tagged import (
     Block,
+    Places,
     TaggedFile,
     decimal_lines,
     distinct,
     from_triangle,
-    positions_of,
     report_isolated,
     report_skipped,
     triangle_names,
     upper_triangle,
 )
-from unifg.lie import SE3
+from unifg.lie import SE2, SE3
+from unifg.pose_graphs.information import Repair
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph, Sightings
-from unifg.typing import Array
+from unifg.typing import Array, IntArray
 
 __all__ = ["parse_g2o", "read_g2o", "write_g2o"]
 
@@ -52,76 +60,89 @@ _UNIT = 1e-12  # a squared norm this close to one is one: what was written here 
 _KNOWN = {
     "VERTEX_SE2", "EDGE_SE2", "VERTEX_XY", "EDGE_SE2_XY", "EDGE_BEARING_SE2_XY", "EDGE_RANGE_SE2_XY", "BR",
     "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "VERTEX_TRACKXYZ", "EDGE_SE3_TRACKXYZ", "PARAMS_SE3OFFSET", "FIX",
+    "ODOMETRY", "LANDMARK",
 }  # fmt: skip
 
 
-def read_g2o(path: str | Path, limits: Limits = LIMITS) -> PoseGraph:
+@dataclass(frozen=True)
+class _Seen:
+    """Measurements of one kind: identifiers (n, 2), lines they stand in (n,), values (n, p), information (n, q, q)."""
+
+    names: NDArray[np.int64]
+    lines: IntArray
+    values: Array
+    information: Array
+
+
+def read_g2o(path: str | Path, limits: Limits = LIMITS, *, repair: Repair | None = None) -> PoseGraph:
     """Read a pose graph; ``#`` begins a comment, lines may come in any order, gzipped files are unpacked.
 
-    Quaternions are normalised. Lines with tags that are not read are counted in ``skipped`` and named in one warning.
+    Quaternions are normalised. What may not be meant is named in a warning and kept: lines with tags that are not read
+    (`PoseGraph.skipped`), indefinite information, edges from a pose to itself and edges that stand in the file twice
+    (`PoseGraph.remarks`).
 
     Args:
         path: the file.
         limits: of what it may hold.
+        repair: what to do about indefinite information; see `unifg.pose_graphs.repaired`. By default it stays.
 
     Raises:
         FileFormatError: the file is missing or holds no pose, mixes planar and spatial poses, or a line (named in the
             message) has the wrong number of fields, is not made of finite numbers, repeats a vertex or refers to one
             that is not there.
     """
-    return parse_g2o(TaggedFile.read(path, limits))
+    return parse_g2o(TaggedFile.read(path, limits), repair)
 
 
-def parse_g2o(file: TaggedFile) -> PoseGraph:
+def parse_g2o(file: TaggedFile, repair: Repair | None = None) -> PoseGraph:
     """The pose graph of a file that has been read already; see `read_g2o`."""
     skipped = report_skipped(file, _KNOWN)
-    planar, spatial = "VERTEX_SE2" in file.texts, "VERTEX_SE3:QUAT" in file.texts
+    planar, spatial = "VERTEX_SE2" in file, "VERTEX_SE3:QUAT" in file
+    given = planar or spatial
+    if not given:
+        planar, spatial = "EDGE_SE2" in file or "ODOMETRY" in file, "EDGE_SE3:QUAT" in file
     if planar == spatial:
         what = "both VERTEX_SE2 and VERTEX_SE3:QUAT" if planar else "neither VERTEX_SE2 nor VERTEX_SE3:QUAT"
         raise FileFormatError(f"{file.path}: found {what} lines; a pose graph has poses of one kind")
-    size = 3 if planar else 7
-    dim = 3 if planar else 6
-    tag = "SE2" if planar else "SE3:QUAT"
-    vertices = file.block(f"VERTEX_{tag}", 1, _POSE[size])
-    poses = vertices.numbers if planar else spatial_poses(file, vertices, vertices.numbers)
-    points = file.block("VERTEX_XY", 1, "id x y") if planar else file.block("VERTEX_TRACKXYZ", 1, "id x y z")
-    identifiers = np.concatenate([vertices.integers[:, 0], points.integers[:, 0]])
-    places = distinct(file, identifiers, np.concatenate([vertices.lines, points.lines]))
-    count = len(vertices)
-    pose_places = {i: k for i, k in places.items() if k < count}
-    point_places = {i: k - count for i, k in places.items() if k >= count}
-
-    edges = file.block(f"EDGE_{tag}", 2, f"{_EDGE[size]} {triangle_names(dim)}")
-    measured = edges.numbers[:, :size]
-    sightings = {}
-    for kind, seen in (_planar_sightings(file) if planar else _spatial_sightings(file)).items():
-        block, values, information = seen
-        sightings[kind] = Sightings(
-            positions_of(file, pose_places, block.integers[:, 0], block.lines, "pose"),
-            positions_of(file, point_places, block.integers[:, 1], block.lines, "landmark"),
-            values,
-            information,
+    remarks = Remarks(file, repair)
+    edges = _planar_edges(file) if planar else _spatial_edges(file)
+    sightings = _planar_sightings(file) if planar else _spatial_sightings(file)
+    if given:
+        vertices = file.block("VERTEX_SE2" if planar else "VERTEX_SE3:QUAT", 1, _POSE[3 if planar else 7])
+        points = file.block("VERTEX_XY", 1, "id x y") if planar else file.block("VERTEX_TRACKXYZ", 1, "id x y z")
+        ids, point_ids = vertices.integers[:, 0], points.integers[:, 0]
+        poses = vertices.numbers if planar else spatial_poses(file, vertices, vertices.numbers)
+        landmarks = points.numbers
+        distinct(file, np.concatenate([ids, point_ids]), np.concatenate([vertices.lines, points.lines]))
+    else:
+        ids = vertices_of(file, [edges.names.ravel()])
+        poses = np.tile(SE2.identity() if planar else SE3.identity(), (len(ids), 1))
+        whole = [seen.names[:, 1] for kind, seen in sightings.items() if kind in ("point", "bearing-range")]
+        point_ids = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *whole]))
+        landmarks = np.zeros((len(point_ids), 2 if planar else 3))
+        distinct(file, np.concatenate([ids, point_ids]), np.zeros(len(ids) + len(point_ids), dtype=np.intp))
+    places, point_places = Places(file, ids), Places(file, point_ids)
+    first, second = (places.of(edges.names[:, k], edges.lines, "pose") for k in (0, 1))
+    weights = remarks.weights("edges", edges.information, edges.names, edges.lines)
+    joined = Edges(first, second, edges.values, weights)
+    remarks.pairs(joined, ids, edges.lines)
+    looked = {
+        kind: Sightings(
+            places.of(seen.names[:, 0], seen.lines, "pose"),
+            point_places.of(seen.names[:, 1], seen.lines, "landmark"),
+            seen.values,
+            remarks.weights(f"sightings '{kind}'", seen.information, seen.names, seen.lines),
         )
-    first, second = (positions_of(file, pose_places, edges.integers[:, k], edges.lines, "pose") for k in (0, 1))
-    seen_from = [seen.pose for seen in sightings.values()]
-    report_isolated(file, "pose", vertices.integers[:, 0], np.concatenate([first, second, *seen_from]))
-    seen_points = [np.zeros(0, dtype=np.intp), *(seen.landmark for seen in sightings.values())]
-    report_isolated(file, "landmark", points.integers[:, 0], np.concatenate(seen_points))
-    return PoseGraph(
-        vertices.integers[:, 0],
-        poses,
-        Edges(
-            first,
-            second,
-            measured.copy() if planar else spatial_poses(file, edges, measured),
-            from_triangle(edges.numbers[:, size:], dim),
-        ),
-        points.integers[:, 0],
-        points.numbers,
-        sightings,
-        _fixed(file, places),
-        skipped,
-    )
+        for kind, seen in sightings.items()
+    }
+    report_isolated(file, "pose", ids, np.concatenate([first, second, *(seen.pose for seen in looked.values())]))
+    seen_points = [np.zeros(0, dtype=np.intp), *(seen.landmark for seen in looked.values())]
+    report_isolated(file, "landmark", point_ids, np.concatenate(seen_points))
+    found = PoseGraph(
+        ids, poses, joined, point_ids, landmarks, looked, _fixed(file, places, point_places), skipped,
+        remarks=tuple(remarks.sentences),
+    )  # fmt: skip
+    return found if given else placed_along(file, found)
 
 
 def write_g2o(path: str | Path, pose_graph: PoseGraph) -> Path:
@@ -186,16 +207,67 @@ def _scalar_last(poses: Array) -> Array:
     return poses if poses.shape[1] == 3 else poses[:, [0, 1, 2, 4, 5, 6, 3]]
 
 
-def _planar_sightings(file: TaggedFile) -> dict[str, tuple[Block, Array, Array]]:
-    """Kind to lines, measurements and information matrices."""
+def _planar_edges(file: TaggedFile) -> _Seen:
+    """Edges with their information, then GTSAM's with their covariance."""
+    edges = file.block("EDGE_SE2", 2, f"{_EDGE[3]} {triangle_names(3)}")
+    steps = file.block("ODOMETRY", 2, f"{_EDGE[3]} {triangle_names(3, 'S')}")
+    information = from_triangle(edges.numbers[:, 3:], 3)
+    if not len(steps):
+        return _Seen(edges.integers, edges.lines, edges.numbers[:, :3].copy(), information)
+    return _Seen(
+        np.concatenate([edges.integers, steps.integers]),
+        np.concatenate([edges.lines, steps.lines]),
+        np.concatenate([edges.numbers[:, :3], steps.numbers[:, :3]]),
+        np.concatenate([information, _inverted(file, steps, steps.numbers[:, 3:], 3)]),
+    )
+
+
+def _spatial_edges(file: TaggedFile) -> _Seen:
+    """The same in space, where GTSAM has g2o's tag only."""
+    edges = file.block("EDGE_SE3:QUAT", 2, f"{_EDGE[7]} {triangle_names(6)}")
+    values, information = spatial_poses(file, edges, edges.numbers[:, :7]), from_triangle(edges.numbers[:, 7:], 6)
+    return _Seen(edges.integers, edges.lines, values, information)
+
+
+def _inverted(file: TaggedFile, block: Block, triangles: Array, dim: int) -> Array:
+    """Information (n, d, d) from the upper triangles of covariances.
+
+    Raises:
+        FileFormatError: a covariance, named by its line, is not positive definite.
+    """
+    covariance = from_triangle(triangles, dim)
+    wrong = np.flatnonzero(~(np.linalg.eigvalsh(covariance)[:, 0] > 0.0))
+    if wrong.size:
+        k = int(wrong[0])
+        text = f"{block.tag}: the covariance {triangles[k]} is not positive definite"
+        raise file.refuse(int(block.lines[k]), text)
+    with np.errstate(all="ignore"):
+        information = np.linalg.inv(covariance)
+    far = np.flatnonzero(~np.isfinite(information).all(axis=(1, 2)))
+    if far.size:
+        text = f"{block.tag}: the covariance {triangles[far[0]]} has no inverse"
+        raise file.refuse(int(block.lines[far[0]]), text)
+    return np.asarray(0.5 * (information + np.swapaxes(information, 1, 2)), dtype=np.float64)
+
+
+def _planar_sightings(file: TaggedFile) -> dict[str, _Seen]:
+    """Measurements of landmarks by kind."""
     found = {}
     points = file.block("EDGE_SE2_XY", 2, f"pose landmark x y {triangle_names(2)}")
-    if len(points):
-        found["point"] = points, points.numbers[:, :2].copy(), from_triangle(points.numbers[:, 2:], 2)
+    spots = file.block("LANDMARK", 2, f"pose landmark x y {triangle_names(2, 'S')}")
+    if len(points) or len(spots):
+        found["point"] = _Seen(
+            np.concatenate([points.integers, spots.integers]),
+            np.concatenate([points.lines, spots.lines]),
+            np.concatenate([points.numbers[:, :2], spots.numbers[:, :2]]),
+            np.concatenate([from_triangle(points.numbers[:, 2:], 2), _inverted(file, spots, spots.numbers[:, 2:], 2)]),
+        )
     for kind in ("bearing", "range"):
         block = file.block(f"EDGE_{kind.upper()}_SE2_XY", 2, f"pose landmark {kind} I11")
         if len(block):
-            found[kind] = block, block.numbers[:, :1].copy(), block.numbers[:, 1:, None].copy()
+            found[kind] = _Seen(
+                block.integers, block.lines, block.numbers[:, :1].copy(), block.numbers[:, 1:, None].copy()
+            )
     both = file.block("BR", 2, "pose landmark bearing range bearing_sigma range_sigma")
     if len(both):
         wrong = np.flatnonzero((both.numbers[:, 2:] < _SMALLEST_SIGMA).any(axis=1))
@@ -205,31 +277,33 @@ def _planar_sightings(file: TaggedFile) -> dict[str, tuple[Block, Array, Array]]
             raise file.refuse(int(both.lines[wrong[0]]), text)
         information = np.zeros((len(both), 2, 2))
         information[:, [0, 1], [0, 1]] = both.numbers[:, 2:] ** -2.0
-        found["bearing-range"] = both, both.numbers[:, :2].copy(), information
+        found["bearing-range"] = _Seen(both.integers, both.lines, both.numbers[:, :2].copy(), information)
     return found
 
 
-def _spatial_sightings(file: TaggedFile) -> dict[str, tuple[Block, Array, Array]]:
+def _spatial_sightings(file: TaggedFile) -> dict[str, _Seen]:
     """The same in space. A sensor that is not at the origin of the body is moved there, with its information."""
     block = file.block("EDGE_SE3_TRACKXYZ", 3, f"pose landmark parameter x y z {triangle_names(3)}")
     if not len(block):
         return {}
     offsets = file.block("PARAMS_SE3OFFSET", 1, "parameter x y z qx qy qz qw")
-    places = distinct(file, offsets.integers[:, 0], offsets.lines)
+    distinct(file, offsets.integers[:, 0], offsets.lines)
     body_T_sensor = spatial_poses(file, offsets, offsets.numbers)
-    used = body_T_sensor[positions_of(file, places, block.integers[:, 2], block.lines, "PARAMS_SE3OFFSET")]
+    used = body_T_sensor[Places(file, offsets.integers[:, 0]).of(block.integers[:, 2], block.lines, "PARAMS_SE3OFFSET")]
     turn = SE3.matrix(used)[:, :3, :3]
     information = turn @ from_triangle(block.numbers[:, 3:], 3) @ np.swapaxes(turn, 1, 2)
     information = 0.5 * (information + np.swapaxes(information, 1, 2))
-    return {"point": (block, SE3.act(used, block.numbers[:, :3]), information)}
+    return {"point": _Seen(block.integers[:, :2], block.lines, SE3.act(used, block.numbers[:, :3]), information)}
 
 
-def _fixed(file: TaggedFile, places: dict[int, int]) -> tuple[int, ...]:
+def _fixed(file: TaggedFile, *places: Places) -> tuple[int, ...]:
     """Identifiers on FIX lines, which may hold several."""
     fixed: list[int] = []
-    for text, line in zip(file.texts.get("FIX", []), file.lines.get("FIX", []), strict=True):
-        for word in text.split():
-            if not word.isdecimal() or int(word) not in places:
+    for line, words in file.words("FIX"):
+        for word in words:
+            known = word.isdecimal() and len(word) <= 19 and int(word) < 2**63
+            wanted = np.array([int(word) if known else -1])
+            if not known or not any(part.find(wanted)[0] >= 0 for part in places):
                 raise file.refuse(line, f"FIX {word}: there is no such vertex in the file")
             fixed.append(int(word))
     return tuple(fixed)

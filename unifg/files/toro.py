@@ -19,18 +19,20 @@ import numpy as np
 
 from unifg.errors import FileFormatError
 from unifg.files.contents import LIMITS, Limits, write_text
+from unifg.files.measured import Remarks, placed_along, vertices_of
 from unifg.files.tagged import (
+    Places,
     TaggedFile,
     decimal_lines,
     distinct,
     from_triangle,
-    positions_of,
     report_isolated,
     report_skipped,
     triangle_names,
     upper_triangle,
 )
-from unifg.lie import SE3, SO3
+from unifg.lie import SE2, SE3, SO3
+from unifg.pose_graphs.information import Repair
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph
 from unifg.typing import Array
 
@@ -41,27 +43,32 @@ _PLANAR_ORDER = [0, 1, 3, 5, 2, 4]  # where the row-by-row entries xx xy xt yy y
 _TO_ROWS = [0, 1, 4, 2, 5, 3]  # ... and TORO's xx xy yy tt xt yt in the row-by-row list
 
 
-def read_toro(path: str | Path, limits: Limits = LIMITS) -> PoseGraph:
+def read_toro(path: str | Path, limits: Limits = LIMITS, *, repair: Repair | None = None) -> PoseGraph:
     """Read a pose graph; gzipped files are unpacked.
 
-    Lines with other tags, such as ``EQUIV``, are counted in ``skipped`` and named in one warning.
+    Lines with other tags, such as ``EQUIV``, are counted in ``skipped`` and named in one warning; what else may not be
+    meant, and files without vertices, are treated as :func:`unifg.files.g2o.read_g2o` does.
 
     Args:
         path: the file.
         limits: of what it may hold.
+        repair: what to do about indefinite information; see `unifg.pose_graphs.repaired`. By default it stays.
 
     Raises:
         FileFormatError: the file is missing or holds no pose, mixes planar and spatial poses, or a line (named in the
             message) has the wrong number of fields, is not made of finite numbers, repeats a vertex or refers to one
             that is not there.
     """
-    return parse_toro(TaggedFile.read(path, limits))
+    return parse_toro(TaggedFile.read(path, limits), repair)
 
 
-def parse_toro(file: TaggedFile) -> PoseGraph:
+def parse_toro(file: TaggedFile, repair: Repair | None = None) -> PoseGraph:
     """The pose graph of a file that has been read already; see `read_toro`."""
     skipped = report_skipped(file, _KNOWN)
-    planar, spatial = "VERTEX2" in file.texts, "VERTEX3" in file.texts
+    planar, spatial = "VERTEX2" in file, "VERTEX3" in file
+    given = planar or spatial
+    if not given:
+        planar, spatial = "EDGE2" in file, "EDGE3" in file
     if planar == spatial:
         what = "both VERTEX2 and VERTEX3" if planar else "neither VERTEX2 nor VERTEX3"
         raise FileFormatError(f"{file.path}: found {what} lines; a pose graph has poses of one kind")
@@ -75,10 +82,17 @@ def parse_toro(file: TaggedFile) -> PoseGraph:
         edges = file.block("EDGE3", 2, f"i j dx dy dz roll pitch yaw {triangle_names(6)}")
         poses, measured = from_angles(vertices.numbers), from_angles(edges.numbers[:, :6])
         information = from_triangle(edges.numbers[:, 6:], 6)
-    places = distinct(file, vertices.integers[:, 0], vertices.lines)
-    first, second = (positions_of(file, places, edges.integers[:, k], edges.lines, "pose") for k in (0, 1))
-    report_isolated(file, "pose", vertices.integers[:, 0], np.concatenate([first, second]))
-    return PoseGraph(vertices.integers[:, 0], poses, Edges(first, second, measured, information), skipped=skipped)
+    ids = vertices.integers[:, 0] if given else vertices_of(file, [edges.integers.ravel()])
+    distinct(file, ids, vertices.lines)
+    if not given:
+        poses = np.tile(SE2.identity() if planar else SE3.identity(), (len(ids), 1))
+    places, remarks = Places(file, ids), Remarks(file, repair)
+    first, second = (places.of(edges.integers[:, k], edges.lines, "pose") for k in (0, 1))
+    joined = Edges(first, second, measured, remarks.weights("edges", information, edges.integers, edges.lines))
+    remarks.pairs(joined, ids, edges.lines)
+    report_isolated(file, "pose", ids, np.concatenate([first, second]))
+    found = PoseGraph(ids, poses, joined, skipped=skipped, remarks=tuple(remarks.sentences))
+    return found if given else placed_along(file, found)
 
 
 def write_toro(path: str | Path, pose_graph: PoseGraph) -> Path:

@@ -2,7 +2,8 @@
 
 from unifg.pose_graphs.certificate import Certificate, certify
 from unifg.pose_graphs.generate import Simulated, manhattan, sphere
-from unifg.pose_graphs.initialise import best_guess, chordal, lago, odometric
+from unifg.pose_graphs.information import Repair, indefinite, repaired
+from unifg.pose_graphs.initialise import Start, best_guess, chordal, lago, odometric, starts
 from unifg.pose_graphs.judgement import Judgement, judge
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph, Sightings
 from unifg.pose_graphs.residuals import bearing, bearing_range, chart_between, distance, sighting
@@ -12,8 +13,10 @@ __all__ = [
     "Edges",
     "Judgement",
     "PoseGraph",
+    "Repair",
     "Sightings",
     "Simulated",
+    "Start",
     "bearing",
     "bearing_range",
     "best_guess",
@@ -21,12 +24,15 @@ __all__ = [
     "chart_between",
     "chordal",
     "distance",
+    "indefinite",
     "judge",
     "lago",
     "manhattan",
     "odometric",
+    "repaired",
     "sighting",
     "sphere",
+    "starts",
 ]
 
 

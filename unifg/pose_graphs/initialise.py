@@ -7,6 +7,9 @@ survey on rotation estimation and its use in pose graph optimization", ICRA 2015
 
 from __future__ import annotations
 
+from contextlib import suppress
+from typing import NamedTuple
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, dijkstra, minimum_spanning_tree
@@ -18,14 +21,30 @@ from unifg.pose_graphs.linear import block_least_squares
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
 from unifg.typing import Array, BoolArray, IntArray
 
-__all__ = ["best_guess", "chordal", "lago", "odometric"]
+__all__ = ["Start", "best_guess", "chordal", "lago", "odometric", "starts"]
 
 _CLOSURE_COST = 1e6  # a spanning tree takes loop closures only where there is no odometry
 _BLIND = 1e-12  # [1 / rad^2]; an edge with less information about the turn is the last that a tree takes
 
 
-def best_guess(pose_graph: PoseGraph, residual: ResidualName = "log", loss: Loss | None = None) -> tuple[str, Array]:
-    """Whichever start costs least: the poses the graph has, chordal relaxation, in the plane also LAGO.
+class Start(NamedTuple):
+    """A first guess.
+
+    Attributes:
+        name: "file", "odometry" where the poses of the graph came from there, "chordal" or "lago".
+        poses: (n, storage).
+        chi2: sum of r' Omega r, without losses.
+        cost: the same with a loss on the closures.
+    """
+
+    name: str
+    poses: Array
+    chi2: float
+    cost: float
+
+
+def starts(pose_graph: PoseGraph, residual: ResidualName = "log", loss: Loss | None = None) -> list[Start]:
+    """First guesses and what they cost: the poses the graph has, chordal relaxation, in the plane also LAGO.
 
     The poses of a file may lie in the basin of a folded map; a relaxation does not know them.
 
@@ -35,29 +54,30 @@ def best_guess(pose_graph: PoseGraph, residual: ResidualName = "log", loss: Loss
         loss: on the loop closures when they are compared.
 
     Returns:
-        Its name, "file", "chordal" or "lago", and poses (n, storage). A start that the measurements do not determine
-        is left out.
+        The poses of the graph first. A start that the measurements do not determine is left out.
     """
     kinds = {"chordal": chordal, "lago": lago} if pose_graph.group is SE2 else {"chordal": chordal}
     closures = ~pose_graph.edges.odometry
 
-    def cost(poses: Array) -> float:
+    def start(name: str, poses: Array) -> Start:
         moved = pose_graph.with_poses(poses)
+        squared, seen = moved.squared_errors(residual), moved.seen_chi2()
+        chi2 = float(squared.sum()) + seen
         if loss is None:
-            return moved.chi2(residual)
-        squared = moved.squared_errors(residual)
-        return float(squared[~closures].sum() + np.sum(loss.value(squared[closures])))
+            return Start(name, poses, chi2, chi2)
+        return Start(name, poses, chi2, float(squared[~closures].sum() + np.sum(loss.value(squared[closures]))) + seen)
 
-    name, poses = "file", pose_graph.poses
-    least = cost(poses)
-    for other, method in kinds.items():
-        try:
-            found = method(pose_graph)
-        except GraphError:
-            continue
-        if (value := cost(found)) < least:
-            name, poses, least = other, found, value
-    return name, poses
+    found = [start("file" if pose_graph.placed else "odometry", pose_graph.poses)]
+    for name, method in kinds.items():
+        with suppress(GraphError):
+            found.append(start(name, method(pose_graph)))
+    return found
+
+
+def best_guess(pose_graph: PoseGraph, residual: ResidualName = "log", loss: Loss | None = None) -> tuple[str, Array]:
+    """Whichever of :func:`starts` costs least: its name and poses (n, storage); for the arguments see there."""
+    best = min(starts(pose_graph, residual, loss), key=lambda start: start.cost)
+    return best.name, best.poses
 
 
 def odometric(pose_graph: PoseGraph) -> Array:

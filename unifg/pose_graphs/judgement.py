@@ -10,16 +10,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtrc
 
+from unifg.answers.fit import is_far, ratio_sentence
 from unifg.language.inventory import counted
+from unifg.pose_graphs.information import indefinite
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
 from unifg.typing import Array, IntArray
 
 __all__ = ["Judgement", "judge"]
 
-FAR = 4.0  # chi2 per degree of freedom: residuals twice as large as stated
-UNLIKELY = 1e-6  # and not by chance
 BLIND = 1e-12  # of the largest eigenvalue of an information matrix
 WORST = 5  # edges named
 
@@ -54,17 +53,13 @@ class Judgement:
     @property
     def far(self) -> bool:
         """Whether residuals are far larger than stated."""
-        return self.freedom > 0 and self.chi2 > FAR * self.freedom and chdtrc(self.freedom, self.chi2) < UNLIKELY
+        return is_far(self.chi2, self.freedom)
 
     def sentences(self) -> list[str]:
         """What a user should know; empty when there is nothing to say."""
         said = []
         if self.far:
-            ratio = (self.chi2 / self.freedom) ** 0.5
-            said.append(
-                f"residuals are {ratio:.3g} times as large as the file states: its weights are too sure, "
-                "some measurements are wrong, or this is not the best map"
-            )
+            said.append(ratio_sentence(self.chi2, self.freedom))
         if self.freedom < 0:
             said.append(f"{-self.freedom} unknowns more than rows of measurements: some poses are not determined")
         if self.parts > 1:
@@ -108,7 +103,7 @@ def judge(pose_graph: PoseGraph, residual: ResidualName = "log") -> Judgement:
     unknown = (len(ids) - len(anchors)) * pose_graph.group.dim
     unknown += (len(pose_graph.landmarks) - len(known)) * pose_graph.group.point_dim
     return Judgement(
-        pose_graph.chi2(residual),
+        float(squared.sum()) + pose_graph.seen_chi2(),
         rows - unknown,
         np.stack([ids[edges.first[order]], ids[edges.second[order]]], axis=1),
         squared[order],
@@ -116,7 +111,7 @@ def judge(pose_graph: PoseGraph, residual: ResidualName = "log") -> Judgement:
         tuple(added.tolist()),
         tuple(ids[~touched].tolist()),
         np.flatnonzero(greatest == 0.0),
-        np.flatnonzero(lengths[:, 0] < -BLIND * greatest) if len(edges) else np.zeros(0, dtype=np.intp),
+        np.flatnonzero(indefinite(edges.information)),
     )
 
 

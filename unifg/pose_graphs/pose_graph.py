@@ -101,6 +101,9 @@ class PoseGraph:
             "range" [m], "bearing-range" [rad, m]; the last three in the plane only.
         fixed_ids: identifiers of poses and landmarks that are known.
         skipped: tags a reader did not know, with the number of lines it left out.
+        placed: whether the poses were given; False where a reader had measurements only, and put the poses along a
+            spanning tree of them.
+        remarks: what else a reader found that may not be meant, or has repaired; sentences.
     """
 
     ids: Ids
@@ -111,6 +114,8 @@ class PoseGraph:
     sightings: Mapping[str, Sightings] = field(default_factory=dict)
     fixed_ids: tuple[int, ...] = ()
     skipped: Mapping[str, int] = field(default_factory=dict)
+    placed: bool = True
+    remarks: tuple[str, ...] = ()
 
     @property
     def group(self) -> LieGroup:
@@ -183,12 +188,16 @@ class PoseGraph:
 
     def chi2(self, residual: ResidualName = "log") -> float:
         """Sum of r' Omega r over all measurements at the present values: no 1/2, no robust loss."""
-        squared = [self.squared_errors(residual).sum()]
+        return float(self.squared_errors(residual).sum()) + self.seen_chi2()
+
+    def seen_chi2(self) -> float:
+        """Sum of r' Omega r over the sightings at the present values."""
+        total = 0.0
         for kind, seen in self.sightings.items():
             function = self._seen(kind)
             whole = function.on(self.group) if isinstance(function, ManifoldResidual) else function
-            squared.append(_squared(whole, seen, self.poses[seen.pose], self.landmarks[seen.landmark]).sum())
-        return float(sum(squared))
+            total += float(_squared(whole, seen, self.poses[seen.pose], self.landmarks[seen.landmark]).sum())
+        return total
 
     def squared_errors(self, residual: ResidualName = "log") -> Array:
         """(m,) r' Omega r of every edge at the present values."""
