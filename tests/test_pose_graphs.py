@@ -227,6 +227,14 @@ def test_long_drives_do_not_confuse_lago() -> None:
     assert graph.with_poses(lago(graph)).chi2() < 3.0 * degrees
 
 
+def test_damping_does_not_stiffen_a_chain() -> None:
+    for seed in range(3):
+        graph, _, guess = manhattan(1000, seed).pose_graph.graph()
+        bare, damped = (solver().solve(graph, guess, check=True) for solver in (GaussNewton, LevenbergMarquardt))
+        assert damped.iterations == bare.iterations < 8
+        assert LevenbergMarquardt(damping=1e-4).solve(graph, guess).iterations > damped.iterations
+
+
 def test_correlations_count() -> None:
     """With strong correlation between position and heading, positions given headings must use it."""
     sim = manhattan(300, 2)
