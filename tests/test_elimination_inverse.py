@@ -63,6 +63,31 @@ def test_joint_covariances(rng: np.random.Generator) -> None:
         factorization.inverse_block(near)
 
 
+@pytest.mark.parametrize("ordering", ["auto", "minimum-degree", "nested-dissection", "natural"])
+def test_blocks_between_nodes_anywhere(rng: np.random.Generator, ordering: str) -> None:
+    """Positive definite and quasi-definite, chains, grids and forests, near and far, twice the same node."""
+    grids = grid(rng, 9, 3), grid(rng, 10, 2)
+    forest = system(rng, [2, 2, 2, 2, 2, 2], [(0, 1), (1, 2), (3, 4), (4, 5)])
+    for pattern, data, label, _ in (*grids, horizon(rng, 20, 3, 2, False), horizon(rng, 12, 3, 2, True), forest):
+        factorization = Factorization(pattern, label, ordering=ordering)  # type: ignore[arg-type]
+        assert factorization.factor(data)
+        inverse = np.linalg.inv(full(pattern, data).toarray())
+        scale = np.abs(inverse).max()
+        nodes = rng.integers(0, label[-1] + 1, (12, 2))
+        nodes[1:4, 0] = nodes[0, 0]
+        nodes[5] = nodes[6]
+        nodes[7, 1] = nodes[7, 0]
+        for i, j in nodes.tolist():
+            rows = np.flatnonzero((label == i) | (label == j))
+            assert np.abs(factorization.inverse_block(rows) - inverse[np.ix_(rows, rows)]).max() < 1e-10 * scale
+        own = [np.array([np.flatnonzero(label == k)[:1] for k in nodes[:, e]]) for e in range(2)]
+        blocks = factorization.inverse_blocks(*own)
+        both = np.concatenate(own, axis=1)
+        assert np.abs(blocks - inverse[both[:, :, None], both[:, None, :]]).max() < 1e-10 * scale
+    assert not factorization._clean.any()
+    assert factorization.inverse_blocks(own[0][:0], own[1][:0]).shape == (0, 2, 2)
+
+
 def test_tree_describes_the_elimination(rng: np.random.Generator) -> None:
     pattern, data, label, _ = grid(rng, 8, 3)
     factorization = Factorization(pattern, label)

@@ -94,6 +94,19 @@ class Covariances:
                 result[k][np.ix_(free, free)] = every[own][np.ix_(place, place)]
         return result
 
+    def pairs(self, first: IntArray, second: IntArray) -> Array:
+        """(n, k + m, k + m) joint covariance of each row of (n, k) with that of (n, m) full tangent columns.
+
+        Raises:
+            GraphError: when one of them is not determined.
+        """
+        unknown = self._program.columns.unknown
+        if self._structure is None and not ((unknown[first] < 0).any() or (unknown[second] < 0).any()):
+            with self._turn:
+                return self._factorization.inverse_blocks(unknown[first], unknown[second])
+        both = np.concatenate([first, second], axis=1)
+        return np.array([self.joint(row) for row in both]).reshape(len(both), both.shape[1], both.shape[1])
+
 
 def _inverse_block(system: KktSystem, chosen: IntArray) -> Array:
     """(k, k) block of the inverse of a factorised KKT matrix over unknowns.

@@ -227,6 +227,23 @@ class Solution:
         """
         return self._covariances.blocks(self._program.columns.of(self._selection(variable)))
 
+    def pair_covariances(self, first: Variable | str, second: Variable | str) -> Array:
+        """(n, k + m, k + m) joint covariances of pairs, as of the present pose and each candidate for a loop.
+
+        Args:
+            first: one member, which is paired with all of the second, or as many as there.
+            second: (n) members.
+
+        Raises:
+            GraphError: when the system is singular, or the selections differ in length.
+        """
+        ends = [self._selection(variable) for variable in (first, second)]
+        count = max(len(end) for end in ends)
+        if any(len(end) not in (1, count) for end in ends):
+            raise GraphError(f"pairs of {len(ends[0])} and {len(ends[1])} members: give as many of both, or one")
+        columns = [self._program.columns.of(end) for end in ends]
+        return self._covariances.pairs(*[np.broadcast_to(rows, (count, rows.shape[1])) for rows in columns])
+
     @cached_property
     def _covariances(self) -> Covariances:
         return Covariances(self._program, self._lin, self._equality | self._held())

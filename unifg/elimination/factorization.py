@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from threading import Lock
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from unifg.elimination import fronts, substitution
 from unifg.elimination.analysis import SLACK, Ordering, Structure, analyse
+from unifg.elimination.far import block_of, blocks_of_pairs, heights
 from unifg.elimination.inverse import invert, locate
 from unifg.elimination.plan import (
     FAILED,
@@ -267,25 +269,41 @@ class Factorization:
     def inverse_block(self, rows: IntArray) -> Array:
         """(k, k) block of the inverse: the joint covariance of some scalars when A is an information matrix.
 
-        Scalars that share a front are read off the tree, and only the path from them to the root is computed; others
-        take a solve each.
+        Scalars that share a front are read off the tree, and only the path from them to the root is computed; of others
+        the paths to their roots are climbed.
 
         Raises:
             UnifgError: there is no factorisation.
         """
         self._demand("inverse_block")
         rows = np.asarray(rows, dtype=np.int64)
-        position = np.empty(self.pattern.size, np.int64)
-        position[self.plan.order] = np.arange(self.pattern.size)
+        chosen = self._position[rows]
         places = np.zeros((len(rows), len(rows)), np.int64)
-        if locate(self.plan, self._owner(), position[rows], places):
-            block: Array = self._filled(position[rows])[places]
+        if locate(self.plan, self._owner(), chosen, places):
+            block: Array = self._filled(chosen)[places]
             return block
-        right = np.zeros((len(rows), self.pattern.size))
-        right[np.arange(len(rows)), rows] = 1.0
-        substitution.solve_columns(self.plan, right, right)
-        block = right[:, rows]
-        return 0.5 * (block + block.T)
+        found: Array = block_of(self.plan, self._parent, self._owner(), self._heights, chosen, self._clean)
+        return found
+
+    def inverse_blocks(self, first: IntArray, second: IntArray) -> Array:
+        """(n, k + m, k + m) blocks of the inverse: joint covariances of n pairs of nodes anywhere in the tree.
+
+        Of each node the path to its root is climbed; a first node that stays the same, as the present pose beside
+        many candidates, is climbed from once.
+
+        Args:
+            first: (n, k) scalars of a node in each row.
+            second: (n, m) the same of another one.
+
+        Raises:
+            UnifgError: there is no factorisation.
+        """
+        self._demand("inverse_blocks")
+        result: Array = blocks_of_pairs(
+            self.plan, self._parent, self._owner(), self._heights, self._position[np.asarray(first, dtype=np.int64)],
+            self._position[np.asarray(second, dtype=np.int64)], self._clean,
+        )  # fmt: skip
+        return result
 
     def diagonal_blocks(self) -> list[Array]:
         """Marginal covariance (d, d) of every node, all in about the time of two factorisations.
@@ -294,9 +312,7 @@ class Factorization:
             UnifgError: there is no factorisation.
         """
         panels = self._filled(None)
-        plan, starts = self.plan, self.structure.starts
-        position = np.empty(self.pattern.size, np.int64)
-        position[plan.order] = np.arange(self.pattern.size)
+        plan, starts, position = self.plan, self.structure.starts, self._position
         sizes, result = np.diff(starts), [NOTHING] * (len(starts) - 1)
         front = plan.fronts[self._owner()]  # one row per scalar
         for size in np.unique(sizes).tolist():
@@ -311,6 +327,26 @@ class Factorization:
             for node, block in zip(chosen.tolist(), blocks, strict=True):
                 result[node] = block
         return result
+
+    @cached_property
+    def _position(self) -> IntArray:
+        """Of each scalar in the order of elimination."""
+        position = np.empty(self.pattern.size, np.int64)
+        position[self.plan.order] = np.arange(self.pattern.size)
+        return position
+
+    @cached_property
+    def _parent(self) -> IntArray:
+        return np.asarray(self.structure.parent, dtype=np.int64)
+
+    @cached_property
+    def _heights(self) -> IntArray:
+        found: IntArray = heights(self.plan, self._parent)
+        return found
+
+    @cached_property
+    def _clean(self) -> Array:
+        return np.zeros(len(self.plan.work))
 
     def _owner(self) -> IntArray:
         """Front that eliminates each scalar, in the order of elimination."""
