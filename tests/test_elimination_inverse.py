@@ -138,4 +138,4 @@ def test_wrong_shapes_are_refused(rng: np.random.Generator) -> None:
     with pytest.raises(UnifgError, match="negative has shape"):
         Factorization(pattern, label, negative=negative[1:]).factor(data)
     with pytest.raises(UnifgError, match="unknown"):
-        Factorization(pattern, label, ordering="metis").factor(data)  # type: ignore[arg-type]
+        Factorization(pattern, label, ordering="amd").factor(data)  # type: ignore[arg-type]

@@ -53,6 +53,7 @@ class Optimality(NamedTuple):
         finite: whether everything could be evaluated.
         determined: whether no unknown may be moved freely; looked at for least squares only.
         rounding: by how much differences may be wrong about the stationarity.
+        weakest: of least squares, the smallest pivot of the Hessian relative to its diagonal; 1 where nobody looked.
     """
 
     stationarity: float
@@ -62,6 +63,7 @@ class Optimality(NamedTuple):
     finite: bool
     determined: bool = True
     rounding: float = 0.0
+    weakest: float = 1.0
 
     def holds(self, tolerance: float) -> bool:
         """Whether all three numbers are within ``tolerance``."""
@@ -100,7 +102,7 @@ def optimality(
         if not (offset.finite and np.isfinite(lin.cost)):
             return Optimality(np.inf, np.inf, np.inf, -1, False)
         rounding = _relative_rounding(program, lin, multipliers) if program.differenced else 0.0
-        return Optimality(offset.value, 0.0, 0.0, -1, True, offset.determined, rounding)
+        return Optimality(offset.value, 0.0, 0.0, -1, True, offset.determined, rounding, offset.weakest)
     measured = _measure(
         program.arrays,
         program.columns.free,

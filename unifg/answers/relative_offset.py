@@ -69,11 +69,13 @@ class Offset:
         value: |P r| / |r|, zero where |P r| is rounding; above ``enough`` it may be a lower bound.
         determined: whether the costs determine every unknown.
         finite: whether everything could be evaluated.
+        weakest: smallest pivot of the Hessian relative to its diagonal; 1 where nobody looked.
     """
 
     value: float
     determined: bool
     finite: bool
+    weakest: float = 1.0
 
 
 def relative_offset(
@@ -135,8 +137,14 @@ class Structure:
             return Offset(cosine, True, True)
         with program.systems.borrowed() as own:
             energy, determined = _energy(program, lin, (limit * size) ** 2 if enough > 0.0 else np.inf, lent, own)
+            used = own if lent is None else lent.solver
+            weakest = 1.0
+            if determined and (lent is None or lent.damping == 0.0) and used.definite:
+                plan = used.plan
+                diagonal = lin.hessian[program.normal.diagonal]
+                weakest = float(_weakest(plan.order, plan.signs, plan.pivots, diagonal, program.size))
         value = math.sqrt(energy) / size if size else 0.0
-        return Offset(0.0 if value <= floor else value, determined, True)
+        return Offset(0.0 if value <= floor else value, determined, True, weakest)
 
 
 def _energy(
@@ -235,7 +243,7 @@ def _sound(solver: Factorization, diagonal: Array, size: int, weak: float = WEAK
     if not solver.definite:
         return False
     plan = solver.plan
-    return bool(_stands_out(plan.order, plan.signs, plan.pivots, diagonal, size, weak))
+    return bool(_weakest(plan.order, plan.signs, plan.pivots, diagonal, size) > weak)
 
 
 def _counted(program: Program) -> BoolArray:
@@ -274,12 +282,16 @@ def _extents(program: Program) -> tuple[IntArray, IntArray, Array]:
 
 
 @compiled
-def _stands_out(order: IntArray, signs: Array, roots: Array, diagonal: Array, size: int, weak: float) -> bool:
-    """Whether all pivots, signs / roots^2, do."""
+def _weakest(order: IntArray, signs: Array, roots: Array, diagonal: Array, size: int) -> float:
+    """Smallest pivot, signs / roots^2, relative to the diagonal; 0 where one is not positive."""
+    least = np.inf
     for k in range(size):
-        if not signs[k] > weak * diagonal[order[k]] * roots[k] * roots[k]:
-            return False
-    return True
+        pivot, scale = signs[k], diagonal[order[k]] * roots[k] * roots[k]
+        if not pivot > least * scale:
+            if not pivot > 0.0:
+                return 0.0
+            least = pivot / scale
+    return least
 
 
 @compiled

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from unifg.answers.conditioning import Conditioning, cheap, conditioning
 from unifg.answers.covariance import Covariances
 from unifg.answers.fit import Fit, fit_of
 from unifg.answers.history import HEADER, FactorNorms, History, Iteration, factor_norms, line
@@ -52,6 +53,7 @@ class Solution:
         stationarity, violation, complementarity: KKT numbers, see :mod:`unifg.answers.optimality`. The stationarity of
             pure least squares is its relative offset, free of the unit of cost; above the tolerance, at least this.
         rounding: by how much numerical differentiation may be wrong about the stationarity.
+        finite: whether everything could be evaluated there.
         iterations: number of iterations taken.
         seconds: wall-clock time of the solve.
         solver: name of the backend.
@@ -87,6 +89,7 @@ class Solution:
         self.cost = linearization.cost
         self.stationarity = measured.stationarity
         self.rounding = measured.rounding
+        self.finite = measured.finite
         self.violation = measured.violation
         self.complementarity = measured.complementarity
         self._worst_row = measured.worst_row
@@ -310,8 +313,23 @@ class Solution:
             self.marginals(selection) if marginals else None,
         )
 
+    @cached_property
+    def conditioning(self) -> Conditioning | None:
+        """How well the normal equations are conditioned here, and solved; None but for pure least squares.
+
+        One factorisation and a few solves, when first asked for.
+        """
+        return conditioning(self._program, self._lin) if self._program.least_squares else None
+
     def report(self) -> str:
         """The status sentence with the numbers behind it."""
+        text = self._told()
+        if self.finite and self._program.least_squares and cheap(self._program) and self.conditioning is not None:
+            text += f" {self.conditioning.sentence()}"
+        return text
+
+    def _told(self) -> str:
+        """All of a report that costs nothing."""
         kkt = (
             f"relative offset {self.stationarity:.1e}"
             if self._program.least_squares
@@ -341,8 +359,8 @@ class Solution:
         return "\n".join([HEADER, *map(line, self.history)])
 
     def __repr__(self) -> str:
-        """The report."""
-        return f"<Solution {self.report()}>"
+        """The report, of what costs nothing."""
+        return f"<Solution {self._told()}>"
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle with the history, and without factorisations, which are found again where somebody asks."""

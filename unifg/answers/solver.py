@@ -12,6 +12,7 @@ from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
+from unifg.answers.conditioning import HARDLY
 from unifg.answers.history import HEADER, Deferred, Iteration, factor_norms, line
 from unifg.answers.optimality import infeasible_stationary, optimality, within_bounds
 from unifg.answers.rehearsal import rehearse
@@ -363,7 +364,7 @@ class SolveState:
             self._move(self._best_lin, self._best_multipliers)
         measured = self.optimality
         if measured.passes(self.tolerance) and status is not Status.UNBOUNDED:
-            status = Status.CONVERGED
+            status = Status.CONVERGED if measured.weakest > HARDLY else Status.HARDLY_DETERMINED
         elif measured.holds(self.tolerance) and not measured.determined:
             status = Status.UNDETERMINED
         elif measured.holds(self.tolerance) and status is not Status.UNBOUNDED:

@@ -6,10 +6,15 @@ from enum import Enum
 class Status(Enum):
     """Outcome of a solve; the value is the sentence shown to the user.
 
-    Only CONVERGED claims a solution, and only the KKT test of :mod:`unifg.answers.optimality` grants it.
+    Only CONVERGED and HARDLY_DETERMINED claim a solution, and only the KKT test of :mod:`unifg.answers.optimality`
+    grants them.
     """
 
     CONVERGED = "The KKT conditions of the problem hold to the tolerance."
+    HARDLY_DETERMINED = (
+        "The KKT conditions of the problem hold to the tolerance, but some direction is so weakly determined that few "
+        "digits of it are known; look at solution.conditioning, add a prior or another measurement."
+    )
     STOP_RULE = "The chosen stop rule ended the loop, but the KKT conditions do not hold to the tolerance."
     ITERATION_LIMIT = "The iteration limit was reached before the KKT conditions held; raise max_iterations."
     TIME_LIMIT = "The time limit was reached before the KKT conditions held; raise time_limit."
@@ -36,4 +41,4 @@ class Status(Enum):
     @property
     def converged(self) -> bool:
         """Whether a solution is claimed."""
-        return self is Status.CONVERGED
+        return self in (Status.CONVERGED, Status.HARDLY_DETERMINED)

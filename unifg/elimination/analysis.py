@@ -9,13 +9,14 @@ import numpy as np
 from unifg.elimination.chain import stages
 from unifg.elimination.dissection import separators
 from unifg.elimination.layout import lay_out
+from unifg.elimination.metis import installed, metis_order
 from unifg.elimination.ordering import block_graph, indistinguishable, minimum_degree
 from unifg.elimination.plan import LARGEST, PANEL, PIVOTS, ROWS, SCALARS, Plan
 from unifg.elimination.symbolic import supernodes
 from unifg.errors import UnifgError
 from unifg.typing import BoolArray, IntArray
 
-Ordering: TypeAlias = Literal["auto", "minimum-degree", "nested-dissection", "natural"] | IntArray
+Ordering: TypeAlias = Literal["auto", "minimum-degree", "nested-dissection", "metis", "natural"] | IntArray
 SLACK = 16  # numbers the kernels may read beyond the last matrix
 DISSECT = 4e6, 3e3  # predicted nanoseconds, in all and per node, from which nested dissection is tried
 COST = 4  # where `supernodes` returns its forecast
@@ -78,6 +79,8 @@ def analyse(
     elif ordering == "nested-dissection":
         staged = minimum_degree(pointer, neighbours, weight, separators(pointer, neighbours, weight))
         tree = supernodes(pointer, neighbours, weight, staged)
+    elif ordering == "metis":
+        kind, tree = "METIS", supernodes(pointer, neighbours, weight, metis_order(pointer, neighbours, weight))
     elif ordering in ("auto", "minimum-degree"):
         flat = np.zeros(nodes, np.int64)
         tree = supernodes(pointer, neighbours, weight, minimum_degree(pointer, neighbours, weight, flat))
@@ -88,13 +91,18 @@ def analyse(
                 dissected = supernodes(pointer, neighbours, weight, staged)
                 if dissected[COST][1] < tree[COST][1]:
                     kind, tree = "nested-dissection", dissected
+                if installed():
+                    theirs = metis_order(pointer, neighbours, weight)
+                    multilevel = supernodes(pointer, neighbours, weight, theirs)
+                    if multilevel[COST][1] < tree[COST][1]:
+                        kind, tree = "METIS", multilevel
             chain, line = stages(pointer, neighbours, weight)
             if chain and line[COST][1] <= tree[COST][1]:
                 kind, tree = "chain", line
     else:
         raise UnifgError(
-            f"ordering {ordering!r} is unknown: choose auto, minimum-degree, nested-dissection, natural or give a "
-            "permutation"
+            f"ordering {ordering!r} is unknown: choose auto, minimum-degree, nested-dissection, metis, natural or "
+            "give a permutation"
         )
     order, bounds, parent, passed, _ = tree
     table, scalar_order, rows, relative, runs, slots, waiting = lay_out(

@@ -88,7 +88,8 @@ class Factorization:
             blocks: (n,) non-decreasing label of the node each scalar belongs to; by default scalars that follow each
                 other and have the same neighbours are one node.
             ordering: how to order the nodes, or a permutation of them: the nodes in the order of elimination. "auto"
-                takes the cheapest of minimum degree, nested dissection (large graphs) and a chain of stages.
+                takes the cheapest of minimum degree, nested dissection (large graphs; METIS' too, where the extra
+                ``unifg[metis]`` is installed) and a chain of stages.
             negative: (n,) whether the pivot of each scalar is expected to be negative; see `unexpected`.
         """
         self._begin(Symbolic(pattern, blocks, ordering, negative))

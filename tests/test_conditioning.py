@@ -1,0 +1,65 @@
+"""Condition and residual of the normal equations of a solution, and the word for directions of few digits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.solvers import GaussNewton, LevenbergMarquardt
+from unifg.typing import Array
+
+
+def chain(anchor: float, unit: float = 1.0, weight: float = 1.0) -> tuple[fg.Graph, fg.Family, Array]:
+    """Thirty poses with odometry of a millimetre, tied to the world by a prior of this sigma."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 30)
+    rng = np.random.default_rng(0)
+    steps = unit * (np.array([1.0, 0.5]) + 1e-3 * rng.standard_normal((29, 2)))
+    graph.minimize(fg.prior, x[0], np.zeros(2), sigma=anchor * unit / np.sqrt(weight))
+    graph.minimize(fg.between, x[:-1], x[1:], steps, sigma=1e-3 * unit / np.sqrt(weight))
+    graph.minimize(fg.between, x[0], x[29], steps.sum(axis=0) + 1e-3 * unit, sigma=1e-3 * unit / np.sqrt(weight))
+    return graph, x, np.zeros((30, 2))
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e6])
+@pytest.mark.parametrize("weight", [1e-12, 1.0, 1e12])
+def test_the_status_between_converged_and_singular(unit: float, weight: float) -> None:
+    """It is a matter of scaling between directions: neither tiny units nor small weights bring it about."""
+    for anchor, status in ((1.0, fg.Status.CONVERGED), (300.0, fg.Status.HARDLY_DETERMINED)):
+        graph, x, guess = chain(anchor, unit, weight)
+        for backend in (GaussNewton(), LevenbergMarquardt(damping=1e-20)):
+            solution = backend.solve(graph, {x: guess})
+            assert solution.converged
+            assert solution.status is status
+            assert ("few digits" in solution.report()) == (status is not fg.Status.CONVERGED)
+
+
+def test_the_estimate_is_that_of_a_dense_matrix_and_has_no_units() -> None:
+    conditions = []
+    for unit in (1e-6, 1.0, 1e4):
+        graph, x, guess = chain(0.1, unit)
+        solution = GaussNewton().solve(graph, {x: guess})
+        assert solution.conditioning is not None
+        pattern = graph.compile().normal
+        upper = pattern.matrix(solution._lin.hessian).toarray()
+        whole = upper + np.triu(upper, 1).T
+        scale = 1.0 / np.sqrt(np.diag(whole))
+        exact = np.linalg.cond(whole * np.outer(scale, scale), 1)
+        assert exact / 3.0 <= solution.conditioning.condition <= exact * (1.0 + 1e-6)
+        assert 0.0 <= solution.conditioning.residual < 1e-13
+        conditions.append(solution.conditioning.condition)
+        assert "Condition of the linear system" in solution.report()
+        assert "Condition" not in repr(solution)
+    np.testing.assert_allclose(conditions, conditions[0], rtol=1e-5)
+
+
+def test_of_constrained_problems_nothing_is_said_and_of_singular_ones_that_it_is_infinite() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 2)
+    graph.minimize(fg.between, x[0], x[1], np.ones(1), sigma=1.0)
+    loose = LevenbergMarquardt().solve(graph, {x: np.zeros((2, 1))})
+    assert loose.conditioning is not None and loose.conditioning.condition > 1e15
+    graph.constrain(lambda a: a, x[0], lower=0.0, upper=0.0)
+    tied = fg.solve(graph, {x: np.zeros((2, 1))})
+    assert tied.converged and tied.conditioning is None and "Condition" not in tied.report()
