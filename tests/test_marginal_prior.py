@@ -171,6 +171,39 @@ def test_a_joint_prior_takes_manifolds_of_the_user(kind: Callable[[], Manifold],
     np.testing.assert_allclose(found, reference, atol=1e-8)
 
 
+def test_an_offset_moves_a_joint_prior_along_the_tangents(rng: np.random.Generator) -> None:
+    """Farther than a turn, too: a quadratic has its lowest point where no point of a group is."""
+    for kinds in (manifolds(), (Own(), fg.SE2)):
+        graph = fg.Graph()
+        families = [graph.variables(f"v{k}", kind, 1) for k, kind in enumerate(kinds)]
+        size = sum(kind.dim for kind in kinds)
+        reference, offset = np.concatenate([kind.random(rng) for kind in kinds]), 20.0 * rng.normal(size=size)
+        graph.minimize(fg.joint_prior(*kinds, offset=True), *families, np.concatenate([reference, offset]), sigma=1.0)
+        guess = {f: f.manifold.random(rng)[None] for f in families}
+        assert not graph.check(guess).findings
+        plain = fg.joint_prior(*kinds)(*guess.values(), reference)
+        cost = GaussNewton(max_iterations=0).solve(graph, guess).cost
+        np.testing.assert_allclose(cost, 0.5 * np.square(plain - offset).sum(), rtol=1e-12)
+
+
+def test_a_marginal_prior_with_an_offset_is_the_same_model(rng: np.random.Generator) -> None:
+    """Its lowest point is where the step leads, and its information is as symmetric as it is asked to be."""
+    graph = fg.Graph()
+    x, b = graph.variables("x", fg.SE2, 2), graph.variables("b", fg.Rn(3), 1)
+    graph.minimize(fg.prior, x[0], fg.SE2.random(rng), sigma=0.3, name="prior")
+    graph.minimize(lambda p, q, c: fg.SE2.between(p, q) + 1e-4 * c, x[0], x[1], b[0], sigma=0.2, name="step")
+    guess = {x: np.stack([fg.SE2.random(rng) for _ in range(2)]), b: rng.normal(size=(1, 3))}
+    solution = GaussNewton(max_iterations=0).solve(graph, guess)
+    lowest, information = solution.marginal_prior(["prior", "step"], x[0], (x[1], b))
+    moved, same = solution.marginal_prior(["prior", "step"], x[0], (x[1], b), offset=True)
+    here, step = moved[0, :6], moved[0, 6:]
+    np.testing.assert_array_equal(here, np.concatenate([solution[x][1], solution[b][0]]))
+    reached = np.concatenate([fg.SE2.retract(here[:3], step[:3]), here[3:] + step[3:]])
+    np.testing.assert_allclose(reached, lowest[0], atol=1e-9 * np.abs(step).max())
+    np.testing.assert_array_equal(same, information)
+    np.testing.assert_array_equal(information, information.T)
+
+
 def test_a_joint_prior_needs_a_manifold() -> None:
     with pytest.raises(fg.GraphError, match="at least one variable"):
         fg.joint_prior()

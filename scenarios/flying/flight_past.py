@@ -112,9 +112,13 @@ class SeenFromTheVehicle:
         """Of state, parameters and landmarks."""
         return arrival(self._slots)
 
-    def express(self, here: Array, reference: Array, information: Array) -> tuple[Array, Array]:
+    def more(self, dim: int) -> int:
+        """Nothing: the reference is the lowest point."""
+        return 0
+
+    def express(self, here: Array, step: Array, lowest: Array, information: Array) -> tuple[Array, Array]:
         """As seen from the vehicle."""
-        return seen_from_the_vehicle(here, reference, information)
+        return seen_from_the_vehicle(here, lowest, information)
 
 
 @dataclass(frozen=True)

@@ -101,6 +101,7 @@ def marginal_prior(
     remove: Variables,
     keep: Variables,
     equality: BoolArray | None = None,
+    offset: bool = False,
 ) -> tuple[Array, Array]:
     """What terms that touch ``remove`` say about ``keep`` once ``remove`` is eliminated.
 
@@ -115,6 +116,8 @@ def marginal_prior(
         remove: variables that leave, one selection or several.
         keep: variables that stay, one selection or several: all those that the terms connect to ``remove``.
         equality: (M,) which constraint rows held as equalities; the present ones by default.
+        offset: whether the reference is the point of ``lin``, followed by the step (D,) from there to the lowest point,
+            for ``fg.joint_prior(..., offset=True)``: the model as it was made, however far that point is.
 
     Returns:
         Reference (1, S), the storage of the kept variables side by side in the order given, and information (D, D)
@@ -138,6 +141,9 @@ def marginal_prior(
     rest[:, ~removal.free] = 0.0
     matrix, gradient = _schur(gone, rest, r, leaving, terms)
     matrix, shift = _lowest(matrix, gradient, ROUNDING * np.einsum("ij,ij->j", rest, rest))
+    if offset:
+        points = [lin.values[s.family][s.indices][:, s.storage].ravel() for s in staying]
+        return np.concatenate([*points, shift])[None], matrix
     reference, at = [], 0
     for selection in staying:
         here = lin.values[selection.family][selection.indices][:, selection.storage]
@@ -321,5 +327,6 @@ def _lowest(matrix: Array, gradient: Array, rounding: Array) -> tuple[Array, Arr
         vectors, eigenvalues = vectors[:, known], eigenvalues[known]
         shift[alive] = -scale * (vectors @ ((vectors.T @ (scale * gradient[alive])) / eigenvalues))
         block = (vectors * eigenvalues) @ vectors.T
+        block = 0.5 * (block + block.T)
     clean[np.ix_(alive, alive)] = block / np.outer(scale, scale)
     return clean, shift

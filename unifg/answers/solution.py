@@ -256,14 +256,17 @@ class Solution:
         columns = np.concatenate([self._program.columns.of(as_selection(v)).ravel() for v in variables])
         return information(self._program, self._lin, terms, columns)[0]
 
-    def marginal_prior(self, terms: Sequence[str], remove: Variables, keep: Variables) -> tuple[Array, Array]:
+    def marginal_prior(
+        self, terms: Sequence[str], remove: Variables, keep: Variables, *, offset: bool = False
+    ) -> tuple[Array, Array]:
         """Reference (1, S) and information (D, D) of a prior that replaces variables leaving a window.
 
         Only the named costs and equality constraints that touch ``remove`` are marginalised, at this solution's
-        linearisation point. ``keep`` is one selection, for ``fg.prior``, or several, for ``fg.joint_prior``; details
-        and errors in :func:`unifg.answers.marginal.marginal_prior`.
+        linearisation point. ``keep`` is one selection, for ``fg.prior``, or several, for ``fg.joint_prior``. With
+        ``offset`` the reference (1, S + D) is for ``fg.joint_prior(..., offset=True)``; details and errors in
+        :func:`unifg.answers.marginal.marginal_prior`.
         """
-        return marginal_prior(self._program, self._lin, terms, remove, keep, self._equality)
+        return marginal_prior(self._program, self._lin, terms, remove, keep, self._equality, offset)
 
     def plot(self, *variables: Variable | str, marginals: bool = False) -> Figure:
         """Draw families, selections or components; all families where none is named.

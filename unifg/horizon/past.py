@@ -7,8 +7,8 @@ the window is not full, factors that touch an empty place do not count, and the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Protocol
+from collections.abc import Iterator, Sequence
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
@@ -27,6 +27,9 @@ from unifg.language.variables import Data, Family, Selection
 from unifg.lie import Manifold
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
+Place: TypeAlias = tuple[slice, slice, slice]
+"""Of a member in the reference of an arrival, in its information, and in an offset behind the reference."""
+
 NOTHING = 1e-12  # information in directions that what has left says nothing about; a matrix without zeros has a root
 
 
@@ -34,30 +37,46 @@ class Arrival(Protocol):
     """Coordinates in which the prior of what has left is a quadratic."""
 
     def residual(self, *manifolds: Manifold) -> Residual:
-        """``r(v_1, ..., v_k, reference)``: difference (n, D) of variables from a reference (S,)."""
+        """``r(v_1, ..., v_k, reference)``: difference (n, D) of variables from a reference.
+
+        The reference is (S,), the storage of all variables side by side, followed by what :meth:`express` adds.
+        """
         ...
 
-    def express(self, here: Array, reference: Array, information: Array) -> tuple[Array, Array]:
-        """Reference (S,) and information (D, D) in these coordinates.
+    def more(self, dim: int) -> int:
+        """How many numbers follow the storage in the reference, for a prior over ``dim`` tangents; at rest all zero."""
+        ...
+
+    def express(self, here: Array, step: Array, lowest: Array, information: Array) -> tuple[Array, Array]:
+        """Reference and information (D, D) in these coordinates.
 
         Args:
             here: (S,) where the prior was linearised.
-            reference: (S,) its lowest point.
+            step: (D,) from there to its lowest point, a right perturbation.
+            lowest: (S,) that point.
             information: (D, D) over right perturbations.
         """
         ...
 
 
 class Tangent:
-    """The tangent spaces of the variables themselves: :func:`unifg.joint_prior`."""
+    """The tangent spaces of the variables themselves, at the point of linearisation: :func:`unifg.joint_prior`.
+
+    The quadratic stays what it was made: its lowest point may be so far along what it hardly knows that no point of a
+    group is there.
+    """
 
     def residual(self, *manifolds: Manifold) -> Residual:
-        """Local differences side by side."""
-        return joint_prior(*manifolds)
+        """Local differences side by side, less an offset."""
+        return joint_prior(*manifolds, offset=True)
 
-    def express(self, here: Array, reference: Array, information: Array) -> tuple[Array, Array]:
+    def more(self, dim: int) -> int:
+        """The offset."""
+        return dim
+
+    def express(self, here: Array, step: Array, lowest: Array, information: Array) -> tuple[Array, Array]:
         """As they are."""
-        return reference, information
+        return np.concatenate([here, step]), information
 
 
 class Left:
@@ -66,7 +85,8 @@ class Left:
     Attributes:
         initial: reference (storage,) and information (d, d) about the node everything began at.
         statics: reference (count, storage) and information (count, d, d) about unknown statics at the start, by name.
-        arrival: reference (S,) and information (D, D) about the oldest nodes and the statics; None before any has left.
+        arrival: reference (S + more,) and information (D, D) about the oldest nodes and the statics, as
+            :class:`Arrival` has them; None before any has left.
         departure: what ``arrival`` becomes with the next node that leaves.
     """
 
@@ -84,7 +104,9 @@ class Left:
         self.arrival: tuple[Array, Array] | None = None
         self.departure: tuple[Array, Array] | None = None
 
-    def admit(self, name: str, member: int, value: Array, information: Array, place: tuple[slice, slice]) -> None:
+    def admit(
+        self, name: str, member: int, value: Array, information: Array, place: tuple[slice, slice, slice]
+    ) -> None:
         """Begin a static anew: what has left says nothing about it.
 
         Args:
@@ -92,16 +114,17 @@ class Left:
             member: which of its members.
             value: (storage,) where it is believed to be.
             information: (d, d) of that belief.
-            place: of the member in the arrival's reference and in its information.
+            place: of the member in the arrival.
         """
         self.forget(place[1])
         values, weights = (array.copy() for array in self.statics[name])
         values[member], weights[member] = value, information
         self.statics[name] = values, weights
         if self.arrival is not None:
-            reference = self.arrival[0].copy()
+            reference, information = self.arrival[0].copy(), self.arrival[1]
             reference[place[0]] = value
-            self.arrival = reference, self.arrival[1]
+            reference[place[2]] = 0.0
+            self.arrival = reference, information
 
     def forget(self, columns: slice) -> None:
         """Marginalise some columns out of the arrival."""
@@ -211,7 +234,7 @@ class Past:
         about = [*(x[k] for k in range(self.reach)), *members]
         size = sum(variable.manifold.dim for variable in about)
         identity = np.concatenate([variable.manifold.identity() for variable in about])
-        self._reference = graph.data("arrival", identity)
+        self._reference = graph.data("arrival", np.concatenate([identity, np.zeros(self._arrival.more(size))]))
         self._information = graph.data("arrival information", np.eye(size))
         self._arrived = graph.data("arrived", np.zeros(1, dtype=bool), each=True)
         graph.minimize(
@@ -281,11 +304,23 @@ class Past:
             return
         x, reach = self.x, self.reach
         kept: list[Family | Selection] = [x[1 : reach + 1], *self.statics]
-        reference, information = solution.marginal_prior(self.names, [x[0], *(f[0] for f in self.families)], kept)
-        here = np.concatenate([solution[variable].ravel() for variable in kept])
+        leaving = [x[0], *(f[0] for f in self.families)]
+        found, information = solution.marginal_prior(self.names, leaving, kept, offset=True)
+        here, step = np.split(found[0], [len(found[0]) - len(information)])
+        lowest = np.concatenate(list(_moved(kept, here, step)))
         nothing = np.flatnonzero(np.diag(information) == 0.0)
         information[nothing, nothing] = NOTHING
-        self._left.departure = self._arrival.express(here, reference[0], information)
+        self._left.departure = self._arrival.express(here, step, lowest, information)
+
+
+def _moved(variables: Sequence[Family | Selection], here: Array, step: Array) -> Iterator[Array]:
+    """Members of variables at ``here`` (S,) side by side, moved by ``step`` (D,) in their tangent spaces."""
+    at = row = 0
+    for variable in variables:
+        kind, count = variable.manifold, len(variable)
+        points = here[at : at + count * kind.storage].reshape(count, kind.storage)
+        yield kind.retract(points, step[row : row + count * kind.dim].reshape(count, kind.dim)).ravel()
+        at, row = at + points.size, row + count * kind.dim
 
 
 def without(information: Array, columns: IntArray) -> Array:

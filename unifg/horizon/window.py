@@ -15,7 +15,7 @@ from unifg.answers.solution import Solution
 from unifg.answers.solver import Solver
 from unifg.answers.status import Status
 from unifg.errors import GraphError, UnifgError
-from unifg.horizon.past import Arrival, Left, Past, Tangent
+from unifg.horizon.past import Arrival, Left, Past, Place, Tangent
 from unifg.horizon.recorded import History
 from unifg.horizon.robot import Robot, information_of
 from unifg.horizon.spread import JointCovariance
@@ -164,12 +164,14 @@ class Window:
             at += own * len(static.values)
         raise GraphError(f"the robot has no static '{name}' with a member {member}", family=name)
 
-    def _arriving(self, name: str, member: int) -> tuple[slice, slice]:
-        """Places of a static's member in the arrival's reference and in its information."""
+    def _arriving(self, name: str, member: int) -> Place:
+        """Where a static's member is in the arrival."""
         state, reach = self.robot.state, self._past.reach
         sizes = (reach * state.storage, "storage"), (reach * state.dim, "dim")
         reference, information = (self._member(name, member, at, size) for at, size in sizes)
-        return reference, information
+        statics = sum(len(static.values) * static.manifold.storage for static in self.robot.statics)
+        behind = reach * state.storage + statics
+        return reference, information, slice(behind + information.start, behind + information.stop)
 
     @in_turn
     def admit(self, name: str, member: int, value: ArrayLike, sigma: ArrayLike) -> None:

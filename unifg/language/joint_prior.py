@@ -25,15 +25,20 @@ VECTOR = 0  # how a leaf is compared; groups by their numbers in GROUPS
 GROUPS: dict[Manifold, int] = {SO2: 1, SE2: 2, SO3: 3, SE3: 4, SE23: 5}
 
 
-def joint_prior(*manifolds: Manifold) -> Residual:
-    """Stacked Log(m_k^-1 x_k) of variables x_k from the parts m_k of one reference.
+def joint_prior(*manifolds: Manifold, offset: bool = False) -> Residual:
+    """Stacked Log(m_k^-1 x_k) of variables x_k from the parts m_k of one reference, less an offset if there is one.
 
     ``graph.minimize(fg.joint_prior(fg.SE2, fg.Rn(1)), x[0], bias, reference, information=omega)``: the last argument
     is the reference, (S,) or (n, S), the storage of all variables side by side; ``information`` is (D, D) over their
     tangent spaces in the same order. :meth:`unifg.Solution.marginal_prior` gives both.
 
+    A quadratic model made at a point, as marginalisation leaves it, has its lowest point far away where it says little:
+    farther than a turn, or than the curvature of a group allows. With ``offset`` the reference is that point, followed
+    by the step (D,) in the tangent spaces that leads to the lowest one, and the model stays what it was.
+
     Args:
         *manifolds: of the variables, in order.
+        offset: whether the reference is (S + D,) or (n, S + D), the last D an offset that is subtracted.
 
     Returns:
         A residual with D rows; compiled when every component is a vector or one of the library's groups.
@@ -43,11 +48,11 @@ def joint_prior(*manifolds: Manifold) -> Residual:
     """
     if not manifolds:
         raise GraphError("joint_prior: name the manifold of at least one variable")
-    return _complete(manifolds)
+    return _complete(manifolds, offset)
 
 
 @cache
-def _complete(manifolds: tuple[Manifold, ...]) -> Residual:
+def _complete(manifolds: tuple[Manifold, ...], offset: bool) -> Residual:
     parts = [leaf for manifold in manifolds for leaf, _, _ in leaves(manifold)]
     storage, dim = (sum(getattr(part, size) for part in parts) for size in ("storage", "dim"))
     if all(_kind(leaf) is not None for leaf in parts):
@@ -55,7 +60,7 @@ def _complete(manifolds: tuple[Manifold, ...]) -> Residual:
         return residual(
             Kernel(
                 _stacked,
-                (*manifolds, (storage,)),
+                (*manifolds, (storage + dim * offset,)),
                 dim,
                 np.array(table, dtype=np.float64).ravel(),
                 name="joint prior",
@@ -76,7 +81,7 @@ def _kind(leaf: Manifold) -> int | None:
 
 @compiled
 def _stacked(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-    """Leaf after leaf; the table holds kind, storage and dimension of each."""
+    """Leaf after leaf; the table holds kind, storage and dimension of each. What follows the reference is an offset."""
     derive = len(J) > 0
     if derive:
         J[:] = 0.0
@@ -113,6 +118,9 @@ def _stacked(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
                         J[row + i, row + k] = square[i, k]
         at += storage
         row += dim
+    if len(p) > at:
+        for i in range(row):
+            r[i] -= p[at + i]
 
 
 class _Stacked:
@@ -123,8 +131,10 @@ class _Stacked:
         self.bounds = np.cumsum([0, *(manifold.storage for manifold in manifolds)]).tolist()
 
     def __call__(self, *arguments: Array) -> Array:
-        """(n, D) stacked differences of variables (n, storage_k) from references (n, S) or (S,)."""
-        return np.concatenate(self._differences(arguments), axis=1)
+        """(n, D) stacked differences of variables (n, storage_k) from references (n, S) or (S,), less the offset."""
+        differences = np.concatenate(self._differences(arguments), axis=1)
+        offset = arguments[-1][..., self.bounds[-1] :]
+        return differences - offset if offset.shape[-1] else differences
 
     def jacobian(self, *arguments: Array) -> list[Array]:
         """One (n, D, d_k) array per variable."""
