@@ -444,7 +444,7 @@ def test_the_gap_to_a_mover_is_a_barrier(speed: float) -> None:
     others = tracks((OPEN[0] + 2.0, OPEN[1], 0.2), velocity=(speed, 0.0), mover=True)
     limits = limits_of(others)
     stages = np.arange(1, s.horizon + 1)
-    travel = np.minimum(max(s.mover_speed, speed) * s.dt * stages, s.mover_allowance)
+    travel = max(s.mover_speed, speed) * np.minimum(s.dt * stages, s.mover_surprise)
     least = HULL + s.disc_clearance + travel
     expected = least + (1.8 - least) * 0.88**stages  # an eighth of it in a tenth of a second
     np.testing.assert_allclose(limits, np.minimum(expected, 1.8))

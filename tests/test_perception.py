@@ -172,6 +172,24 @@ def test_mover_that_turns_round_is_followed() -> None:
     assert np.mean(away) < 0.06
 
 
+@pytest.mark.parametrize("speed", [0.3, 0.6, 1.0, 1.5])
+def test_a_mover_that_turns_round_is_believed_soon(speed: float) -> None:
+    """From where it turns it goes a forearm, at any speed, to where its track thought that it would not be."""
+    occupancy, length, wrong = hall(), 2.2, []
+    for seed in range(3):
+        begin = np.array([3.8 + 0.2 * seed, 5.3])
+        mover = Obstacle(begin, 0.2, begin + np.array([length, 0.0]), speed)
+        world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(seed), courteous=False)
+        tracker, rng = DiscTracker(field(occupancy)), np.random.default_rng(seed)
+        turn = math.ceil(length / speed / DT - 1e-9)
+        watch(world, tracker, turn - 10, np.zeros(3), rng)
+        found = np.array([watch(world, tracker, 1, np.array([0.005, 0.005, 0.002]), rng).velocity[0, 0]
+                          for _ in range(10 + round(1.5 / speed / DT))])  # fmt: skip
+        assert np.abs(found[4:9] - speed).max() < 0.1
+        wrong.append(DT * np.abs(found[10:] + speed).sum())
+    assert np.mean(wrong) < 0.35
+
+
 def test_mover_that_waited_is_followed_when_it_goes_on() -> None:
     """A mover that has stood for two seconds, for the robot's sake, is not left behind by its track."""
     occupancy = hall()

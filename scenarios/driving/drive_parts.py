@@ -206,14 +206,14 @@ def disc_limits(
     """(N, M) least distances to the centres (N, M, 2) of discs less their radii, as far as the way out keeps them.
 
     They are wider by what the estimate (2, 2) may be off towards a disc. A disc that has ever moved is kept off by what
-    it can travel in the meantime, up to a limit, and what is left of the gap is a barrier that may shrink at the rate
-    ``approach`` from now on; with ``avoidance="barrier"`` that holds for every disc.
+    it can travel in the meantime, or before it is noticed that it goes elsewhere, and what is left of the gap is a
+    barrier that may shrink at the rate ``approach`` from now on; with ``avoidance="barrier"`` that holds for each.
     """
     stages = s.dt * np.arange(1, s.horizon + 1)[:, None]
     kept = np.hypot(*np.moveaxis(way_out[1:, None, :2] - centres, 2, 0)) - tracks.radius
     movers, now = tracks.mover, pose[:2] - tracks.centre
     walk = np.maximum(np.hypot(*tracks.velocity.T), s.mover_speed)
-    allowance = np.where(movers, np.minimum(walk * stages, s.mover_allowance), 0.0)
+    allowance = np.where(movers, walk * np.minimum(stages, s.mover_surprise), 0.0)
     least = s.robot_radius + s.disc_clearance + s.sigmas * along(spread, now) + allowance
     guarded = movers | (s.avoidance == "barrier")
     spare = np.where(guarded, np.maximum(np.hypot(*now.T) - tracks.radius - least, 0.0), 0.0)

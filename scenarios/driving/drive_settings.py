@@ -44,7 +44,8 @@ class ControllerSettings:
         disc_clearance: least distance of the hull to tracked discs [m].
         sigmas: by how many standard deviations of the estimate, along the normal, both distances are wider.
         mover_speed: at least this fast is a disc that has ever moved believed to be able to go on [m/s].
-        mover_allowance: most that is added to the clearance from discs that have ever moved [m].
+        mover_surprise: for so long a disc that has ever moved may go anywhere before the robot has seen it, decided and
+            begun to act [s]; what it travels in that time is kept off, too.
         mover_margin: added to the soft margin around such discs [m].
         approach: rate at which the gap to such a disc may close, alpha of its barrier [1/s].
         avoidance: of walls and discs: "clearance" as a constraint, with a barrier to discs that have ever moved;
@@ -76,7 +77,7 @@ class ControllerSettings:
     disc_clearance: float = 0.06
     sigmas: float = 2.0
     mover_speed: float = 0.3
-    mover_allowance: float = 0.15
+    mover_surprise: float = 0.5
     mover_margin: float = 0.3
     approach: float = -math.log(0.88) / 0.1
     avoidance: str = option("clearance", choices=AVOIDANCES)

@@ -99,7 +99,7 @@ class DiscTracker:
         discs = self.finder.find(scan, place)
         self._predict(dt)
         track, disc = self._associate(discs)
-        self._correct(track, disc, discs)
+        self._correct(track, disc, discs, dt)
         missed = np.ones(len(self._rows), dtype=bool)
         missed[track] = False
         self._review(missed, scan, place, dt)
@@ -150,7 +150,7 @@ class DiscTracker:
         chosen = np.array(pairs, dtype=np.intp).reshape(-1, 2)
         return chosen[:, 0], chosen[:, 1]
 
-    def _correct(self, track: IntArray, disc: IntArray, discs: Discs) -> None:
+    def _correct(self, track: IntArray, disc: IntArray, discs: Discs, dt: float) -> None:
         if track.size == 0:
             return
         rows = self._rows
@@ -158,10 +158,12 @@ class DiscTracker:
         variance = _centre_variance(discs.distance[disc])
         covariance = rows.covariance[track]
         innovation = seen - rows.mean[track, 0]
-        # A mover that turns round surprises the filter: let its velocity go rather than lag behind.
-        surprise = np.sum(innovation**2, axis=1) / (covariance[:, 0, 0] + variance) > _SURPRISE
-        covariance[surprise, 1, 1] += _FIRST_SPEED**2
-        covariance[surprise, 0, 0] += 0.05**2
+        # A mover that turns round surprises the filter: let its velocity go rather than lag behind, by as much as the
+        # surprise asks for if it is that of one step. When it turned is not known, so the place tells nothing yet.
+        away = np.sum(innovation**2, axis=1)
+        surprise = away / (covariance[:, 0, 0] + variance) > _SURPRISE
+        covariance[surprise, 0, 0] += away[surprise]
+        covariance[surprise, 1, 1] += away[surprise] / dt**2
         gain = covariance[:, :, 0] / (covariance[:, 0, 0] + variance)[:, None]
         rows.mean[track] += gain[:, :, None] * innovation[:, None, :]
         rows.covariance[track] = covariance - gain[:, :, None] * covariance[:, None, 0, :]
@@ -186,7 +188,7 @@ class DiscTracker:
         speed = np.linalg.norm(rows.mean[track, 1], axis=1)
         spread = np.sqrt(rows.covariance[track, 1, 1])
         begins = (speed > _SPEED_FLOOR) & (speed > 3.0 * spread) & (rows.hits[track] >= 4)
-        moving = np.where(rows.moving[track], speed > _SPEED_FLOOR, begins)
+        moving = np.where(rows.has_moved[track], speed > _SPEED_FLOOR, begins)
         rows.moving[track] = moving
         rows.has_moved[track] |= moving
         moved = track[moving]
