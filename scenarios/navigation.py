@@ -45,6 +45,7 @@ from unifg.scenarios.worlds.faults import DRIVE_FAULTS, DriveFaults, Fault, one_
 from unifg.scenarios.worlds.imperfection import Imperfection, imperfect
 from unifg.scenarios.worlds.placement import PlacementRules, place_obstacles
 from unifg.scenarios.worlds.plane import LidarModel, OdometryModel, World
+from unifg.scenarios.worlds.traffic import Traffic, draw_traffic
 from unifg.typing import Array
 
 INITIAL_SIGMA = (0.1, 0.1, 0.05)  # [m, m, rad]
@@ -73,7 +74,8 @@ class NavigationSettings:
         coupling: of estimation and control: estimation first, then control conditioned on it; or one graph for both.
         obstacles: number of obstacles that are not on the map; one in three moves.
         mover_speed: speed of those that move [m/s], which the robot is not told.
-        courteous: whether they wait for a robot at rest; else they go on through it.
+        courteous: whether they, people and carts mind the robot; else they go on through it.
+        traffic: people, carts and doors.
         seed: of everything random.
         controller: weights and limits.
         drivetrain: of the base; the controller is told the accelerations on its data sheet.
@@ -95,6 +97,7 @@ class NavigationSettings:
     obstacles: int = option(0, text=partial(count, most=200), metavar="K")
     mover_speed: float = option(0.3, text=positive, metavar="M/S")
     courteous: bool = option(False)
+    traffic: Traffic = field(default_factory=Traffic)
     seed: int = option(0, metavar="S")
     controller: ControllerSettings = field(default_factory=ControllerSettings)
     drivetrain: Drivetrain = field(default_factory=Drivetrain)
@@ -143,7 +146,7 @@ class Episode:
         self.goals = np.array([_pose(goal, None, "goal") for goal in goals])
         if not len(self.goals):
             raise ScenarioError("at least one goal is needed")
-        placement, sensors, belief, floor, drawn, wrong = np.random.default_rng(settings.seed).spawn(6)
+        placement, sensors, belief, floor, drawn, wrong, about = np.random.default_rng(settings.seed).spawn(7)
         self.occupancy, true = imperfect(self.occupancy, settings.imperfection, self.start, self.goals, wrong)
         self.distance_map = _field(self.occupancy)
         legs = zip([self.start, *self.goals[:-1]], self.goals, strict=True)
@@ -159,11 +162,15 @@ class Episode:
             goals=self.goals,
             rules=PlacementRules(speed=settings.mover_speed),
         )
+        traffic = draw_traffic(
+            settings.traffic, true, _field(true) if settings.imperfection != Imperfection() else self.distance_map,
+            self.path, self.goals, about, settings.courteous,
+        )  # fmt: skip
         self.world = World(
             true, self.start, discs, sensors, robot_radius=control.robot_radius, lidar=settings.lidar,
             odometry=settings.odometry,
             drivetrain=settings.drivetrain, patches=draw_patches(settings.drivetrain, self.path, floor),
-            courteous=settings.courteous,
+            courteous=settings.courteous, traffic=traffic,
         )  # fmt: skip
         sigma = np.array(INITIAL_SIGMA)
         believed = self.start + sigma * belief.standard_normal(3)
@@ -348,6 +355,7 @@ class Episode:
             horizon=plan.states,
             scan=scan.ranges,
             obstacles=world.obstacle_states()[:, :3],
+            boxes=world.boxes(),
             detected=np.column_stack([pilot.tracks.centre, pilot.tracks.radius]),
             solve_ms=took["localise_ms"] + took["plan_ms"],
             **took,

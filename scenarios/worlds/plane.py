@@ -25,6 +25,7 @@ from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.worlds.drivetrain import Drivetrain, Wheels, slip_at
 from unifg.scenarios.worlds.rectangles import wall_rectangles
 from unifg.scenarios.worlds.space import OTHERS, Obstacle, Space
+from unifg.scenarios.worlds.traffic import Cart, Door, Person, moved
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["ROBOT_RADIUS", "LidarModel", "OdometryModel", "World"]
@@ -101,6 +102,7 @@ class World:
         drivetrain: Drivetrain | None = None,
         patches: Array | None = None,
         courteous: bool = True,
+        traffic: Sequence[Person | Cart | Door] = (),
     ) -> None:
         """Build the walls, place the obstacles and the robot.
 
@@ -115,6 +117,7 @@ class World:
             drivetrain: what the base makes of its commands; None for a base that follows them at once.
             patches: (K, 3) x, y, radius [m] of slippery patches on the floor.
             courteous: whether movers wait for a robot at rest, or go on through it.
+            traffic: who else goes about.
 
         Raises:
             ScenarioError: if the start is not a finite pose, or the robot would stand in a wall or an
@@ -142,6 +145,9 @@ class World:
         self._add_walls()
         for index, obstacle in enumerate(self.obstacles):
             self._space.add_disc(obstacle, index)
+        self._traffic = tuple(traffic)
+        for index, thing in enumerate(self._traffic, start=len(self.obstacles)):
+            self._space.add_thing(thing, index)
         self._robot = self._space.vehicle
         self._trail: list[tuple[float, tuple[float, float, float]]] = [
             (self.time, (*self._robot.position, self._robot.angle))
@@ -323,5 +329,9 @@ class World:
         return math.inf
 
     def obstacle_states(self) -> Array:
-        """(K, 4) x, y, radius [m] of the obstacles now, and 1 for those that move by design, else 0."""
-        return self._space.discs()
+        """(K, 4) x, y, radius [m] of the obstacles and people now, and 1 for those that move by design, else 0."""
+        return np.concatenate([self._space.discs(), moved(self._traffic)[0]])
+
+    def boxes(self) -> Array:
+        """(B, 5) x, y [m], angle [rad], length and width [m] of the carts and the leaves of doors now."""
+        return moved(self._traffic)[1]

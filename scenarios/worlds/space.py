@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import pymunk
@@ -17,7 +17,7 @@ import pymunk
 from unifg.errors import ScenarioError
 from unifg.typing import Array
 
-__all__ = ["COURTESY_GAP", "OTHERS", "Obstacle", "Space"]
+__all__ = ["COURTESY_GAP", "OTHERS", "Obstacle", "Space", "Thing"]
 
 COURTESY_GAP = 0.1
 """Gap a mover keeps between its hull and that of a resting robot [m]."""
@@ -60,6 +60,24 @@ class Obstacle:
         return positions
 
 
+class Thing(Protocol):
+    """Something that moves by itself."""
+
+    @property
+    def body(self) -> pymunk.Body:
+        """Kinematic."""
+        ...
+
+    @property
+    def shape(self) -> pymunk.Shape:
+        """Of the body."""
+        ...
+
+    def advance(self, robot: pymunk.Body, robot_radius: float, resting: bool, dt: float) -> None:
+        """Choose the velocity of the next substep, knowing where the robot is and whether it is at rest."""
+        ...
+
+
 class Space:
     """One vehicle's disc and what it can run into, each thing with an owner's number.
 
@@ -87,6 +105,7 @@ class Space:
         self.collisions = 0
         self._owner: dict[pymunk.Shape, int] = {}
         self._movers: dict[int, _Mover] = {}  # by place in obstacles
+        self._things: list[Thing] = []
         self._touching: dict[int, int] = {}
         self._separated: dict[int, float] = {}
 
@@ -112,6 +131,12 @@ class Space:
             shape = pymunk.Circle(self.engine.static_body, obstacle.radius, offset)
         self.obstacles.append(obstacle)
         return self.add(shape, owner)
+
+    def add_thing(self, thing: Thing, owner: int) -> None:
+        """Add something that moves by itself, whoever stands there."""
+        self._things.append(thing)
+        self.engine.add(thing.body)
+        self.add(thing.shape, owner)
 
     def add_vehicle(self) -> None:
         """Let the vehicle in, after everything else."""
@@ -149,6 +174,8 @@ class Space:
         """Move everything for a substep [s]; courteous movers wait for a vehicle that is ``resting``."""
         for mover in self._movers.values():
             mover.advance(self.vehicle, self.radius, resting and self._courteous, pause)
+        for thing in self._things:
+            thing.advance(self.vehicle, self.radius, resting, pause)
         self.engine.step(pause)
 
     def without_contacts(self, velocity: pymunk.Vec2d, relative: bool = True) -> pymunk.Vec2d:
