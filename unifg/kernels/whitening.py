@@ -86,7 +86,10 @@ def square_roots(name: str, information: Array, count: int, size: int) -> Array:
             f"term '{name}': information has shape {information.shape}, expected {(m, m)} or {(count, m, m)}",
             term=name,
         )
-    stack = information.reshape(-1, m, m)
+    stack = np.array(information, dtype=np.float64, order="C").reshape(-1, m, m)
+    quick = np.empty((len(stack), m * m))
+    if quick_roots(stack, quick):
+        return quick.reshape(stack.shape)
     transposed = np.swapaxes(stack, -1, -2)
     if not np.isfinite(stack).all() or not np.allclose(stack, transposed, rtol=1e-9, atol=0.0):
         unequal = ~np.isfinite(stack) | ~np.isclose(stack, transposed, rtol=1e-9, atol=0.0)
