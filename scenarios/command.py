@@ -157,7 +157,7 @@ def _campaign(chosen: argparse.Namespace) -> int:
     from unifg.scenarios.campaigns.campaign import run_campaign
 
     folder: Path = chosen.out or Path("out") / "campaigns" / chosen.file.stem
-    with _progress_bar(chosen.file.stem) as progress:
+    with _progress_bar(chosen.file.stem, begun=True) as progress:
         found = run_campaign(
             chosen.file, folder, workers=chosen.workers, scheduler=chosen.scheduler, again=chosen.again,
             any_code=chosen.any_code, progress=progress,
@@ -260,10 +260,10 @@ def _run_settings(chosen: argparse.Namespace, module: Any, settings: Any, name: 
     with _progress_bar(name) as progress:
         watched = {"announce": _announce} if getattr(chosen, "live", False) else {}
         outcome: Outcome = module.run(settings, progress, **watched)
-    try:
-        files = outcome.write(folder)
-    except OSError as error:
-        return _refuse(f"--out {folder}: cannot write the results ({error})")
+        try:
+            files = outcome.write(folder)  # whole, whoever asks for an end meanwhile
+        except OSError as error:
+            return _refuse(f"--out {folder}: cannot write the results ({error})")
     print(outcome.summary)
     print()
     for file in files:
@@ -274,26 +274,30 @@ def _run_settings(chosen: argparse.Namespace, module: Any, settings: Any, name: 
 
 
 @contextmanager
-def _progress_bar(name: str) -> Iterator[Progress]:
+def _progress_bar(name: str, begun: bool = False) -> Iterator[Progress]:
     """A bar on stderr; the first control-C or SIGTERM waits for the end of a tick, so that the record stays whole.
+
+    Before the first tick there is no record, and nothing to wait for; after the last one the results are written first.
 
     Args:
         name: beside the bar.
+        begun: whether there is something to keep from the beginning.
     """
     wanted = False
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         nonlocal wanted
-        if wanted:  # it does not come to an end: stop at once
+        if wanted or not begun:  # it does not come to an end, or has nothing to keep: stop at once
             raise KeyboardInterrupt
         wanted = True
 
     with _bar(name) as show:
 
         def progress(done: float, text: str) -> None:
-            nonlocal wanted
+            nonlocal wanted, begun
             show(done, text)
-            if wanted:
+            begun = True
+            if wanted and done < 1.0:
                 wanted = False
                 raise KeyboardInterrupt
 

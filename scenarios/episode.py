@@ -38,7 +38,10 @@ def run_ticks(limit: int, tick: Callable[[int], tuple[float, str] | None], progr
             progress(min(max(0.0, told[0]), 0.99), told[1])
     except KeyboardInterrupt:
         interrupted = True
-    progress(1.0, "done")
+    try:
+        progress(1.0, "done")
+    except KeyboardInterrupt:  # asked for in the last tick, by somebody who waits for more than this run
+        interrupted = True
     return interrupted
 
 

@@ -125,6 +125,7 @@ class SolvedGraph:
     judgement: Judgement
     certificate: Certificate | None
     seconds: dict[str, float] = field(default_factory=dict)
+    interrupted: bool = False
 
     @property
     def name(self) -> str:
@@ -135,11 +136,6 @@ class SolvedGraph:
     def chi2_inliers(self) -> float:
         """chi2 at the solution without the outliers."""
         return self.chi2[2] - float(self.squared[self.outliers].sum())
-
-    @property
-    def interrupted(self) -> bool:
-        """Whether the user stopped it."""
-        return self.solution.status is Status.INTERRUPTED
 
 
 def solve_file(settings: SolveSettings, progress: Progress = silent) -> SolvedGraph:
@@ -184,14 +180,18 @@ def solve_file(settings: SolveSettings, progress: Progress = silent) -> SolvedGr
     clock.split("initialise")
     solve = _Solve(settings, loss, clock, progress)
     solution, after, squared, outliers = solve(before)
-    certificate = None
-    if (settings.certify or settings.staircase) and solution.status is not Status.INTERRUPTED:
-        progress(0.95, "is another map better?")
-        clock.start()
-        certificate = certify(after, used=~outliers, staircase=settings.staircase)
-        clock.split("certify")
-        if certificate.rank > read.group.point_dim:
-            solution, after, squared, outliers = solve(before.with_poses(certificate.poses))
+    certificate, stopped = None, solution.status is Status.INTERRUPTED
+    if (settings.certify or settings.staircase) and not stopped:
+        try:
+            progress(0.95, "is another map better?")
+            clock.start()
+            certificate = certify(after, used=~outliers, staircase=settings.staircase)
+            clock.split("certify")
+            if certificate.rank > read.group.point_dim:
+                solution, after, squared, outliers = solve(before.with_poses(certificate.poses))
+        except KeyboardInterrupt:  # there is something to write
+            stopped = True
+    stopped = stopped or solution.status is Status.INTERRUPTED
     with suppress(KeyboardInterrupt):  # there is something to write
         progress(1.0, solution.status.name.lower().replace("_", " "))
     numbers, steps = solve.snapshots.chosen()
@@ -199,7 +199,7 @@ def solve_file(settings: SolveSettings, progress: Progress = silent) -> SolvedGr
     judgement = judge(replace(after, edges=after.edges[~outliers]), settings.residual)
     return SolvedGraph(
         settings, before, after, chi2, solution, loss, squared, outliers, steps, numbers, begun, judgement, certificate,
-        clock.seconds,
+        clock.seconds, stopped,
     )  # fmt: skip
 
 
@@ -214,6 +214,8 @@ class _Solve:
         """The solution, the graph at it, (m,) its r' Omega r and which edges the loss takes for outliers."""
         settings, loss, clock = self.settings, self.loss, self.clock
         clock.start()
+        if not self.before:
+            self.progress(0.06, "compiling")
         graph, x, guess = begin.graph(robust=loss, residual=settings.residual)
         graph.compile()
         clock.split("compile")

@@ -23,6 +23,7 @@ from unifg.files.tum import read_tum
 from unifg.scenarios import command
 from unifg.scenarios import navigation as navigation_scenario
 from unifg.scenarios.commands import drives
+from unifg.scenarios.episode import run_ticks
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.navigation import NavigationSettings
 from unifg.scenarios.options import add_options, option, pose, positive, settings_of
@@ -231,6 +232,40 @@ def test_first_interrupt_waits_for_the_end_of_the_tick(
     assert finished == [0, 1, 2, 3]
     assert (tmp_path / "out" / "scene.html").exists()
     assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals work otherwise on Windows")
+@pytest.mark.parametrize("when", ["before", "last tick", "while writing"])
+def test_an_end_asked_for_at_any_moment_loses_nothing(
+    when: str, navigation: FakeNavigation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before the first tick it ends at once; what was run to its end is written whole."""
+    ticks: list[int] = []
+    written = drives.write_results
+
+    def loop(settings: NavigationSettings, progress: Progress) -> EpisodeLog:
+        def tick(number: int) -> tuple[float, str] | None:
+            ticks.append(number)
+            if number == 4 and when == "last tick":
+                os.kill(os.getpid(), signal.SIGTERM)
+            return None if number == 4 else (number / 5, "driving")
+
+        if when == "before":
+            os.kill(os.getpid(), signal.SIGTERM)
+        return replace(navigation.log, interrupted=run_ticks(10, tick, progress))
+
+    def write(folder: Path, log: EpisodeLog) -> list[Path]:
+        if when == "while writing":
+            os.kill(os.getpid(), signal.SIGTERM)
+        return written(folder, log)
+
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(navigation_scenario, "run_navigation", loop)
+    monkeypatch.setattr(drives, "write_results", write)
+    assert run(tmp_path) == (130 if when == "before" else 0)
+    assert len(ticks) == (0 if when == "before" else 5)
+    assert (tmp_path / "out" / "scene.html").exists() is (when != "before")
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 @pytest.mark.parametrize(

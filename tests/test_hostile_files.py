@@ -261,6 +261,19 @@ def test_sigterm_ends_with_the_results_so_far(
     assert (tmp_path / "out" / "graph.g2o").is_file() and signal.getsignal(signal.SIGTERM) is before
 
 
+def test_an_end_asked_for_after_the_solve_keeps_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pose_graph, "certify", stopped)
+    edges = ("0 1 1 0 0", "1 2 1 0 1.57", "2 0 0.1 2 -1.57")
+    text = "\n".join(f"EDGE_SE2 {edge} 1 0 0 1 0 1" for edge in edges)
+    path = put(tmp_path, "g.g2o", ("".join(f"VERTEX_SE2 {k} {k} 0 0\n" for k in range(3)) + text).encode())
+    assert main(["solve", str(path), "--out", str(tmp_path / "out"), "--no-scene", "--certify"]) == 130
+    numbers = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert numbers["interrupted"] and numbers["converged"] and numbers["certificate"] is None
+
+
 WITHOUT = """
 import sys
 for name in ("tqdm", "matplotlib", "meshcat", "pymunk", "PIL", "yaml"):
