@@ -206,6 +206,11 @@ class Episode:
 
     def run(self, progress: Progress) -> EpisodeLog:
         """Tick until the last goal is reached or given up."""
+        self.begin()
+        return self.finish(run_ticks(self.longest, self._tick, progress))
+
+    def begin(self) -> None:
+        """Open the log."""
         s = self.settings
         self._recorder = Recorder(
             EpisodeLog,
@@ -226,8 +231,14 @@ class Episode:
         self._outcomes = ["time ran out"] * len(self.goals)
         self._goal, self._driven, self._dead_reckoning = 0, 0.0, self.pilot.pose
         self._begun, self._helpless = 0.0, 0.0
-        limit = int(sum(map(_longest, self.legs)) / s.controller.dt)
-        interrupted = run_ticks(limit, self._tick, progress)
+
+    @property
+    def longest(self) -> int:
+        """Ticks that the drive may take."""
+        return int(sum(map(_longest, self.legs)) / self.settings.controller.dt)
+
+    def finish(self, interrupted: bool) -> EpisodeLog:
+        """Close the log."""
         return self._recorder.finish(
             collisions=self.world.collisions,
             reached=[outcome == REACHED for outcome in self._outcomes],
@@ -237,7 +248,15 @@ class Episode:
         )
 
     def _tick(self, number: int) -> tuple[float, str] | None:
-        """Move on from the last tick, scan, decide, record and drive; None at the last goal."""
+        """Decide and drive; None at the last goal."""
+        control = self.decide(number)
+        if control is None:
+            return None
+        self.world.step(*control, self.settings.controller.dt)
+        return self._driven / path_length(self.path), f"goal {self._goal + 1}/{len(self.goals)}"
+
+    def decide(self, number: int) -> tuple[float, float] | None:
+        """Move on from the last tick, scan, decide and record; the control to be driven, None at the last goal."""
         dt, goal, now = self.settings.controller.dt, self._goal, self.world.time
         faults = self.faults
         if faults.carries(now):
@@ -270,8 +289,7 @@ class Episode:
             self._begin_leg(goal)
         asked = np.array(plan.control, dtype=np.float64)
         v, omega = faults.control(asked, now, dt).tolist()
-        self.world.step(v, omega, dt)
-        return self._driven / path_length(self.path), f"goal {goal + 1}/{len(self.goals)}"
+        return v, omega
 
     def _outcome(self, goal: int) -> str | None:
         """What has become of a goal; None while the robot is on its way."""

@@ -12,7 +12,7 @@ into walls already touched.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +25,7 @@ from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.worlds.drivetrain import Drivetrain, Wheels, slip_at
 from unifg.scenarios.worlds.rectangles import wall_rectangles
 from unifg.scenarios.worlds.space import OTHERS, Obstacle, Space
-from unifg.scenarios.worlds.traffic import Cart, Door, Person, moved
+from unifg.scenarios.worlds.traffic import Cart, Door, Fellow, Person, moved
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["ROBOT_RADIUS", "LidarModel", "OdometryModel", "World"]
@@ -145,9 +145,9 @@ class World:
         self._add_walls()
         for index, obstacle in enumerate(self.obstacles):
             self._space.add_disc(obstacle, index)
-        self._traffic = tuple(traffic)
-        for index, thing in enumerate(self._traffic, start=len(self.obstacles)):
-            self._space.add_thing(thing, index)
+        self._traffic: list[Person | Cart | Door | Fellow] = []
+        for thing in traffic:
+            self._let_in(thing)
         self._robot = self._space.vehicle
         self._trail: list[tuple[float, tuple[float, float, float]]] = [
             (self.time, (*self._robot.position, self._robot.angle))
@@ -160,6 +160,14 @@ class World:
                 f"it would overlap a wall or an obstacle by {-self.clearance():.2f} m; "
                 f"choose a start in free space of map {occupancy.name!r}"
             )
+
+    def _let_in(self, thing: Person | Cart | Door | Fellow) -> None:
+        self._space.add_thing(thing, len(self.obstacles) + len(self._traffic))
+        self._traffic.append(thing)
+
+    def meet(self, other: World) -> None:
+        """Let in the robot of another world, which goes here where it goes there, a substep late at the most."""
+        self._let_in(Fellow(other._robot, other.robot_radius))
 
     def _add_walls(self) -> None:
         rectangles = wall_rectangles(self.occupancy.occupied)
@@ -190,6 +198,11 @@ class World:
         Raises:
             ScenarioError: if a command or the duration is not a usable number.
         """
+        for _ in self.stepping(v, omega, dt):
+            pass
+
+    def stepping(self, v: float, omega: float, dt: float = 0.1) -> Iterator[None]:
+        """The same substep by substep, each when it is asked for, so that several worlds can go on side by side."""
         if not (math.isfinite(v) and math.isfinite(omega)):
             raise ScenarioError(
                 f"the control (v, omega) = ({v}, {omega}) is not finite; stop the robot, do not drive on it"
@@ -204,6 +217,7 @@ class World:
                 self._start_tick(pause)
             self._space.step(pause, resting=self._robot.velocity.length < _REST_SPEED)
             self._trail.append((self.time, (*self._robot.position, self._robot.angle)))
+            yield
         self._measure(before, heading_before, dt, self._gripped / self._spun if self._spun > 0.0 else 1.0)
 
     def _grip(self, body: pymunk.Body) -> float:
@@ -329,7 +343,7 @@ class World:
         return math.inf
 
     def obstacle_states(self) -> Array:
-        """(K, 4) x, y, radius [m] of the obstacles and people now, and 1 for those that move by design, else 0."""
+        """(K, 4) x, y, radius [m] of obstacles, people and other robots, and 1 for those that move, else 0."""
         return np.concatenate([self._space.discs(), moved(self._traffic)[0]])
 
     def boxes(self) -> Array:

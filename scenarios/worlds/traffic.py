@@ -26,7 +26,7 @@ from unifg.scenarios.ways.grid import path_exists
 from unifg.scenarios.ways.polyline import arc_lengths, at_stations
 from unifg.typing import Array, BoolArray
 
-__all__ = ["Cart", "Door", "Person", "Schedule", "Traffic", "draw_traffic", "moved"]
+__all__ = ["Cart", "Door", "Fellow", "Person", "Schedule", "Traffic", "draw_traffic", "moved"]
 
 RELAXATION = 0.5  # [s], of a person's velocity to the one that is wanted
 PUSH, REACH = 25.0, 0.08  # of a person: acceleration at a touch [m/s^2], length over which it falls to 1/e [m]
@@ -198,6 +198,26 @@ class Cart:
             for place in (np.array(self.body.position), target)
         )
         return there < min(BEFORE, here)
+
+
+class Fellow:
+    """The robot of another world, as this one meets it: a disc that is where that one is.
+
+    Attributes:
+        body: kinematic.
+        radius: [m].
+    """
+
+    def __init__(self, robot: pymunk.Body, radius: float) -> None:
+        """Stand where the other robot stands; ``radius`` is its own [m]."""
+        self._robot, self.radius = robot, radius
+        self.body = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+        self.body.position = robot.position
+        self.shape = pymunk.Circle(self.body, radius)
+
+    def advance(self, robot: pymunk.Body, robot_radius: float, resting: bool, dt: float) -> None:
+        """Be where the other is by the end of the next ``dt`` [s]."""
+        self.body.velocity = (self._robot.position - self.body.position) / dt
 
 
 @dataclass(frozen=True)
@@ -423,12 +443,12 @@ def doorways(walls: DistanceMap, points: Array, goals: Array) -> list[tuple[Arra
     return chosen
 
 
-def moved(things: Sequence[Person | Cart | Door]) -> tuple[Array, Array]:
+def moved(things: Sequence[Person | Cart | Door | Fellow]) -> tuple[Array, Array]:
     """(K, 4) discs x, y, radius [m] and 1 of those that are round, (B, 5) x, y, angle, length, width of the others."""
     round_, boxes = [], []
     for thing in things:
         x, y = thing.body.position
-        if isinstance(thing, Person):
+        if isinstance(thing, Person | Fellow):
             round_.append((x, y, thing.radius, 1.0))
         else:
             boxes.append((x, y, thing.body.angle, *thing.size))
