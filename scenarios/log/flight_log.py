@@ -145,7 +145,7 @@ class FlightLog:
         rest = {name: getattr(self, name) for name in _WORDS}
         rest |= {"version": _VERSION, "layout_name": self.layout.name}
         with beside(path) as own, open(own, "wb") as file:  # numpy adds a suffix to a name, not to a file
-            np.savez_compressed(file, allow_pickle=False, words=np.array(json.dumps(rest)), **arrays)
+            np.savez_compressed(file, words=np.array(json.dumps(rest)), **arrays)
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> FlightLog:

@@ -45,7 +45,7 @@ def save_columns(path: str | os.PathLike[str], log: Any, kind: str, known: dict[
     rest = {name: value for name, value in known.items() if not isinstance(value, np.ndarray)}
     about = {"kind": kind, "units": {name: column.unit for name, column in columns(log).items()}, **rest}
     with beside(path) as own, open(own, "wb") as file:  # numpy adds a suffix to a name, not to a file
-        np.savez_compressed(file, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
+        np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)
 
 
 def load_columns(path: str | os.PathLike[str], log: type, kind: str) -> tuple[dict[str, Any], dict[str, Any]]:
