@@ -35,6 +35,7 @@ __all__ = [
     "stamped",
     "tableau",
     "terminal",
+    "trajectory",
     "uncertainty",
     "unicycle",
     "universal",
