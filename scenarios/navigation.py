@@ -28,7 +28,7 @@ from unifg.scenarios.driving.route import Blocked, Route
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.options import count, existing, option, pose, positive
+from unifg.scenarios.options import count, existing, option, pair, pose, positive
 from unifg.scenarios.rivals.choices import (
     LOCALISERS,
     OWN_LOCALISER,
@@ -73,6 +73,7 @@ class NavigationSettings:
         solver: one of `unifg.solvers.names.CONSTRAINED`.
         coupling: of estimation and control: estimation first, then control conditioned on it; or one graph for both.
         obstacles: number of obstacles that are not on the map; one in three moves.
+        obstacle_radius: least and greatest radius of them [m]; the robot expects what the default says.
         mover_speed: speed of those that move [m/s], which the robot is not told.
         courteous: whether they, people and carts mind the robot; else they go on through it.
         traffic: people, carts and doors.
@@ -95,6 +96,7 @@ class NavigationSettings:
     solver: str = "ipm"
     coupling: str = option("sequential", choices=("sequential", "joint"))
     obstacles: int = option(0, text=partial(count, most=200), metavar="K")
+    obstacle_radius: tuple[float, float] = option((0.15, 0.25), text=pair, metavar="LO,HI")
     mover_speed: float = option(0.3, text=positive, metavar="M/S")
     courteous: bool = option(False)
     traffic: Traffic = field(default_factory=Traffic)
@@ -138,6 +140,9 @@ class Episode:
             ):
                 if chosen != own:
                     raise ScenarioError(f"the {word} '{chosen}' stands for itself: its coupling is 'sequential'")
+        least, most = settings.obstacle_radius
+        if not 0.0 < least <= most < np.inf:
+            raise ScenarioError(f"obstacles have radii 0 < least <= greatest, got {least:g} and {most:g} m")
         self.occupancy = building_map() if settings.map is None else load_map(settings.map)
         self.start = _pose(settings.start, DEMO_START if settings.map is None else None, "start")
         if settings.goals is None and settings.map is not None:
@@ -160,7 +165,7 @@ class Episode:
             placement,
             start=self.start,
             goals=self.goals,
-            rules=PlacementRules(speed=settings.mover_speed),
+            rules=PlacementRules(radius=settings.obstacle_radius, speed=settings.mover_speed),
         )
         traffic = draw_traffic(
             settings.traffic, true, _field(true) if settings.imperfection != Imperfection() else self.distance_map,

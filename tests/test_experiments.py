@@ -4,11 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+import pytest
+
 from benchmarks.experiments import beside, drivers, leg_by_leg, rendered
 from benchmarks.large_maps import CAMPAIGNS
+from benchmarks.localisation import LOG, made, mapped, real_ticks, replayed
+from unifg.files.carmen import read_carmen
 from unifg.scenarios.campaigns.performed import FAILED, OK
 from unifg.scenarios.campaigns.sheet import Combination, Failure, Sheet
 from unifg.scenarios.campaigns.statement import read
+from unifg.scenarios.navigation import INITIAL_SIGMA
+from unifg.scenarios.ways.polyline import path_length
 
 SEEDS = (1, 2, 3)
 LEGS = ["AC", "CB"]
@@ -88,3 +95,19 @@ def test_others_drive_the_same_legs_on_the_same_seeds() -> None:
         legs = [next(axis for axis in made.axes if axis.name == "leg") for made in (ours, others)]
         assert legs[0] == legs[1]
         assert {episode.settings["planner"] for episode in others.episodes()} == {"teb", "mppi", "dwa", "pursuit"}
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("name", "most"), [("graph", 0.06), ("AMCL, wheels trusted", 0.06)])
+def test_half_of_a_real_log_is_localised_on_a_map_of_the_other(shared_data: Path, name: str, most: float) -> None:
+    """Both localisers find the corrected poses of scans that the map has not seen, all the way of some forty metres."""
+    scans = read_carmen(shared_data / "lidar" / LOG).scans[0]
+    piece = slice(0, 240)
+    poses = scans.pose[piece]
+    ranges = np.where(scans.ranges[piece] >= min(scans.maximum, 79.0), np.inf, scans.ranges[piece])
+    occupancy = mapped(scans.angles, ranges[::2], poses[::2])
+    ticks = real_ticks(scans.angles, ranges[1::2], poses[1::2], np.random.default_rng(5))
+    assert path_length(poses) > 20.0
+    estimator = made(name, occupancy, poses[1], np.array(INITIAL_SIGMA), len(scans.angles), 0)
+    errors = replayed(estimator, ticks)
+    assert np.mean(errors[:, 0]) < most and errors[:, 0].max() < 0.35 and np.mean(errors[:, 1]) < 0.03

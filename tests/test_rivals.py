@@ -6,6 +6,7 @@ import functools
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -50,7 +51,7 @@ def bands(accelerations: tuple[float, float]) -> ElasticBand:
     return ElasticBand(hall(), replace(SETTINGS, accelerations=accelerations), BandSettings(poses=(3, 16)))
 
 
-def planner(name: str, accelerations: tuple[float, float] = SLOW, seed: int = 0) -> LocalPlanner:
+def planner(name: str, accelerations: tuple[float, float] = SLOW, seed: int = 0) -> LocalPlanner[Any]:
     """One of the others."""
     if name == "teb":
         bands(accelerations).forget()
@@ -77,7 +78,7 @@ def discs(*rows: tuple[float, float, float], velocity: tuple[float, float] = (0.
 
 
 def drives(
-    own: LocalPlanner, ticks: int, others: Tracks | None = None, end: float = math.inf, start: Array = START
+    own: LocalPlanner[Any], ticks: int, others: Tracks | None = None, end: float = math.inf, start: Array = START
 ) -> tuple[Array, Array]:
     """Poses and controls of a drive in a perfect world."""
     poses, controls, seen = [start], [], discs() if others is None else others

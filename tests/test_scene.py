@@ -53,6 +53,8 @@ def test_page_has_no_placeholder_left_and_says_what_it_shows(page: str, log: Epi
     assert any("lidar hits" in key["text"] for key in data["legend"])
     failed = data_of(drive_scene(replace(log, collisions=2, reached=[False])).html())
     assert failed["outcome"] == "0 of 1 goals reached, 2 collisions" and failed["good"] is False
+    lost = replace(log, goals=np.tile(log.goals, (2, 1)), reached=[False] * 2, outcomes=["lost: no beam came back"] * 2)
+    assert data_of(drive_scene(lost).html())["outcome"].count("lost: no beam came back") == 1
     assert 'good ? "good" : "bad"' in around
 
 

@@ -242,3 +242,14 @@ def test_a_drive_meets_its_traffic_and_keeps_a_log_of_it(monkeypatch: pytest.Mon
     assert log.boxes.shape[1:] == (2, 5) and log.obstacles.shape[1] == 2
     assert np.abs(log.boxes[-1] - log.boxes[0]).max() > 0.0
     assert traffic.CART[0] > traffic.CART[1]
+
+
+def test_obstacles_may_be_other_than_the_robot_expects() -> None:
+    def radii(between: tuple[float, float]) -> Array:
+        settings = NavigationSettings(obstacles=6, seed=2, obstacle_radius=between)
+        return Episode(settings, rehearsal=True).world.obstacle_states()[:, 2]
+
+    assert 0.15 <= radii((0.15, 0.25)).min() and radii((0.15, 0.25)).max() <= 0.25
+    assert 0.08 <= radii((0.08, 0.1)).min() and radii((0.08, 0.1)).max() <= 0.1
+    with pytest.raises(ScenarioError, match="radii 0 < least"):
+        radii((0.0, 0.1))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from unifg.errors import ScenarioError
@@ -27,7 +29,7 @@ LOCALISERS = (OWN_LOCALISER, "amcl")
 
 def make_planner(
     name: str, distance_map: DistanceMap, settings: ControllerSettings, rng: np.random.Generator
-) -> LocalPlanner | None:
+) -> LocalPlanner[Any] | None:
     """A planner by its name; None for that of this library.
 
     Args:

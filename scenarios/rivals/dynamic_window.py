@@ -13,8 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.rivals.local_planner import LocalPlanner, Situation, Wish
 from unifg.scenarios.rivals.sampled_drives import driven, nearest_on
 from unifg.typing import Array, BoolArray
@@ -57,22 +55,10 @@ class WindowSettings:
     decay: float = 3.0
 
 
-class DynamicWindow(LocalPlanner):
-    """Tries velocities.
+class DynamicWindow(LocalPlanner[WindowSettings]):
+    """Tries velocities."""
 
-    Attributes:
-        own: numbers of the planner.
-    """
-
-    def __init__(
-        self,
-        distance_map: DistanceMap,
-        settings: ControllerSettings,
-        own: WindowSettings | None = None,
-    ) -> None:
-        """Stand still."""
-        super().__init__(distance_map, settings)
-        self.own = own or WindowSettings()
+    usual = WindowSettings
 
     def wish(self, now: Situation) -> Wish | None:
         """The cheapest admissible velocity; a turn at the goal."""

@@ -197,23 +197,21 @@ class Band:
         return solution[self._x], np.exp(solution[self._t][:, 0]), solution.iterations
 
 
-class ElasticBand(LocalPlanner):
+class ElasticBand(LocalPlanner[BandSettings]):
     """Plans by a band along the reference.
 
     Attributes:
-        own: numbers of the planner.
         poses, times: the last band, (n + 1, 3) and (n,); empty without one.
     """
 
+    usual = BandSettings
+
     def __init__(
-        self,
-        distance_map: DistanceMap,
-        settings: ControllerSettings,
-        own: BandSettings | None = None,
+        self, distance_map: DistanceMap, settings: ControllerSettings, own: BandSettings | None = None
     ) -> None:
         """Stand still; graphs are prepared for bands of every length."""
-        super().__init__(distance_map, settings)
-        self.own, field = own or BandSettings(), SmoothField(distance_map)
+        super().__init__(distance_map, settings, own)
+        field = SmoothField(distance_map)
         least, most = self.own.poses
         self._bands = {n: Band(field, settings, self.own, n) for n in range(least - 1, most)}
         self.forget()

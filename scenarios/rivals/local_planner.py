@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -104,18 +106,27 @@ class Wish:
     effort: int = 1
 
 
-class LocalPlanner(ABC):
+Own = TypeVar("Own")
+"""Numbers of a planner."""
+
+
+class LocalPlanner(ABC, Generic[Own]):
     """Decides the next control from a pose, a reference and tracks, as the model-predictive controller does.
 
     Attributes:
+        usual: makes the numbers that its authors use.
         settings: limits of the robot, and the clearances that everybody keeps.
         distance_map: of the map that the robot was given.
+        own: numbers of the planner.
         applied: (2,) control of the last tick [m/s, rad/s].
         estimate: (3,) present pose: what it was given [m, m, rad].
     """
 
-    def __init__(self, distance_map: DistanceMap, settings: ControllerSettings) -> None:
-        """Stand still."""
+    usual: Callable[[], Own]
+
+    def __init__(self, distance_map: DistanceMap, settings: ControllerSettings, own: Own | None = None) -> None:
+        """Stand still; without ``own`` numbers with the usual ones."""
+        self.own: Own = self.usual() if own is None else own
         self.settings, self.distance_map = settings, distance_map
         self.applied, self.estimate = np.zeros(2), np.zeros(3)
         self._turning = False

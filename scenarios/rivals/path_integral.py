@@ -73,13 +73,14 @@ class PathIntegralSettings:
     turn_within: float = 0.5
 
 
-class PathIntegral(LocalPlanner):
+class PathIntegral(LocalPlanner[PathIntegralSettings]):
     """Averages noisy drives.
 
     Attributes:
-        own: numbers of the planner.
         mean: (N, 2) the last plan, moved on by a tick [m/s, rad/s].
     """
+
+    usual = PathIntegralSettings
 
     def __init__(
         self,
@@ -89,8 +90,8 @@ class PathIntegral(LocalPlanner):
         own: PathIntegralSettings | None = None,
     ) -> None:
         """Stand still; all noise comes from ``rng``."""
-        super().__init__(distance_map, settings)
-        self.own, self._rng = own or PathIntegralSettings(), rng
+        super().__init__(distance_map, settings, own)
+        self._rng = rng
         self.mean: Array = np.zeros((settings.horizon, 2))
 
     def wish(self, now: Situation) -> Wish | None:

@@ -13,8 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from unifg.models import unicycle
-from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.rivals.local_planner import LocalPlanner, Situation, Wish
 from unifg.typing import Array
 
@@ -48,22 +46,10 @@ class PursuitSettings:
     foresight: float = 1.0
 
 
-class PurePursuit(LocalPlanner):
-    """Follows a carrot.
+class PurePursuit(LocalPlanner[PursuitSettings]):
+    """Follows a carrot."""
 
-    Attributes:
-        own: numbers of the planner.
-    """
-
-    def __init__(
-        self,
-        distance_map: DistanceMap,
-        settings: ControllerSettings,
-        own: PursuitSettings | None = None,
-    ) -> None:
-        """Stand still."""
-        super().__init__(distance_map, settings)
-        self.own = own or PursuitSettings()
+    usual = PursuitSettings
 
     def wish(self, now: Situation) -> Wish | None:
         """An arc to the carrot, a turn towards it, or a stop."""

@@ -42,7 +42,7 @@ def drive_scene(log: EpisodeLog) -> Scene:
         drive_frame(scene.frame(), log, tick, min(log.ticks, _FRAMES))
     m = episode_metrics(log)
     stopped = ", interrupted by the user" if m["interrupted"] else ""
-    missed = "".join(f"; {words}" for words in m["outcomes"] if words != "reached")
+    missed = "".join(f"; {words}" for words in dict.fromkeys(m["outcomes"]) if words != "reached")  # each once
     scene.outcome = (
         f"{m['goals_reached']} of {m['goals']} goals reached, {collision_words(m['collisions'])}{stopped}{missed}"
     )
