@@ -1,6 +1,7 @@
 """Pose graphs: the data, residuals in two conventions, first guesses, and made-up examples."""
 
 from unifg.pose_graphs.certificate import Certificate, certify
+from unifg.pose_graphs.consistency import pairwise_consistent
 from unifg.pose_graphs.generate import Simulated, manhattan, sphere
 from unifg.pose_graphs.information import Repair, indefinite, repaired
 from unifg.pose_graphs.initialise import Start, best_guess, chordal, lago, odometric, starts
@@ -29,6 +30,7 @@ __all__ = [
     "lago",
     "manhattan",
     "odometric",
+    "pairwise_consistent",
     "repaired",
     "sighting",
     "sphere",

@@ -1,0 +1,98 @@
+"""Pairwise consistent loop closures: which are kept, whatever the units, directions and parts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from unifg.errors import GraphError
+from unifg.pose_graphs import Edges, PoseGraph, Simulated, manhattan, pairwise_consistent, sphere
+from unifg.pose_graphs.consistency import _clique
+from unifg.typing import BoolArray
+
+CITY, GLOBE = manhattan(250, 2, outliers=0.5), sphere(6, 12, seed=2, outliers=0.5)
+
+
+def kept(made: Simulated, pose_graph: PoseGraph | None = None) -> tuple[float, int]:
+    """The share of right closures that is kept, and the number of wrong ones."""
+    graph = made.pose_graph if pose_graph is None else pose_graph
+    found, closures = pairwise_consistent(graph), ~graph.edges.odometry
+    assert found[~closures].all()
+    return float(found[closures & ~made.outliers].mean()), int(found[made.outliers].sum())
+
+
+@pytest.mark.parametrize("made", [CITY, GLOBE], ids=["plane", "space"])
+def test_wrong_closures_agree_with_few(made: Simulated) -> None:
+    recall, wrong = kept(made)
+    assert recall > 0.6 and wrong <= 0.05 * made.outliers.sum()
+
+
+def turned_round(pose_graph: PoseGraph) -> PoseGraph:
+    """Every other edge measured from its other end."""
+    edges, group = pose_graph.edges, pose_graph.group
+    other = np.arange(len(edges)) % 2 == 1
+    first, second = np.where(other, edges.second, edges.first), np.where(other, edges.first, edges.second)
+    measured, information = edges.measured.copy(), edges.information.copy()
+    back = group.adjoint(edges.measured[other])  # a right error of Z is a left one of its inverse, but for the sign
+    seen = np.linalg.inv(back)
+    measured[other] = group.inverse(measured[other])
+    information[other] = np.swapaxes(seen, 1, 2) @ information[other] @ seen
+    return replace(
+        pose_graph, edges=Edges(first, second, measured, 0.5 * (information + np.swapaxes(information, 1, 2)))
+    )
+
+
+@pytest.mark.parametrize("made", [CITY, GLOBE], ids=["plane", "space"])
+def test_directions_and_places_do_not_matter(made: Simulated) -> None:
+    plain = pairwise_consistent(made.pose_graph)
+    np.testing.assert_array_equal(pairwise_consistent(turned_round(made.pose_graph)), plain)
+    lost = made.pose_graph.with_poses(made.pose_graph.poses[::-1])
+    np.testing.assert_array_equal(pairwise_consistent(lost), plain)
+
+
+def test_drives_that_odometry_does_not_connect() -> None:
+    edges = CITY.pose_graph.edges
+    cut = (np.minimum(edges.first, edges.second) == 124) & edges.odometry
+    graph = replace(CITY.pose_graph, edges=edges[~cut])
+    recall, wrong = kept(replace(CITY, outliers=CITY.outliers[~cut]), graph)
+    assert recall > 0.5 and wrong <= 0.15 * CITY.outliers.sum()
+
+
+def test_edges_that_cannot_be_tested_stay() -> None:
+    graph = CITY.pose_graph
+    information = graph.edges.information.copy()
+    blind = np.flatnonzero(CITY.outliers)[:3]
+    information[blind, 2, 2] = 0.0
+    found = pairwise_consistent(replace(graph, edges=replace(graph.edges, information=information)))
+    assert found[blind].all()
+    chain = replace(graph, edges=graph.edges[graph.edges.odometry])
+    assert pairwise_consistent(chain).all()
+    for options in ({"probability": 1.0}, {"tries": 0}):
+        with pytest.raises(GraphError, match="must be"):
+            pairwise_consistent(graph, **options)  # type: ignore[arg-type]
+
+
+def test_cliques_are_cliques_and_mostly_the_largest(rng: np.random.Generator) -> None:
+    found = []
+    for _ in range(20):
+        agreeing = rng.random((12, 12)) < 0.6
+        agreeing = np.triu(agreeing, 1)
+        agreeing |= agreeing.T
+        chosen = _clique(agreeing, 12)
+        assert all(agreeing[a, b] for a, b in combinations(chosen.tolist(), 2))
+        assert not any(agreeing[k, chosen].all() for k in range(12))  # nothing could join
+        found.append(len(chosen) / largest(agreeing))
+    assert min(found) >= 0.6 and np.mean(found) > 0.9
+    assert _clique(np.zeros((0, 0), dtype=bool), 3).tolist() == []
+
+
+def largest(agreeing: BoolArray) -> int:
+    """Size of the largest clique, by trying all."""
+    for size in range(len(agreeing), 0, -1):
+        for chosen in combinations(range(len(agreeing)), size):
+            if all(agreeing[a, b] for a, b in combinations(chosen, 2)):
+                return size
+    return 0

@@ -1,0 +1,174 @@
+"""Loop closures that agree with each other pair by pair: a first stage that needs no guess but odometry.
+
+Two closures and the odometry between their ends make a loop, which two right ones close but for noise. Of the graph
+whose nodes are closures and whose edges are such pairs, a large clique is kept: a wrong closure would have to agree
+with every other. J. Mangelson, D. Dominic, R. Eustice, R. Vasudevan, "Pairwise consistent measurement set maximization
+for robust multi-robot map merging", ICRA 2018. The largest clique is hard to find; a greedy search from closures that
+agree with most others finds one that nothing could join: B. Pattabiraman, M. Patwary, A. Gebremedhin, W. Liao,
+A. Choudhary, "Fast algorithms for the maximum clique problem on massive graphs with applications to overlapping
+community detection", Internet Mathematics 11(4-5), 2015.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.kernels.whitening import quick_roots
+from unifg.machine.jit import compiled
+from unifg.pose_graphs.pose_graph import PoseGraph
+from unifg.typing import Array, BoolArray, IntArray
+
+__all__ = ["pairwise_consistent"]
+
+TRIES = 30  # closures from which a clique is grown
+
+
+def pairwise_consistent(pose_graph: PoseGraph, probability: float = 0.9999, tries: int = TRIES) -> BoolArray:
+    """Which edges to keep: odometry, and a large set of closures of which every two are consistent.
+
+    Drift is linearised at odometry: along drives whose heading is lost, right closures seem inconsistent. Closures
+    between parts that odometry does not connect, such as the drives of two robots, are compared with others between the
+    same parts. Edges whose information is singular say too little to be tested, and stay.
+
+    Args:
+        pose_graph: relative poses; those in the graph do not matter.
+        probability: that the loop of two right closures passes the chi-squared test. Every two of a thousand have to,
+            so 0.99 loses a third of the right ones; with more nines, more wrong ones pass where odometry has drifted.
+        tries: searches for a clique, each from another closure.
+
+    Returns:
+        (m,) True for the edges to be kept.
+
+    Raises:
+        GraphError: for a probability outside (0, 1), or no tries.
+    """
+    if not 0.0 < probability < 1.0 or tries < 1:
+        raise GraphError(f"probability {probability} must be in (0, 1) and tries {tries} at least 1")
+    from scipy.special import chdtri  # slow to load
+
+    group, edges, dim = pose_graph.group, pose_graph.edges, pose_graph.group.dim
+    roots = np.empty((1, dim * dim))
+    certain = np.array([quick_roots(np.ascontiguousarray(one[None]), roots) for one in edges.information], dtype=bool)
+    poses, drift, part = _dead_reckoned(pose_graph, certain)
+    closures = np.flatnonzero(~edges.odometry & certain & (edges.first != edges.second))
+    first, second, measured = edges.first[closures], edges.second[closures], edges.measured[closures]
+    covariance = np.linalg.inv(edges.information[closures])
+    # Seen from the first end, whichever that is in the file.
+    turned = first > second
+    adjoint = group.adjoint(measured[turned])
+    covariance[turned] = adjoint @ covariance[turned] @ np.swapaxes(adjoint, 1, 2)
+    first, second = np.minimum(first, second), np.maximum(first, second)
+    measured[turned] = group.inverse(measured[turned])
+    # Where a closure carries the world to, seen from the world; the identity, had odometry not drifted.
+    end = group.compose(poses[first], measured)
+    offset = group.compose(end, group.inverse(poses[second]))
+    across = group.adjoint(end)
+    covariance = across @ covariance @ np.swapaxes(across, 1, 2)
+    keep = edges.odometry | ~certain | (edges.first == edges.second)
+    pairs = part[first] * (int(part.max(initial=0)) + 1) + part[second]
+    bound = float(chdtri(dim, 1.0 - probability))
+    for one in np.unique(pairs):
+        own = np.flatnonzero(pairs == one)
+        agreeing = np.zeros((len(own), len(own)), dtype=np.bool_)
+        for k in range(len(own) - 1):
+            a, others = own[k], own[k + 1 :]
+            error = group.log(group.compose(offset[a], group.inverse(offset[others])))
+            _test(error, covariance, drift, first, second, a, others, bound, agreeing[k, k + 1 :])
+        agreeing |= agreeing.T
+        keep[closures[own[_clique(agreeing, tries)]]] = True
+    return keep
+
+
+def _dead_reckoned(pose_graph: PoseGraph, certain: BoolArray) -> tuple[Array, Array, IntArray]:
+    """Along odometry: poses (n, storage), the covariance of their drift seen from the start (n, d, d), and their part.
+
+    Errors that are seen from one place add up, so the drift between two poses is the difference of their covariances.
+    """
+    group, edges, count = pose_graph.group, pose_graph.edges, len(pose_graph.poses)
+    step = np.full(count, -1, dtype=np.intp)  # the edge from the pose before
+    along = np.flatnonzero(edges.odometry & certain)[::-1]
+    step[np.maximum(edges.first[along], edges.second[along])] = along
+    forward = edges.first[step] < edges.second[step]
+    noise = np.linalg.inv(np.where(step[:, None, None] >= 0, edges.information[step], np.eye(group.dim)))
+    moved = np.where(forward[:, None], edges.measured[step], group.inverse(edges.measured[step]))
+    back = group.adjoint(edges.measured[step])
+    noise = np.where(forward[:, None, None], noise, back @ noise @ np.swapaxes(back, 1, 2))
+    poses = np.tile(group.identity(), (count, 1))
+    for k in range(1, count):
+        if step[k] >= 0:
+            poses[k] = group.compose(poses[k - 1], moved[k])
+    seen = group.adjoint(poses)
+    added = np.where(step[:, None, None] >= 0, seen @ noise @ np.swapaxes(seen, 1, 2), 0.0)
+    return poses, np.cumsum(added, axis=0), np.cumsum(step < 0)
+
+
+@compiled
+def _test(
+    error: Array,
+    covariance: Array,
+    drift: Array,
+    first: IntArray,
+    second: IntArray,
+    one: int,
+    others: IntArray,
+    bound: float,
+    agree: BoolArray,
+) -> None:
+    """Whether loops of one closure with others close: e' S^-1 e against a bound, S by Cholesky.
+
+    Args:
+        error: (k, d) of the loops.
+        covariance: (m, d, d) of the closures, seen from the start.
+        drift: (n, d, d) of odometry up to every pose, seen from the start.
+        first: (m,) poses.
+        second: (m,) poses.
+        one: closure.
+        others: (k,) closures.
+        bound: of the squared error.
+        agree: (k,) takes the answer.
+    """
+    dim = error.shape[1]
+    S, e = np.empty((dim, dim)), np.empty(dim)
+    for k in range(len(others)):
+        other = others[k]
+        i, j = min(first[one], first[other]), max(first[one], first[other])
+        u, v = min(second[one], second[other]), max(second[one], second[other])
+        for r in range(dim):
+            for c in range(r + 1):
+                S[r, c] = covariance[one, r, c] + covariance[other, r, c]
+                S[r, c] += drift[j, r, c] - drift[i, r, c] + drift[v, r, c] - drift[u, r, c]
+        total = 0.0
+        for r in range(dim):
+            for c in range(r + 1):
+                value = S[r, c]
+                for s in range(c):
+                    value -= S[r, s] * S[c, s]
+                S[r, c] = math.sqrt(value) if r == c else value / S[c, c]
+            value = error[k, r]
+            for s in range(r):
+                value -= S[r, s] * e[s]
+            e[r] = value / S[r, r]
+            total += e[r] * e[r]
+        agree[k] = total <= bound
+
+
+def _clique(agreeing: BoolArray, tries: int) -> IntArray:
+    """Nodes of a large clique: grown from each of the nodes of most neighbours, by those of most neighbours first."""
+    degree = agreeing.sum(axis=1)
+    order = np.argsort(-degree, kind="stable")
+    ranked = agreeing[order][:, order]  # so that the first of the candidates is the best
+    best = np.zeros(0, dtype=np.intp)
+    for begin in range(min(tries, len(order))):
+        if degree[order[begin]] + 1 <= len(best):
+            break
+        members, candidates = [begin], ranked[begin].copy()
+        while candidates.any():
+            member = int(candidates.argmax())
+            members.append(member)
+            candidates &= ranked[member]
+        if len(members) > len(best):
+            best = np.array(members, dtype=np.intp)
+    return order[best]
