@@ -72,7 +72,7 @@ def test_edges_that_cannot_be_tested_stay() -> None:
     assert pairwise_consistent(chain).all()
     for options in ({"probability": 1.0}, {"tries": 0}):
         with pytest.raises(GraphError, match="must be"):
-            pairwise_consistent(graph, **options)  # type: ignore[arg-type]
+            pairwise_consistent(graph, **options)
 
 
 def test_cliques_are_cliques_and_mostly_the_largest(rng: np.random.Generator) -> None:

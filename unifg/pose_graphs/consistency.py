@@ -55,7 +55,7 @@ def pairwise_consistent(pose_graph: PoseGraph, probability: float = 0.9999, trie
     poses, drift, part = _dead_reckoned(pose_graph, certain)
     closures = np.flatnonzero(~edges.odometry & certain & (edges.first != edges.second))
     first, second, measured = edges.first[closures], edges.second[closures], edges.measured[closures]
-    covariance = np.linalg.inv(edges.information[closures])
+    covariance = np.linalg.inv(edges.information[closures]).astype(np.float64, copy=False)
     # Seen from the first end, whichever that is in the file.
     turned = first > second
     adjoint = group.adjoint(measured[turned])
@@ -67,7 +67,7 @@ def pairwise_consistent(pose_graph: PoseGraph, probability: float = 0.9999, trie
     offset = group.compose(end, group.inverse(poses[second]))
     across = group.adjoint(end)
     covariance = across @ covariance @ np.swapaxes(across, 1, 2)
-    keep = edges.odometry | ~certain | (edges.first == edges.second)
+    keep: BoolArray = edges.odometry | ~certain | (edges.first == edges.second)
     pairs = part[first] * (int(part.max(initial=0)) + 1) + part[second]
     bound = float(chdtri(dim, 1.0 - probability))
     for one in np.unique(pairs):
