@@ -5,7 +5,7 @@
 #   make test-lowest    the same with the lowest versions of all packages that pyproject.toml allows, in .venv-lowest
 #   make processes    graphs and solutions in other processes, however these begin, with joblib and dask (a minute)
 #   make fuzz     mutated files for every reader, a minute each
-#   make lint     check style (ruff) and types (mypy)
+#   make lint     check style (ruff) and types (mypy; what users write with pyright, too)
 #   make performance  time what the library does against the record of the checkout; fails for a loss of 15 % (half a minute)
 #   make bench    measure everything again and rewrite the tables in docs/ (long)
 #   make results PAGE=control-cases    measure one page of docs/ again; without PAGE, list them
@@ -16,6 +16,7 @@
 #   make examples run all scripts of examples/ and draw the pictures of docs/examples.md again
 #   make offsets  solve the same problems with their worlds moved by up to 5000 km (minutes)
 #   make docs     build the site with the reference of all public names into out/site, every link checked
+#   make notebooks  run the notebooks of docs/notebooks as a reader does, with a kernel, into out/notebooks
 #   make fences   run the shell commands shown in README.md and docs/
 #   make clean    remove everything made here
 #
@@ -33,7 +34,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Matrices here are small: more threads per process only make the processes wait for each other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: docs kernels performance help demo test fuzz test-lowest processes lint types bench results stale release-check mutants fences clean offsets examples
+.PHONY: docs kernels performance notebooks help demo test fuzz test-lowest processes lint types bench results stale release-check mutants fences clean offsets examples
 .DELETE_ON_ERROR:
 
 help:
@@ -61,9 +62,11 @@ processes: $(VENV)/ready
 lint: $(VENV)/ready-dev
 	$(BIN)/ruff check --output-format concise .
 	$(BIN)/mypy
+	$(BIN)/basedpyright
 
 types: $(VENV)/ready-dev
 	$(BIN)/mypy
+	$(BIN)/basedpyright
 
 bench: $(VENV)/ready-bench
 	$(BIN)/python -m benchmarks.pages measure all
@@ -98,6 +101,9 @@ docs: $(VENV)/ready-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo out/site/readme.html
 
+notebooks: $(VENV)/ready-notebooks
+	$(ONE_THREAD) $(BIN)/python docs/run_notebooks.py
+
 fences: $(VENV)/ready
 	$(BIN)/python docs/check_shell_fences.py
 
@@ -126,8 +132,13 @@ $(VENV)-lowest/ready: pyproject.toml tests/lowest.py
 	@touch $@
 
 $(VENV)/ready-dev: $(VENV)/ready
-	@echo "Installing ruff and mypy into $(VENV)"
+	@echo "Installing ruff, mypy and pyright into $(VENV)"
 	@$(PIP) install --editable ".[scenarios,dev]"
+	@touch $@
+
+$(VENV)/ready-notebooks: $(VENV)/ready
+	@echo "Installing what runs notebooks into $(VENV)"
+	@$(PIP) install --editable ".[scenarios,notebooks]"
 	@touch $@
 
 $(VENV)/ready-docs: $(VENV)/ready

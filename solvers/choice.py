@@ -23,7 +23,7 @@ from unifg.solvers.augmented_lagrangian import AugmentedLagrangian
 from unifg.solvers.interior_point.method import InteriorPoint
 from unifg.solvers.least_squares import LevenbergMarquardt
 from unifg.solvers.sqp import SQP
-from unifg.typing import ArrayLike
+from unifg.typing import Numbers
 
 logger = logging.getLogger("unifg")
 
@@ -54,7 +54,7 @@ class Choice:
 
 def choose(
     graph: Statement,
-    data: Mapping[Data, ArrayLike] | None = None,
+    data: Mapping[Data, Numbers] | None = None,
     *,
     tolerance: float = 1e-6,
     time_limit: float = np.inf,
@@ -94,7 +94,7 @@ def solve(
     graph: Statement,
     guess: AnyGuess,
     *,
-    data: Mapping[Data, ArrayLike] | None = None,
+    data: Mapping[Data, Numbers] | None = None,
     check: bool = False,
     callback: Callback | None = None,
     tolerance: float = 1e-6,

@@ -43,7 +43,7 @@ from unifg.language.variables import Data
 from unifg.program.term import CompiledTerm
 from unifg.solvers.gating import Innovations, Scatter
 from unifg.solvers.least_squares import GaussNewton, LevenbergMarquardt
-from unifg.typing import Array, ArrayLike, BoolArray, IntArray
+from unifg.typing import Array, BoolArray, IntArray, Numbers
 
 logger = logging.getLogger("unifg")
 
@@ -147,7 +147,7 @@ class GraduatedNonConvexity(Backend):
         graph: Statement,
         guess: AnyGuess,
         *,
-        data: Mapping[Data, ArrayLike] | None = None,
+        data: Mapping[Data, Numbers] | None = None,
         check: bool = False,
         callback: Callback | None = None,
     ) -> Solution:
@@ -188,7 +188,7 @@ class _Search:
         graph: Statement,
         staged: Statement,
         stages: list[_Stage],
-        data: Mapping[Data, ArrayLike] | None,
+        data: Mapping[Data, Numbers] | None,
         callback: Callback | None,
     ) -> None:
         self._options, self._stages, self._data = options, stages, data
@@ -425,7 +425,7 @@ class _History:
         self._restart = False
 
     def add(
-        self, run: Prepared, start: AnyGuess, data: Mapping[Data, ArrayLike] | None, *, restart: bool = False
+        self, run: Prepared, start: AnyGuess, data: Mapping[Data, Numbers] | None, *, restart: bool = False
     ) -> Solution:
         """Solve and keep the rows."""
         self._stage += 1

@@ -59,7 +59,7 @@ from unifg.lie import (
 )
 from unifg.machine.jit import compiled
 from unifg.smoothing import FixedLag, Incremental
-from unifg.typing import ArrayLike as _ArrayLike
+from unifg.typing import Numbers as _Numbers
 
 _HERE = _Path(__file__).resolve().parent
 # Where links are lost (Windows, some archives), a checkout finds its side folders beside this one.
@@ -138,7 +138,7 @@ def solve(
     graph: Graph,
     guess: _AnyGuess,
     *,
-    data: _Mapping[Data, _ArrayLike] | None = None,
+    data: _Mapping[Data, _Numbers] | None = None,
     check: bool = False,
     callback: _Callback | None = None,
     tolerance: float = 1e-6,

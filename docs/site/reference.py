@@ -7,12 +7,14 @@ Nothing is imported: sources are read, so the site is built where nothing but it
 from __future__ import annotations
 
 import ast
+import json
 from collections.abc import Iterator
 from functools import cache
 from inspect import cleandoc
 from pathlib import Path
 
 CHECKOUT = Path(__file__).resolve().parent.parent.parent
+NOTEBOOKS = sorted((CHECKOUT / "docs" / "notebooks").glob("*.ipynb"))
 ROOMS = ("unifg", "unifg.solvers", "unifg.horizon", "unifg.smoothing", "unifg.pose_graphs", "unifg.view", "unifg.lie")
 """Their names are public where they are listed."""
 SHELVES = ("unifg.models", "unifg.files")
@@ -28,12 +30,24 @@ def pages() -> dict[str, str]:
     made["license.md"] = f"# License\n\n{(CHECKOUT / 'LICENSE').read_text()}"
     made["CITATION.cff"] = (CHECKOUT / "CITATION.cff").read_text()
     made |= {f"examples/{path.name}": path.read_text() for path in sorted((CHECKOUT / "examples").glob("[!_]*.py"))}
+    made |= {f"notebooks/{path.stem}.md": _told(path) for path in NOTEBOOKS}
     for module, names in public().items():
         entries = "\n".join(entry(module, name) for name in names)
         made[f"api/{module}.md"] = f"# {module}\n\n{summary(module)}\n\n{entries}"
     listed = "\n".join(f"- [{module}]({module}.md): {summary(module)}" for module in public())
     made["api/index.md"] = f"# Reference\n\nEvery public name, by the module it is imported from.\n\n{listed}\n"
     return made
+
+
+def _told(notebook: Path) -> str:
+    """A notebook as a page: its words, its code, and where to get it."""
+    cells = json.loads(notebook.read_text())["cells"]
+    parts = ["".join(cell["source"]) for cell in cells]
+    for k, cell in enumerate(cells):
+        if cell["cell_type"] == "code":
+            parts[k] = f"```python\n{parts[k]}\n```"
+    title, *rest = parts[0].split("\n", 1)
+    return "\n\n".join([title, f"[As a notebook]({notebook.name}) to run and change.", *rest, *parts[1:]]) + "\n"
 
 
 @cache

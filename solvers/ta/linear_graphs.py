@@ -45,7 +45,7 @@ from unifg.solvers.ta.elimination import (
     Undetermined,
     eliminate,
 )
-from unifg.typing import Array, ArrayLike, BoolArray, IntArray
+from unifg.typing import Array, BoolArray, IntArray, Numbers
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -191,9 +191,9 @@ class LinearGraphs:
     def at(
         cls,
         graph: Graph,
-        start: Mapping[Family, ArrayLike] | Guess | Solution,
+        start: Mapping[Family, Numbers] | Guess | Solution,
         *,
-        data: Mapping[Data, ArrayLike] | None = None,
+        data: Mapping[Data, Numbers] | None = None,
         hessian: Literal["gauss-newton", "exact"] = "gauss-newton",
     ) -> LinearGraphs:
         """Linearise a graph, and solve both linear graphs in the engine's order.

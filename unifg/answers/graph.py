@@ -15,7 +15,7 @@ from unifg.language.statement import Statement
 from unifg.language.variables import Data
 from unifg.plots.factor_graph import draw_graph
 from unifg.program.program import Program, compile_graph
-from unifg.typing import ArrayLike
+from unifg.typing import Numbers
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,7 +34,7 @@ class Graph(Statement):
         fixes: fixed variables.
     """
 
-    def check(self, guess: AnyGuess, data: Mapping[Data, ArrayLike] | None = None) -> Report:
+    def check(self, guess: AnyGuess, data: Mapping[Data, Numbers] | None = None) -> Report:
         """Look for mistakes at ``guess``, or at a solution: see :mod:`unifg.answers.check`."""
         return check_graph(self, values_of(guess), data)
 

@@ -23,7 +23,7 @@ from unifg.language.variables import Family, Selection, Variable, as_selection
 from unifg.plots.shown import Shown, apart, draw_shown
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
-from unifg.typing import Array, ArrayLike, BoolArray
+from unifg.typing import Array, BoolArray, Numbers
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -418,10 +418,10 @@ class NotConverged(UnifgError, RuntimeError):
         return type(self), (self.solution,)
 
 
-AnyGuess: TypeAlias = Mapping[Family, ArrayLike] | Guess | Solution
+AnyGuess: TypeAlias = Mapping[Family, Numbers] | Guess | Solution
 
 
-def values_of(guess: AnyGuess) -> Mapping[Family, ArrayLike]:
+def values_of(guess: AnyGuess) -> Mapping[Family, Numbers]:
     """The values of a guess, of whatever form.
 
     Raises:

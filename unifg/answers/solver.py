@@ -28,7 +28,7 @@ from unifg.program.columns import Values
 from unifg.program.linearization import Linearization, all_finite
 from unifg.program.program import Program, idle_program
 from unifg.turns import Turn
-from unifg.typing import Array, ArrayLike
+from unifg.typing import Array, Numbers
 
 logger = logging.getLogger("unifg")
 
@@ -62,7 +62,7 @@ class Backend(ABC):
         graph: Statement,
         guess: AnyGuess,
         *,
-        data: Mapping[Data, ArrayLike] | None = None,
+        data: Mapping[Data, Numbers] | None = None,
         check: bool = False,
         callback: Callback | None = None,
     ) -> Solution:
@@ -119,8 +119,8 @@ class Solver(Backend):
         graph: Statement,
         guess: AnyGuess,
         *,
-        data: Mapping[Data, ArrayLike] | None = None,
-        duals: Mapping[str, ArrayLike] | None = None,
+        data: Mapping[Data, Numbers] | None = None,
+        duals: Mapping[str, Numbers] | None = None,
         check: bool = False,
         callback: Callback | None = None,
     ) -> Solution:
@@ -444,8 +444,8 @@ class Prepared:
         self,
         guess: AnyGuess,
         *,
-        data: Mapping[Data, ArrayLike] | None = None,
-        duals: Mapping[str, ArrayLike] | None = None,
+        data: Mapping[Data, Numbers] | None = None,
+        duals: Mapping[str, Numbers] | None = None,
         check: bool = False,
         callback: Callback | None = None,
     ) -> Solution:
@@ -472,8 +472,8 @@ class Prepared:
     def _solve(
         self,
         guess: AnyGuess,
-        data: Mapping[Data, ArrayLike] | None,
-        duals: Mapping[str, ArrayLike] | None,
+        data: Mapping[Data, Numbers] | None,
+        duals: Mapping[str, Numbers] | None,
         check: bool,
         callback: Callback | None,
     ) -> Solution:
@@ -530,7 +530,7 @@ class Prepared:
         """Workspaces hold compiled objects that do not pickle; they are rebuilt on first use."""
         return {**self.__dict__, "_workspace": None}
 
-    def _stacked(self, what: str, given: Mapping[str, ArrayLike]) -> Array:
+    def _stacked(self, what: str, given: Mapping[str, Numbers]) -> Array:
         """(M,) multipliers or penalties, zero where none are given."""
         if isinstance(given, ByTerm) and given.places is self.program.places and given.intact:
             result = given.flat.copy()
@@ -541,7 +541,7 @@ class Prepared:
             raise GraphError(f"{what} of '{name}' are not finite", term=name)
         return result
 
-    def _read(self, what: str, given: Mapping[str, ArrayLike]) -> Array:
+    def _read(self, what: str, given: Mapping[str, Numbers]) -> Array:
         """The same of arrays from anywhere."""
         result = np.zeros(self.program.constraints.count)
         for name, value in given.items():

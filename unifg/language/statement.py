@@ -6,7 +6,7 @@ returns. One that is refused leaves the graph as it was.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from difflib import get_close_matches
 from html import escape
@@ -16,7 +16,7 @@ from typing import Any, Final, TypeAlias, TypeVar
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.kernels.residuals import Function, Residual, as_residual, residual
+from unifg.kernels.residuals import Residual, as_residual, residual
 from unifg.kernels.robust import Loss
 from unifg.language.doubles import doubles
 from unifg.language.factors import ManifoldResidual
@@ -37,7 +37,26 @@ from unifg.lie import Manifold, Rn
 from unifg.lie.product import Product
 from unifg.typing import Array, ArrayLike, IntArray
 
-AnyResidual: TypeAlias = Function | Residual | ManifoldResidual
+AnyResidual: TypeAlias = (
+    Callable[[Array], Array]
+    | Callable[[Array, Array], Array]
+    | Callable[[Array, Array, Array], Array]
+    | Callable[[Array, Array, Array, Array], Array]
+    | Callable[[Any], Array]
+    | Callable[[Any, Any], Array]
+    | Callable[[Any, Any, Any], Array]
+    | Callable[[Any, Any, Any, Any], Array]
+    | Callable[[Any, Any, Any, Any, Any], Array]
+    | Callable[[Any, Any, Any, Any, Any, Any], Array]
+    | Callable[[Any, Any, Any, Any, Any, Any, Any], Array]
+    | Callable[[Any, Any, Any, Any, Any, Any, Any, Any], Array]
+    | Callable[[Any, Any, Any, Any, Any, Any, Any, Any, Any], Array]
+    | Callable[[Any, Any, Any, Any, Any, Any, Any, Any, Any, Any], Array]
+    | Residual
+    | ManifoldResidual
+)
+"""What computes residuals. By the first lines a type checker knows that a lambda's arguments are arrays, by the others
+functions may take numbers besides; with ``Callable[..., Array]`` among them, pyright would know nothing of a lambda."""
 S = TypeVar("S", bound="Statement")
 SAME: Final[Any] = object()
 """In the place of what :meth:`Statement.replace` leaves as it is, and of a limit that is not given."""

@@ -14,7 +14,7 @@ from unifg.smoothing.families import GrowingFamily
 from unifg.smoothing.marginalize import marginalize
 from unifg.smoothing.smoother import Effort, Smoother
 from unifg.turns import in_turn
-from unifg.typing import Array, ArrayLike, BoolArray
+from unifg.typing import Array, BoolArray, Numbers
 
 
 class FixedLag(Smoother):
@@ -83,7 +83,7 @@ class FixedLag(Smoother):
     @in_turn
     def update(
         self,
-        values: Mapping[GrowingFamily, ArrayLike] | None = None,
+        values: Mapping[GrowingFamily, Numbers] | None = None,
         *,
         time: float | None = None,
         iterations: int = 1,

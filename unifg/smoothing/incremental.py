@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from unifg.smoothing.families import GrowingFamily
 from unifg.smoothing.smoother import Effort, Smoother
 from unifg.turns import in_turn
-from unifg.typing import ArrayLike
+from unifg.typing import Numbers
 
 
 class Incremental(Smoother):
@@ -36,7 +36,7 @@ class Incremental(Smoother):
         super().__init__(relinearize, every, wildfire)
 
     @in_turn
-    def update(self, values: Mapping[GrowingFamily, ArrayLike] | None = None, *, iterations: int = 1) -> Effort:
+    def update(self, values: Mapping[GrowingFamily, Numbers] | None = None, *, iterations: int = 1) -> Effort:
         """Take in what was stated since the last update and improve all estimates.
 
         Args:

@@ -31,7 +31,7 @@ from unifg.smoothing.tree import give_up
 from unifg.smoothing.undetermined import enough
 from unifg.smoothing.update import begin, renew, update_tree
 from unifg.turns import Turn, in_turn
-from unifg.typing import Array, ArrayLike, BoolArray, IntArray
+from unifg.typing import Array, ArrayLike, BoolArray, IntArray, Numbers
 
 FIRST_MADE = PLACE[MADE[0]]
 VARIABLE_END, FACTOR_END, CLIQUE_END = PLACE["variable_end"], PLACE["factor_end"], PLACE["clique_end"]
@@ -277,7 +277,7 @@ class Smoother:
         return int(self._state.factors["used"][: self._state.counters["factor_end"][0]].sum())
 
     @in_turn
-    def _update(self, values: Mapping[GrowingFamily, ArrayLike] | None, time: float | None, iterations: int) -> None:
+    def _update(self, values: Mapping[GrowingFamily, Numbers] | None, time: float | None, iterations: int) -> None:
         """Take in new members and staged factors, then bring everything up to date."""
         new = [self._checked(family, value) for family, value in values.items()] if values else []
         if self._staged:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -248,6 +249,11 @@ class Scene(Content, Canvas):
             ViewError: nothing is drawn, or meshcat is not installed.
         """
         return recorded(self).html()
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the page in a frame."""
+        frame = 'style="width: 100%; height: 520px; border: 0" allowfullscreen'
+        return f'<iframe srcdoc="{escape(self.html())}" {frame}></iframe>'
 
     def save(self, path: str | Path) -> Path:
         """Write the page and return its path; an existing file is replaced.
