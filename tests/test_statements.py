@@ -90,7 +90,7 @@ HOSTILE: dict[str, tuple[States, str]] = {
     "nothing allowed": (limited(lower=np.inf), "which nothing satisfies"),
     "bound on a group": (lambda g, x, u: g.bound(x, upper=1.0, name="t"), "SE2 is not Rn"),
     "bound on an array": (lambda g, x, u: g.bound(np.zeros(3), upper=1.0, name="t"), "takes one family or selection"),
-    "one axis": (returning(np.zeros(4)), r"returned shape \(4,\), expected \(n, m\) with n = 4"),
+    "one axis": (returning(np.zeros(4)), r"\(4,\), expected \(n, m\) with n = 4; a number .* return r\[:, None\]"),
     "three axes": (returning(np.zeros((4, 1, 1))), "returned shape"),
     "batch length": (returning(np.zeros((3, 2))), r"returned shape \(3, 2\)"),
     "whole numbers": (returning(np.zeros((4, 1), dtype=int)), "returned int64, expected float64"),

@@ -20,13 +20,19 @@ ROOMS = ("unifg", "unifg.solvers", "unifg.horizon", "unifg.smoothing", "unifg.po
 SHELVES = ("unifg.models", "unifg.files")
 """Their modules are."""
 ALONE = ("unifg.errors", "unifg.answers.status", "unifg.answers.solver", "unifg.solvers.names")
-MOVED = {"](../README.md": "](readme.md", "](../CHANGELOG.md": "](changelog.md", "](../examples/": "](examples/"}
+MOVED = {
+    "](../README.md": "](readme.md",
+    "](../CHANGELOG.md": "](changelog.md",
+    "](../CONTRIBUTING.md": "](contributing.md",
+    "](../LICENSE": "](license.md",
+    "](../examples/": "](examples/",
+}
 """Links out of the folder of pages, and where they lead on the site."""
 
 
 def pages() -> dict[str, str]:
     """Text of every page that is made, by its address."""
-    made = {name.lower(): _from_above(CHECKOUT / name) for name in ("README.md", "CHANGELOG.md")}
+    made = {name.lower(): _from_above(CHECKOUT / name) for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")}
     made["license.md"] = f"# License\n\n{(CHECKOUT / 'LICENSE').read_text()}"
     made["CITATION.cff"] = (CHECKOUT / "CITATION.cff").read_text()
     made |= {f"examples/{path.name}": path.read_text() for path in sorted((CHECKOUT / "examples").glob("[!_]*.py"))}

@@ -124,8 +124,10 @@ def size_of(found: Array, name: str, arguments: Sequence[Any], count: int, scala
     """
     if found.ndim != (1 if scalar else 2) or len(found) != count:
         expected = "(n,)" if scalar else "(n, m)"
+        column = not scalar and found.shape == (count,)
+        hint = "; a number for each factor is a column, (n, 1): return r[:, None]" if column else ""
         raise GraphError(
-            f"term '{name}': its function returned shape {found.shape}, expected {expected} with n = {count}; "
+            f"term '{name}': its function returned shape {found.shape}, expected {expected} with n = {count}{hint}; "
             f"arguments were {told(arguments, count)}",
             term=name,
         )

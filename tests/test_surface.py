@@ -1,0 +1,35 @@
+"""The public surface is listed and frozen, the version is stated once, licences of what is installed are known."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+
+from fences import CHECKOUT
+
+sys.path.insert(0, str(CHECKOUT / "docs" / "site"))
+
+import licences  # noqa: E402
+import reference  # noqa: E402
+import surface  # noqa: E402
+
+
+def test_no_name_comes_or_goes_unseen() -> None:
+    listed = surface.PAGE.read_text(encoding="utf-8")
+    assert listed == surface.text(), (
+        "the public surface has changed: python docs/site/surface.py, and say so in CHANGELOG"
+    )
+
+
+def test_every_listed_name_can_be_imported() -> None:
+    for module, names in reference.public().items():
+        found = importlib.import_module(module)
+        assert [name for name in names if not hasattr(found, name)] == [], module
+
+
+def test_every_dependency_has_a_licence_on_the_page() -> None:
+    page = licences.PAGE.read_text(encoding="utf-8")
+    named = set(re.findall(r"^\| ([\w.-]+) \|", page, flags=re.MULTILINE))
+    assert {licences.plain(name) for name in licences.stated()} <= named, "python docs/site/licences.py"
+    assert "unknown" not in page
