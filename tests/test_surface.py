@@ -10,9 +10,9 @@ from fences import CHECKOUT
 
 sys.path.insert(0, str(CHECKOUT / "docs" / "site"))
 
-import licences  # noqa: E402
-import reference  # noqa: E402
-import surface  # noqa: E402
+import licences
+import reference
+import surface
 
 
 def test_no_name_comes_or_goes_unseen() -> None:

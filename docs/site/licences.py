@@ -62,13 +62,13 @@ def closure() -> dict[str, str]:
 def licence(name: str) -> str:
     """What the metadata of a package say: the expression, the classifier, the first words of the field."""
     about = metadata.metadata(name)
-    if about.get("License-Expression"):
+    if "License-Expression" in about:
         return str(about["License-Expression"])
     classified = [c.rpartition("::")[2].strip() for c in about.get_all("Classifier") or [] if c.startswith("License")]
     said = [c for c in classified if c != "OSI Approved"]
     if said:
         return ", ".join(said)
-    field = (about.get("License") or "").strip().split("\n")[0]
+    field = (about["License"] if "License" in about else "").strip().split("\n")[0]
     return field[:60] or "unknown"
 
 

@@ -16,9 +16,9 @@ PAGE = reference.CHECKOUT / "docs" / "surface.md"
 HEAD = """# The public surface
 
 Every name that a release promises, by the module it is imported from; what it does is in the reference of the site
-(`make docs`). Everything else, names with an underscore and modules that are not listed, may change at any time. The page is
-made by `python docs/site/surface.py`, and a test fails until a name that was added or removed stands here, too. What
-happens to these names between versions: [releases](releases.md).
+(`make docs`). Everything else, names with an underscore and modules that are not listed, may change at any time. The
+page is made by `python docs/site/surface.py`, and a test fails until a name that was added or removed stands here, too.
+What happens to these names between versions: [releases](releases.md).
 """
 
 
