@@ -11,7 +11,7 @@ import unifg as fg
 from unifg.errors import BackendError, GraphError
 from unifg.pose_graphs import Edges, PoseGraph, Simulated, best_guess, certify, chordal, judge, manhattan, sphere
 from unifg.pose_graphs.relaxation import Relaxation
-from unifg.solvers import DogLeg, GaussNewton, LevenbergMarquardt
+from unifg.solvers import DogLeg, GaussNewton, LevenbergMarquardt, names
 from unifg.typing import Array
 
 GROUPS = {"plane": fg.SE2, "space": fg.SE3}
@@ -200,6 +200,34 @@ def test_edges_without_information_say_nothing(name: str) -> None:
     assert certificate.certified and certificate.chi2 == certificate.gap == certificate.least_eigenvalue == 0.0
     with pytest.raises(GraphError, match="not determined"):
         chordal(nothing)
+
+
+def test_hostile_graphs_are_certified_rightly_or_refused() -> None:
+    loop = solved(ring(20, 1))
+    for fixed in ((7,), (0,)):
+        assert certify(replace(loop, fixed_ids=fixed)).certified
+    alone = PoseGraph(np.arange(21), np.concatenate([loop.poses, [[50.0, 0.0, 1.0]]]), loop.edges)
+    assert certify(alone).certified and certify(alone).poses[20].tolist() == [50.0, 0.0, 1.0]
+    nothing = Edges(*(np.zeros(0, dtype=np.intp) for _ in range(2)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    itself = Edges(np.array([0]), np.array([0]), np.array([[0.1, 0.0, 0.0]]), np.eye(3)[None])
+    for edges, said in ((nothing, 0), (itself, 1)):
+        one = certify(PoseGraph(np.arange(1), np.zeros((1, 3)), edges))
+        assert one.certified and one.chi2 == 0.0 and one.moved == (0.0, 0.0) and len(one.caveats) == said
+    for value, message in ((-np.eye(3), "edge 5 has a negative eigenvalue, of 1 edges"), (np.nan, "finite")):
+        information = loop.edges.information.copy()
+        information[5] = value
+        with pytest.raises(GraphError, match=message):
+            certify(replace(loop, edges=replace(loop.edges, information=information)))
+
+
+@pytest.mark.parametrize("name", names.LEAST_SQUARES)
+def test_units_of_information_do_not_move_the_optimum(name: str) -> None:
+    made = manhattan(60, seed=1).pose_graph
+    costs = []
+    for weight in (1.0, 1e-6, 1e6):
+        graph, _, guess = replace(made, edges=replace(made.edges, information=weight * made.edges.information)).graph()
+        costs.append(names.backend(name).solve(graph, guess, check=True).cost / weight)
+    np.testing.assert_allclose(costs, costs[0], rtol=1e-9)
 
 
 def test_the_start_that_costs_least_is_taken() -> None:

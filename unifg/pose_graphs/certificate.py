@@ -83,7 +83,11 @@ def certify(
     """
     problem = Relaxation.of(pose_graph, used)
     judge = _Judge(problem, tolerance)
-    point = problem.minimize(problem.lift(pose_graph))
+    # Seen from the anchor of its part, a pose keeps its digits wherever the map lies.
+    shift = pose_graph.poses[problem.anchors][problem.parts, : problem.dim]
+    near = pose_graph.poses.copy()
+    near[:, : problem.dim] -= shift
+    point = problem.minimize(problem.lift(pose_graph.with_poses(near)))
     verdict = judge(point)
     rank = problem.dim
     if staircase and not verdict.proven:
@@ -91,6 +95,7 @@ def certify(
         verdict = judge(point)
         verdict = replace(verdict, gap=min(verdict.gap, max(verdict.cost - bound, 0.0)))
     poses = problem.lower(point, pose_graph)
+    poses[:, : problem.dim] += shift
     poses[problem.anchors] = pose_graph.poses[problem.anchors]
     apart = pose_graph.group.local(pose_graph.poses, poses)
     turned = np.linalg.norm(apart[:, problem.dim :], axis=1)

@@ -18,6 +18,7 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.lie import SO3
+from unifg.pose_graphs.information import indefinite
 from unifg.pose_graphs.linear import BlockQuadratic, block_gradient
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.typing import Array, BoolArray, IntArray
@@ -34,10 +35,19 @@ def admit(pose_graph: PoseGraph) -> None:
     """See that a graph can be stated in this form, which can be known before it is solved.
 
     Raises:
-        GraphError: the graph has landmarks, or several poses of one part are known.
+        GraphError: the graph has landmarks, several poses of one part are known, or an information matrix is none.
     """
     if len(pose_graph.landmarks):
         raise GraphError("the chordal relaxation holds relative poses only: this graph has landmarks")
+    information = pose_graph.edges.information
+    if not (np.isfinite(information).all() and np.isfinite(pose_graph.edges.measured).all()):
+        raise GraphError("the chordal relaxation needs finite measurements and information matrices")
+    if (wrong := indefinite(information)).any():
+        k = int(np.flatnonzero(wrong)[0])
+        raise GraphError(
+            f"the information of edge {k} has a negative eigenvalue, of {wrong.sum()} edges in all: see repaired",
+            index=k,
+        )
     anchors, parts = pose_graph.anchors()[0], pose_graph.parts()
     if len(np.unique(parts[anchors])) < len(anchors):
         raise GraphError("the chordal relaxation moves every connected part freely: two poses of one are known")
@@ -80,12 +90,15 @@ class Relaxation:
         Raises:
             GraphError: the graph has landmarks, or several poses of one part are known.
         """
-        kept = pose_graph if used is None else replace(pose_graph, edges=pose_graph.edges[used])
+        real = pose_graph.edges.first != pose_graph.edges.second
+        kept = replace(pose_graph, edges=pose_graph.edges[real if used is None else used & real])
         edges, anchors, parts = kept.edges, kept.anchors()[0], kept.parts()
         admit(kept)
         dim, angles = pose_graph.group.point_dim, pose_graph.group.dim - pose_graph.group.point_dim
         moving, turning = edges.information[:, :dim, :dim], edges.information[:, dim:, dim:]
         caveats = []
+        if not real.all():
+            caveats.append(f"{(~real).sum()} edges from a pose to itself, which cost the same in any map, are left out")
         tau = np.trace(moving, axis1=1, axis2=2) / dim
         crooked = ~_close(moving, tau[:, None, None] * np.eye(dim))
         if crooked.any():
@@ -160,6 +173,8 @@ class Relaxation:
         system = BlockQuadratic(self.first, self.second, self.count, size, self.anchors)
         cost, damping = self.cost(point), 0.0
         scale = float(np.max(np.abs(self.by_second), initial=0.0) ** 2)
+        if not len(system.free) or not len(self.first):
+            return point
         for _ in range(ROUNDS):
             basis = _tangents(point, spins)
             flat = basis.reshape(self.count, dim + 1, rank * size)
