@@ -24,6 +24,7 @@ from unifg.solvers import GaussNewton
 from unifg.typing import Array, IntArray
 
 PAIRS = 10  # joint covariances of two poses
+MANY = 300  # candidates for a loop with the last pose
 FEW = 5  # rounds at most
 SLOW = 2.0  # [s]; what takes GTSAM longer is compared once
 SAMPLE = 500  # poses whose covariance is compared with GTSAM's of the same linear factors
@@ -69,17 +70,26 @@ def measure_case(case: pose_graphs.Case, rounds: int) -> Result:
         found["named"] = np.array([solution.covariance(x[pair]) for pair in pairs])
         return (time.perf_counter() - begin) / len(pairs)
 
+    others = rng.integers(0, count - 1, MANY)
+
+    def of_candidates() -> float:
+        begin = time.perf_counter()
+        found["candidates"] = solution.pair_covariances(x[-1], x[others])
+        return (time.perf_counter() - begin) / MANY
+
     candidates: dict[str, Callable[[], float]] = {"all": every, "tree": from_tree}
     result: Result = {"name": case.name, "poses": count, "named": None, "difference": None, "refused": ""}
     try:
         by_name()
-        candidates["named"] = by_name
+        candidates |= {"named": by_name, "candidates": of_candidates}
     except fg.GraphError as error:
         result["refused"] = str(error)
     times = interleave(candidates, rounds)
     result |= {what: milliseconds(values) for what, values in times.items()}
     if "named" in found:
         result["own difference"] = _largest(found["named"], found["joint"])
+        named = np.array([solution.covariance(x[[count - 1, int(other)]]) for other in others[:PAIRS]])
+        result["candidates' difference"] = _largest(found["candidates"][:PAIRS], named)
     if available():
         result |= _compared(case, tree.lin, solution[x], pairs, found, every, rounds)
     return result
@@ -157,6 +167,8 @@ COLUMNS: dict[str, Callable[[Result], str]] = {
     "its difference": lambda row: _power(row.get("joint difference")),
     "two poses, `solution.covariance` [ms]": lambda row: "refused" if row["refused"] else shown(row["named"]),
     "difference from the tree": lambda row: _power(row.get("own difference")),
+    "last pose and one of many, `solution.pair_covariances` [ms]": lambda row: shown(row.get("candidates")),
+    "its difference from `covariance`": lambda row: _power(row.get("candidates' difference")),
 }
 
 
@@ -167,7 +179,8 @@ def render(result: Result) -> str:
         "All poses: linearisation, ordering, factorisation and the entries of the inverse that the elimination tree "
         "holds (`Factorization.diagonal_blocks`), against `gtsam.Marginals` with one call per pose. Two poses: joint "
         f"covariance of {PAIRS} pairs anywhere in the graph, by `Factorization.inverse_block` of a factorisation "
-        "there is, and as a user asks for it. Differences, from GTSAM where nothing else is said, are relative to the "
+        f"there is, and as a user asks for it; the last pose and each of {MANY} candidates for a loop, in one call. "
+        "Differences, from GTSAM where nothing else is said, are relative to the "
         "largest entry of a block. GTSAM is given our Jacobians for them, and every so many poses are compared; the "
         "column after shows all poses with its own, whose derivative of the logarithm in the plane loses figures at "
         f"small angles. {result['rounds']} rounds, one where GTSAM takes longer than {SLOW:g} s.{refusals}"

@@ -150,3 +150,28 @@ def test_what_is_fixed_is_known(constrained: bool) -> None:
     np.testing.assert_array_equal(solution.covariance(x[0]), np.zeros((3, 3)))
     np.testing.assert_array_equal(solution.covariance(x[2].v), np.zeros((1, 1)))
     np.testing.assert_array_equal(solution.marginals(x[0].p), np.zeros((1, 2, 2)))
+
+
+@pytest.mark.parametrize("case", ["free", "fixed", "constrained"])
+def test_covariances_of_pairs_are_those_of_each_pair(case: str) -> None:
+    """Free members by two paths of the tree; fixed ones are known; held rows take the KKT matrix."""
+    rng, graph = np.random.default_rng(0), fg.Graph()
+    x, y = graph.variables("x", fg.SE2, 12), graph.variables("y", fg.Rn(2), 3)
+    graph.minimize(fg.between, x[:-1], x[1:], np.array([1.0, 0.0, 0.2]), sigma=0.1)
+    graph.minimize(lambda a, b: a[:, :2] - b, x[[1, 5, 9]], y, sigma=0.3)
+    graph.minimize(fg.prior, x[0], np.zeros(3), sigma=0.1)
+    if case == "fixed":
+        graph.fix(x[4], np.array([3.5, 1.5, 0.8]))
+    if case == "constrained":
+        graph.constrain(lambda a: a[:, :1], x[6], lower=4.0, upper=4.0)
+    guess = {x: fg.SE2.exp(0.1 * rng.standard_normal((12, 3))), y: np.zeros((3, 2))}
+    solution = fg.solve(graph, guess, check=True)
+    for first, second in ((x[11], x[[0, 4, 4, 11]]), (y[1], x), (x[[2, 3]], y[[0, 2]]), (x[3], x[7])):
+        pairs = solution.pair_covariances(first, second)
+        count = max(len(first), len(second))
+        assert len(pairs) == count
+        for k, pair in enumerate(pairs):
+            ends = [end if len(end) == 1 else end[k] for end in (first, second)]
+            np.testing.assert_allclose(pair, solution.covariance(*ends), rtol=0.0, atol=1e-9 * np.abs(pair).max())
+    with pytest.raises(fg.GraphError, match="pairs of 2 and 3"):
+        solution.pair_covariances(x[:2], y)
