@@ -10,7 +10,7 @@
 #   make bench    measure everything again and rewrite the tables in docs/ (long)
 #   make results PAGE=control-cases    measure one page of docs/ again; without PAGE, list them
 #   make stale    name the pages of docs/ whose tables were measured on other sources
-#   make release-check    the same, and fail if there are any, or if the kernels that come with unifg are out of date
+#   make release-check    build sdist and wheel twice, compare and try them; fail for stale pages and kernels, too
 #   make kernels  compile everything anew into unifg/machine/kernels.zip, which spares a first use most of it (minutes)
 #   make mutants  change decisions one at a time and see whether a test notices (hours; FILES='scenarios/driving/drive_past.py')
 #   make examples run all scripts of examples/ and draw the pictures of docs/examples.md again
@@ -79,6 +79,7 @@ stale: $(VENV)/ready
 	@$(BIN)/python -m benchmarks.pages stale
 
 release-check: $(VENV)/ready
+	$(BIN)/python docs/check_release.py
 	@$(BIN)/python -m benchmarks.pages stale --strict
 	@$(BIN)/unifg warmup --check
 

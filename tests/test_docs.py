@@ -58,8 +58,9 @@ def test_python_blocks_run(page: Path, scratch: Path, monkeypatch: pytest.Monkey
     blocks = [f for f in fences(page) if f.language in PYTHON and f.skip is None]
     if not blocks:
         pytest.skip("this page shows no Python")
-    if find_spec("casadi") is None:  # an extra that the tests do not ask for
-        blocks = [f for f in blocks if not f.code.startswith("import casadi")]
+    for peer in ("casadi", "gtsam"):  # extras that the tests do not ask for
+        if find_spec(peer) is None:
+            blocks = [f for f in blocks if not f.code.startswith(f"import {peer}")]
     run_page(blocks, monkeypatch)
 
 
