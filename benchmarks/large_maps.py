@@ -2,6 +2,7 @@
 
     python -m benchmarks.large_maps                  draws the maps of benchmarks/campaigns again
     python -m benchmarks.large_maps --measure 500    what a map of 500 m costs: time of the processor, and memory
+    python -m benchmarks.large_maps --drive 500      a whole drive through it: ticks, way, memory
 
 Bazzana et al. 2022 drive 30 times along eight legs of their department (Table I: four of about 170 m, two of 91, two
 of 18) and four legs of a factory-like map (Table II: 154, 87, 142 and 131 m). Neither map is published with
@@ -18,6 +19,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -25,6 +27,8 @@ from benchmarks.report import command
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, save_map
 from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.log.drive_metrics import episode_metrics
+from unifg.scenarios.navigation import NavigationSettings, run_navigation
 from unifg.scenarios.ways.grid import plan
 from unifg.scenarios.ways.polyline import path_length
 from unifg.scenarios.worlds.rectangles import wall_rectangles
@@ -280,13 +284,48 @@ def measured(side: float) -> Iterator[str]:
         return
 
 
+def driven(side: float) -> Iterator[str]:
+    """Drive a whole way through a town, from one end to the other: ticks and memory, quarter by quarter."""
+    with TemporaryDirectory() as folder:
+        occupancy, rooms = town(side)
+        save(Path(folder) / "town.yaml", occupancy)
+        field = DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+        standing = [room for room in rooms if field.distance(np.array([room.x, room.y])) > 0.3]
+        for first, last in product(standing[:6], standing[:-7:-1]):
+            try:
+                path = plan(occupancy, field, (first.x, first.y), (last.x, last.y, 0.0), robot_radius=0.17)
+            except ScenarioError:
+                continue
+            break
+        else:
+            raise ScenarioError("no two rooms of this town are joined")
+        start = (first.x, first.y, float(path[0, 2]))
+        goal = (last.x, last.y, float(path[-2, 2]))
+        del field
+        began = time.process_time()
+        log = run_navigation(NavigationSettings(map=Path(folder) / "town.yaml", start=start, goals=(goal,)))
+    spent = time.process_time() - began
+    metrics = episode_metrics(log)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    yield (
+        f"{occupancy.occupied.size / 1e6:.1f} million cells: {', '.join(log.outcomes)}, {log.collisions} contacts, "
+        f"{metrics['path_length_m']:.0f} m in {metrics['duration_s']:.0f} s, localisation "
+        f"{1e3 * metrics['localisation_error_m']['mean']:.1f} mm on average; {spent:.0f} s of the processor with "
+        f"reading the map, at most {peak:.2f} GB"
+    )
+    for number, quarter in enumerate(np.array_split(log.tick_ms, 4), start=1):
+        p50, p99 = np.percentile(quarter, [50.0, 99.0])
+        yield f"quarter {number}: tick median {p50:.1f} ms, 99 % {p99:.1f} ms, at most {quarter.max():.1f} ms"
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Draw the maps of the campaigns, or measure a large one."""
     parser = command(__doc__)
     parser.add_argument("--measure", type=float, metavar="SIDE", help="of a town [m]; draws no map of the campaigns")
+    parser.add_argument("--drive", type=float, metavar="SIDE", help="through such a town, from end to end [m]")
     options = parser.parse_args(arguments)
-    if options.measure is not None:
-        for line in measured(options.measure):
+    if options.measure is not None or options.drive is not None:
+        for line in measured(options.measure) if options.measure is not None else driven(options.drive):
             print(line, flush=True)
         return 0
     CAMPAIGNS.mkdir(exist_ok=True)

@@ -21,6 +21,7 @@ from unifg.files.contents import legible
 
 __all__ = [
     "Option",
+    "Text",
     "add_options",
     "count",
     "existing",

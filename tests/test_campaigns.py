@@ -205,6 +205,24 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     assert read(path).title == "weg ü"
 
 
+def test_a_fault_is_stated_by_its_word() -> None:
+    def made(fault: object) -> Statement:
+        return stated({"scenario": "navigation", "seeds": [0], "grid": {"fault": [fault, "gust@1"]}})
+
+    with pytest.raises(ScenarioError, match="unknown fault 'gust'"):
+        made("lidar-nan@2:1")
+    for wrong, message in ((3, "cannot be stated in a file but by a word"), ("lidar-nan", "is not KIND@SECONDS")):
+        with pytest.raises(ScenarioError, match=message):
+            stated({"scenario": "navigation", "seeds": [0], "settings": {"fault": wrong}})
+    one, same, other = (
+        next(stated({"scenario": "navigation", "seeds": [0], "settings": {"fault": word}}).episodes())
+        for word in ("lidar-nan@2:1", "lidar-nan@2.0:1.0", "lidar-nan@2:3")
+    )
+    assert one.key == same.key != other.key and json.dumps(one.settings)
+    built = campaigns_settings(stated({"scenario": "navigation", "seeds": [0]}), {"faults": ["lidar-nan@2:1"]})
+    assert [str(fault) for fault in built.faults] == ["lidar-nan@2:1"]
+
+
 # ---------------------------------------------------------------- rows on file
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from unifg.errors import ScenarioError
-from unifg.scenarios.options import Option, plain
+from unifg.scenarios.options import Option, Text, plain
 
 __all__ = ["Fields", "identity", "nearest"]
 
@@ -76,7 +76,7 @@ class Fields:
         option: Option | None = declared.metadata.get("option")
         many = option is not None and option.many
         values = given if not many or (isinstance(given, list | tuple) and not _single(kind, given)) else [given]
-        found = self._fitting(plain(kind), values, where)
+        found = self._fitting(plain(kind), values, where, option.text if option is not None else None)
         for one in found if many else (found,):
             self._permitted(path, option, one, where)
         return found
@@ -88,7 +88,7 @@ class Fields:
             made = _replaced(made, path.split("."), value)
         return made
 
-    def _fitting(self, kind: Any, given: Any, where: str) -> Any:
+    def _fitting(self, kind: Any, given: Any, where: str, text: Text | None) -> Any:
         arguments = get_args(kind)
         wrong = ScenarioError(f"{where}: {given!r} does not fit: {_words(kind)} is expected")
         if get_origin(kind) is Literal:
@@ -99,10 +99,10 @@ class Fields:
             if not isinstance(given, list | tuple):
                 raise wrong
             if len(arguments) == 2 and arguments[1] is Ellipsis:
-                return tuple(self._fitting(plain(arguments[0]), one, where) for one in given)
+                return tuple(self._fitting(plain(arguments[0]), one, where, text) for one in given)
             if len(given) != len(arguments):
                 raise wrong
-            return tuple(self._fitting(plain(k), one, where) for k, one in zip(arguments, given, strict=True))
+            return tuple(self._fitting(plain(k), one, where, text) for k, one in zip(arguments, given, strict=True))
         if kind is float:
             if isinstance(given, bool) or not isinstance(given, int | float) or math.isnan(given):
                 raise wrong
@@ -115,7 +115,12 @@ class Fields:
             if type(given) is not kind:
                 raise wrong
             return given
-        raise ScenarioError(f"{where}: {_words(kind)} cannot be stated in a file")
+        if text is None or not isinstance(given, str):
+            raise ScenarioError(f"{where}: {_words(kind)} cannot be stated in a file" + " but by a word" * bool(text))
+        try:  # the word that the command line takes
+            return text(given)
+        except argparse.ArgumentTypeError as error:
+            raise ScenarioError(f"{where}: {error}") from None
 
     def _permitted(self, path: str, option: Option | None, value: Any, where: str) -> None:
         """Refuse what the command line refuses."""
@@ -144,7 +149,9 @@ def identity(value: Any) -> Any:
             if beside.is_file():
                 total.update(beside.name.encode() + b"\0" + beside.read_bytes() + b"\0")
         return total.hexdigest()[:12]
-    return [identity(one) for one in value] if isinstance(value, tuple) else value
+    if isinstance(value, tuple):
+        return [identity(one) for one in value]
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
 def _literal(name: str) -> str:
