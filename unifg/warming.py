@@ -201,6 +201,9 @@ def _pose_graph(simulated: Simulated) -> None:
         for name in ("gn", "lm", "dogleg"):
             solution = backend(name, max_iterations=5).solve(graph, guess)
         solution.marginals(x)
+        solution.covariance(x[::7])
+        solution.pair_covariances(x[-1], x[:3])
+        solution.report()
     graph, x, guess = found.graph(robust=TruncatedLeastSquares(1.0))
     GraduatedNonConvexity().solve(graph, guess)
 
@@ -220,3 +223,4 @@ def _smooth(simulated: Simulated) -> None:
                 smoother.minimize(between, x[first], x[second], measured, sigma=0.1, robust=Huber(1.0))
             smoother.update({x: pose})
         smoother.covariance(x[-1])
+        smoother.estimate(x[-1], best=True)

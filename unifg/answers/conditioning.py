@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from unifg.elimination.factorization import Factorization
+from unifg.elimination.plan import PIVOTS, ROWS
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.typing import Array
@@ -39,7 +40,9 @@ class Conditioning(NamedTuple):
 
 def cheap(program: Program) -> bool:
     """Whether a report may factorise."""
-    return program.systems.normal().tree.flops <= EFFORT
+    fronts = program.systems.normal().structure.plan.fronts[:-1].astype(np.float64)
+    pivots, rows = fronts[:, PIVOTS], fronts[:, ROWS]
+    return float((pivots * (pivots**2 / 3.0 + pivots * rows + rows**2)).sum()) <= EFFORT
 
 
 def conditioning(program: Program, lin: Linearization) -> Conditioning:
