@@ -1,8 +1,9 @@
 """Build what is released, twice, and try it where nothing else is: part of `make release-check`.
 
 Both builds begin with a copy of what git tracks and end in dist/: a wheel, and an sdist whose times, owners and order
-are made the same. They have to be equal to the last bit, within the size that docs/releases.md allows, and the wheel has to
-solve and answer `unifg doctor` in an environment of its own (`--no-install` leaves that out; it fetches packages).
+are made the same. They have to be equal to the last bit, within the size that docs/releases.md allows, and the wheel
+has to solve and answer `unifg doctor` in an environment of its own (`--no-install` leaves that out, for it fetches
+packages).
 """
 
 from __future__ import annotations
