@@ -1,4 +1,4 @@
-"""File formats: pose graphs (g2o, TORO), trajectories (TUM, KITTI), robot logs (CARMEN) and occupancy maps (ROS).
+"""File formats: pose graphs (g2o, TORO), trajectories (TUM, KITTI, EuRoC), robot logs (CARMEN) and maps (ROS).
 
 Each format is a module of its own; importing one reads nothing else.
 """
@@ -10,6 +10,7 @@ __all__ = [
     "carmen",
     "contents",
     "decimals",
+    "euroc",
     "g2o",
     "kitti",
     "measured",
