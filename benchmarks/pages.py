@@ -21,7 +21,7 @@ from benchmarks.sources import CHECKOUT, digest
 
 DOCS = CHECKOUT / "docs"
 DIGEST_LINE = "Digest of the sources: {}."
-CARRIED = re.compile(r"^Digest of the sources: `(?P<digest>[0-9a-f]{12})`\.$", re.MULTILINE)
+CARRIED = re.compile(r"^Digest of the sources: (?P<digests>`[0-9a-f]{12}`(?: and `[0-9a-f]{12}`)*)\.$", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,16 @@ class Page:
         return digest([self.module])
 
     @property
-    def carried(self) -> str | None:
-        """The digest the page carries."""
+    def carried(self) -> frozenset[str]:
+        """The digests the page carries: of every state of the code that its rows were measured on."""
         text = self.path.read_text(encoding="utf-8") if self.path.is_file() else ""
         found = CARRIED.search(text)
-        return found["digest"] if found else None
+        return frozenset(re.findall("[0-9a-f]{12}", found["digests"])) if found else frozenset()
+
+    @property
+    def current(self) -> bool:
+        """Whether every row was measured on the sources as they are now."""
+        return self.carried == {self.digest}
 
 
 PAGES = {
@@ -103,12 +108,12 @@ PAGES = {
 
 def stale() -> list[Page]:
     """Pages that carry another digest than that of their sources, or none."""
-    return [page for page in PAGES.values() if page.carried != page.digest]
+    return [page for page in PAGES.values() if not page.current]
 
 
 def sentence(page: Page) -> str:
     """What is wrong with a stale page and what to do."""
-    carried = f"measured on {page.carried}" if page.carried else "carries no digest"
+    carried = f"measured on {' and '.join(sorted(page.carried))}" if page.carried else "carries no digest"
     return f"docs/{page.name}.md: {carried}, the sources are {page.digest}: make results PAGE={page.name}"
 
 
@@ -139,7 +144,7 @@ def main(arguments: list[str] | None = None) -> int:
             print(sentence(page))
         return 1 if wrong and options.strict else 0
     for page in PAGES.values():
-        print(f"{page.name:20} {page.module:30} {'up to date' if page.carried == page.digest else 'stale'}")
+        print(f"{page.name:20} {page.module:30} {'up to date' if page.current else 'stale'}")
     return 0
 
 

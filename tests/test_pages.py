@@ -87,6 +87,8 @@ def test_a_page_is_stale_until_it_is_measured_again(tmp_path: Path, monkeypatch:
     assert "measured on 000000000000" in pages.sentence(page) and page in pages.stale()
     put_results(page.path, "A page", "mixed", ["0" * 12, page.digest])
     assert page in pages.stale()
+    assert page.carried == {"0" * 12, page.digest}
+    assert f"measured on {'0' * 12} and {page.digest}, the sources" in pages.sentence(page)
 
     monkeypatch.setattr(pages, "PAGES", {page.name: page})
     assert pages.main(["stale"]) == 0
