@@ -41,7 +41,7 @@ __all__ = ["CONTROLLERS", "Controller", "Knowledge", "SafeFlight", "SafeSettings
 
 Controller = Literal["barrier", "flatness", "filter", "cascade", "spline"]
 Knowledge = Literal["estimated", "books"]
-Sight = Literal["exact", "noisy"]
+Sight = Literal["exact", "noisy", "relative"]
 CONTROLLERS: tuple[Controller, ...] = get_args(Controller)
 
 _TAG = 72  # keeps the noise apart from other numbers of the same seed
@@ -82,7 +82,8 @@ class SafeSettings:
         controller: who decides: a plan with barriers, flatness, flatness with a filter of one step, such a filter
             below a plan that is made now and then, or flatness along a spline that was planned before; may be repeated.
         terminal: whether plans have to end at rest.
-        sight: whether obstacles are seen where they are and as fast as they are, or with noise and without velocity.
+        sight: whether obstacles are seen where they are and as fast as they are, or with noise and without velocity,
+            in the world or, "relative", from the vehicle.
         knowledge: "estimated" mass and drag with prediction of what is pending, or what is in the "books" without.
         seed: of sizes, places, phases and noise; without one, the case as it is described.
         solver: one of `unifg.solvers.names.CONSTRAINED`.
@@ -184,8 +185,8 @@ class SafeFlight:
         self.filter = StateFilter(s.believed, s.dt) if estimating else None
         path = self._spline() if controller == "spline" else about.path
         self.pace = Pace(path, s.patience * speed)
-        noisy = s.sight == "noisy" and len(about.bodies) > 0
-        self.sightings = Sightings(s.sighting, self._bodies(0.0)) if noisy else None
+        noisy, beside = s.sight != "exact" and len(about.bodies) > 0, s.sight == "relative"
+        self.sightings = Sightings(s.sighting, self._bodies(0.0), beside) if noisy else None
         self._decide = self._deciders(controller, barriers, s.faster * speed)
 
     def _deciders(
@@ -272,16 +273,21 @@ class SafeFlight:
         """Mass and drag as the past says, or as in the books."""
         return self.settings.books.parameters if self.weighing is None else self.weighing.believed
 
-    def see(self) -> tuple[Array, Obstacles]:
-        """State (10,) and obstacles as they are seen now."""
-        s = self.settings
-        sigma = np.repeat(s.seen, 3) * self._noise.standard_normal(9)
-        state = quadrotor.STATE.retract(self.plant.state[None], sigma[None])[0]
+    def see(self) -> Array:
+        """State (10,) as it is seen now."""
+        sigma = np.repeat(self.settings.seen, 3) * self._noise.standard_normal(9)
+        state: Array = quadrotor.STATE.retract(self.plant.state[None], sigma[None])[0]
+        return state
+
+    def look_around(self, state: Array) -> Obstacles:
+        """Obstacles as they are seen now by a vehicle that believes to be in a state (10,)."""
         truth = self._bodies(self.plant.time)
         if self.sightings is None:
-            return state, truth
-        blurred = truth.position + s.sighting.noise * self._blur.standard_normal(truth.position.shape)
-        return state, self.sightings.see(self.plant.time, blurred)
+            return truth
+        blur = self.settings.sighting.noise * self._blur.standard_normal(truth.position.shape)
+        beside = self.plant.state[:3] if self.sightings.relative else np.zeros(3)
+        own = self.settings.seen[0] if self.filter is None else self.filter.unsure
+        return self.sightings.see(self.plant.time, truth.position - beside + blur, state[:3], own)
 
     def _bodies(self, now: float) -> Obstacles:
         """Obstacles as they are."""
@@ -307,13 +313,14 @@ class SafeFlight:
 
         def tick(number: int) -> tuple[float, str]:
             now = self.plant.time
-            state, obstacles = self.see()
+            state = self.see()
             if self.weighing is not None:
                 self.weighing.see(state, float(self.model.loops[6]))
                 self.model.airframe = replace(s.books, parameters=self.believed)
             begin = time.thread_time()
             state = state if self.filter is None else self.filter.see(state)
             filtered_ms = 1e3 * (time.thread_time() - begin)
+            obstacles = self.look_around(state)
             self.pace.see(state[:3])
             before = self.plant.state.copy()
             decision = self._decide(state, obstacles)

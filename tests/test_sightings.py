@@ -30,27 +30,36 @@ def things(doubt: Array | None = None) -> Obstacles:
 # ---------------------------------------------------------------- looks
 
 
-def test_looks_are_weighed_as_dense_least_squares_weigh_them() -> None:
-    """Place, velocity, and how far where they will be is to be believed; before and after the memory is full."""
+@pytest.mark.parametrize("relative", [False, True])
+def test_looks_are_weighed_as_dense_least_squares_weigh_them(relative: bool) -> None:
+    """Place, velocity, and how far where they will be is to be believed; before and after the memory is full.
+
+    The vehicle's own place is an unknown of the same problem: what it is beside where it is believed to be adds to the
+    distance from what is seen in the world, and drops out of that from what is seen beside the vehicle.
+    """
     rng, like, s = np.random.default_rng(0), things(), SightingSettings(noise=0.05, believed=0.04, looks=6, k=2.0)
-    sightings, seen, times = Sightings(s, like), [], []
+    sightings, seen, times = Sightings(s, like, relative), [], []
+    unsure, reach, turn = 0.02, np.array([1.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0])
     for k in range(9):
-        now = 0.03 * k
+        now, here = 0.03 * k, np.array([0.1 * k, 0.0, 1.0])
         fall = DOWN * like.falls[:, None]
         truth = like.position + now * like.velocity + 0.5 * now**2 * fall
         seen.append(truth + s.noise * rng.normal(size=(2, 3)))
         times.append(now)
-        found = sightings.see(now, seen[-1])
+        found = sightings.see(now, seen[-1] - here * relative, here, unsure)
         since = np.array(times[-s.looks :]) - now
-        rows = np.concatenate([np.stack([np.ones_like(since), since], 1) / s.believed, [[0.0, 1.0 / s.fast]]])
+        looks = np.stack([np.ones_like(since), since, -np.full_like(since, relative)], 1) / s.believed
+        rows = np.concatenate([looks, [[0.0, 1.0 / s.fast, 0.0], [0.0, 0.0, 1.0 / unsure]]])
         spread = np.linalg.inv(rows.T @ rows)
         for j in range(2):
             looked = np.array([z[j] for z in seen[-s.looks :]]) - 0.5 * since[:, None] ** 2 * fall[j]
-            expected = spread @ rows.T @ np.concatenate([looked / s.believed, np.zeros((1, 3))])
-            np.testing.assert_allclose(np.stack([found.position[j], found.velocity[j]]), expected, atol=1e-9)
+            expected = spread @ rows.T @ np.concatenate([looked / s.believed, np.zeros((2, 3))])
+            np.testing.assert_allclose(np.stack([found.position[j], found.velocity[j]]), expected[:2], atol=1e-9)
         later = np.array([0.0, 0.1, 0.7])
-        sigma = np.sqrt(spread[0, 0] + 2.0 * later * spread[0, 1] + later**2 * spread[1, 1])
-        np.testing.assert_allclose(found.off(later), like.keep + s.k * sigma[:, None], rtol=1e-9)
+        sigma = [np.sqrt(row @ spread @ row) for row in (reach + t * turn for t in later)]
+        np.testing.assert_allclose(found.off(later), like.keep + s.k * np.array(sigma)[:, None], rtol=1e-7)
+        alone = np.linalg.inv(rows[:, :2].T @ rows[:, :2])[0, 0]  # of the place, if the vehicle's were known
+        assert sigma[0] ** 2 == pytest.approx(alone + (not relative) * unsure**2)
     np.testing.assert_allclose(found.velocity, like.velocity + now * fall, atol=2.0)
 
 

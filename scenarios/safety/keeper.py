@@ -40,7 +40,6 @@ __all__ = ["TRACKING", "Decision", "Keeper", "KeeperSettings", "Obstacles", "Ter
 Reading: TypeAlias = Literal["decay", "published"]
 Terminal: TypeAlias = Literal["none", "rest"]
 
-TOLERANCE = 1e-4  # of the KKT test, in a loop that goes on
 FAR = 1e3  # where obstacles are that are not there [m]
 PRICE = 1e5  # of violation: multipliers of squared slacks that are used grow with them
 SLOWING = 3.0  # deceleration of a vehicle that is faster than it may be [m/s^2]
@@ -75,6 +74,9 @@ class KeeperSettings:
         speed: greatest speed [m/s].
         slack: its weight; None for that of the form.
         hinge: weight of the squared hinge [s^2 m^2], as published without one.
+        tolerance: of the KKT test.
+        settled: whether every plan is solved to its tolerance; or one step of the interior point is made per tick, and
+            more of them only while the plan violates the constraints.
         iterations: most of a solve with a warm start.
         budget: wall-clock time of a solve [s]; a finite one makes a flight depend on the machine.
     """
@@ -98,17 +100,21 @@ class KeeperSettings:
     speed: float = 4.0
     slack: float | None = None
     hinge: float = 1e4
+    tolerance: float = 1e-4
+    settled: bool = False
     iterations: int = 10
     budget: float = np.inf
 
 
 TRACKING = KeeperSettings(
-    position=180.0, attitude=5e-3, velocity=2.7, rate=2.9e-5, thrust=8.3e-5, rate_change=1.3e-6, thrust_change=3.7e-5
-)
+    position=180.0, attitude=5e-3, velocity=2.7, rate=2.9e-5, thrust=8.3e-5, rate_change=1.3e-6, thrust_change=3.7e-5,
+    tolerance=1e-5, settled=True,
+)  # fmt: skip
 """Weights for flights with nothing in the way; ``python -m benchmarks.flight_tuning --controller barrier`` finds them.
 
 They make controls cheap, which is what following a path closely takes; among obstacles, where the path may lie inside
-of things, they do harm.
+of things, they do harm. What they weigh are millimetres: a plan that is stopped after one step is off by a good part of
+what noise and gusts leave.
 """
 
 
@@ -336,12 +342,11 @@ class Keeper:
         if s.slots:
             self._state_barriers(graph, steps)
         self.graph = graph
-        # One step of the interior point a tick, and more of them only while the plan violates the constraints.
-        early = {"step_tolerance": np.inf} if solver == "ipm" else {}
+        early = {"step_tolerance": np.inf} if solver == "ipm" and not s.settled else {}
         dear = {"price": PRICE} if solver == "ipm" else {}
-        self._cold = backend(solver, tolerance=TOLERANCE, **dear, **early).prepare(graph)
+        self._cold = backend(solver, tolerance=s.tolerance, **dear, **early).prepare(graph)
         hurried = backend(
-            solver, tolerance=TOLERANCE, time_limit=s.budget, max_iterations=s.iterations, **dear, **early
+            solver, tolerance=s.tolerance, time_limit=s.budget, max_iterations=s.iterations, **dear, **early
         )
         self._warm = hurried.prepare(graph)
         self._guess: fg.Guess | None = None

@@ -10,6 +10,11 @@ be has the variance
 in any direction: k of its standard deviations are kept beyond what is to be kept (:attr:`Obstacles.doubt`; it is
 :func:`unifg.models.barriers.uncertain` with a root that is the same along every axis). What turns is believed late, by
 half of what is remembered.
+
+The vehicle is not quite where it is believed to be either, and a distance is as unsure as both of its ends. By how much
+it is not, o, is an unknown of the graph with the variance that the vehicle's own past gives it. Looks that say where a
+thing is in the world have nothing to do with o: the variances add up. Looks from the vehicle are of c - o: c and o are
+coupled, and in the distance, which is of c - o as well, o drops out.
 """
 
 from __future__ import annotations
@@ -25,6 +30,8 @@ from unifg.solvers import GaussNewton
 from unifg.typing import Array
 
 __all__ = ["SightingSettings", "Sightings"]
+
+SUREST = 1e-6  # least standard deviation of the vehicle's place [m]
 
 
 @dataclass(frozen=True)
@@ -52,17 +59,30 @@ def missed(centre: Array, velocity: Array, since: Array, fall: Array, seen: Arra
     return found
 
 
+def weighed(own: Array, unsure: Array) -> Array:
+    """(1, 3) what the vehicle is beside where it is believed to be, in standard deviations ``unsure`` (1, 3) [m]."""
+    found: Array = own / unsure
+    return found
+
+
+def missed_from_here(centre: Array, velocity: Array, own: Array, since: Array, fall: Array, seen: Array) -> Array:
+    """(n, 3) the same of a look from a vehicle that is ``own`` (n, 3) beside where it is believed to be [m]."""
+    found: Array = missed(centre, velocity, since, fall, seen) - own
+    return found
+
+
 class Sightings:
     """Remembers looks at M obstacles.
 
     Attributes:
         settings: the numbers.
+        relative: whether looks say where a thing is beside the vehicle.
     """
 
-    def __init__(self, settings: SightingSettings, obstacles: Obstacles) -> None:
+    def __init__(self, settings: SightingSettings, obstacles: Obstacles, relative: bool = False) -> None:
         """State the graph for obstacles like these; nothing was seen yet."""
         s, m = settings, len(obstacles.keep)
-        self.settings, self._like = s, obstacles
+        self.settings, self._like, self.relative = s, obstacles, relative
         self._times, self._seen = np.full(s.looks, np.nan), np.zeros((s.looks, m, 3))
         fall = np.array([0.0, 0.0, -quadrotor.GRAVITY]) * obstacles.falls[:, None]
         graph = fg.Graph()
@@ -73,22 +93,41 @@ class Sightings:
         self._looks = graph.data("seen", np.zeros((n, 3)), each=True)
         self._active = graph.data("remembered", np.zeros(n, dtype=bool), each=True)
         looks = self._since, np.tile(fall, (s.looks, 1)), self._looks
-        graph.minimize(
-            missed, self.place[every], self.speed[every], *looks, sigma=s.believed, active=self._active, name="looks"
-        )
+        self.own = graph.variables("own", fg.Rn(3), 1)
+        ends: tuple[fg.Selection, ...] = self.place[every], self.speed[every]
+        ends = (*ends, self.own[np.zeros(n, dtype=np.intp)]) if relative else ends
+        misses = missed_from_here if relative else missed
+        graph.minimize(misses, *ends, *looks, sigma=s.believed, active=self._active, name="looks")
         graph.minimize(fg.prior, self.speed, np.zeros(3), sigma=s.fast, name="fast")
+        self._unsure = graph.data("unsure", np.ones((1, 3)))
+        graph.minimize(weighed, self.own, self._unsure, name="own place")
         self._run = GaussNewton(max_iterations=3).prepare(graph)
 
-    def see(self, now: float, places: Array) -> Obstacles:
-        """Take in places (M, 3) as they are seen now [m]; what is believed of the obstacles."""
+    def see(self, now: float, places: Array, here: Array, unsure: float) -> Obstacles:
+        """Take in places as they are seen now; what is believed of the obstacles.
+
+        Args:
+            now: [s].
+            places: (M, 3) in the world; beside the vehicle where looks are relative [m].
+            here: (3,) where the vehicle is believed to be [m]. What it is beside that is taken for the same at all
+                looks that are remembered, for it changes little in that time.
+            unsure: its standard deviation [m].
+        """
         s, like = self.settings, self._like
+        places = places + here if self.relative else places
         self._times, self._seen = np.roll(self._times, -1), np.roll(self._seen, -1, axis=0)
         self._times[-1], self._seen[-1] = now, places
         known = np.repeat(np.isfinite(self._times), len(places))
         since = np.repeat(np.nan_to_num(self._times - now), len(places))[:, None]
-        data = {self._since: since, self._looks: self._seen.reshape(-1, 3), self._active: known}
-        found = self._run.solve({self.place: places, self.speed: np.zeros_like(places)}, data=data)
-        # All are looked at alike, and along all axes.
-        spread = found.covariance(self.place[0], self.speed[0])[::3, ::3] * s.k**2
+        data = {
+            self._since: since, self._looks: self._seen.reshape(-1, 3), self._active: known,
+            self._unsure: np.full((1, 3), max(unsure, SUREST)),
+        }  # fmt: skip
+        guess = {self.place: places, self.speed: np.zeros_like(places), self.own: np.zeros((1, 3))}
+        found = self._run.solve(guess, data=data)
+        # All are looked at alike, and along all axes; distances are of place less own place.
+        joint = found.covariance(self.place[0], self.speed[0], self.own[0])[::3, ::3] * s.k**2
+        apart = np.array([[1.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+        spread = apart @ joint @ apart.T
         doubt = np.tile([spread[0, 0], 2.0 * spread[0, 1], spread[1, 1]], (len(places), 1))
         return Obstacles(found[self.place], found[self.speed], like.keep, like.upright, like.falls, doubt)

@@ -64,6 +64,11 @@ class StateFilter:
         self.gust = np.zeros(3)
         self.covariance = np.diag(np.concatenate([self._noise, blow]))
 
+    @property
+    def unsure(self) -> float:
+        """Standard deviation of the position, along the axis of which it is greatest [m]."""
+        return math.sqrt(float(np.linalg.eigvalsh(self.covariance[P, P])[-1]))
+
     def see(self, seen: Array) -> Array:
         """Take in a state (10,) as it is seen now; returns the state (10,) that is believed."""
         if self.state is None:
