@@ -74,7 +74,7 @@ def plot_above(logs: Sequence[SafeLog], ax: Axes) -> Axes:
         reach = first.radii[inside, None]
         ends = np.concatenate([ends, near[inside] - reach, near[inside] + reach])
     ground(ax, ends.min(axis=0) - _BESIDE, ends.max(axis=0) + _BESIDE)
-    ax.set_title("From above; dotted: nearer than this the margin is not kept")
+    ax.set_title("From above; dotted: nearer than this the margin is not kept" if len(first.radii) else "From above")
     return ax
 
 
