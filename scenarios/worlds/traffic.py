@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pymunk
@@ -379,13 +379,8 @@ def _cart(
         end = begin + reach * turn[:, 0]
         discs = [(*(at + s * length * turn[:, 0]), 0.6 * width) for at in (begin, 0.5 * (begin + end), end)
                  for s in (-0.3, 0.0, 0.3)]  # fmt: skip
-        ways = (np.array(discs[k : k + 3]) for k in (0, 3, 6))
-        starts = [path[0, :2]] * len(goals)
-        if all(
-            path_exists(occupancy, walls, start, goal[:2], WAY, at)
-            for at in ways
-            for start, goal in zip(starts, goals, strict=True)
-        ):
+        ways = [np.array(discs[k : k + 3]) for k in (0, 3, 6)]
+        if all(path_exists(occupancy, walls, path[0, :2], goal[:2], WAY, at) for at in ways for goal in goals):
             return Cart(begin, end, traffic.cart_speed, courteous=courteous)
     raise ScenarioError(
         f"there is no straight and wide piece of the path for so many carts of {length:g} m by {width:g} m; "
@@ -405,15 +400,11 @@ def _doors(traffic: Traffic, walls: DistanceMap, points: Array, goals: Array, rn
     doors = []
     for at in np.sort(rng.permutation(len(places))[: traffic.doors]):
         middle, heading, width = places[int(at)]
-        schedule = Schedule(traffic.open_for, traffic.closed_for)
         begun, side = rng.random(2)
-        turned = heading + (math.pi if side < 0.5 else 0.0)
-        doors.append(Door(middle, turned, width, Schedule(*_times(schedule), begun=begun * schedule.period)))
+        schedule = Schedule(traffic.open_for, traffic.closed_for)
+        schedule = replace(schedule, begun=begun * schedule.period)
+        doors.append(Door(middle, heading + (math.pi if side < 0.5 else 0.0), width, schedule))
     return doors
-
-
-def _times(schedule: Schedule) -> tuple[float, float, float]:
-    return schedule.open_for, schedule.closed_for, schedule.sliding
 
 
 def doorways(walls: DistanceMap, points: Array, goals: Array) -> list[tuple[Array, float, float]]:
