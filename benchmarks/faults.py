@@ -3,32 +3,41 @@
     python -m benchmarks.faults [--seeds 0:5] [--only FAULT ...] [--workers K] [--fresh] [--report]
 
 Drives along the corridor of the shipped building and flights through the corridor of cylinders, each with one fault
-from second 2 (flights 3) on: for two seconds, after which a robot is to go on, and for good, where it is to stop or to
-go on as well as it can. Counted are drives and flights that ended by name, contacts, and exceptions; none may be
-raised. Every finished one is a line of out/benchmarks/faults.jsonl.
+from second 2 (flights 3) on: for two seconds, after which a robot is to go on, and for good, where it is to stop or
+to go on as well as it can. Counted are drives and flights that ended by name, contacts, and exceptions; none may be
+raised. Of a flight that touched something it is asked what the stopping set could have done: from the state in which
+the fault found it, the same world is flown on as it was for a reaction time, and then braked with true state and true
+wind in view. Where that touches nothing, the contact could have been avoided. Every finished one is a line of
+out/benchmarks/faults.jsonl.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 from benchmarks import runs
 from benchmarks.report import command, machine, publish, table
 from unifg.scenarios.campaigns.comparison import Row
 from unifg.scenarios.flight import FlightSettings, run_flight
+from unifg.scenarios.flying.braking import braking_control
 from unifg.scenarios.log.drive_metrics import episode_metrics
+from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
-from unifg.scenarios.worlds.faults import DRIVE_FAULTS, FLIGHT_FAULTS, Fault
+from unifg.scenarios.worlds.air import QuadrotorWorld
+from unifg.scenarios.worlds.conditions import draw_conditions
+from unifg.scenarios.worlds.disturbance import DisturbanceModel
+from unifg.scenarios.worlds.faults import DRIVE_FAULTS, FLIGHT_FAULTS, GUST, Fault
 
 SEEDS = range(5)
 ROBOTS = {"drive": DRIVE_FAULTS, "flight": FLIGHT_FAULTS}
 BEGIN = {"drive": 2.0, "flight": 3.0}  # [s]
 DURATIONS = (2.0, 1000.0)  # [s]; the second one for good
 GUST_TIMES = (0.5, 2.0)  # [s]; nobody flies on against a gale for good
+REACTION = 2  # ticks: the one in which something is felt, and the one that answers
 START, GOAL = (6.5, 14.0, 0.0), (13.5, 14.1, 0.0)
 
 
@@ -45,6 +54,7 @@ class Case:
 def episode(case: Case) -> Row:
     """Run one; an exception is what is looked for, and kept."""
     fault = Fault(case.fault, BEGIN[case.robot], case.duration)
+    braked: float | None = None
     try:
         if case.robot == "drive":
             drive = NavigationSettings(start=START, goals=(GOAL,), obstacles=1, seed=case.seed, faults=(fault,))
@@ -57,12 +67,31 @@ def episode(case: Case) -> Row:
             m = flight_metrics(flight)
             said = [k for k, health in enumerate(flight.health) if health != "ok"]
             outcome, first = flight.outcome, float(flight.time[said[0]]) if said else None
+            if m["collisions"]:
+                braked = stopped_clear(case, flight)
     except Exception as error:
         return {"raised": f"{type(error).__name__}: {error}"}
     return {
+        "braked": braked,
         "outcome": outcome, "collisions": m["collisions"], "causes": m["causes"], "first": first,
         "clearance": m["min_clearance_m"], "dropped": sum(m["dropped_samples"].values()),
     }  # fmt: skip
+
+
+def stopped_clear(case: Case, log: FlightLog) -> float:
+    """Least clearance [m] of the vehicle of a flight that brakes as well as can be, over the time of the fault."""
+    settings = FlightSettings(seed=case.seed)
+    begin = round(BEGIN["flight"] / log.dt)
+    true = draw_conditions(case.seed, settings.mass_error).true
+    gust = GUST if case.fault == "gust" else 0.0
+    true = replace(true, wind=(true.wind[0], true.wind[1] + gust))
+    world = QuadrotorWorld(log.layout, case.seed, true, start=log.truth[begin], disturbance=DisturbanceModel.calm())
+    box, clearance = settings.controller.box, world.clearance()
+    for tick in range(round(min(case.duration, GUST_TIMES[-1]) / log.dt)):
+        braking = braking_control(world.state, true, *box)
+        world.step(log.controls[begin + tick] if tick < REACTION else braking, log.dt)
+        clearance = min(clearance, world.clearance())
+    return clearance
 
 
 def cases(seeds: Iterable[int], only: Iterable[str]) -> list[Case]:
@@ -117,13 +146,20 @@ def render(rows: list[Row]) -> str:
     )  # fmt: skip
     contacts = [
         f"`{row['robot']}`, {row['fault']}, {row['duration']:g} s, seed {row['seed']}: "
-        f"{row['collisions']} contacts, {row['outcome']}"
+        f"{row['collisions']} contacts, {row['outcome']}{_avoidable(row['braked'])}"
         for row in ended
         if row["collisions"]
     ]
     listed = "\n".join(f"- {line}" for line in contacts)
     parts = [sums, table(head, lines, text=3), *([f"Episodes with contacts:\n\n{listed}"] if contacts else [])]
     return "\n\n".join([*parts, machine("numpy", "scipy", "pymunk")])
+
+
+def _avoidable(braked: float | None) -> str:
+    """What the stopping set could have done, by the clearance it leaves [m]."""
+    if braked is None:
+        return ""
+    return f"; the stopping set keeps {braked:.2f} m" if braked > 0.0 else "; the stopping set touches as well"
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -32,7 +32,7 @@ COUNT = 30
 INTERRUPTED = 130
 BEFORE = (-signal.SIGTERM, 128 + signal.SIGTERM)  # of a process whose handlers do not stand yet
 NOTHING = "before there was anything to write"
-RUN = "run navigation --start 6.5,14,0 --goal 9.5,14.1,0"
+RUN = "run navigation --start 6.5,14,0 --goal 13.5,14.1,0 --obstacles 0"
 CAMPAIGN = """\
 scenario = "manoeuvres"
 [grid]
@@ -44,12 +44,12 @@ solver = ["ipm", "sqp"]
 def commands(folder: Path) -> dict[str, list[str]]:
     """Arguments of the command line, but for where results go."""
     graph, campaign = folder / "graph.g2o", folder / "two.toml"
-    write_g2o(graph, manhattan(400).pose_graph)
+    write_g2o(graph, manhattan(4000).pose_graph)
     campaign.write_text(CAMPAIGN, encoding="utf-8")
     return {
         "run": RUN.split(),
         "campaign": ["campaign", str(campaign), "--workers", "1"],
-        "solve": ["solve", str(graph), "--certify"],
+        "solve": ["solve", str(graph), "--init", "file", "--certify"],
     }
 
 
@@ -129,7 +129,9 @@ def main(arguments: list[str] | None = None) -> int:
             if kind not in chosen.only:
                 continue
             stopped(words, folder / f"{kind}-warm", None)
-            finished, seconds, _ = stopped(words, folder / f"{kind}-whole", None)
+            finished, seconds, said = stopped(words, folder / f"{kind}-whole", None)
+            if finished != 0:
+                raise SystemExit(f"{kind} does not come to its end: {said}")
             ends, longest, wrong = [0, 0, 0], 0.0, 0
             for number in range(chosen.count):
                 out = folder / f"{kind}-{number}"

@@ -135,7 +135,7 @@ class FlightLog:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything to one compressed ``.npz`` file; lists of arrays are stored end to end."""
-        arrays = {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+        arrays: dict[str, Any] = {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
         arrays |= {f"layout_{name}": getattr(self.layout, name) for name in _LAYOUT_ARRAYS}
         lists: dict[str, list[Any]] = {"pasts": self.pasts, "seen": self.seen}
         lists |= {f"landmarks_{name}": [getattr(row, name) for row in self.landmarks] for name in LandmarkRow._fields}

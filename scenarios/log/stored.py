@@ -16,7 +16,6 @@ import numpy as np
 
 from unifg.errors import FileFormatError
 from unifg.scenarios.log.columns import columns
-from unifg.typing import Array
 from unifg.whole import beside
 
 __all__ = ["load_columns", "save_columns"]
@@ -31,7 +30,7 @@ def save_columns(path: str | os.PathLike[str], log: Any, kind: str, known: dict[
         kind: what it is, with the version of its format; :func:`load_columns` asks for the same.
         known: what else there is: arrays, and values that JSON knows.
     """
-    arrays: dict[str, Array] = {}
+    arrays: dict[str, Any] = {}
     for name in columns(log):
         values = getattr(log, name)
         if isinstance(values, np.ndarray):
