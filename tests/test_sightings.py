@@ -84,6 +84,20 @@ def test_those_that_are_not_there_are_sure() -> None:
     assert things().doubts.shape == (2, 3) and not things().doubts.any()
 
 
+@pytest.mark.parametrize("knowledge", ["estimated", "books"])
+def test_what_is_seen_from_the_vehicle_goes_where_it_is_believed_to_be(knowledge: Any) -> None:
+    """Half a metre beside where it thinks it is, a vehicle sees things as far beside their place, unless in the world."""
+    wrong = np.array([0.5, -0.2, 0.0])
+    cases: tuple[tuple[Any, Array], ...] = ("relative", wrong), ("noisy", np.zeros(3))
+    for sight, moved in cases:
+        flight = flights(SafeSettings(case="static", sight=sight, knowledge=knowledge))[0]
+        truth = flight.situation.bodies.at(np.zeros(1))[0][0, 0]
+        believed = flight.plant.state + np.concatenate([wrong, np.zeros(7)])
+        seen = flight.look_around(believed)
+        np.testing.assert_allclose(seen.position[0] - truth, moved, atol=0.1)
+        assert seen.doubts[0, 0] > (3.0 * 0.0199) ** 2
+
+
 # ---------------------------------------------------------------- plans
 
 
