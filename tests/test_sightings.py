@@ -86,7 +86,7 @@ def test_those_that_are_not_there_are_sure() -> None:
 
 @pytest.mark.parametrize("knowledge", ["estimated", "books"])
 def test_what_is_seen_from_the_vehicle_goes_where_it_is_believed_to_be(knowledge: Any) -> None:
-    """Half a metre beside where it thinks it is, a vehicle sees things as far beside their place, unless in the world."""
+    """Half a metre beside where it thinks it is, a vehicle sees things as far beside, unless in the world."""
     wrong = np.array([0.5, -0.2, 0.0])
     cases: tuple[tuple[Any, Array], ...] = ("relative", wrong), ("noisy", np.zeros(3))
     for sight, moved in cases:
