@@ -208,7 +208,8 @@ def test_hostile_graphs_are_certified_rightly_or_refused() -> None:
         assert certify(replace(loop, fixed_ids=fixed)).certified
     alone = PoseGraph(np.arange(21), np.concatenate([loop.poses, [[50.0, 0.0, 1.0]]]), loop.edges)
     assert certify(alone).certified and certify(alone).poses[20].tolist() == [50.0, 0.0, 1.0]
-    nothing = Edges(*(np.zeros(0, dtype=np.intp) for _ in range(2)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    nobody = np.zeros(0, dtype=np.intp)
+    nothing = Edges(nobody, nobody, np.zeros((0, 3)), np.zeros((0, 3, 3)))
     itself = Edges(np.array([0]), np.array([0]), np.array([[0.1, 0.0, 0.0]]), np.eye(3)[None])
     for edges, said in ((nothing, 0), (itself, 1)):
         one = certify(PoseGraph(np.arange(1), np.zeros((1, 3)), edges))
