@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from unifg.errors import ScenarioError
+from unifg.files.contents import Limits
 from unifg.files.ros_map import OccupancyMap, load_map
 from unifg.horizon import Plan
 from unifg.lie import wrap_angle
@@ -60,6 +61,7 @@ FREEING = 20  # steps to there
 SLOWEST = 0.25  # [m/s]; a goal that takes longer than this, and a minute, is given up
 HELPLESS = 20.0  # [s] that a robot that may not move waits before it gives up
 REACHED = "reached"
+LARGEST = Limits(pixels=200_000_000)  # of a map that a user names: 700 m by 700 m at 0.05 m
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,7 @@ class Episode:
         least, most = settings.obstacle_radius
         if not 0.0 < least <= most < np.inf:
             raise ScenarioError(f"obstacles have radii 0 < least <= greatest, got {least:g} and {most:g} m")
-        self.occupancy = building_map() if settings.map is None else load_map(settings.map)
+        self.occupancy = building_map() if settings.map is None else load_map(settings.map, LARGEST)
         self.start = _pose(settings.start, DEMO_START if settings.map is None else None, "start")
         if settings.goals is None and settings.map is not None:
             raise ScenarioError("a map of your own needs at least one --goal=X,Y,THETA")

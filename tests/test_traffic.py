@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pymunk
 import pytest
 
 from unifg.errors import ScenarioError
+from unifg.files.contents import Limits
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios import navigation
@@ -242,6 +244,16 @@ def test_a_drive_meets_its_traffic_and_keeps_a_log_of_it(monkeypatch: pytest.Mon
     assert log.boxes.shape[1:] == (2, 5) and log.obstacles.shape[1] == 2
     assert np.abs(log.boxes[-1] - log.boxes[0]).max() > 0.0
     assert traffic.CART[0] > traffic.CART[1]
+
+
+def test_a_map_of_half_a_kilometre_is_read(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def load(path: Path, limits: Limits) -> OccupancyMap:
+        assert limits.pixels * 0.05**2 >= 500.0**2
+        raise ScenarioError("read")
+
+    monkeypatch.setattr(navigation, "load_map", load)
+    with pytest.raises(ScenarioError, match="read"):
+        Episode(NavigationSettings(map=tmp_path / "town.yaml", start=(1.0, 1.0, 0.0), goals=((2.0, 1.0, 0.0),)))
 
 
 def test_obstacles_may_be_other_than_the_robot_expects() -> None:
