@@ -22,6 +22,7 @@ import numpy as np
 from unifg.errors import FileFormatError
 from unifg.files.carmen import read_carmen
 from unifg.files.contents import Limits
+from unifg.files.euroc import read_euroc
 from unifg.files.g2o import read_g2o
 from unifg.files.kitti import read_kitti
 from unifg.files.pose_graph import read_pose_graph
@@ -56,6 +57,15 @@ TUM = b"""# t x y z qx qy qz qw
 0.0 0 0 0 0 0 0 1
 0.1 1 0 0 0 0 0.6 0.8
 0.2 2.5e0 0 0 0 0 0.6 0.8
+"""
+VICTORIA = b"""ODOMETRY 0 1 1 0 0.1 0.0001 0 0 4e-06 0 4e-06
+LANDMARK 1 2 11.5 -3.2 0.4 0 0.4
+ODOMETRY 1 3 1 0 0.1 0.0001 0 0 4e-06 0 4e-06
+LANDMARK 3 2 10.5 -3.2 0.4 0 0.4
+"""
+EUROC = b"""#timestamp, x, y, z, qw, qx, qy, qz
+1403636580838555648,4.688319,-1.786938,0.783338,0.6,0,0,0.8,-0.02
+1403636580843555648,4.688177,-1.786770,0.787350,0.6,0,0,0.8,-0.03
 """
 KITTI = b"1 0 0 0 0 1 0 0 0 0 1 0\n0 -1 0 1 1 0 0 2 0 0 1 3\n"
 CARMEN = b"""# message
@@ -101,6 +111,11 @@ READERS = {
     "toro": _one(read_toro, "graph.graph", TORO),
     "pose graph": _one(read_pose_graph, "graph.txt", PLANAR),
     "tum": _one(read_tum, "way.tum", TUM),
+    "edges alone": _one(
+        read_g2o, "graph.g2o", b"\n".join(line for line in PLANAR.split(b"\n") if b"VERTEX_S" not in line)
+    ),
+    "victoria": _one(read_pose_graph, "park.txt", VICTORIA),
+    "euroc": _one(read_euroc, "data.csv", EUROC),
     "kitti": _one(read_kitti, "way.txt", KITTI),
     "carmen": _one(read_carmen, "log.clf", CARMEN),
     "map": Reader(lambda path: load_map(path, limits=SMALL), {"m.yaml": YAML, "m.pgm": PGM}, ("m.yaml",)),
