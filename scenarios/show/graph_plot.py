@@ -86,7 +86,9 @@ def plot_graph(graph: PoseGraph, outliers: BoolArray, colour: str, label: str, a
 
 
 def plot_cost(solved: SolvedGraph, ax: Axes) -> Axes:
-    """The cost that was minimised over iterations, on a logarithmic scale."""
+    """The cost that was minimised over iterations, on a logarithmic scale where it falls to less than a third."""
+    from matplotlib.ticker import MaxNLocator
+
     rows = solved.solution.history
     numbers, costs = [row.number for row in rows], np.array([row.cost for row in rows])
     ax.plot(numbers, np.maximum(costs, 1e-300), "o-", color=css("robot"), ms=3.5, lw=1.2)
@@ -99,6 +101,7 @@ def plot_cost(solved: SolvedGraph, ax: Axes) -> Axes:
     more = "; a line begins the next surrogate of the loss" if stages else ""
     solve = 1e3 * solved.seconds["solve"]
     title = f"{what}, per iteration: {solved.solution.iterations} in {solve:.0f} ms{more}"
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     return face(ax, title, "cost", "iteration")
 
 
