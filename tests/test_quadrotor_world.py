@@ -353,7 +353,7 @@ def flown(ticks: int) -> FlightLog:
             landmarks=(reading.ids, world.things()[reading.ids, :2], np.tile(np.eye(2), (count, 1, 1)), reading.radii),
             parameters=PARAMETERS.packed, parameters_sigma=np.zeros(7), seen=reading.ids, movers=world.mover_states(),
             estimate_ms=1.0, plan_ms=2.0, compiled=0, statuses="converged", clearance=world.clearance(),
-            emergency=tick == 1,
+            emergency=tick == 1, health="ok", causes="", fault="gust" if tick == 1 else "",
         )  # fmt: skip
         world.step(HOVER)
     return recorder.finish(collisions=world.collisions, reached=False)
