@@ -36,7 +36,7 @@ def test_nanoseconds_and_quaternions(tmp_path: Path) -> None:
         ("1 0 0 0 1 0 0 0", "line 5: 1 fields between commas"),
         ("1.5,0,0,0,1,0,0,0", r"line 5: the time '1\.5' is not in whole nanoseconds"),
         ("1,0,x,0,1,0,0,0", "line 5: field y is 'x', not a number"),
-        ("1,0,0,inf,1,0,0,0", "line 5: field z is inf, not a finite number"),
+        ("1,0,0,inf,1,0,0,0", "line 5: field z is 'inf', not a finite number"),
         ("1,0,0,0,0,0,0,0", "line 5: the quaternion .* has norm 0"),
     ],
 )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import reprlib
 from pathlib import Path
 
 import numpy as np
@@ -49,15 +50,15 @@ def read_euroc(path: str | Path, limits: Limits = LIMITS) -> Trajectory:
                 f"{place}: {len(words)} fields between commas, expected {len(_FIELDS)} or more ({', '.join(_FIELDS)})"
             )
         if not _WHOLE.fullmatch(words[0]):
-            raise FileFormatError(f"{place}: the time {words[0]!r} is not in whole nanoseconds")
+            raise FileFormatError(f"{place}: the time {reprlib.repr(words[0])} is not in whole nanoseconds")
         values = []
         for field, word in zip(_FIELDS[1:], words[1:], strict=False):
             try:
                 value = float(word if word.isascii() and "_" not in word else "none")
             except ValueError:
-                raise FileFormatError(f"{place}: field {field} is {word!r}, not a number") from None
+                raise FileFormatError(f"{place}: field {field} is {reprlib.repr(word)}, not a number") from None
             if not math.isfinite(value):
-                raise FileFormatError(f"{place}: field {field} is {word}, not a finite number")
+                raise FileFormatError(f"{place}: field {field} is {reprlib.repr(word)}, not a finite number")
             values.append(value)
         norm = math.hypot(*values[3:])
         if not _SMALLEST_NORM <= norm <= _LARGEST_NORM:

@@ -26,6 +26,7 @@ from unifg.whole import write_whole
 _DEFAULT_OCCUPIED, _DEFAULT_FREE = 0.65, 0.196
 # Values of ROS's own map_saver; 205 lies between the default thresholds.
 _WIDEST = 1e6  # of a map [m]
+_LONGEST = 255  # name of a file, on the systems there are
 _pillow = Lock()  # its limit of pixels is one for all threads
 _PIXEL_OCCUPIED, _PIXEL_FREE, _PIXEL_UNKNOWN = 0, 254, 205
 
@@ -150,6 +151,8 @@ def load_map(path: str | Path, limits: Limits = LIMITS) -> OccupancyMap:
     image = header.get("image")
     if not isinstance(image, str) or not image:
         raise FileFormatError(f"{name}: 'image' is {reprlib.repr(image)}; it must name the image beside the YAML file")
+    if max(map(len, image.split("/"))) > _LONGEST:
+        raise FileFormatError(f"{name}: 'image' is {reprlib.repr(image)}; no file has so long a name")
     grey, visible = _read_image(name, path.parent / image, limits)
     width = resolution * max(grey.shape)
     if width > _WIDEST or max(map(abs, origin)) > 1e12 * resolution:
