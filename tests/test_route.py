@@ -12,7 +12,18 @@ from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.driving.drive_control import Controller
 from unifg.scenarios.driving.drive_settings import ControllerSettings
-from unifg.scenarios.driving.route import ALLOWANCE, GAP, PATIENCE, STUCK_TICKS, WALL_GAP, Route
+from unifg.scenarios.driving.route import (
+    ALLOWANCE,
+    CLOSED,
+    GAP,
+    PATIENCE,
+    STALLED,
+    STUCK_TICKS,
+    VAIN,
+    WAITING,
+    WALL_GAP,
+    Route,
+)
 from unifg.scenarios.driving.stopping import followed
 from unifg.scenarios.seeing.tracks import Tracks
 from unifg.scenarios.ways.grid import SPACING
@@ -117,6 +128,43 @@ def test_robot_that_waits_beside_a_mover_goes_back_the_way_it_came() -> None:
     assert 2.3 < furthest < 2.7
     assert np.allclose(route.path[0, :2], here[:2], atol=0.02)
     assert np.allclose(route.path[-1], [11.0, 0.45, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("tracks", "given_up"),
+    [
+        (disc(2.2, 1.9, 0.2, (0.0, 1.0)), False),
+        (disc(2.2, 1.9, 0.2), True),
+        (disc(1.0 + WAITING + 0.5, 1.9, 0.2, (0.0, 1.0)), True),
+    ],
+    ids=["moves by", "stands", "moves far off"],
+)
+def test_a_goal_is_not_given_up_for_what_moves_nearby(
+    tracks: Tracks, given_up: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A robot that does not come nearer may wait for a mover as long as that moves; for all else there is an end."""
+    route, start = through_the_hall()
+    monkeypatch.setattr(route, "_stuck", lambda end: False)
+    for _ in range(STALLED + 3):
+        route.repair(start, tracks)
+    assert (route.blocked is not None) == given_up
+
+
+@pytest.mark.parametrize("mover", [False, True])
+def test_detours_around_movers_that_rest_are_no_sign_of_a_closed_way(mover: bool) -> None:
+    """Each place where a mover rests is driven around; what then stands in the way gets the patience it is due."""
+    route, start = through_the_hall()
+    route.repair(start, disc(30.0, 1.0, 0.2))
+    detours = 0
+    while detours <= CLOSED // VAIN:
+        ahead = route.path[30, :2]
+        resting = disc(float(ahead[0]), float(np.clip(ahead[1], 0.8, 1.2)), 0.25)
+        for _ in range(PATIENCE + 1):
+            detours += route.repair(start, replace(resting, mover=np.array([mover])))
+    standing = disc(3.5, 1.0, 0.9)
+    for _ in range(PATIENCE + 2):
+        route.repair(start, standing)
+    assert (route.blocked is not None) == (not mover)
 
 
 @pytest.mark.parametrize("heading", [0.0, 1.6, 3.1])

@@ -35,7 +35,8 @@ PATIENCE = 5  # ticks between two repairs
 ANYWHERE = 15  # ticks between two searches of the whole map
 CLOSED = 60  # ticks for which no way is to be had at all since the goal came nearer, after which there is none
 VAIN = 6  # of those ticks that a detour counts which does not lead nearer
-STALLED = 400  # ticks without coming nearer to the goal, after which there is no use
+STALLED = 400  # ticks without coming nearer to the goal while nothing moves nearby, after which there is no use
+WAITING = 2.0  # [m] from the robot within which something that moves may be what it waits for
 FRESH_STARTS = 3  # ways round about, on each of which the goal may be farther off again
 
 
@@ -133,7 +134,7 @@ class Route:
             self._crumbs = [*self._crumbs[-round(RETREAT / CRUMB) :], pose[:2].copy()]
         self._rest, self._since_anywhere = max(self._rest - 1, 0), self._since_anywhere + 1
         self._trail = [*self._trail[-STUCK_TICKS + 1 :], pose[:2].copy()]
-        self._look_for_progress(pose)
+        self._look_for_progress(pose, tracks)
         if self._rest:
             return False
         arc = SPACING * np.arange(len(self.path))
@@ -159,11 +160,12 @@ class Route:
             return False
         self._rest = PATIENCE
         last = float(arc[ahead][np.flatnonzero(blocked)[-1]])
-        if self._detour(pose, min(last + REJOIN, float(arc[-1])), standing, ALLOWANCE):
-            self._closed += VAIN  # unless the goal comes nearer on it
-            return True
         staying = ~standing.mover
         closed = (room[:, staying] < self._radius + self._disc_gap).any(axis=1)
+        if self._detour(pose, min(last + REJOIN, float(arc[-1])), standing, ALLOWANCE):
+            if closed.any():  # what has moved and only rests says nothing of whether there is a way
+                self._closed += VAIN  # unless the goal comes nearer on it
+            return True
         if not closed.any():  # what has moved may go on: where it alone is in the way, the robot waits
             return False
         return self._round_about(pose, standing.at(staying), self.path[ahead][np.flatnonzero(closed)[0], :2])
@@ -179,13 +181,13 @@ class Route:
             self.blocked = Blocked(place.copy(), self._radius + self._wall_gap)
         return False
 
-    def _look_for_progress(self, pose: Array) -> None:
-        """Give up a goal that has not come nearer for long."""
+    def _look_for_progress(self, pose: Array, tracks: Tracks) -> None:
+        """Give up a goal that has not come nearer for long, the time left out in which something moved on the way."""
         left = float(SPACING * len(self.path)) - self._reached
         if left < self._nearest - CRUMB:
             self._nearest, self._stalled, self._closed = left, 0, 0
             return
-        self._stalled += 1
+        self._stalled += not self._waits_for_a_mover(pose, tracks)
         if self._stalled > STALLED:
             if self._starts and left > self._nearest + 2.0 * REJOIN:  # it is on its way round about
                 self._starts -= 1
@@ -198,6 +200,11 @@ class Route:
         if len(self._trail) < STUCK_TICKS or end - self._reached < NEAR_GOAL:
             return False
         return bool(np.ptp(np.array(self._trail), axis=0).max() < STUCK_DISTANCE)
+
+    def _waits_for_a_mover(self, pose: Array, tracks: Tracks) -> bool:
+        """Whether something that moves just now may keep the robot from going on: it will be elsewhere."""
+        speed, offset = np.hypot(*tracks.velocity.T), np.hypot(*(tracks.centre - pose[:2]).T)
+        return bool(((speed >= STANDING) & (offset - tracks.radius < WAITING)).any())
 
     def _beside_a_mover(self, pose: Array, tracks: Tracks) -> bool:
         gap = np.hypot(*(tracks.centre - pose[:2]).T) - tracks.radius - self._radius
