@@ -204,6 +204,9 @@ def _repeat(chosen: argparse.Namespace) -> int:
     from unifg.scenarios.commands import repetition
 
     before, folder = repetition.read_inputs(chosen.folder), chosen.out or chosen.folder / "replay"
+    if folder.resolve() == chosen.folder.resolve():
+        return _refuse(f"--out {folder}: would write over the run that it is compared with")
+    repetition.require_files(before)
     words = [*before.words, "--out", str(folder), *(["--live"] if chosen.live else [])]
     try:
         again = _parser(words).parse_args(words)
@@ -215,6 +218,8 @@ def _repeat(chosen: argparse.Namespace) -> int:
         return status
     for sentence in before.changed(repetition.read_inputs(folder)):
         print(f"note: {sentence}")
+    if repetition.ended_early(chosen.folder):
+        print("note: its user ended the first run early, and this one went on")
     count, found = repetition.differences(chosen.folder, folder)
     for sentence in found:
         print(f"differs: {sentence}")

@@ -58,9 +58,11 @@ def test_inputs_are_words_and_files(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert found.changed(later) == [
         "version: 1.0 then, 1.1 now", "settings: 3 then, 4 now", "graph.g2o: another content",
     ]  # fmt: skip
-    for text, said in (("{}", "is not what"), ("[", "is not what"), ('{"words": []}', "is not what")):
+    rest = {"settings": "", "version": "", "sources": "", "machine": ""}
+    numbers, nothing = ({"words": ["solve", 5], "files": {}} | rest), ({"words": ["solve", "a"], "files": None} | rest)
+    for text in ("{}", "[", "null", '{"words": []}', json.dumps(numbers), json.dumps(nothing)):
         (tmp_path / "inputs.json").write_text(text)
-        with pytest.raises(ScenarioError, match=said):
+        with pytest.raises(ScenarioError, match="is not what"):
             read_inputs(tmp_path)
     write_inputs(tmp_path, Inputs(["campaign", "x"], {}, "", "", "", ""))
     with pytest.raises(ScenarioError, match="names no run"):
@@ -87,3 +89,25 @@ def test_a_run_is_repeated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert f"differs: metrics.json.{name}" in out
     assert "note: machine: an abacus then" in out
     assert command.main(["replay", str(tmp_path)]) == 2
+    capsys.readouterr()
+    before = (folder / "metrics.json").read_bytes()
+    assert command.main(["replay", str(folder), "--out", str(tmp_path / "again" / ".." / "out")]) == 2
+    assert "would write over the run" in capsys.readouterr().err
+    assert (folder / "metrics.json").read_bytes() == before
+    (folder / "metrics.json").write_text("{")
+    assert command.main(["replay", str(folder), "--out", str(tmp_path / "again")]) == 2
+    assert "metrics.json: cannot be compared" in capsys.readouterr().err
+    (folder / "metrics.json").write_text(json.dumps(numbers | {"interrupted": True}))
+    assert command.main(["replay", str(folder), "--out", str(tmp_path / "again")]) == 1
+    assert "note: its user ended the first run early" in capsys.readouterr().out
+
+
+def test_files_that_a_run_read_and_that_have_moved_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gone = str(tmp_path / "grün und blau.g2o")
+    write_inputs(tmp_path, Inputs(["solve", gone], {gone: "0"}, "", "", "", ""))
+    assert command.main(["replay", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert f"{gone}: the run has read this file, which is no longer there" in error
+    assert "understood" not in error

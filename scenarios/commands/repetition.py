@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -102,13 +103,41 @@ def read_inputs(folder: Path) -> Inputs:
         ) from None
     except (OSError, ValueError, TypeError) as error:
         raise ScenarioError(f"{file}: is not what `unifg run` has written ({error})") from error
-    if not (isinstance(found.words, list) and found.words[:1] in (["run"], ["solve"])):
+    if not (_are_words(found.words) and isinstance(found.files, dict)):
+        raise ScenarioError(
+            f"{file}: is not what `unifg run` has written (words {found.words!r}, files {found.files!r})"
+        )
+    if found.words[:1] not in (["run"], ["solve"]):
         raise ScenarioError(f"{file}: names no run: {found.words!r}")
     return found
 
 
+def _are_words(words: object) -> bool:
+    return isinstance(words, list) and all(isinstance(word, str) for word in words)
+
+
+def require_files(found: Inputs) -> None:
+    """See that what a run has read can be read again.
+
+    Raises:
+        ScenarioError: a file is gone.
+    """
+    for name in found.files:
+        if not _is_file(name):
+            raise ScenarioError(f"{name}: the run has read this file, which is no longer there (from {Path.cwd()})")
+
+
+def ended_early(folder: Path) -> bool:
+    """Whether a user has ended a run before its end; False where its results do not say."""
+    return any(str(value) == "true" for name, value in _numbers(folder) if name == "metrics.json.interrupted")
+
+
 def differences(first: Path, second: Path) -> tuple[int, list[str]]:
-    """How many rows of numbers two folders of results have in common, and where they differ."""
+    """How many rows of numbers two folders of results have in common, and where they differ.
+
+    Raises:
+        ScenarioError: a file is damaged.
+    """
     mine, theirs = dict(_numbers(first)), dict(_numbers(second))
     found = [f"{name}: only in one of them" for name in sorted(mine.keys() ^ theirs.keys())]
     both = [name for name in mine if name in theirs]
@@ -134,17 +163,28 @@ def _apart(a: Array, b: Array) -> str:
 
 
 def _numbers(folder: Path) -> Iterator[tuple[str, Array]]:
-    """Everything in a folder that the same run has to repeat, by name."""
+    """Everything in a folder that the same run has to repeat, by name.
+
+    Raises:
+        ScenarioError: a file is damaged.
+    """
     for file in sorted(folder.iterdir()):
-        if file.suffix == ".npz":
-            with np.load(file, allow_pickle=False) as stored:
-                for name in stored.files:
-                    if not CLOCKED.search(name):
-                        yield f"{file.name}[{name}]", stored[name]
-        elif file.suffix in (".tum", ".g2o", ".csv"):
-            yield file.name, np.array(file.read_text(encoding="utf-8").split("\n"))
-        elif file.name == "metrics.json":
-            yield from _of_json(file.name, json.loads(file.read_text(encoding="utf-8")))
+        try:
+            yield from _of_file(file)
+        except (OSError, ValueError, EOFError, BadZipFile) as error:
+            raise ScenarioError(f"{file}: cannot be compared ({error})") from error
+
+
+def _of_file(file: Path) -> Iterator[tuple[str, Array]]:
+    if file.suffix == ".npz":
+        with np.load(file, allow_pickle=False) as stored:
+            for name in stored.files:
+                if not CLOCKED.search(name):
+                    yield f"{file.name}[{name}]", stored[name]
+    elif file.suffix in (".tum", ".g2o", ".csv"):
+        yield file.name, np.array(file.read_text(encoding="utf-8").split("\n"))
+    elif file.name == "metrics.json":
+        yield from _of_json(file.name, json.loads(file.read_text(encoding="utf-8")))
 
 
 def _of_json(name: str, value: Any) -> Iterator[tuple[str, Array]]:
