@@ -14,12 +14,11 @@ for cumulative B-splines on Lie groups*), with A_j = Exp(B_j d_j),
 
 Control poses are guides, not places the trajectory passes through: at the knot of c_k it is at their mean with weights
 1/6, 4/6, 1/6. The functions are batched NumPy and are traced, so a measurement at any moment is a factor on four
-members, with exact derivatives (a residual calls them by a name of their own: it is asked what it reaches)::
+members, with exact derivatives::
 
     curve = CubicTrajectory(fg.SE3, start=0.0, spacing=0.1)
-    place, pose = curve.places(stamps, len(x)), curve.pose
-    seen = lambda a, b, c, d, u, z: fg.SE3.local(z, pose(a, b, c, d, u))
-    graph.minimize(seen, *place.of(x), measured, sigma=0.01)
+    seen = lambda a, b, c, d, u, z: fg.SE3.local(z, curve.pose(a, b, c, d, u))
+    graph.minimize(seen, *curve.places(stamps, len(x)).of(x), measured, sigma=0.01)
 """
 
 from __future__ import annotations

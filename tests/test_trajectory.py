@@ -67,6 +67,16 @@ def test_its_functions_are_traced_and_their_derivatives_exact(rng: np.random.Gen
             assert abs((ahead - behind) / (2.0 * h) - lin.gradient[k]) < 1e-6 * (1.0 + abs(lin.gradient[k]))
 
 
+def test_residuals_may_ask_it_for_its_functions() -> None:
+    curve = CubicTrajectory(fg.SE2, spacing=0.5)
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE2, 6)
+    seen = curve.places([0.1, 0.7, 1.4], 6).of(x)
+    graph.minimize(lambda a, b, c, d, u: curve.pose(a, b, c, d, u), *seen, sigma=1.0, name="pose")
+    graph.minimize(lambda a, b, c, d, u: curve.velocity(a, b, c, d, u), *seen, sigma=1.0, name="velocity")
+    assert not graph.compile().left_to_python
+
+
 def test_brackets_of_rotations_are_cross_products(rng: np.random.Generator) -> None:
     a, b = rng.normal(size=(2, 3))
     np.testing.assert_allclose(np.einsum("ijk,i,j->k", brackets(fg.SO3), a, b), np.cross(a, b), atol=1e-15)

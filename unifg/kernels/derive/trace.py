@@ -12,6 +12,8 @@ import builtins
 import math
 import sys
 from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import fields, is_dataclass
 from functools import partial
 from types import CellType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any, cast
@@ -164,6 +166,19 @@ class Rebound:
 
         return one_by_one if is_compiled(kernel.function) else batched
 
+    def record(self, record: Any) -> Any:
+        """A copy of a frozen record whose fields are functions, or know some; any other one as it is."""
+        if not getattr(vars(type(record)).get("__dataclass_params__"), "frozen", False):
+            return record
+        present = {f.name: getattr(record, f.name) for f in fields(record)}
+        rebound = {name: self.thing(value) for name, value in present.items()}
+        if all(rebound[name] is value for name, value in present.items()):
+            return record
+        copied = copy(record)
+        for name, value in rebound.items():
+            object.__setattr__(copied, name, value)
+        return copied
+
     def thing(self, thing: Any) -> Any:
         """What a name means while a function is traced."""
         if id(thing) in self.given:
@@ -191,6 +206,8 @@ class Rebound:
             return thing if module.partition(".")[0] == "numpy" else self.function(thing)
         if isinstance(thing, partial | MethodType):
             return self.callable(thing)
+        if is_dataclass(thing) and not isinstance(thing, type):
+            return self.record(thing)
         return CONSTRUCTORS.get(id(thing), thing) if callable(thing) else thing
 
 
