@@ -70,6 +70,7 @@ def test_edges_that_cannot_be_tested_stay() -> None:
     assert found[blind].all()
     chain = replace(graph, edges=graph.edges[graph.edges.odometry])
     assert pairwise_consistent(chain).all()
+    assert pairwise_consistent(replace(graph, edges=graph.edges[:0])).shape == (0,)
     for options in ({"probability": 1.0}, {"tries": 0}):
         with pytest.raises(GraphError, match="must be"):
             pairwise_consistent(graph, **options)

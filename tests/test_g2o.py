@@ -15,7 +15,7 @@ from unifg.errors import FileFormatError, GraphError
 from unifg.files.g2o import read_g2o, write_g2o
 from unifg.files.pose_graph import read_pose_graph
 from unifg.files.toro import read_toro, write_toro
-from unifg.pose_graphs import Edges, PoseGraph, Sightings, indefinite, sphere
+from unifg.pose_graphs import Edges, PoseGraph, Sightings, indefinite, repaired, sphere
 
 PLANAR = """\
 # two poses and a tree
@@ -328,6 +328,10 @@ def test_tags_of_gtsam_hold_covariances(tmp_path: Path) -> None:
     ):
         with pytest.raises(FileFormatError, match=message):
             read_g2o(write(tmp_path, text + line))
+
+
+def test_information_in_whole_numbers_is_projected_beyond_them() -> None:
+    np.testing.assert_allclose(repaired(np.array([[[1, 2], [2, 1]]]), "project"), np.full((1, 2, 2), 1.5))
 
 
 def test_indefinite_information_is_named_and_repaired(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -47,6 +47,8 @@ def pairwise_consistent(pose_graph: PoseGraph, probability: float = 0.9999, trie
     """
     if not 0.0 < probability < 1.0 or tries < 1:
         raise GraphError(f"probability {probability} must be in (0, 1) and tries {tries} at least 1")
+    if not len(pose_graph.edges):
+        return np.zeros(0, dtype=np.bool_)
     from scipy.special import chdtri  # slow to load
 
     group, edges, dim = pose_graph.group, pose_graph.edges, pose_graph.group.dim

@@ -52,7 +52,7 @@ def repaired(information: Array, how: Repair) -> Array:
     """
     require_repair(how)
     wrong = indefinite(information)
-    result = information.copy()
+    result = np.array(information, dtype=np.float64)
     result[wrong] = 0.0
     if how == "project" and wrong.any():
         lengths, axes = np.linalg.eigh(information[wrong])
