@@ -87,7 +87,10 @@ def _kind(program: Program) -> tuple[str, bool]:
     rows = np.flatnonzero(limited & ~program.equality)
     if len(rows):
         return f"the inequality '{program.row_name(int(rows[0]))[0]}'", True
-    return f"the equality '{program.constraint_terms[0].name}'", True
+    equal = np.flatnonzero(program.equality)
+    if len(equal):
+        return f"the equality '{program.row_name(int(equal[0]))[0]}'", True
+    return f"the constraint '{program.constraint_terms[0].name}', without limits now", True
 
 
 def solve(

@@ -44,6 +44,18 @@ def test_what_is_stated_decides() -> None:
     assert picked.reason == "the scalar cost 'quartic'"
 
 
+def test_limits_that_are_none_now_are_no_equality() -> None:
+    graph, x = line(1)
+    graph.minimize(fg.prior, x, [1.0, 0.0])
+    graph.bound(x, upper=graph.data("most", np.inf), name="box")
+    assert choose(graph).reason == "the constraint 'box', without limits now"
+
+
+def test_a_time_limit_that_is_no_number_is_refused() -> None:
+    with pytest.raises(fg.errors.BackendError, match="time_limit must be a number of seconds, found nan"):
+        choose(circled()[0], time_limit=float("nan"))
+
+
 def test_options_reach_both() -> None:
     picked = choose(circled()[0], tolerance=1e-3, time_limit=5.0, verbose=True)
     for solver in (picked.first, picked.second):

@@ -493,3 +493,13 @@ def test_a_copy_states_its_own_factors() -> None:
         one.update({own: np.zeros(3)})
     np.testing.assert_allclose(other.estimate(other.families["x"]), smoother.estimate(x), atol=1e-12)
     assert len(smoother) == len(other) == 3
+
+
+def test_finite_measurements_whose_sum_is_none_are_taken() -> None:
+    smoother = fg.Incremental()
+    x = smoother.variables("x", fg.Rn(2))
+    for _ in range(2):
+        smoother.minimize(fg.prior, x[0], np.array([1e308, 1.5e308]), sigma=1e300)
+    smoother.minimize(fg.prior, x[0], np.zeros(2), sigma=1e300)
+    with pytest.raises(GraphError, match="a parameter of factor 0 is not finite"):
+        smoother.minimize(fg.prior, x[0], np.array([1.0, np.nan]), sigma=1.0)

@@ -109,6 +109,8 @@ class Solver(Backend):
         """Refuse options no solve could honour."""
         if not self.tolerance > 0.0:
             raise BackendError(f"{self.name}: tolerance must be positive, found {self.tolerance}")
+        if np.isnan(self.time_limit):
+            raise BackendError(f"{self.name}: time_limit must be a number of seconds, found {self.time_limit}")
         if self.max_iterations < 0:
             raise BackendError(f"{self.name}: max_iterations must not be negative, found {self.max_iterations}")
         if self.search_iterations < 0:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -213,8 +212,9 @@ class Types:
                 whitener = roots.reshape(len(roots), size * size)
             whitening = FULL
         data = side_by_side([*parameters, whitener], count)
-        if not isfinite(data.sum()):
-            index = int(np.argwhere(~np.isfinite(data))[0, 0])
+        finite = np.isfinite(data).all(axis=1)
+        if not finite.all():
+            index = int(np.argmin(finite))
             raise GraphError(f"term '{name}': a parameter of factor {index} is not finite", term=name, index=index)
         counts = data.shape[1] - whitener.shape[1], data.shape[1], whitening, size
         kind = self._kind(kernel, counts, selections, shapes, *form)

@@ -107,4 +107,4 @@ def numbers_of(kind: Kind, arguments: Sequence[Any], sigma: Any, information: An
         stack = np.array(information, ndmin=3, order="C")
         if stack.shape[1] != kind.size or stack.shape[2] != kind.size or not quick_roots(stack, data[:, kind.first :]):
             return None
-    return data if isfinite(row.sum()) else None
+    return data if isfinite(sum(row.tolist())) else None  # a sum that overflows is looked at
