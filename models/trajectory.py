@@ -99,7 +99,13 @@ class CubicTrajectory:
         return CubicTrajectory, (self.group, self.start, self.spacing)
 
     def controls(self, end: float) -> int:
-        """How many control poses hold all moments up to an end [s]."""
+        """How many control poses hold all moments up to an end [s].
+
+        Raises:
+            ModelError: the end is not finite.
+        """
+        if not isfinite(end):
+            raise ModelError(f"trajectory: the end {end!r} must be finite")
         return ORDER + max(int(np.ceil((end - self.start) / self.spacing - 1e-9)) - 1, 0)
 
     def knots(self, count: int) -> Array:

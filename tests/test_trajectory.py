@@ -104,6 +104,9 @@ def test_moments_outside_are_refused() -> None:
     for spacing in (0.0, -1.0, np.inf, np.nan):
         with pytest.raises(ModelError, match="spacing"):
             CubicTrajectory(fg.SE2, spacing=spacing)
+    for end in (np.inf, np.nan):
+        with pytest.raises(ModelError, match="end .* must be finite"):
+            CubicTrajectory(fg.SE2).controls(end)
 
 
 def test_a_long_run_is_found_from_sensors_that_know_no_nodes(rng: np.random.Generator) -> None:
