@@ -60,6 +60,14 @@ def test_records_go_to_a_file_and_back(tmp_path: Path) -> None:
         performance.history(tmp_path / "none")
 
 
+@pytest.mark.parametrize("ratios", ["[]", '{"a": []}', '{"a": 1.0}', '{"a": ["b"]}', '{"a": [0.0]}'])
+def test_records_without_ratios_are_refused(tmp_path: Path, ratios: str) -> None:
+    file = tmp_path / "history.jsonl"
+    file.write_text('{"version": "", "when": "", "machine": "", "milliseconds": {}, "ratios": ' + ratios + "}")
+    with pytest.raises(ScenarioError, match="is no record"):
+        performance.history(file)
+
+
 @pytest.mark.parametrize(("scale", "machine", "status"), [(1.0, "here", 0), (1.4, "here", 1), (1.4, "there", 0)])
 def test_bench_fails_for_a_loss_on_a_machine_of_the_same_kind(
     scale: float, machine: str, status: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,

@@ -105,7 +105,7 @@ def test_moments_outside_are_refused() -> None:
         with pytest.raises(ModelError, match="spacing"):
             CubicTrajectory(fg.SE2, spacing=spacing)
     for end in (np.inf, np.nan):
-        with pytest.raises(ModelError, match="end .* must be finite"):
+        with pytest.raises(ModelError, match="must be finite"):
             CubicTrajectory(fg.SE2).controls(end)
 
 

@@ -247,9 +247,19 @@ def history(file: Path = HISTORY) -> list[Record]:
     except OSError as error:
         raise ScenarioError(f"{file}: cannot be read ({error.strerror})") from error
     try:
-        return [Record(**json.loads(line)) for line in lines if line.strip()]
+        return [_read(line) for line in lines if line.strip()]
     except (ValueError, TypeError) as error:
         raise ScenarioError(f"{file}: holds a line that is no record of `unifg bench` ({error})") from error
+
+
+def _read(line: str) -> Record:
+    found = Record(**json.loads(line))
+    if not (isinstance(found.ratios, dict) and all(isinstance(row, list) and row for row in found.ratios.values())):
+        raise ValueError("a case without ratios")
+    for ratios in found.ratios.values():
+        if not (np.array(ratios, dtype=np.float64) > 0.0).all():
+            raise ValueError("ratios that are not positive")
+    return found
 
 
 def append(file: Path, record: Record) -> None:
