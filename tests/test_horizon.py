@@ -797,6 +797,7 @@ def test_a_robot_on_se2_finds_a_lamp_while_it_drives(coupling: Any) -> None:
     "wrong",
     [
         {"measured": {"gps": np.zeros(2)}},
+        {"measured": {"gps": ["here"]}},
         {"measured": {"sonar": np.zeros(1)}},
         {"measured": {"gps": [0.2], "sonar": [0.1]}},
         {"applied": [np.nan]},

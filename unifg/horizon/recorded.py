@@ -144,11 +144,15 @@ class History:
         """A measured value as an array.
 
         Raises:
-            GraphError: when nothing measures that, or its shape differs.
+            GraphError: when nothing measures that, its shape differs, or it holds no numbers.
         """
         if name not in self._values:
             raise GraphError(f"nothing measures '{name}' (there are: {', '.join(self._values) or 'none'})")
-        expected, array = self._values[name].shape[1:], np.asarray(value, dtype=np.float64)
+        expected = self._values[name].shape[1:]
+        try:
+            array = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise GraphError(f"measurement '{name}' must be {expected} numbers, got {value!r}") from error
         if array.shape != expected:
             raise GraphError(f"measurement '{name}' has shape {array.shape}, expected {expected}")
         return array

@@ -241,9 +241,10 @@ TABLE |= {
     }.items()
     for function in functions
 }  # fmt: skip
-TABLE |= {  # of NumPy 2
+TABLE |= {  # not in every NumPy: of 2, and what 2.5 calls deprecated
     getattr(module, name): made
     for module, name, made in (
+        (np, "fix", lambda x, out=None: np.trunc(wrapped(_objects(x)), out=out)),
         (np, "vecdot", _product_of_sums),
         (np.linalg, "vecdot", lambda a, b, *, axis=-1: _product_of_sums(a, b, axis)),
         (np.linalg, "vector_norm", lambda x, *, axis=None, keepdims=False, ord=2: _norm(x, ord, axis, keepdims)),

@@ -73,6 +73,16 @@ class Symbol:
         """The same."""
         return self
 
+    @property
+    def real(self) -> Symbol:
+        """Itself: NumPy asks the entries of plain arrays of objects, since 2.5."""
+        return self
+
+    @property
+    def imag(self) -> float:
+        """None."""
+        return 0.0
+
     __add__, __radd__ = _both("add")
     __sub__, __rsub__ = _both("subtract")
     __mul__, __rmul__ = _both("multiply")
@@ -180,6 +190,16 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
             if isinstance(part, Symbol | Symbols):
                 raise TraceError("puts entries by a number that is not known yet; write np.where(condition, a, b)")
         super().__setitem__(key, value)
+
+    @property  # type: ignore[misc]
+    def real(self) -> Any:
+        """The same; since NumPy 2.5 a ufunc, which asks the entries."""
+        return self
+
+    @property  # type: ignore[misc]
+    def imag(self) -> Any:
+        """Zeros."""
+        return symbols(self.shape)
 
     def __bool__(self) -> bool:
         """Only a single entry that is known."""
