@@ -197,7 +197,12 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     words = ["run", "quadrotor-obstacles", "--out", str(tmp_path)]
     assert command.main([*words, "--solver", "ipm", "--avoidance", "hard", "--seed", "1003"]) == 0
     assert "obstacle course 1003" in capsys.readouterr().out
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["iterates.png", "metrics.json", "scene.html"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "inputs.json",
+        "iterates.png",
+        "metrics.json",
+        "scene.html",
+    ]
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["succeeded"] and metrics["guess"] == "way" and metrics["layout"] == "obstacle course 1003"
     assert command.main([*words, "--seed", "-1"]) == 2

@@ -211,7 +211,9 @@ def test_traffic_is_drawn_where_there_is_room() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"people": -1}, "people must not be negative"),
+        ({"people": -1}, "people must be from 0 to 200"),
+        ({"people": 10**9}, "people must be from 0 to 200"),
+        ({"carts": 201}, "carts must be from 0 to 200"),
         ({"walking": "run"}, "choose social or scripted"),
         ({"slowest": 2.0}, "slowest <= fastest"),
         ({"cart_speed": math.nan}, "cart_speed must be above zero"),
@@ -265,3 +267,10 @@ def test_obstacles_may_be_other_than_the_robot_expects() -> None:
     assert 0.08 <= radii((0.08, 0.1)).min() and radii((0.08, 0.1)).max() <= 0.1
     with pytest.raises(ScenarioError, match="radii 0 < least"):
         radii((0.0, 0.1))
+
+
+def test_a_person_in_the_middle_of_a_short_way_walks_on() -> None:
+    """No point of it is far enough to be gone for."""
+    person = Person(np.column_stack([np.linspace(1.0, 1.7, 8), np.full(8, 2.0)]), 0.2, 1.0, field(hall()))
+    for place in ((1.35, 2.0), (1.0, 2.0), (1.7, 2.0)):
+        assert np.isfinite(person.force(np.array(place), np.zeros(2))).all()

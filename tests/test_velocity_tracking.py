@@ -301,7 +301,12 @@ def test_an_interrupt_writes_what_there_is(tmp_path: Path, monkeypatch: pytest.M
     assert stopped.solution.status is fg.Status.INTERRUPTED
     monkeypatch.setattr(velocity_tracking, "run_tracking", lambda settings, progress: stopped)
     assert run(tmp_path) == command.INTERRUPTED
-    assert {file.name for file in tmp_path.iterdir()} == {"scene.html", "velocity_tracking.png", "metrics.json"}
+    assert {file.name for file in tmp_path.iterdir()} == {
+        "scene.html",
+        "velocity_tracking.png",
+        "metrics.json",
+        "inputs.json",
+    }
 
 
 def test_wrong_settings_are_refused() -> None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pymunk
@@ -31,6 +32,7 @@ __all__ = ["Cart", "Door", "Fellow", "Person", "Schedule", "Traffic", "draw_traf
 RELAXATION = 0.5  # [s], of a person's velocity to the one that is wanted
 PUSH, REACH = 25.0, 0.08  # of a person: acceleration at a touch [m/s^2], length over which it falls to 1/e [m]
 HASTE = 1.3  # fastest walk, in shares of the pace that is wanted
+MOST = 200  # people, carts or doors
 CARROT = 0.5  # [m] ahead on their way that people go for
 BEFORE = 0.1  # [m] before the robot that a courteous cart stops
 SAFE = 0.1  # [m] around a door's leaf in which it feels a robot
@@ -63,13 +65,13 @@ class Traffic:
         closed_for: time for which it is wholly closed [s].
     """
 
-    people: int = option(0, text=count, metavar="K")
+    people: int = option(0, text=partial(count, most=MOST), metavar="K")
     walking: str = option("social", choices=("social", "scripted"))
     slowest: float = option(0.3, text=positive, metavar="M/S", flag="people-slowest")
     fastest: float = option(1.5, text=positive, metavar="M/S", flag="people-fastest")
-    carts: int = option(0, text=count, metavar="K")
+    carts: int = option(0, text=partial(count, most=MOST), metavar="K")
     cart_speed: float = option(0.5, text=positive, metavar="M/S")
-    doors: int = option(0, text=count, metavar="K")
+    doors: int = option(0, text=partial(count, most=MOST), metavar="K")
     open_for: float = option(8.0, text=positive, metavar="S", flag="doors-open")
     closed_for: float = option(4.0, text=positive, metavar="S", flag="doors-closed")
 
@@ -84,8 +86,8 @@ class Traffic:
         if not 0.0 < self.slowest <= self.fastest < math.inf:
             raise ScenarioError(f"people walk at 0 < slowest <= fastest, got {self.slowest:g} and {self.fastest:g} m/s")
         for name in ("people", "carts", "doors"):
-            if getattr(self, name) < 0:
-                raise ScenarioError(f"the number of {name} must not be negative, got {getattr(self, name)}")
+            if not 0 <= getattr(self, name) <= MOST:
+                raise ScenarioError(f"the number of {name} must be from 0 to {MOST}, got {getattr(self, name)}")
         for name in ("cart_speed", "open_for", "closed_for"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ScenarioError(f"{name} must be above zero and finite, got {getattr(self, name)}")
@@ -135,10 +137,13 @@ class Person:
     def force(self, place: Array, velocity: Array, robot: tuple[pymunk.Body, float] | None = None) -> Array:
         """(2,) acceleration at a place (2,) and velocity (2,), between what is wanted and what is kept off [m/s^2]."""
         carrot = at_stations(self.way, self._arc, np.array([self._along]))[0] - place
-        while float(np.hypot(*carrot)) < CARROT:
+        # Once to and fro: of a way that bends or is short, no point may be far enough.
+        for _ in range(math.ceil(2.0 * float(self._arc[-1]) / STEP)):
+            if float(np.hypot(*carrot)) >= CARROT:
+                break
             self._go_on(STEP)
             carrot = at_stations(self.way, self._arc, np.array([self._along]))[0] - place
-        made: Array = (self.pace * carrot / float(np.hypot(*carrot)) - velocity) / RELAXATION
+        made: Array = (self.pace * carrot / max(float(np.hypot(*carrot)), 1e-6) - velocity) / RELAXATION
         for body, radius in [*self.others, *([] if robot is None else [robot])]:
             away = place - np.array(body.position)
             distance = max(float(np.hypot(*away)), 1e-6)
