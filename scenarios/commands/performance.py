@@ -247,19 +247,25 @@ def history(file: Path = HISTORY) -> list[Record]:
     except OSError as error:
         raise ScenarioError(f"{file}: cannot be read ({error.strerror})") from error
     try:
-        return [_read(line) for line in lines if line.strip()]
+        records = [Record(**json.loads(line)) for line in lines if line.strip()]
+        whole = all(map(_has_ratios, records))
     except (ValueError, TypeError) as error:
         raise ScenarioError(f"{file}: holds a line that is no record of `unifg bench` ({error})") from error
+    if not whole:
+        raise ScenarioError(
+            f"{file}: holds a line that is no record of `unifg bench` (each case needs positive ratios)"
+        )
+    return records
 
 
-def _read(line: str) -> Record:
-    found = Record(**json.loads(line))
-    if not (isinstance(found.ratios, dict) and all(isinstance(row, list) and row for row in found.ratios.values())):
-        raise ValueError("a case without ratios")
-    for ratios in found.ratios.values():
-        if not (np.array(ratios, dtype=np.float64) > 0.0).all():
-            raise ValueError("ratios that are not positive")
-    return found
+def _has_ratios(record: Record) -> bool:
+    """Whether every case has ratios, and all are positive."""
+    if not isinstance(record.ratios, dict):
+        return False
+    return all(
+        isinstance(row, list) and row and np.all(np.array(row, dtype=np.float64) > 0.0)
+        for row in record.ratios.values()
+    )
 
 
 def append(file: Path, record: Record) -> None:
