@@ -79,7 +79,7 @@ def test_a_damaged_file_is_named_and_written_anew(
     file.write_bytes(DAMAGES[damage](file.read_bytes()))
     again = compiled(twice)
     assert again(3.0) == 6.0 and not read_from_cache(again)
-    assert [str(file) in record.message for record in caplog.records if "damaged" in record.message] == [True]
+    assert [str(file) in record.message for record in caplog.records if "is damaged" in record.message] == [True]
     after = compiled(twice)
     assert after(3.0) == 6.0 and read_from_cache(after), "written anew"
 
