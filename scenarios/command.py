@@ -5,8 +5,9 @@ its limits), 1 if not, 2 for arguments that cannot be served, 130 after an inter
 written all the same); SIGTERM interrupts, too.
 
 ``unifg campaign`` runs many episodes (0 if every one of them succeeded), ``unifg report`` says what came of them,
-``unifg replay`` shows one of them. ``unifg doctor`` examines the installation, ``unifg bench`` times it. What can be
-run stands in `unifg.scenarios.commands.catalogue`; only the scenario that is named is loaded.
+``unifg replay`` shows one of them, ``unifg mcap`` writes a drive for other tools. ``unifg doctor`` examines the
+installation, ``unifg bench`` times it. What can be run stands in `unifg.scenarios.commands.catalogue`; only the
+scenario that is named is loaded.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return stop.code if isinstance(stop.code, int) else REFUSED
     does = {
         "warmup": _warm_up, "campaign": _campaign, "report": _report, "replay": _replay, "doctor": _doctor,
-        "bench": _bench,
+        "bench": _bench, "mcap": _mcap,
     }  # fmt: skip
     try:
         return does.get(chosen.name, _run)(chosen)
@@ -95,6 +96,11 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
         warm.set_defaults(module=import_module("unifg.scenarios.commands.warm"))
     _add_examinations(commands)
     _add_campaigns(commands)
+    about = "Write the log of a drive, drive.npz, as messages that Foxglove, PlotJuggler and mcap's tools play."
+    played = commands.add_parser("mcap", help="a drive for other tools", description=about, allow_abbrev=False)
+    played.set_defaults(name="mcap")
+    played.add_argument("folder", type=Path, metavar="DIR", help="results of unifg run navigation, or the log itself")
+    played.add_argument("--out", type=Path, metavar="FILE", help="to write (default: drive.mcap beside the log)")
     return parser
 
 
@@ -226,6 +232,24 @@ def _repeat(chosen: argparse.Namespace) -> int:
     if not found:
         print(f"the same to the last bit: {count} rows of numbers, those told by clocks aside")
     return FAILED if found else SUCCEEDED
+
+
+def _mcap(chosen: argparse.Namespace) -> int:
+    """Write a drive's log for other tools."""
+    from unifg.scenarios.log.drive_log import EpisodeLog
+    from unifg.scenarios.log.drive_mcap import write_mcap
+
+    stored: Path = chosen.folder / "drive.npz" if chosen.folder.is_dir() else chosen.folder
+    out: Path = chosen.out or stored.with_suffix(".mcap")
+    log = EpisodeLog.load(stored)
+    try:
+        write_mcap(out, log)
+    except ImportError as error:
+        return _refuse(str(error))
+    except OSError as error:
+        return _refuse(f"--out {out}: cannot write it ({error.strerror})")
+    print(legible(out))
+    return SUCCEEDED
 
 
 def _warm_up(chosen: argparse.Namespace) -> int:

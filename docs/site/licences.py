@@ -12,7 +12,8 @@ from pathlib import Path
 
 CHECKOUT = Path(__file__).resolve().parent.parent.parent
 PAGE = CHECKOUT / "docs" / "licences.md"
-USED = ("view", "scenarios", "casadi", "campaign", "bench")  # extras; those for tests, style and this site stay with us
+# Extras; those for tests, style and this site stay with us.
+USED = ("view", "scenarios", "casadi", "campaign", "mcap", "metis", "bench")
 HEAD = """# Licences
 
 unifg itself is under the [MIT licence](../LICENSE). It contains no code of others; scenes carry meshcat's viewer inside

@@ -1,0 +1,122 @@
+"""A drive as MCAP: read again by mcap's own reader, compared with the log."""
+
+from __future__ import annotations
+
+import base64
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from episodes import episode
+from unifg.scenarios.command import main
+from unifg.scenarios.log.columns import columns
+from unifg.scenarios.log.drive_log import EpisodeLog
+from unifg.scenarios.log.drive_mcap import write_mcap
+
+Recorded = dict[str, list[tuple[int, dict[str, Any]]]]
+
+
+def refuse(word: str) -> Any:
+    raise AssertionError(f"{word} is not JSON")
+
+
+def recorded(path: Path) -> Recorded:
+    reader = pytest.importorskip("mcap.reader")
+    found: Recorded = {}
+    with open(path, "rb") as file:
+        for schema, channel, message in reader.make_reader(file).iter_messages():
+            content = json.loads(message.data, parse_constant=refuse)
+            declared = json.loads(schema.data)["properties"]
+            assert set(content) <= set(declared), (channel.topic, set(content) - set(declared))
+            found.setdefault(channel.topic, []).append((message.log_time, content))
+    return found
+
+
+def yaw(pose: dict[str, float]) -> float:
+    return 2 * float(np.arctan2(pose["z"], pose["w"]))
+
+
+def test_every_tick_is_there_at_its_time(tmp_path: Path) -> None:
+    log = episode(ticks=6)
+    log.horizon[3] = np.nan  # a tick without a plan
+    log.obstacles[2, 1] = np.nan  # an obstacle that is nowhere
+    write_mcap(tmp_path / "drive.mcap", log)
+    found = recorded(tmp_path / "drive.mcap")
+    stamps = [round(t * 1e9) for t in log.time]
+    for topic in ("/tf", "/scan", "/plan", "/obstacles", "/tracked", "/tick"):
+        assert [stamp for stamp, _ in found[topic]] == stamps, topic
+    for k in range(log.ticks):
+        frames = {frame["child_frame_id"]: frame for frame in found["/tf"][k][1]["transforms"]}
+        for name, pose in (("estimate", log.estimate[k]), ("truth", log.true_pose[k])):
+            place = frames[name]["translation"]
+            turned = yaw(frames[name]["rotation"])
+            np.testing.assert_allclose([place["x"], place["y"], turned], pose, atol=1e-12)
+        ranges = np.array(found["/scan"][k][1]["ranges"])
+        np.testing.assert_array_equal(ranges, np.where(np.isfinite(log.scan[k]), log.scan[k], 0.0))
+        tick = found["/tick"][k][1]
+        assert tick["control"] == log.control[k].tolist()
+        assert tick["status"] == log.status[k]
+        assert tick["emergency"] == bool(log.emergency[k])
+    assert found["/plan"][3][1]["poses"] == []
+    assert len(found["/plan"][0][1]["poses"]) == log.horizon.shape[1]
+    discs = [len(message["entities"][0]["cylinders"]) for _, message in found["/obstacles"]]
+    assert discs == [2, 2, 1, 2, 2, 2]
+    units = {"control": "m/s, rad/s", "solve_ms": "ms"}
+    with open(tmp_path / "drive.mcap", "rb") as file:
+        summary = pytest.importorskip("mcap.reader").make_reader(file).get_summary()
+    declared = next(json.loads(s.data) for s in summary.schemas.values() if s.name == "unifg.DriveTick")["properties"]
+    assert {name: declared[name]["description"] for name in units} == units
+
+
+def test_the_map_is_where_it_was(tmp_path: Path) -> None:
+    log = episode(ticks=1, map_yaw=0.3)
+    write_mcap(tmp_path / "drive.mcap", log)
+    ((_, grid),) = recorded(tmp_path / "drive.mcap")["/map"]
+    cells = np.frombuffer(base64.b64decode(grid["data"]), dtype=np.uint8).reshape(-1, grid["column_count"])
+    np.testing.assert_array_equal(cells == 100, log.occupancy.occupied)
+    np.testing.assert_array_equal(cells == 0, log.occupancy.free)
+    assert (grid["pose"]["position"]["x"], grid["pose"]["position"]["y"]) == log.occupancy.origin[:2]
+    assert yaw(grid["pose"]["orientation"]) == pytest.approx(0.3)
+
+
+def test_a_route_is_told_when_it_changes_also_after_loading(tmp_path: Path) -> None:
+    log = episode(ticks=5)
+    log.route = [log.path, log.path, log.path[:3], log.path[:3], log.path[:3]]
+    log.save(tmp_path / "drive.npz")
+    write_mcap(tmp_path / "drive.mcap", EpisodeLog.load(tmp_path / "drive.npz"))
+    found = recorded(tmp_path / "drive.mcap")["/route"]
+    assert [(stamp, len(message["poses"])) for stamp, message in found] == [(0, len(log.path)), (round(0.2e9), 3)]
+
+
+def test_an_episode_that_never_began_has_its_map_and_path(tmp_path: Path) -> None:
+    log = episode(ticks=1)
+    write_mcap(tmp_path / "drive.mcap", replace(log, **{name: getattr(log, name)[:0] for name in columns(log)}))
+    assert set(recorded(tmp_path / "drive.mcap")) == {"/map", "/goals", "/route"}
+
+
+def test_the_command_takes_a_folder_or_a_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("mcap")
+    episode(ticks=2).save(tmp_path / "drive.npz")
+    assert main(["mcap", str(tmp_path)]) == 0
+    assert main(["mcap", str(tmp_path / "drive.npz"), "--out", str(tmp_path / "other.mcap")]) == 0
+    assert (tmp_path / "drive.mcap").read_bytes() == (tmp_path / "other.mcap").read_bytes()
+    assert main(["mcap", str(tmp_path / "nowhere")]) == 2
+    assert main(["mcap", str(tmp_path), "--out", str(tmp_path / "no" / "x.mcap")]) == 2
+    said = capsys.readouterr()
+    assert "drive.mcap" in said.out
+    assert "nowhere is no unifg drive log" in said.err
+
+
+def test_without_mcap_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "mcap.writer", None)
+    episode(ticks=1).save(tmp_path / "drive.npz")
+    assert main(["mcap", str(tmp_path)]) == 2
+    assert "pip install 'unifg[mcap]'" in capsys.readouterr().err
+    assert not (tmp_path / "drive.mcap").exists()
