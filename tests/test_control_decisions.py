@@ -11,11 +11,11 @@ import pytest
 import unifg as fg
 from episodes import room
 from unifg.models.distance_map import DistanceMap, SmoothField
-from unifg.scenarios.driving.drive_control import LEFT_BEHIND, PATIENCE, Controller, is_behind
+from unifg.scenarios.driving.drive_control import LEFT_BEHIND, OFF_WALLS, PATIENCE, Controller, is_behind
 from unifg.scenarios.driving.drive_parts import along, disc_limits, in_world, predicted, wall_limits
 from unifg.scenarios.driving.drive_past import Smoother
 from unifg.scenarios.driving.drive_settings import ControllerSettings
-from unifg.scenarios.driving.stopping import followed, stopped
+from unifg.scenarios.driving.stopping import evasions, followed, stopped
 from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.seeing.tracks import Tracks
 from unifg.scenarios.ways.follow import PathFollower
@@ -104,6 +104,32 @@ def test_the_way_out_is_rest_unless_somebody_comes_into_it(controller: Controlle
     places = coming.centre + s.dt * np.arange(1.0, s.horizon + 1)[:, None] * coming.velocity
     assert (np.hypot(*(way.states[1:, :2] - places).T) - 0.2).min() > HULL
     assert controller.field.distance(way.states[:, :2]).min() > HULL
+
+
+@pytest.mark.parametrize(
+    ("pose", "bearing", "distance", "speed"),
+    [
+        ((3.62, -0.59, -0.3), 1.40, 0.56, 0.3),
+        ((2.42, -0.58, -0.3), 0.84, 0.69, 0.6),
+        ((0.52, -0.44, 0.3), 1.14, 0.7, 0.6),
+    ],
+)
+def test_nobody_is_evaded_into_a_wall(
+    controller: Controller, pose: tuple[float, ...], bearing: float, distance: float, speed: float
+) -> None:
+    """Who is pressed towards a wall takes the way that leaves it, even where another would leave a little more room."""
+    towards = np.array([np.cos(bearing), np.sin(bearing)])
+    place = np.array(pose[:2]) + distance * towards
+    others = tracks((place[0], place[1], 0.2), velocity=tuple(-speed * towards), mover=True)
+    controller.loop.applied = np.array([0.6, 0.0])
+    way = controller._way_out(np.array(pose), others)
+    assert way.evades
+    assert controller.field.distance(way.states[1:, :2]).min() - HULL >= OFF_WALLS
+    centres = predicted(SETTINGS, np.array(pose), others)
+    ways = evasions(controller.loop.applied, SETTINGS.most, SETTINGS.box[1], SETTINGS.horizon, SETTINGS.dt)
+    states = [followed(np.array(pose), controller.loop.applied, one, SETTINGS.dt) for one in ways]
+    roomy = max(states, key=lambda s: min(controller._room(s, centres, others.radius), controller._off_walls(s)))
+    assert controller.field.distance(roomy[1:, :2]).min() < HULL, "room alone would have led into the wall"
 
 
 # ---------------------------------------------------------------- how near it may come

@@ -28,6 +28,7 @@ PURSUIT = 0.3  # [m] ahead of the robot, where a guess aims at the reference
 PURSUIT_TIME = 0.2  # [s] in which it would turn there
 ARRIVED = 0.05  # [m] to the end of the reference, where it only turns
 SETTLED = (fg.Status.CONVERGED, fg.Status.STOP_RULE)
+OFF_WALLS = 0.015  # [m] from the hull to walls: less is touching, as far as maps and estimates can tell
 PATIENCE = 5  # ticks of being left behind before the plan starts over from the reference
 
 
@@ -93,7 +94,8 @@ class Controller:
         """Rest along the path of the last plan; if a mover would come too near there, the best simple way of evading.
 
         Which is the best is judged by the least distance on the way, of discs and of walls alike, beyond what is to be
-        kept from them.
+        kept from them. One that leads into a wall is taken only where each does: walls do not step aside, and what the
+        way out comes near to the plan may come near to as well.
         """
         s, last = self.settings, self.loop.applied
         controls = stopped(last, self._coming, s.most, s.horizon)
@@ -102,13 +104,18 @@ class Controller:
         if not len(movers) or self._room(rest.states, predicted(s, pose, movers), movers.radius) >= 0.0:
             return rest
         centres, best = predicted(s, pose, tracks), rest
-        most = min(self._room(rest.states, centres, tracks.radius), self._off_walls(rest.states))
+        most = self._worth(rest.states, centres, tracks.radius)
         for way in evasions(last, s.most, s.box[1], s.horizon, s.dt):
             states = followed(pose, last, way, s.dt)
-            room = min(self._room(states, centres, tracks.radius), self._off_walls(states))
+            room = self._worth(states, centres, tracks.radius)
             if room > most:
                 most, best = room, WayOut(states, way, evades=True)
         return best
+
+    def _worth(self, states: Array, centres: Array, radii: Array) -> tuple[bool, float]:
+        """How good a way out is, the greater the better: whether it touches no wall, and its least distance."""
+        walls = self._off_walls(states)
+        return walls + self.settings.wall_clearance >= OFF_WALLS, min(self._room(states, centres, radii), walls)
 
     def _room(self, states: Array, centres: Array, radii: Array) -> float:
         """Least gap between the hull at states (N + 1, 3) and discs at centres (N, k, 2), beyond what is to be kept."""
