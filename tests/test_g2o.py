@@ -160,10 +160,10 @@ def test_unknown_tags_are_counted_and_named_once(tmp_path: Path, caplog: pytest.
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("EDGE_SE2 10 7 1 0 0 1 0 0 1 0", r"line 12: EDGE_SE2 has 10 fields, expected 11"),
-        ("EDGE_SE2 10 7 1 0 0 1 0 0 1 0 0 0", r"line 12: EDGE_SE2 has 12 fields"),
+        ("EDGE_SE2 10 7 1 0 0 1 0 0 1 0", r"line 12: EDGE_SE2: 10 fields, expected 11"),
+        ("EDGE_SE2 10 7 1 0 0 1 0 0 1 0 0 0", r"line 12: EDGE_SE2: 12 fields"),
         ("EDGE_SE2 10 7 1 0 x 1 0 0 1 0 0", r"line 12: EDGE_SE2: field dtheta is 'x', not a number"),
-        ("EDGE_SE2 10 7 1 0 nan 1 0 0 1 0 0", r"line 12: EDGE_SE2: field dtheta is nan, not a finite"),
+        ("EDGE_SE2 10 7 1 0 nan 1 0 0 1 0 0", r"line 12: EDGE_SE2: field dtheta is 'nan', not a finite"),
         ("EDGE_SE2 10 7.5 1 0 0 1 0 0 1 0 0", r"line 12: EDGE_SE2: field j is '7.5', not an integer"),
         ("EDGE_SE2 10 99999999999999999999 1 0 0 1 0 0 1 0 0", r"line 12: EDGE_SE2: field j .* 64 bits"),
         ("EDGE_SE2 10 8 1 0 0 1 0 0 1 0 0", r"line 12: there is no pose 8 in the file"),
@@ -189,7 +189,7 @@ def test_what_is_wrong_is_named_with_its_line(tmp_path: Path, line: str, message
 
 def test_two_wrong_counts_do_not_hide_each_other(tmp_path: Path) -> None:
     text = "VERTEX_SE2 0 0 0\nVERTEX_SE2 1 0 0 0 0\n"
-    with pytest.raises(FileFormatError, match="line 1: VERTEX_SE2 has 3 fields"):
+    with pytest.raises(FileFormatError, match="line 1: VERTEX_SE2: 3 fields"):
         read_g2o(write(tmp_path, text))
 
 
@@ -240,7 +240,7 @@ def test_toro_in_space(tmp_path: Path, rng: np.random.Generator) -> None:
 def test_toro_refuses_what_it_cannot_say(tmp_path: Path, rng: np.random.Generator) -> None:
     with pytest.raises(FileFormatError, match="no landmarks"):
         write_toro(tmp_path / "g.graph", random_graph(rng, fg.SE2))
-    with pytest.raises(FileFormatError, match="line 2: EDGE2 has 4 fields"):
+    with pytest.raises(FileFormatError, match="line 2: EDGE2: 4 fields"):
         read_toro(write(tmp_path, "VERTEX2 0 0 0 0\nEDGE2 0 0 1 0\n"))
 
 

@@ -46,7 +46,8 @@ def test_kitti_lifts_the_plane(tmp_path: Path) -> None:
     [
         ("1 0 0 0 0 1 0 0 0 0 1", "line 2: 11 fields, expected 12"),
         ("1,0,0,0,0,1,0,0,0,0,1,0", "blanks, not commas"),
-        ("1 0 0 0 0 1 0 0 0 0 one 0", "line 2: not twelve numbers"),
+        ("1 0 0 0 0 1 0 0 0 0 one 0", "line 2: field r33 is 'one', not a number"),
+        ("1 0 0 0 0 1 0 0 0 0 1 1_0", "line 2: field tz is '1_0', not a number"),
         ("1 0 0 0 0 2 0 0 0 0 1 0", "line 2: .* not a rotation matrix"),
         ("1 0 0 0 0 1 0 0 0 0 -1 0", "line 2: .* not a rotation matrix"),  # a reflection
         ("1 0 0 nan 0 1 0 0 0 0 1 0", "line 2: "),
@@ -98,6 +99,7 @@ def test_carmen_lines(tmp_path: Path, packed: bool) -> None:
     [
         ("ODOM 1 2 3 4 5 6 7 host", "line 8: ODOM: 9 words, expected 10"),
         ("ODOM 1 2 x 4 5 6 7 host 8", "line 8: ODOM: 'x' is not a number"),
+        ("ODOM 1 2 1_0 4 5 6 7 host 8", "line 8: ODOM: '1_0' is not a number"),
         ("FLASER 3 1 2 0 0 0 0 0 0 7 host 8", "line 8: FLASER: 13 words, expected 14"),
         ("FLASER x 1 2 0 0 0 0 0 0 7 host 8", "line 8: FLASER: 'x' is not a number of readings"),
         ("FLASER 2 1 inf 0 0 0 0 0 0 7 host 8", "line 8: FLASER: inf is not a finite"),

@@ -20,6 +20,7 @@ import numpy as np
 
 from unifg.errors import FileFormatError
 from unifg.files.contents import LIMITS, Limits, legible, read_text
+from unifg.files.fields import decimal
 from unifg.typing import Array
 
 __all__ = ["CarmenLog", "Odometry", "Scans", "read_carmen"]
@@ -207,7 +208,7 @@ def _count(word: str) -> int:
 
 def _number(word: str) -> float:
     try:
-        value = float(word)
+        value = decimal(word)
     except ValueError:
         raise FileFormatError(f"{word!r} is not a number") from None
     if not math.isfinite(value):

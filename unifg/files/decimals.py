@@ -95,19 +95,34 @@ def parse_fields(
 
 
 @in_order
+def _digits(data: NDArray[np.uint8], at: int, stop: int, point: int) -> tuple[int, np.uint64, int]:
+    """Read a row of digits, and one point among them where `point` is negative.
+
+    Returns:
+        Where it ends, its value modulo 2^64 without the point, and where the point stands; `point` if there is none.
+    """
+    found = np.uint64(0)
+    while at < stop:
+        digit = np.uint64(data[at]) - np.uint64(48)  # huge where a byte comes before "0"
+        if digit <= np.uint64(9):
+            found = found * np.uint64(10) + digit
+        elif point < 0 and data[at] == 46:
+            point = at
+        else:
+            break
+        at += 1
+    return at, found, point
+
+
+@in_order
 def _integer(data: NDArray[np.uint8], at: int, stop: int) -> tuple[int, np.int64]:
     """An integer whose size has 63 bits: where it ends, ~begin where there is something else, and its value."""
     begin = at
     negative = data[at] == 45
     if negative or data[at] == 43:
         at += 1
-    first, found = at, np.uint64(0)
-    while at < stop:
-        digit = np.int64(data[at]) - 48
-        if digit < 0 or digit > 9:
-            break
-        found = found * np.uint64(10) + np.uint64(digit)
-        at += 1
+    first = at
+    at, found, _ = _digits(data, at, stop, at)
     if at == first or at - first > DIGITS or found >= np.uint64(2**63):
         return ~begin, np.int64(0)
     return at, -np.int64(found) if negative else np.int64(found)
@@ -120,25 +135,12 @@ def _number(data: NDArray[np.uint8], at: int, stop: int) -> tuple[int, float]:
     negative = data[at] == 45
     if negative or data[at] == 43:
         at += 1
-    digits, first, scale = np.uint64(0), at, np.int64(0)
-    while at < stop:
-        digit = np.int64(data[at]) - 48
-        if digit < 0 or digit > 9:
-            break
-        digits = digits * np.uint64(10) + np.uint64(digit)
-        at += 1
+    first, scale = at, np.int64(0)
+    at, digits, point = _digits(data, at, stop, -1)
     read = at - first
-    if at < stop and data[at] == 46:
-        at += 1
-        point = at
-        while at < stop:
-            digit = np.int64(data[at]) - 48
-            if digit < 0 or digit > 9:
-                break
-            digits = digits * np.uint64(10) + np.uint64(digit)
-            at += 1
-        scale -= at - point
-        read += at - point
+    if point >= 0:
+        scale -= at - point - 1
+        read -= 1
     if read == 0:
         return ~begin, 0.0
     if read > DIGITS:  # zeros at the front do not count
@@ -154,16 +156,11 @@ def _number(data: NDArray[np.uint8], at: int, stop: int) -> tuple[int, float]:
         downwards = at < stop and data[at] == 45
         if downwards or (at < stop and data[at] == 43):
             at += 1
-        first, exponent = at, np.int64(0)
-        while at < stop and at - first < 5:
-            digit = np.int64(data[at]) - 48
-            if digit < 0 or digit > 9:
-                break
-            exponent = 10 * exponent + digit
-            at += 1
+        first = at
+        at, exponent, _ = _digits(data, at, min(stop, at + 5), at)  # more digits are no end of a word
         if at == first:
             return ~begin, 0.0
-        scale += -exponent if downwards else exponent
+        scale += -np.int64(exponent) if downwards else np.int64(exponent)
     if digits == np.uint64(0):
         value = 0.0
     elif digits <= np.uint64(2**53) and -EXACT <= scale <= EXACT:

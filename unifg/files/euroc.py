@@ -6,7 +6,6 @@ M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 35(10), 2016.
 
 from __future__ import annotations
 
-import math
 import re
 import reprlib
 from pathlib import Path
@@ -15,13 +14,13 @@ import numpy as np
 
 from unifg.errors import FileFormatError
 from unifg.files.contents import LIMITS, Limits, legible, read_text
+from unifg.files.fields import finite, norms
 from unifg.files.tum import Trajectory
 
 __all__ = ["read_euroc"]
 
 _FIELDS = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
 _WHOLE = re.compile(r"[0-9]{1,19}")
-_SMALLEST_NORM, _LARGEST_NORM = 1e-6, 1e6  # of a quaternion that says something about a rotation
 
 
 def read_euroc(path: str | Path, limits: Limits = LIMITS) -> Trajectory:
@@ -40,7 +39,7 @@ def read_euroc(path: str | Path, limits: Limits = LIMITS) -> Trajectory:
         FileFormatError: the file is missing, or a line (named in the message) does not begin with whole nanoseconds and
             seven finite numbers with a usable quaternion.
     """
-    name, stamps, rows = legible(path), list[int](), list[list[float]]()
+    name, stamps, rows, lines = legible(path), list[int](), list[list[float]](), list[int]()
     for number, line in enumerate(read_text(path, limits).split("\n"), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
@@ -51,20 +50,10 @@ def read_euroc(path: str | Path, limits: Limits = LIMITS) -> Trajectory:
             )
         if not _WHOLE.fullmatch(words[0]):
             raise FileFormatError(f"{place}: the time {reprlib.repr(words[0])} is not in whole nanoseconds")
-        values = []
-        for field, word in zip(_FIELDS[1:], words[1:], strict=False):
-            try:
-                value = float(word if word.isascii() and "_" not in word else "none")
-            except ValueError:
-                raise FileFormatError(f"{place}: field {field} is {reprlib.repr(word)}, not a number") from None
-            if not math.isfinite(value):
-                raise FileFormatError(f"{place}: field {field} is {reprlib.repr(word)}, not a finite number")
-            values.append(value)
-        norm = math.hypot(*values[3:])
-        if not _SMALLEST_NORM <= norm <= _LARGEST_NORM:
-            raise FileFormatError(f"{place}: the quaternion {values[3:]} has norm {norm:g}; expected one")
         stamps.append(int(words[0]))
-        rows.append([*values[:3], *(value / norm for value in (*values[4:], values[3]))])
+        rows.append([finite(place, field, word) for field, word in zip(_FIELDS[1:], words[1:], strict=False)])
+        lines.append(number)
     table = np.array(rows, dtype=np.float64).reshape(-1, 7)
     time = np.array([1e-9 * (stamp - stamps[0]) for stamp in stamps], dtype=np.float64)
-    return Trajectory(time, table[:, :3], table[:, 3:])
+    turned = table[:, [4, 5, 6, 3]]
+    return Trajectory(time, table[:, :3], turned / norms(turned, lambda row: f"{name}, line {lines[row]}")[:, None])

@@ -23,7 +23,6 @@ a spanning tree of the edges. Which *residual* an information matrix belongs to 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +31,7 @@ from numpy.typing import NDArray
 
 from unifg.errors import FileFormatError
 from unifg.files.contents import LIMITS, Limits, write_text
+from unifg.files.fields import norms
 from unifg.files.measured import Remarks, placed_along, vertices_of
 from unifg.files.tagged import (
     Block,
@@ -54,9 +54,7 @@ __all__ = ["parse_g2o", "read_g2o", "write_g2o"]
 
 _POSE = {3: "id x y theta", 7: "id x y z qx qy qz qw"}
 _EDGE = {3: "i j dx dy dtheta", 7: "i j dx dy dz qx qy qz qw"}
-_SMALLEST_NORM, _LARGEST_NORM = 1e-6, 1e6  # of a quaternion that says something about a rotation
 _SMALLEST_SIGMA = 1e-12  # [m] or [rad]
-_UNIT = 1e-12  # a squared norm this close to one is one: what was written here is read back unchanged
 _KNOWN = {
     "VERTEX_SE2", "EDGE_SE2", "VERTEX_XY", "EDGE_SE2_XY", "EDGE_BEARING_SE2_XY", "EDGE_RANGE_SE2_XY", "BR",
     "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "VERTEX_TRACKXYZ", "EDGE_SE3_TRACKXYZ", "PARAMS_SE3OFFSET", "FIX",
@@ -191,14 +189,7 @@ def spatial_poses(file: TaggedFile, block: Block, poses: Array) -> Array:
     Raises:
         FileFormatError: a quaternion, named by its line, is nearly zero or huge.
     """
-    with np.errstate(over="ignore", under="ignore"):
-        squared = np.einsum("ni,ni->n", poses[:, 3:], poses[:, 3:])
-    bad = np.flatnonzero(~((squared >= _SMALLEST_NORM**2) & (squared <= _LARGEST_NORM**2)))
-    if bad.size:
-        k = int(bad[0])
-        long = math.hypot(*poses[k, 3:].tolist())
-        raise file.refuse(int(block.lines[k]), f"the quaternion {poses[k, 3:]} has norm {long:g}, not one")
-    norm = np.where(np.abs(squared - 1.0) <= _UNIT, 1.0, np.sqrt(squared))
+    norm = norms(poses[:, 3:], lambda row: f"{file.path}, line {block.lines[row]}")
     return np.column_stack([poses[:, :3], poses[:, 6] / norm, poses[:, 3:6] / norm[:, None]])
 
 

@@ -10,18 +10,19 @@ from pathlib import Path
 import numpy as np
 
 from unifg.errors import FileFormatError
-from unifg.files.contents import LIMITS, Limits, legible, read_text, write_text
+from unifg.files.contents import LIMITS, Limits, write_text
+from unifg.files.tables import Table
 from unifg.lie import SE2, SE3
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["read_kitti", "write_kitti"]
 
-_FIELDS = 12
+_FIELDS = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
 _ROTATION = 1e-2  # largest |R'R - I| that rounding and single precision excuse
 
 
 def read_kitti(path: str | Path, limits: Limits = LIMITS) -> Array:
-    """Read poses; empty lines are skipped, matrices are moved to the nearest rotation.
+    """Read poses; empty lines and comments are skipped, matrices are moved to the nearest rotation.
 
     Args:
         path: the file, gzipped or not.
@@ -34,28 +35,15 @@ def read_kitti(path: str | Path, limits: Limits = LIMITS) -> Array:
         FileFormatError: the file is missing, or a line (named in the message) is not twelve finite numbers with a
             rotation among them.
     """
-    name, rows, lines = legible(path), [], []
-    for number, line in enumerate(read_text(path, limits).split("\n"), start=1):
-        words = line.split()
-        if not words:
-            continue
-        if len(words) != _FIELDS:
-            hint = "; fields are separated by blanks, not commas" if "," in line else ""
-            raise FileFormatError(f"{name}, line {number}: {len(words)} fields, expected {_FIELDS}{hint}")
-        try:
-            rows.append([float(word) for word in words])
-        except ValueError:
-            raise FileFormatError(f"{name}, line {number}: not twelve numbers: {line.strip()[:200]!r}") from None
-        lines.append(number)
-    matrices = np.array(rows, dtype=np.float64).reshape(-1, 3, 4)
+    rows = Table.read(path, 0, _FIELDS, limits)
+    matrices = rows.numbers.reshape(-1, 3, 4)
     rotations = matrices[:, :, :3]
-    # In this order NaN counts as too far.
     with np.errstate(all="ignore"):
         right = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2), initial=0.0) < _ROTATION
-        right &= np.isfinite(matrices).all(axis=(1, 2)) & (np.linalg.det(np.nan_to_num(rotations)) > 0.0)
+        right &= np.linalg.det(rotations) > 0.0
     if not right.all():
         k = int(np.flatnonzero(~right)[0])
-        raise FileFormatError(f"{name}, line {lines[k]}: columns 1 to 3, 5 to 7, 9 to 11 are not a rotation matrix")
+        raise rows.refuse(k, "columns 1 to 3, 5 to 7, 9 to 11 are not a rotation matrix")
     full = np.tile(np.eye(4), (len(matrices), 1, 1))
     full[:, :3] = matrices
     return SE3.from_matrix(full)
@@ -86,5 +74,5 @@ def write_kitti(path: str | Path, poses: ArrayLike) -> Path:
     else:
         rows[:, 2, 2] = 1.0
         rows[:, :2, [0, 1, 3]] = SE2.matrix(array)[:, :2]
-    lines = [" ".join(f"{value + 0.0:.9e}" for value in row) for row in rows.reshape(-1, _FIELDS).tolist()]
+    lines = [" ".join(f"{value + 0.0:.9e}" for value in row) for row in rows.reshape(-1, 12).tolist()]
     return write_text(path, "".join(line + "\n" for line in lines))

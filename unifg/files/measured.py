@@ -110,10 +110,16 @@ def placed_along(file: TaggedFile, pose_graph: PoseGraph) -> PoseGraph:
 
     Args:
         file: for messages.
-        pose_graph: whose poses are all the identity, and whose landmarks mean nothing yet.
+        pose_graph: whose poses (n, 3) or (n, 7) are all the identity, and whose landmarks (k, 2) or (k, 3) mean nothing
+            yet.
+
+    Returns:
+        The same graph, not `placed`: poses [m, rad, or unit quaternions], known ones or the first of each part at the
+        identity; landmarks [m] where the first of their sightings puts them ("point" before "bearing-range"). Landmarks
+        of which only bearings or ranges are known stay as they are.
 
     Raises:
-        FileFormatError: the edges do not reach every pose.
+        FileFormatError: a pose is joined to the others through landmarks only.
     """
     group = pose_graph.group
     try:

@@ -1,13 +1,12 @@
 """Text files whose lines begin with a tag, parsed a tag at a time: what g2o and TORO files have in common.
 
-One compiled pass over the bytes finds where the lines of every tag stand; another reads the numbers of a tag
-(:mod:`unifg.files.decimals`). Python looks at a line only where something about it is unusual.
+One compiled pass over the bytes finds where the lines of every tag stand (:mod:`unifg.files.lines`); another reads the
+numbers of a tag (:mod:`unifg.files.fields`). Python looks at a line only where something about it is unusual.
 """
 
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unifg.errors import FileFormatError
-from unifg.files.contents import LIMITS, Limits, checked_text, legible, read_bytes
-from unifg.files.decimals import is_blank, parse_fields
-from unifg.machine.jit import compiled
-from unifg.typing import Array, BoolArray, IntArray
+from unifg.files.contents import LIMITS, Limits, legible
+from unifg.files.fields import read_fields
+from unifg.files.lines import read_lines
+from unifg.typing import Array, IntArray
 
 __all__ = [
     "Block",
@@ -38,8 +37,6 @@ __all__ = [
 
 logger = logging.getLogger("unifg")
 
-_EXACT = float(2**53)  # whole numbers up to here are exact in float64
-_WHOLE = re.compile(r"[+-]?[0-9]+")
 _TAGS = 64  # told apart by compiled code; who has more has them counted by Python
 
 
@@ -71,6 +68,10 @@ class _Lines(NamedTuple):
     end: IntArray
     numbers: IntArray
 
+    def of(self, chosen: IntArray) -> _Lines:
+        """Some of them."""
+        return _Lines(self.begin[chosen], self.end[chosen], self.numbers[chosen])
+
 
 _NONE = _Lines(*(np.zeros(0, dtype=np.intp) for _ in range(3)))
 
@@ -96,12 +97,14 @@ class TaggedFile:
         Raises:
             FileFormatError: the file is missing, is no text, or exceeds a limit.
         """
-        content = read_bytes(path, limits)
-        found = _split(content, limits.digits)
-        if found is None:  # nearly all files are plain text
-            content = checked_text(path, content, limits).encode()
-            found = _split(content)
-        return cls(legible(path), content, found or {})
+        found = read_lines(path, _TAGS, limits)
+        content, rows = found.content, _Lines(found.begin, found.end, found.number)
+        result = {tag: rows.of(np.flatnonzero(found.kind == k)) for k, tag in enumerate(found.tags)}
+        more: dict[str, list[int]] = {}
+        for row in np.flatnonzero(found.kind == _TAGS).tolist():
+            more.setdefault(content[found.first[row] : found.begin[row]].decode(), []).append(row)
+        result |= {tag: rows.of(np.array(chosen)) for tag, chosen in more.items()}
+        return cls(legible(path), content, result)
 
     def __contains__(self, tag: str) -> bool:
         """Whether there is a line with a tag."""
@@ -127,184 +130,16 @@ class TaggedFile:
         Raises:
             FileFormatError: a line, named in the message, has too few or too many fields, or no numbers.
         """
-        fields, where = names.split(), self.lines.get(tag, _NONE)
-        count, width = len(where.numbers), len(fields)
-        whole = np.empty((count, integers), dtype=np.int64)
-        table, strange = np.empty((count, width - integers)), np.zeros((count, width), dtype=np.bool_)
-        data = np.frombuffer(self.content, dtype=np.uint8)
-        wrong = parse_fields(data, where.begin, where.end, integers, whole, table, strange) if count else -1
-        if wrong >= 0:
-            text = self.content[where.begin[wrong] : where.end[wrong]]
-            hint = "; fields are separated by blanks, not commas" if b"," in text else ""
-            raise self.refuse(
-                int(where.numbers[wrong]), f"{tag} has {len(text.split())} fields, expected {width} ({names}){hint}"
-            )
-        if strange.any():
-            self._read_one_by_one(tag, where, fields, whole, table, strange)
+        where = self.lines.get(tag, _NONE)
+        whole, table = read_fields(
+            self.content, where.begin, where.end, integers, names,
+            lambda row: f"{self.path}, line {where.numbers[row]}: {tag}",
+        )  # fmt: skip
         return Block(tag, whole, table, where.numbers)
 
     def refuse(self, line: int, message: str) -> FileFormatError:
         """The error for one line."""
         return FileFormatError(f"{self.path}, line {line}: {message}")
-
-    def _read_one_by_one(
-        self, tag: str, where: _Lines, fields: list[str], whole: NDArray[np.int64], table: Array, strange: BoolArray
-    ) -> None:
-        """Words that no compiled code reads: many digits, far exponents, identifiers as decimals, and what is wrong."""
-        leading = whole.shape[1]
-        for row in np.flatnonzero(strange.any(axis=1)).tolist():
-            words = [word.decode() for word in self.content[where.begin[row] : where.end[row]].split()]
-            line = int(where.numbers[row])
-            for column in np.flatnonzero(strange[row]).tolist():
-                word, name = words[column], fields[column]
-                try:
-                    value = float(word if word.isascii() and "_" not in word else "none")  # 1_000 is for programs
-                except ValueError:
-                    raise self.refuse(line, f"{tag}: field {name} is {word!r}, not a number") from None
-                if not np.isfinite(value):
-                    raise self.refuse(line, f"{tag}: field {name} is {word}, not a finite number")
-                if column >= leading:
-                    table[row, column - leading] = value
-                elif _WHOLE.fullmatch(word) and -(2**63) <= int(word) < 2**63:
-                    whole[row, column] = int(word)
-                elif value.is_integer() and abs(value) < _EXACT:
-                    whole[row, column] = int(value)
-                else:
-                    raise self.refuse(line, f"{tag}: field {name} is {word!r}, not an integer of 64 bits")
-
-
-def _split(content: bytes, longest: int | None = None) -> dict[str, _Lines] | None:
-    """Where the lines of every tag stand.
-
-    Args:
-        content: the text.
-        longest: characters of a line; None for text that has been checked.
-
-    Returns:
-        None where the text needs a closer look: characters beyond ASCII or below the blank, or a longer line.
-    """
-    if not content:
-        return {}
-    data = np.frombuffer(content, dtype=np.uint8)
-    most, plain = _look(data)
-    if longest is not None and not plain:
-        return None
-    first, begin, end, number, kind = (np.empty(most + 1, dtype=np.intp) for _ in range(5))
-    tag_begin, tag_end = np.empty(_TAGS, dtype=np.intp), np.empty(_TAGS, dtype=np.intp)
-    words = np.frombuffer(content, dtype=np.uint64, count=len(content) // 8)
-    kept, tags, long = _find_lines(data, words, first, begin, end, number, kind, tag_begin, tag_end)
-    if longest is not None and long > longest:
-        return None
-    begin, end, number, kind = begin[:kept], end[:kept], number[:kept], kind[:kept]
-    result = {}
-    for k in range(tags):
-        chosen = np.flatnonzero(kind == k)
-        tag = content[tag_begin[k] : tag_end[k]].decode()
-        result[tag] = _Lines(begin[chosen], end[chosen], number[chosen])
-    more: dict[str, list[int]] = {}
-    for row in np.flatnonzero(kind == _TAGS).tolist():
-        more.setdefault(content[first[row] : begin[row]].decode(), []).append(row)
-    for tag, rows in more.items():
-        result[tag] = _Lines(begin[rows], end[rows], number[rows])
-    return result
-
-
-@compiled
-def _look(data: NDArray[np.uint8]) -> tuple[int, bool]:
-    """The number of line feeds, and whether all else are blanks, tabulators and visible ASCII."""
-    feeds, odd = 0, 0
-    for k in range(len(data)):
-        byte = data[k]
-        feeds += byte == 10
-        odd += ((byte < 32) & (byte != 10) & (byte != 9)) | (byte > 126)
-    return feeds, odd == 0
-
-
-@compiled
-def _line_end(data: NDArray[np.uint8], words: NDArray[np.uint64], at: int) -> int:
-    """The next line feed, or the end; words are the same bytes by eights."""
-    size = len(data)
-    while at < size and at & 7:
-        if data[at] == 10:
-            return at
-        at += 1
-    k = at >> 3
-    while k < len(words):
-        # A byte of zero, and none else, borrows from its uppermost bit (Mycroft 1987).
-        found = words[k] ^ np.uint64(0x0A0A0A0A0A0A0A0A)
-        if (found - np.uint64(0x0101010101010101)) & ~found & np.uint64(0x8080808080808080):
-            break
-        k += 1
-    at = max(at, 8 * k)
-    while at < size and data[at] != 10:
-        at += 1
-    return at
-
-
-@compiled
-def _find_lines(
-    data: NDArray[np.uint8],
-    words: NDArray[np.uint64],
-    first: IntArray,
-    begin: IntArray,
-    end: IntArray,
-    number: IntArray,
-    kind: IntArray,
-    tag_begin: IntArray,
-    tag_end: IntArray,
-) -> tuple[int, int, int]:
-    """Find lines that are neither empty nor comments, and their first words.
-
-    Args:
-        data: bytes of the text.
-        words: the same bytes by eights, as far as they go.
-        first: (n,) takes where the first word of a line begins,
-        begin: (n,) where it ends,
-        end: (n,) where the line ends.
-        number: (n,) takes the numbers of the lines, from 1.
-        kind: (n,) takes the numbers of the tags, from 0; their limit for all that are too many.
-        tag_begin: takes where the tags stand first,
-        tag_end: and where they end there.
-
-    Returns:
-        The number of lines kept, the number of tags, and the length of the longest line.
-    """
-    size, at, line, kept, tags, last, longest = len(data), 0, 0, 0, 0, -1, 0
-    while at < size:
-        line += 1
-        stop = _line_end(data, words, at)
-        longest = max(longest, stop - at)
-        while at < stop and is_blank(data[at]):
-            at += 1
-        tag = at
-        while at < stop and not is_blank(data[at]):
-            at += 1
-        word, at = at, stop + 1
-        if word == tag or data[tag] == 35:  # "#"
-            continue
-        if last < 0 or not _same(data, tag, word, tag_begin[last], tag_end[last]):
-            last = 0
-            while last < tags and not _same(data, tag, word, tag_begin[last], tag_end[last]):
-                last += 1
-            if last == tags and tags < len(tag_begin):
-                tag_begin[tags], tag_end[tags] = tag, word
-                tags += 1
-        first[kept], begin[kept], end[kept], number[kept], kind[kept] = tag, word, stop, line, last
-        kept += 1
-        if last == len(tag_begin):
-            last = -1
-    return kept, tags, longest
-
-
-@compiled
-def _same(data: NDArray[np.uint8], first: int, end: int, other: int, other_end: int) -> bool:
-    """Whether two pieces of text are alike."""
-    if end - first != other_end - other:
-        return False
-    for k in range(end - first):
-        if data[first + k] != data[other + k]:
-            return False
-    return True
 
 
 class Places:

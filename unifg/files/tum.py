@@ -7,20 +7,20 @@ Exactly eight fields separated by single blanks, no trailing blank, the quaterni
 from __future__ import annotations
 
 import logging
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from unifg.errors import FileFormatError
-from unifg.files.contents import LIMITS, Limits, legible, read_text, write_text
+from unifg.files.contents import LIMITS, Limits, write_text
+from unifg.files.fields import norms
+from unifg.files.tables import Table
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["Trajectory", "read_tum", "write_tum"]
 
-_FIELDS = ("t", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
-_SMALLEST_NORM, _LARGEST_NORM = 1e-6, 1e6  # of a quaternion that says something about a rotation
+_FIELDS = "t tx ty tz qx qy qz qw"
 
 logger = logging.getLogger("unifg")
 
@@ -95,36 +95,9 @@ def read_tum(path: str | Path, limits: Limits = LIMITS) -> Trajectory:
         FileFormatError: the file is missing, or a line (named in the message) is not eight finite numbers
             with a usable quaternion.
     """
-    name, rows, lines = legible(path), [], []
-    for number, line in enumerate(read_text(path, limits).split("\n"), start=1):
-        if line.strip() and not line.lstrip().startswith("#"):
-            rows.append(_parse(f"{name}, line {number}", line))
-            lines.append(number)
-    table = np.array(rows, dtype=np.float64).reshape(-1, len(_FIELDS))
+    rows = Table.read(path, 0, _FIELDS, limits)
+    table = rows.numbers
     back = np.flatnonzero(np.diff(table[:, 0]) < 0.0)
     if len(back):
-        logger.warning(
-            "%s, line %d: time runs backwards, here and %d times more", name, lines[back[0] + 1], len(back) - 1
-        )
-    return Trajectory(table[:, 0], table[:, 1:4], table[:, 4:])
-
-
-def _parse(place: str, line: str) -> list[float]:
-    """The eight numbers of one line, its quaternion normalised."""
-    words = line.split()
-    if len(words) != len(_FIELDS):
-        hint = "; fields are separated by blanks, not commas" if "," in line else ""
-        raise FileFormatError(f"{place}: {len(words)} fields, expected {len(_FIELDS)} ({' '.join(_FIELDS)}){hint}")
-    values = []
-    for name, word in zip(_FIELDS, words, strict=True):
-        try:
-            value = float(word)
-        except ValueError:
-            raise FileFormatError(f"{place}: field {name} is {word!r}, not a number") from None
-        if not np.isfinite(value):
-            raise FileFormatError(f"{place}: field {name} is {word}, not a finite number")
-        values.append(value)
-    norm = math.hypot(*values[4:])
-    if not _SMALLEST_NORM <= norm <= _LARGEST_NORM:
-        raise FileFormatError(f"{place}: the quaternion {' '.join(words[4:])} has norm {norm:g}; expected one")
-    return values[:4] + [value / norm for value in values[4:]]
+        logger.warning("%s: time runs backwards, here and %d times more", rows.place(int(back[0]) + 1), len(back) - 1)
+    return Trajectory(table[:, 0], table[:, 1:4], table[:, 4:] / norms(table[:, 4:], rows.place)[:, None])
