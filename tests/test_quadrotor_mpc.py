@@ -21,6 +21,7 @@ from unifg.scenarios.commands.catalogue import SCENARIOS
 from unifg.scenarios.episode import Progress
 from unifg.scenarios.flight import Flight, FlightSettings, run_flight
 from unifg.scenarios.flying import flight_watch
+from unifg.scenarios.flying.estimator import EstimatorSettings
 from unifg.scenarios.flying.flight_pilot import COUPLINGS
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics, state_errors
@@ -299,16 +300,55 @@ def test_tracks_find_velocities(association: str) -> None:
         state = np.concatenate([[0.1 * k, 0.0, 1.5], SO3.exp(np.array([0.0, 0.0, 0.3 + 0.02 * k])), np.zeros(3)])
         places = np.array([[5.0, 1.0], [5.0, -1.5]]) + time * velocities
         order = [0, 1] if k % 2 else [1, 0]  # an unknown association must not depend on the order
-        movers = tracker.update(sighting(time, places[order], [[20, 21][i] for i in order], state), state)
+        reading = tracker.told(sighting(time, places[order], [[20, 21][i] for i in order], state), state)
+        movers = tracker.update(reading, state)
     rows = np.argsort(-movers.centre[:, 1])
     np.testing.assert_allclose(movers.centre[rows], places, atol=1e-9)
     np.testing.assert_allclose(movers.velocity[rows], velocities, atol=1e-9)
     np.testing.assert_allclose(movers.radius, 0.4)
     # Out of sight a disc goes on for a while and is then given up.
     unseen = sighting(1.0, np.zeros((0, 2)), [], state)
-    later = tracker.update(unseen, state)
+    later = tracker.update(tracker.told(unseen, state), state)
     np.testing.assert_allclose(later.centre[rows], places + (1.0 - time) * velocities, atol=1e-9)
     assert len(tracker.update(replace(unseen, time=3.0), state)) == 0
+
+
+@pytest.mark.parametrize("flag", [False, True])
+def test_who_moves_is_found_out_where_nobody_names_things(flag: bool) -> None:
+    """Of noisy sightings of discs that stand none ever moves, whatever the sensor flags; one that walks soon does."""
+    rng, state = np.random.default_rng(0), np.array([0.0, 0.0, 1.5, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    standing, told = LineTracker(association="unknown"), []
+    places = np.array([[4.0, 1.5 * k - 3.0] for k in range(5)])
+    for k in range(400):
+        reading = replace(
+            sighting(0.05 * k, places + 0.05 * rng.standard_normal((5, 2)), [9] * 5, state), moving=np.full(5, flag)
+        )
+        told.append(standing.told(reading, state))
+    assert not np.any([reading.moving for reading in told])
+    assert all(sorted(reading.ids) == sorted(told[0].ids) for reading in told), "five discs keep five names"
+    assert len(standing.update(told[-1], state)) == 0
+    walking, first = LineTracker(association="unknown"), []
+    for k in range(60):
+        place = np.array([[4.0, 0.4 * 0.05 * k]]) + 0.05 * rng.standard_normal((1, 2))
+        reading = walking.told(replace(sighting(0.05 * k, place, [9], state), moving=np.array([flag])), state)
+        first += [k] if reading.moving[0] else []
+    assert 0.05 * first[0] < 1.5 and len(first) == 60 - first[0], "once it has moved, it is a mover"
+    assert walking.update(reading, state).velocity[0] == pytest.approx([0.0, 0.4], abs=0.15)
+
+
+def test_what_turns_out_to_move_leaves_the_map() -> None:
+    flight = Flight(replace(short(3.0, movers=2), seed=7, estimator=EstimatorSettings(association="unknown")))
+    log = flight.run(silent)
+    assert log.collisions == 0
+    cylinders = flight.world.layout.cylinders[:, :2]
+    final, ever = log.landmarks[-1], 0.0
+    for row in log.landmarks:
+        own = row.means[row.radii > 0.0]
+        away = np.hypot(*np.moveaxis(own[:, None] - cylinders, 2, 0)).min(axis=1, initial=np.inf)
+        ever = max(ever, float(away.max(initial=0.0)))
+    assert ever > 1.0, "at first sight nobody knows"
+    own = final.means[final.radii > 0.0]
+    assert np.hypot(*np.moveaxis(own[:, None] - cylinders, 2, 0)).min(axis=1).max() < 0.3
 
 
 # ------------------------------------------------------------------- the command

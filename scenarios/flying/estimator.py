@@ -188,6 +188,7 @@ class Estimator:
         self.window = window(own, vehicle, self.survey, state, settings.state_sigma, solver)
         self.covariance = np.zeros((FIRST_LANDMARK + 2 * own.landmarks,) * 2)
         self.covariance[:STATE_SIZE, :STATE_SIZE] = np.diag(settings.state_sigma**2)
+        self._seen_as = np.full(own.landmarks, -1, dtype=np.intp)  # by slot: what the last sighting was called
         self._time: float | None = None
 
     @property
@@ -228,13 +229,15 @@ class Estimator:
         self._time = reading.time
 
     def see(self, reading: Reading) -> None:
-        """Attach a reading to the present; what moves by design is tracked elsewhere."""
+        """Attach a reading to the present; what moves is tracked elsewhere, and leaves the map when it turns out to."""
         window, atlas = self.window, self.atlas
         window.record("height", reading.height)
         window.record("tilt", reading.tilt)
         window.record("sightings", np.zeros((self.own.landmarks, 3)))
         present = window.history.recorded("sightings")[0][-1]
         atlas.tick()
+        for mover in np.flatnonzero(atlas.used & np.isin(self._seen_as, reading.ids[reading.moving])).tolist():
+            self._strike(mover)
         own = np.flatnonzero(~reading.moving)
         sightings = np.column_stack([reading.bearings, reading.ranges])[own]
         slots = self._associate(reading, own, sightings)
@@ -251,6 +254,7 @@ class Estimator:
                 atlas.admit(slot, int(reading.kinds[row]), name)
                 self._look_up(slot)
             present[slot] = bearing, distance, 1.0
+            self._seen_as[slot] = reading.ids[row]
             atlas.sight(slot, float(reading.radii[row]))
 
     def estimate(self) -> Belief:
@@ -328,6 +332,13 @@ class Estimator:
         self.window.forget("landmarks", slot)
         self.survey.known[slot] = False
         return slot
+
+    def _strike(self, slot: int) -> None:
+        """Take what moves off the map, with all that was believed to be seen of it."""
+        self.window.history.recorded("sightings")[0][:, slot] = 0.0
+        self.window.forget("landmarks", slot)
+        self.atlas.strike(slot)
+        self._seen_as[slot] = -1
 
     def _look_up(self, slot: int) -> None:
         """Find a new corner on the map."""

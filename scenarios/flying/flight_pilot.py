@@ -53,7 +53,10 @@ class Pilot:
             control: (4,) applied since the last reading; None at the first one.
         """
         self.clock.start()
-        self.belief = self.alone = self.estimator.update(reading, control)
+        self.estimator.predict(reading, control)
+        reading = self.tracker.told(reading, self.estimator.window.present)
+        self.estimator.see(reading)
+        self.belief = self.alone = self.estimator.estimate()
         movers = self.tracker.update(reading, self.alone.state)
         self.clock.split("estimate")
         given = self.pushed(self.alone)

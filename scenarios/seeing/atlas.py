@@ -76,7 +76,11 @@ class Atlas:
         name = int(self.names[slot])
         row = (int(self._first[slot]), name, position.copy(), covariance.copy(), float(self.radii[slot]))
         self._retired.append((*row, int(self.kinds[slot])))
-        del self._slots[name]
+        self.strike(slot)
+
+    def strike(self, slot: int) -> None:
+        """Free a slot; what it held was no landmark."""
+        del self._slots[int(self.names[slot])]
         self.names[slot] = FREE
 
     def landmarks(self, positions: Array, covariance: Array) -> Landmarks:

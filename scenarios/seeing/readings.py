@@ -50,7 +50,7 @@ class Reading:
         ranges: (K,) in the ground plane to the axis or corner [m].
         radii: (K,) of the cylinders [m]; 0 for corners.
         kinds: (K,) ``Landmarks.CYLINDER`` or ``Landmarks.CORNER``.
-        moving: (K,) True for what moves by design.
+        moving: (K,) True for what moves by design. For known association only.
         height: above the floor [m].
         tilt: (3,) R' e3, the world's vertical in the body; not normalised.
         rates: (3,) mean body rates over the last step [rad/s]; of a vehicle at rest before the first.
