@@ -211,7 +211,7 @@ class Flight:
         plan: Plan | None = None
         with counting() as new:
             try:
-                plan = pilot.tick(reading, self._control)
+                plan = pilot.tick(reading, self._control, watch.felt.push)
             except (UnifgError, ArithmeticError, ValueError) as error:  # a robot in the air has to go on
                 logger.warning("the tick at %.2f s failed, the vehicle brakes: %s", world.time, error)
         if self.faults.hold("solver-timeout", world.time):

@@ -29,6 +29,7 @@ from unifg.scenarios.options import add_options, settings_of
 from unifg.scenarios.seeing.line_tracker import LineTracker
 from unifg.scenarios.seeing.readings import Reading
 from unifg.scenarios.worlds.conditions import DRAG, MASS, WIND, draw_conditions
+from unifg.scenarios.worlds.faults import Fault
 from unifg.typing import Array
 
 SEED = 1006  # of those open to tuning
@@ -311,6 +312,14 @@ def test_tracks_find_velocities(association: str) -> None:
     later = tracker.update(tracker.told(unseen, state), state)
     np.testing.assert_allclose(later.centre[rows], places + (1.0 - time) * velocities, atol=1e-9)
     assert len(tracker.update(replace(unseen, time=3.0), state)) == 0
+
+
+@pytest.mark.parametrize("coupling", ["sequential", "joint"])
+def test_a_gust_is_no_motion_of_the_vehicle(coupling: str) -> None:
+    """What pushes and is felt does not bend the velocity that is believed."""
+    log = run_flight(short(2.0, coupling=coupling, faults=(Fault("gust", 0.5, 1.5),)))
+    assert "a gust pushes" in log.causes
+    assert np.abs(log.believed[:, 7:9] - log.truth[:, 7:9]).max() < 0.3
 
 
 @pytest.mark.parametrize("flag", [False, True])

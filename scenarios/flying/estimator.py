@@ -37,6 +37,7 @@ FIRST_LANDMARK = STATE_SIZE + PARAMETER_SIZE  # column in the joint covariance
 ASSOCIATIONS = ("known", "unknown")
 SAME_CORNER = 1.0  # [m]; a corner seen nearer than this to one on the map is that one
 LIGHTEST = 0.01  # [kg]
+STILL = np.zeros(2)  # nothing pushes
 TOLERANCE = 1e-3  # of the KKT test, and of the dynamics in their own units
 
 
@@ -110,6 +111,10 @@ class Dynamics:
         """Control (4,) that stands in the dynamics, and what the gyro saw beyond it (3,)."""
         return control, reading.rates - control[:3]
 
+    def pushed(self, push: Array) -> Array:
+        """What a push (2,) that was felt is to the model, beside its own forces [m/s^2]."""
+        return push
+
     def believed(self, parameters: Array) -> quadrotor.Parameters:
         """What is believed where the window holds ``parameters`` (7,)."""
         return flyable(parameters)
@@ -137,6 +142,10 @@ class DeadReckoning(Dynamics):
     def motion(self, reading: Reading, control: Array) -> tuple[Array, Array]:
         """The gyro's rates without thrust; nothing beyond them."""
         return np.concatenate([reading.rates, [0.0]]), np.zeros(3)
+
+    def pushed(self, push: Array) -> Array:
+        """Nothing: every force is a manoeuvre to it."""
+        return np.zeros(2)
 
     def believed(self, parameters: Array) -> quadrotor.Parameters:
         """Nothing else than at the start."""
@@ -201,29 +210,43 @@ class Estimator:
         """(K, 2) believed places of the slots [m]."""
         return self.window.history.statics["landmarks"]
 
-    def update(self, reading: Reading, control: Array | None) -> Belief:
+    def update(self, reading: Reading, control: Array | None, push: Array = STILL) -> Belief:
         """Take in one reading.
 
         Args:
             reading: of now.
             control: (4,) applied since the last reading; None at the first one.
+            push: as for :meth:`predict`.
         """
-        self.predict(reading, control)
+        self.predict(reading, control, push)
         self.see(reading)
         return self.estimate()
 
-    def predict(self, reading: Reading, control: Array | None) -> None:
-        """Move the window on to the time of a reading."""
+    def predict(self, reading: Reading, control: Array | None, push: Array = STILL) -> None:
+        """Move the window on to the time of a reading.
+
+        Args:
+            reading: of now.
+            control: (4,) applied since the last reading; None at the first one.
+            push: (2,) horizontal acceleration in the world that was felt meanwhile and that no model holds [m/s^2]. The
+                noise of the step is expected to be that; or else velocity and wind, which nothing measures, take it up.
+        """
         if self._time is not None and control is not None:
             dt = reading.time - self._time
             control, turned = self.model.motion(reading, np.asarray(control, dtype=np.float64))
             noise = np.zeros(6)
             noise[:3] = turned * self._gain()
             moved = control + np.concatenate([noise[:3], [0.0]])
+            push = self.model.pushed(push)
             state = quadrotor.step(self.window.present[None], moved[None], dt, flyable(self.parameters))[0]
+            if push.any():
+                noise[3:5] = push
+                state[:2] += 0.5 * dt**2 * push
+                state[7:9] += dt * push
             self._propagate(state, control, noise, dt)
             self.window.move(control, self.window.history.times[-1] + dt, state, {"noise": noise})
             self.window.record("turned", turned)
+            self.window.record("push", push)
             if self.own.force_sigma is not None:
                 self.window.record("force", reading.force)
         self._time = reading.time

@@ -129,14 +129,15 @@ class Motion:
 
     @property
     def records(self) -> Mapping[str, tuple[int, ...]]:
-        """The gyro's rates since the last node, less those commanded [rad/s]."""
-        return {"turned": (3,)}
+        """The gyro's rates since the last node, less those commanded [rad/s]; what pushed meanwhile [m/s^2]."""
+        return {"turned": (3,), "push": (2,)}
 
     def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
         """Add them."""
         s, noise, steps = self.settings, graph.families["noise"], len(x) - 1
         durations = graph.data("durations", np.zeros(steps), each=True)
-        graph.minimize(fg.prior, noise, np.zeros(6), sigma=s.noise_sigma, name="noise")
+        pushed = graph.data("pushed", np.zeros((steps, 6)), each=True)
+        graph.minimize(fg.prior, noise, pushed, sigma=s.noise_sigma, name="noise")
         if s.gyro_sigma is not None:
             turned = graph.data("turned", np.zeros((steps, 3)), each=True)
             graph.minimize(gyro, noise, turned, sigma=s.gyro_sigma, name="gyro")
@@ -144,8 +145,10 @@ class Motion:
         graph.constrain(quadrotor.disturbed_dynamics, *motion, lower=0.0, upper=0.0, name="dynamics")
 
     def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
-        """How long the steps took, and what the gyro saw."""
-        found: dict[str, ArrayLike] = {"durations": np.diff(now.past.times)}
+        """How long the steps took, what pushed, and what the gyro saw."""
+        pushed = np.zeros((len(now.past.times) - 1, 6))
+        pushed[:, 3:5] = now.past.recorded("push")[0][1:]
+        found: dict[str, ArrayLike] = {"durations": np.diff(now.past.times), "pushed": pushed}
         if self.settings.gyro_sigma is not None:
             found["turned"] = now.past.recorded("turned")[0][1:]
         return found

@@ -8,7 +8,7 @@ from dataclasses import replace
 from unifg.errors import ScenarioError
 from unifg.horizon import Plan
 from unifg.models import quadrotor
-from unifg.scenarios.flying.estimator import DeadReckoningEstimator, Estimator, EstimatorSettings
+from unifg.scenarios.flying.estimator import STILL, DeadReckoningEstimator, Estimator, EstimatorSettings
 from unifg.scenarios.flying.flight_control import Controller
 from unifg.scenarios.flying.flight_joint import BELIEVABLE, JointSettings, SharedFlight
 from unifg.scenarios.flying.flight_settings import ControllerSettings
@@ -45,15 +45,16 @@ class Pilot:
         self.clock = Stopwatch()
         self.clock.seconds = {"estimate": 0.0, "plan": 0.0}
 
-    def tick(self, reading: Reading, control: Array | None) -> Plan:
+    def tick(self, reading: Reading, control: Array | None, push: Array = STILL) -> Plan:
         """Decide.
 
         Args:
             reading: of now.
             control: (4,) applied since the last reading; None at the first one.
+            push: (2,) what was felt meanwhile and no model holds [m/s^2].
         """
         self.clock.start()
-        self.estimator.predict(reading, control)
+        self.estimator.predict(reading, control, push)
         reading = self.tracker.told(reading, self.estimator.window.present)
         self.estimator.see(reading)
         self.belief = self.alone = self.estimator.estimate()
