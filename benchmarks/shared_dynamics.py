@@ -25,7 +25,7 @@ from unifg.models import quadrotor
 from unifg.scenarios.campaigns.comparison import Row, digits, interval, paired, where
 from unifg.scenarios.episode import silent
 from unifg.scenarios.flight import Flight, FlightSettings
-from unifg.scenarios.flying.estimator import DeadReckoning, Dynamics, Estimator, EstimatorSettings
+from unifg.scenarios.flying.estimator import STILL, DeadReckoning, Dynamics, Estimator, EstimatorSettings
 from unifg.scenarios.flying.flight_control import Controller
 from unifg.scenarios.flying.flight_past import WindowSettings
 from unifg.scenarios.flying.flight_pilot import Pilot
@@ -86,12 +86,12 @@ class Divided(Pilot):
         super().__init__(estimator, controller)
         self.adviser, self._nominal = adviser, nominal
 
-    def tick(self, reading: Reading, control: Array | None) -> Plan:
+    def tick(self, reading: Reading, control: Array | None, push: Array = STILL) -> Plan:
         """Decide."""
-        self.alone = self.estimator.update(reading, control)
+        self.alone = self.estimator.update(reading, control, push)
         parameters = self._nominal
         if self.adviser is not None:
-            told = self.alone if self.adviser is self.estimator else self.adviser.update(reading, control)
+            told = self.alone if self.adviser is self.estimator else self.adviser.update(reading, control, push)
             parameters = told.parameters
         self.belief = replace(self.alone, parameters=parameters)
         return self.controller.plan(self.belief, Tracks.none())
