@@ -18,6 +18,7 @@ __all__ = [
     "landmarks",
     "lidar",
     "manipulator",
+    "matching",
     "obstacles",
     "odometry",
     "potential",

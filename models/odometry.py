@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unifg.errors import ModelError
 from unifg.lie import SE2
 from unifg.models import unicycle
-from unifg.typing import Array
+from unifg.typing import Array, ArrayLike
 
 
 @dataclass(frozen=True)
@@ -53,3 +54,58 @@ def predict(pose: Array, covariance: Array, u: Array, dt: float, noise: Odometry
     moved = unicycle.step(pose[None, :], np.asarray(u, dtype=np.float64)[None, :], dt)[0]
     transport = SE2.adjoint(SE2.between(moved, pose))
     return moved, transport @ covariance @ transport.T + noise.covariance(u, dt)
+
+
+def driven(steps: ArrayLike) -> Array:
+    """Where steps lead, each an arc of constant curvature, from the identity.
+
+    Args:
+        steps: (n, 2) distance and turn of each [m, rad].
+
+    Returns:
+        (n + 1, 3) poses x, y, heading [m, m, rad]; the heading is not wrapped.
+
+    Raises:
+        ModelError: the array has another shape.
+    """
+    table = np.asarray(steps, dtype=np.float64)
+    if table.ndim != 2 or table.shape[1] != 2:
+        raise ModelError(f"steps have shape {table.shape}, expected (n, 2): distances and turns")
+    heading = np.concatenate([[0.0], np.cumsum(table[:, 1])])
+    # An arc is a chord of length s sinc(turn / 2) in the direction half a turn on.
+    chord = table[:, 0] * np.sinc(table[:, 1] / (2.0 * np.pi))
+    along = heading[:-1] + 0.5 * table[:, 1]
+    way = np.cumsum(chord[:, None] * np.column_stack([np.cos(along), np.sin(along)]), axis=0)
+    return np.column_stack([np.concatenate([np.zeros((1, 2)), way]), heading])
+
+
+def held(time: ArrayLike, velocity: ArrayLike, at: ArrayLike) -> Array:
+    """Where velocities lead that hold until the next one, at other times, from the identity at the first of these.
+
+    Args:
+        time: (n,) of the velocities, rising [s]; before the first of them nothing moves.
+        velocity: (n, 2) forward and turning [m/s, rad/s]; the last one holds on.
+        at: (m,) when to look, rising [s].
+
+    Returns:
+        (m, 3) poses x, y, heading [m, m, rad]; the heading is not wrapped.
+
+    Raises:
+        ModelError: shapes do not fit, or times fall.
+    """
+    since, speed, when = (np.asarray(part, dtype=np.float64) for part in (time, velocity, at))
+    if since.ndim != 1 or speed.shape != (len(since), 2) or when.ndim != 1:
+        raise ModelError(
+            f"time {since.shape}, velocity {speed.shape} and at {when.shape} must be (n,), (n, 2) and (m,)"
+        )
+    if (np.diff(since) < 0.0).any() or (np.diff(when) < 0.0).any():
+        raise ModelError("times of velocities, and those to look at, must not fall")
+    if not len(when):
+        return np.zeros((0, 3))
+    inside = since[(since > when[0]) & (since < when[-1])]
+    ends = np.unique(np.concatenate([when, inside]))
+    valid = np.searchsorted(since, ends[:-1], side="right") - 1
+    moving = np.concatenate([np.zeros((1, 2)), speed])[valid + 1]
+    path = driven(moving * np.diff(ends)[:, None])
+    found: Array = path[np.searchsorted(ends, when)]
+    return found

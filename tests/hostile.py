@@ -25,6 +25,8 @@ from unifg.files.contents import Limits
 from unifg.files.euroc import read_euroc
 from unifg.files.g2o import read_g2o
 from unifg.files.kitti import read_kitti
+from unifg.files.mrclam import read_mrclam
+from unifg.files.plaza import read_plaza
 from unifg.files.pose_graph import read_pose_graph
 from unifg.files.ros_map import load_map
 from unifg.files.toro import read_toro
@@ -73,6 +75,17 @@ ODOM 0 0 0 0 0 0 1.5 host 0.0
 FLASER 3 1.0 2.0 81.9 0 0 0 0 0 0 1.6 host 0.1
 ROBOTLASER1 0 -1.57 3.14 1.57 81.9 0.01 0 3 1 2 3 0 0 0 0 0 0 0 0 0 0.3 0.3 1e6 1.7 host 0.2
 """
+MRCLAM = {
+    "Barcodes.dat": b"# Subject # Barcode #\n1 5\n6 72\n7 27\n",
+    "Landmark_Groundtruth.dat": b"# Subject x y\n6 1.5 -2 0.0001 0.0002\n7 3 4 0.0001 0.0003\n",
+    "Robot1_Odometry.dat": b"# Time v w\n1248272272.841\t   0.000\t   0.000\n1248272272.856\t   0.5\t  -0.1\n",
+    "Robot1_Measurement.dat": b"# t code r b\n1248272273.500 72 2.5 -0.25\n1248272273.6 4 1 0.1\n1248272274 5 4 0.3\n",
+    "Robot1_Groundtruth.dat": b"1248272272.841 1 2 0.5\n",
+}
+PLAZA = {
+    "DR.txt": b"  3.8570e+003\t  5.0000e-001\t -2.5000e-001\t\n  3.85725e+003\t  1.5000e+000\t  1.2500e-001\t\n",
+    "TD.txt": b"  3.8580e+003\t  2.0000e+000\t  5.0000e+000\t  6.5500e+001\t\n3858.5 2 6 35.75\n",
+}
 PROFILE = b"t_s,v_ref_mps,slope_rad\n0,0,0\n1,2.5,0.01\n2,5,0.02\n"
 YAML = b"""image: m.pgm
 mode: trinary
@@ -120,6 +133,9 @@ READERS = {
     "carmen": _one(read_carmen, "log.clf", CARMEN),
     "map": Reader(lambda path: load_map(path, limits=SMALL), {"m.yaml": YAML, "m.pgm": PGM}, ("m.yaml",)),
     "image": Reader(lambda path: load_map(path, limits=SMALL), {"m.yaml": YAML, "m.pgm": PGM}, ("m.pgm",)),
+    "barcodes": Reader(lambda path: read_mrclam(path.parent, limits=SMALL), MRCLAM, ("Barcodes.dat",)),
+    "room": Reader(lambda path: read_mrclam(path.parent, limits=SMALL), MRCLAM, tuple(MRCLAM)),
+    "ranges": Reader(lambda path: read_plaza(path, path.parent / "TD.txt", limits=SMALL), PLAZA, tuple(PLAZA)),
     "profile": _one(read_profile, "speeds.csv", PROFILE),
 }
 WORDS = (
@@ -200,7 +216,8 @@ def trouble(reader: Reader, folder: Path, number: int) -> str:
             warnings.simplefilter("error")
             found = reader.read(first)
     except FileFormatError as error:
-        return "" if first.name.split(".")[0] in str(error) and len(str(error)) < 2000 else f"says {str(error)[:200]!r}"
+        named = any(name.split(".")[0] in str(error) for name in reader.mutated)
+        return "" if named and len(str(error)) < 2000 else f"says {str(error)[:200]!r}"
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt):
             raise

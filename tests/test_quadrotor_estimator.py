@@ -14,10 +14,10 @@ from unifg.answers.solver import Prepared
 from unifg.horizon.past import without
 from unifg.lie import SO3
 from unifg.models import quadrotor
+from unifg.models.matching import DOUBTFUL, NEW, Gates, nearest
 from unifg.scenarios.flying.arrival import arrival, seen_from_the_vehicle
 from unifg.scenarios.flying.estimator import DeadReckoningEstimator, Estimator, EstimatorSettings
 from unifg.scenarios.flying.flight_past import WindowSettings
-from unifg.scenarios.seeing.association import DOUBTFUL, NEW, Gates, nearest
 from unifg.scenarios.seeing.belief import Belief, Landmarks
 from unifg.scenarios.seeing.readings import Reading
 from unifg.scenarios.worlds.air import QuadrotorWorld

@@ -13,6 +13,7 @@ import numpy as np
 
 import unifg as fg
 from unifg.models import quadrotor
+from unifg.models.matching import DOUBTFUL, NEW, Gates, nearest
 from unifg.scenarios.flying.flight_past import (
     PARAMETER_SIZE,
     STATE_SIZE,
@@ -24,7 +25,7 @@ from unifg.scenarios.flying.flight_past import (
     window,
 )
 from unifg.scenarios.options import option
-from unifg.scenarios.seeing.association import DOUBTFUL, NEW, Gates, expected, nearest, places
+from unifg.scenarios.seeing.association import expected, places
 from unifg.scenarios.seeing.atlas import Atlas
 from unifg.scenarios.seeing.belief import Belief, Landmarks
 from unifg.scenarios.seeing.readings import Reading

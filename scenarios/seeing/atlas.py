@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.scenarios.seeing.association import NEW
+from unifg.models.matching import NEW
 from unifg.scenarios.seeing.belief import Landmarks
 from unifg.typing import Array, BoolArray, IntArray
 

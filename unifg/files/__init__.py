@@ -1,4 +1,4 @@
-"""File formats: pose graphs (g2o, TORO), trajectories (TUM, KITTI, EuRoC), robot logs (CARMEN) and maps (ROS).
+"""File formats: pose graphs (g2o, TORO), trajectories (TUM, KITTI, EuRoC), logs (CARMEN, MRCLAM, Plaza), maps (ROS).
 
 Each format is a module of its own; importing one reads nothing else.
 """
@@ -16,6 +16,8 @@ __all__ = [
     "kitti",
     "lines",
     "measured",
+    "mrclam",
+    "plaza",
     "pose_graph",
     "ros_map",
     "tables",
