@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -134,6 +135,43 @@ def test_units_and_offsets_decide_nothing(weight: float, at: float) -> None:
     assert certify(right, tolerance=1e-5).certified
     assert not certify(folded, tolerance=1e-5).certified
     assert certify(folded, tolerance=1e-5, staircase=True).certified
+
+
+def in_units(pose_graph: PoseGraph, unit: float) -> PoseGraph:
+    """The same graph with lengths in units of so many metres."""
+    dim, edges = pose_graph.group.point_dim, pose_graph.edges
+    poses, measured = pose_graph.poses.copy(), edges.measured.copy()
+    poses[:, :dim] /= unit
+    measured[:, :dim] /= unit
+    by = np.where(np.arange(pose_graph.group.dim) < dim, unit, 1.0)
+    information = edges.information * by[:, None] * by
+    return replace(pose_graph, poses=poses, edges=Edges(edges.first, edges.second, measured, information))
+
+
+@pytest.mark.parametrize("made", [manhattan(120, seed=3), sphere(5, 12, seed=1)], ids=["plane", "space"])
+def test_the_unit_of_length_decides_nothing(made: Simulated) -> None:
+    """In kilometres, feet or millimetres: the same proof, the same gap, the same caveats, the same map."""
+    graph = solved(made.pose_graph)
+    coupled = graph.edges.information.copy()
+    dim = graph.group.point_dim
+    coupled[:, 0, dim] = coupled[:, dim, 0] = 1e-3 * np.sqrt(coupled[:, 0, 0] * coupled[:, dim, dim])
+    bound = replace(graph, edges=replace(graph.edges, information=coupled))
+    asked = certify(graph)
+    assert asked.certified and 0.0 < asked.gap < 1e-5 * asked.chi2
+    for unit in (1000.0, 0.3048, 1e-3, 1e-9):
+        found = certify(in_units(graph, unit))
+        assert found.certified and found.gap == pytest.approx(asked.gap, rel=1e-3)
+        assert found.tolerance == pytest.approx(asked.tolerance, rel=1e-9)
+        assert found.chi2 == pytest.approx(asked.chi2, rel=1e-9)
+        np.testing.assert_allclose(unit * found.poses[:, :dim], asked.poses[:, :dim], atol=1e-6)
+        assert certify(in_units(bound, unit)).caveats == certify(bound).caveats != ()
+
+
+def test_what_is_used_has_one_word_for_each_edge() -> None:
+    graph = ring(6, 1)
+    for used in (np.ones(5, dtype=bool), np.ones((6, 1), dtype=bool), np.array(True), np.arange(6)):
+        with pytest.raises(GraphError, match=rf"used has shape {re.escape(str(used.shape))}.*expected \(6,\) of bool"):
+            certify(graph, used=used)  # type: ignore[arg-type]
 
 
 def test_parts_are_judged_together() -> None:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, eigsh
 
+from unifg.errors import GraphError
 from unifg.pose_graphs.linear import BlockQuadratic
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.pose_graphs.relaxation import Relaxation
@@ -79,14 +80,23 @@ def certify(
         tolerance: of the gap, relative to chi2.
 
     Raises:
-        GraphError: the graph has landmarks, or several poses of one part are known.
+        GraphError: the graph has landmarks, several poses of one part are known, or `used` is something else than one
+            truth value for each edge.
     """
-    problem = Relaxation.of(pose_graph, used)
+    chosen = None if used is None else np.asarray(used)
+    if chosen is not None and (chosen.shape != (len(pose_graph.edges),) or chosen.dtype != np.bool_):
+        raise GraphError(
+            f"used has shape {chosen.shape} and holds {chosen.dtype}: expected ({len(pose_graph.edges)},) of bool, "
+            "one for each edge"
+        )
+    # Weights of positions and of frames are added up below: the unit of length is the graph's own, not the file's.
+    unit = _length(pose_graph, chosen)
+    problem = Relaxation.of(_measured_in(pose_graph, unit), chosen)
     judge = _Judge(problem, tolerance)
     # Seen from the anchor of its part, a pose keeps its digits wherever the map lies.
     shift = pose_graph.poses[problem.anchors][problem.parts, : problem.dim]
     near = pose_graph.poses.copy()
-    near[:, : problem.dim] -= shift
+    near[:, : problem.dim] = (near[:, : problem.dim] - shift) / unit
     point = problem.minimize(problem.lift(pose_graph.with_poses(near)))
     verdict = judge(point)
     rank = problem.dim
@@ -95,7 +105,7 @@ def certify(
         verdict = judge(point)
         verdict = replace(verdict, gap=min(verdict.gap, max(verdict.cost - bound, 0.0)))
     poses = problem.lower(point, pose_graph)
-    poses[:, : problem.dim] += shift
+    poses[:, : problem.dim] = poses[:, : problem.dim] * unit + shift
     poses[problem.anchors] = pose_graph.poses[problem.anchors]
     apart = pose_graph.group.local(pose_graph.poses, poses)
     turned = np.linalg.norm(apart[:, problem.dim :], axis=1)
@@ -104,6 +114,26 @@ def certify(
     return Certificate(
         verdict.proven, verdict.cost, verdict.gap, verdict.tolerance, verdict.least, poses, moved, rank, problem.caveats
     )
+
+
+def _length(pose_graph: PoseGraph, used: BoolArray | None) -> float:
+    """The length of a typical step, by which the certificate measures: root of the weighted mean square; 1 for none."""
+    dim, edges = pose_graph.group.point_dim, pose_graph.edges if used is None else pose_graph.edges[used]
+    with np.errstate(all="ignore"):
+        weight = np.trace(edges.information[:, :dim, :dim], axis1=1, axis2=2)
+        squared = np.sum(weight * np.sum(edges.measured[:, :dim] ** 2, axis=1)) / np.sum(weight)
+    return float(np.sqrt(squared)) if 0.0 < squared < np.inf else 1.0
+
+
+def _measured_in(pose_graph: PoseGraph, unit: float) -> PoseGraph:
+    """The same graph in another unit of length: its costs stay."""
+    dim, edges = pose_graph.group.point_dim, pose_graph.edges
+    poses, measured = pose_graph.poses.copy(), edges.measured.copy()
+    poses[:, :dim] /= unit
+    measured[:, :dim] /= unit
+    by = np.where(np.arange(pose_graph.group.dim) < dim, unit, 1.0)
+    information = edges.information * by[:, None] * by
+    return replace(pose_graph, poses=poses, edges=replace(edges, measured=measured, information=information))
 
 
 @dataclass(frozen=True, eq=False)

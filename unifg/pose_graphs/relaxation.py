@@ -106,7 +106,8 @@ class Relaxation:
                 f"translation information of {crooked.sum()} edges is not the same in all directions: "
                 "its mean stands for it"
             )
-        coupled = ~_close(edges.information[:, :dim, dim:], 0.0, edges.information)
+        # A coupling is small beside what it couples, in whatever units these are.
+        coupled = ~_close(edges.information[:, :dim, dim:], 0.0, np.sqrt(_greatest(moving) * _greatest(turning)))
         if coupled.any():
             caveats.append(f"{coupled.sum()} edges couple rotation and translation: the coupling is left out")
         mean = np.trace(turning, axis1=1, axis2=2)[:, None, None]
@@ -210,10 +211,15 @@ class Relaxation:
         return point
 
 
-def _close(found: Array, wanted: Array | float, beside: Array | None = None) -> BoolArray:
-    """(m,) whether blocks are as wanted, measured by their own size or that of larger ones."""
-    size = np.abs(found if beside is None else beside).max(axis=(1, 2), initial=0.0)
-    near: BoolArray = np.abs(found - wanted).max(axis=(1, 2), initial=0.0) <= ISOTROPIC * size
+def _greatest(blocks: Array) -> Array:
+    """(m,) the size of the largest entry of each block."""
+    found: Array = np.abs(blocks).max(axis=(1, 2), initial=0.0)
+    return found
+
+
+def _close(found: Array, wanted: Array | float, size: Array | None = None) -> BoolArray:
+    """(m,) whether blocks are as wanted, measured by their own size or by another (m,)."""
+    near: BoolArray = _greatest(found - wanted) <= ISOTROPIC * (_greatest(found) if size is None else size)
     return near
 
 
