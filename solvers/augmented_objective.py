@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from unifg.machine.inner import inner
 from unifg.machine.jit import compiled
 from unifg.program.columns import Values
 from unifg.program.curvature import lagrangian_hessian
@@ -77,7 +78,7 @@ class Primal:
         pull = program.costs.transposed_times(np.abs(lin.jacobian), np.abs(lin.residual))
         pull += program.constraints.transposed_times(np.abs(lin.constraint_jacobian), np.abs(after))
         size = np.concatenate([np.repeat(np.abs(lin.values[f]).max(axis=1), f.manifold.dim) for f in program.families])
-        return float(np.finfo(np.float64).eps * (pull @ size))
+        return float(np.finfo(np.float64).eps * inner(pull, size))
 
     def slope(self, lin: Linearization, multipliers: Array) -> float:
         """Largest entry of the Lagrangian's gradient over the unknowns."""

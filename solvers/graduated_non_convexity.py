@@ -40,6 +40,7 @@ from unifg.kernels.robust import DCS, Graduated, Loss
 from unifg.language.statement import Statement
 from unifg.language.terms import Cost
 from unifg.language.variables import Data
+from unifg.machine.inner import inner
 from unifg.program.term import CompiledTerm
 from unifg.solvers.gating import Innovations, Scatter
 from unifg.solvers.least_squares import GaussNewton, LevenbergMarquardt
@@ -383,7 +384,7 @@ class _Answer:
         weights = [goal.weight(s) * a for goal, s, a in zip(self._goals, squared, self._active, strict=True)]
         self.kept: list[BoolArray] = [weight >= HALF for weight in weights]
         self.doubted: dict[str, IntArray] = {}
-        self.scatter = Scatter(rest + sum(float(w @ s) for w, s in zip(weights, squared, strict=True)), freedom)
+        self.scatter = Scatter(rest + sum(inner(w, s) for w, s in zip(weights, squared, strict=True)), freedom)
 
     def judged(self, unit: float) -> float:
         """Twice the cost with the noise of all measurements smaller, by the root of ``unit``, than they state."""

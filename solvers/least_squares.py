@@ -15,6 +15,7 @@ import numpy as np
 from unifg.answers.solver import Solver, SolveState
 from unifg.answers.status import Status
 from unifg.errors import BackendError
+from unifg.machine.inner import inner
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.solvers.augmented_objective import Primal
@@ -93,7 +94,7 @@ class GaussNewton(LeastSquares):
             if not self.line_search:
                 run.accept(run.program.linearize(run.program.retract(lin.values, step)), none, norm(step), 1.0)
             else:
-                slope, slack = float(gradient @ step), ROUNDING * lin.cost
+                slope, slack = inner(gradient, step), ROUNDING * lin.cost
                 found = search(lin, step, merit, lin.cost, slope, slack, eager=True, shortest=SHORTEST)
                 if found is None:
                     return Status.STALLED
@@ -222,7 +223,7 @@ class Path:
         if newton is None:
             return None
         downhill = gradient / (norm(gradient) or 1.0)
-        curvature = float((downhill * program.normal.times(lin.hessian, downhill)).sum())
+        curvature = inner(downhill, program.normal.times(lin.hessian, downhill))
         return cls(program, lin.hessian, gradient, newton, -gradient / max(curvature, 1e-300))
 
     def step(self, radius: float) -> Array:
@@ -233,7 +234,7 @@ class Path:
             return self.cauchy * (radius / norm(self.cauchy))
         size = norm(self.newton)  # whose square may overflow
         begin, leg = self.cauchy / size, (self.newton - self.cauchy) / size
-        a, b = float((leg * leg).sum()), float((begin * leg).sum())
+        a, b = inner(leg, leg), inner(begin, leg)
         c = norm(begin) ** 2 - (radius / size) ** 2
         fraction = -c / (b + np.sqrt(b * b - a * c))  # the positive root, without cancellation
         step: Array = size * (begin + fraction * leg)
@@ -242,4 +243,4 @@ class Path:
     def decrease(self, step: Array) -> float:
         """What the quadratic model promises."""
         curved = self.program.normal.times(self.hessian, step)
-        return -float((step * (self.gradient + 0.5 * curved)).sum())
+        return -inner(step, self.gradient + 0.5 * curved)

@@ -20,6 +20,7 @@ from unifg.answers.requirements import require
 from unifg.answers.solver import Solver, SolveState
 from unifg.answers.status import Status
 from unifg.errors import BackendError
+from unifg.machine.inner import inner
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.solvers.globalize.least_violation import Watch, leave, settle
@@ -218,7 +219,7 @@ class SQP(Solver):
             reached = program.linearize(program.retract(lin.values, answer.step))
             return Taken(reached, answer.step, 1.0)
         here, linear = merit.value(lin), qp.linear(answer.step)
-        slope = merit.slope(float(qp.gradient @ answer.step), lin, linear)
+        slope = merit.slope(inner(qp.gradient, answer.step), lin, linear)
         # The QP meets its conditions to its own accuracy only; what that costs in merit is noise.
         slack = ROUNDING * max(1.0, abs(here)) + max(NOISE * merit.price, min(answer.error, accuracy))
         if program.least_squares:  # what is rounding depends on the cost alone, whose unit is free
@@ -255,8 +256,8 @@ def missing_curvature(
     if squared < SHORTEST_SECANT**2:
         return 0.0
     change = program.lagrangian_gradient(after, multipliers) - program.lagrangian_gradient(before, multipliers)
-    known = float(step @ (qp.curved(step) - qp.damping * step)) / squared
-    missing = float(step @ change[program.columns.free]) / squared - known
+    known = inner(step, qp.curved(step) - qp.damping * step) / squared
+    missing = inner(step, change[program.columns.free]) / squared - known
     return missing if missing > SECANT_MATTERS * known else 0.0
 
 

@@ -264,6 +264,23 @@ MACHINE_PATH = re.compile(r"(?<![\w.\-])/(?:home|root|work|opt|Users|mnt)/\w")
 TEXT = {".py", ".md", ".toml", ".cff", ".yaml", ".yml", ".in", ".cfg", ".sh", ".txt", ""}
 
 
+def test_products_of_long_vectors_wake_no_threads() -> None:
+    """Solvers multiply vectors as long as the problem by `unifg.machine.inner`, not by a BLAS that shares them out."""
+    woken = re.compile(r"float\((?:[^()]|\([^()]*\))* @ |np\.linalg\.norm\((?![^\n]*axis)|np\.vdot\(")
+    assert woken.search("slope = float(gradient @ step)") and woken.search("size = float(np.linalg.norm(residual))")
+    assert woken.search("float(step @ curved(step))") and not woken.search("np.linalg.norm(rows, axis=1)")
+    folders = ("solvers", "unifg/answers")
+    found = [
+        f"{path.relative_to(CHECKOUT)}:{number}: {line.strip()}"
+        for folder in folders
+        for path in sorted((CHECKOUT / folder).rglob("*.py"))
+        if path.parent.name != "ta"  # its matrices are those of one state
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        if woken.search(line)
+    ]
+    assert not found, "\n".join(found)
+
+
 def test_no_machine_paths() -> None:
     listing = subprocess.run(
         ["git", "ls-files", "--cached", "--others", "--exclude-standard"],

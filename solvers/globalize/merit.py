@@ -6,6 +6,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from unifg.machine.inner import inner
 from unifg.program.linearization import Evaluation, Linearization
 from unifg.program.program import Program
 from unifg.typing import Array
@@ -75,7 +76,7 @@ class RowPrices(Merit):
 
     def value(self, point: Point) -> float:
         """Merit at a point."""
-        return point.cost + float(self.prices @ self.outside(point.constraints))
+        return point.cost + inner(self.prices, self.outside(point.constraints))
 
     def slope(self, descent: float, lin: Linearization, linear: Array) -> float:
         """Upper bound of the merit's derivative along a step.
@@ -86,7 +87,7 @@ class RowPrices(Merit):
             linear: (M,) A times the step.
         """
         change = self.outside(lin.constraints + linear) - self.outside(lin.constraints)
-        return descent + float(self.prices @ change)
+        return descent + inner(self.prices, change)
 
     def accepts(self, trial: Point, here: float, slope: float, length: float, slack: float) -> bool:
         """Armijo's condition, not too far from the constraints: the merit may be unbounded out there."""
@@ -124,7 +125,7 @@ class OnePrice(Merit):
             step: (n,).
             linear: (M,) A times the step.
         """
-        descent = float(lin.gradient[self.program.columns.free] @ step)
+        descent = inner(lin.gradient[self.program.columns.free], step)
         gain = float(self.outside(lin.constraints).sum()) - float(self.outside(lin.constraints + linear).sum())
         if gain > 0.0:
             curved = self._curved(lin, step)
@@ -140,4 +141,4 @@ class OnePrice(Merit):
     def _curved(self, lin: Linearization, step: Array) -> float:
         """Curvature of the cost along a step, which may be too long for the range of numbers."""
         with np.errstate(over="ignore", invalid="ignore"):
-            return float(step @ self.program.hessian.times(self.program.hessian_entries(lin), step))
+            return inner(step, self.program.hessian.times(self.program.hessian_entries(lin), step))

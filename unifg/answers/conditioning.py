@@ -13,6 +13,7 @@ import numpy as np
 
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.plan import PIVOTS, ROWS
+from unifg.machine.inner import inner
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.typing import Array
@@ -84,7 +85,7 @@ def _inverse_norm(factorization: Factorization, size: int) -> float:
         estimate = norm
         slope = factorization.solve(np.where(solved < 0.0, -1.0, 1.0))
         place = int(np.abs(slope).argmax())
-        if abs(slope[place]) <= float(slope @ vector):
+        if abs(slope[place]) <= inner(slope, vector):
             break
         vector = np.zeros(size)
         vector[place] = 1.0

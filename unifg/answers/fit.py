@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unifg.answers.history import FactorNorms
+from unifg.machine.inner import inner
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 
@@ -92,4 +93,4 @@ def fit_of(program: Program, lin: Linearization, norms: FactorNorms) -> Fit | No
     if rows <= program.size:
         return None
     candidates.sort(key=lambda named: -named[2])
-    return Fit(float(lin.residual @ lin.residual), rows - program.size, tuple(candidates[:WORST]))
+    return Fit(inner(lin.residual, lin.residual), rows - program.size, tuple(candidates[:WORST]))

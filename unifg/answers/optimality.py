@@ -36,6 +36,7 @@ import numpy as np
 from unifg.answers.relative_offset import Factored, relative_offset
 from unifg.answers.violation import ViolationModel
 from unifg.kernels.steps import EPSILON, FIRST, step_for
+from unifg.machine.inner import inner
 from unifg.machine.jit import compiled
 from unifg.program import passes
 from unifg.program.linearization import Linearization
@@ -124,7 +125,7 @@ def optimality(
 def _relative_rounding(program: Program, lin: Linearization, multipliers: Array) -> float:
     """By how much differences may be wrong about a relative offset."""
     rounding = gradient_rounding(program, lin, multipliers)
-    size = float(np.linalg.norm(lin.residual))
+    size = math.sqrt(inner(lin.residual, lin.residual))
     if not len(rounding) or size == 0.0:
         return 0.0
     curvature = np.sqrt(lin.hessian[program.normal.diagonal])

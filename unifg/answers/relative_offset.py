@@ -30,6 +30,7 @@ import numpy as np
 
 from unifg.elimination.factorization import Factorization
 from unifg.kernels.steps import ANGLE, TURN
+from unifg.machine.inner import inner
 from unifg.machine.jit import compiled
 from unifg.program.curvature import lagrangian_hessian
 from unifg.program.linearization import Linearization
@@ -172,12 +173,12 @@ def _energy(
     if lent is not None:
         lent.damping = 0.0
     if solver.factor(lin.hessian) and _sound(solver, diagonal, program.size):
-        return float(gradient @ solver.solve(gradient)), True
+        return inner(gradient, solver.solve(gradient)), True
     idle = _idle(program, diagonal)
     if idle.any():  # what no active factor touches is not asked for
         added = np.where(idle, 1.0, 0.0)
         if solver.factor(lin.hessian, added) and _sound(solver, diagonal + added, program.size):
-            return float(gradient @ solver.solve(gradient)), True
+            return inner(gradient, solver.solve(gradient)), True
     largest = diagonal.max(initial=0.0)
     if largest == 0.0:
         return 0.0, False
@@ -185,7 +186,7 @@ def _energy(
         return np.inf, False
     energy, _ = _climb(program, lin.hessian, gradient, solver, limit)
     bent = _bent(program, lin, own)
-    return (energy, False) if bent is None else (float(gradient @ bent.solve(gradient)), True)
+    return (energy, False) if bent is None else (inner(gradient, bent.solve(gradient)), True)
 
 
 def _bent(program: Program, lin: Linearization, solver: Factorization) -> Factorization | None:
@@ -206,8 +207,8 @@ def _regular(program: Program, hessian: Array, diagonal: Array, lent: Factored) 
     vector = np.random.default_rng(1).choice([-1.0, 1.0], program.size) / np.sqrt(diagonal)
     for _ in range(2):
         vector = lent.solver.solve(diagonal * vector)
-        vector /= math.sqrt(float(diagonal @ np.square(vector)))
-    return float(vector @ program.normal.times(hessian, vector)) > DAMPED * lent.damping
+        vector /= math.sqrt(inner(diagonal, np.square(vector)))
+    return inner(vector, program.normal.times(hessian, vector)) > DAMPED * lent.damping
 
 
 def _climb(
@@ -216,13 +217,13 @@ def _climb(
     """Energy of conjugate gradients on H x = g, preconditioned by a factor; and whether nothing is missing from it."""
     energy, rest = 0.0, gradient.copy()
     z = solver.solve(rest)
-    product = float(rest @ z)
+    product = inner(rest, z)
     direction = z
     for _ in range(STEPS):
         if not product > 0.0:
             return energy, product == 0.0
         curved = program.normal.times(hessian, direction)
-        curvature = float(direction @ curved)
+        curvature = inner(direction, curved)
         if not curvature > 0.0:
             return energy, False
         length = product / curvature
@@ -231,7 +232,7 @@ def _climb(
             return energy, False
         rest -= length * curved
         z = solver.solve(rest)
-        before, product = product, float(rest @ z)
+        before, product = product, inner(rest, z)
         if product <= SAME * energy:
             return energy + max(product, 0.0), True
         direction = z + product / before * direction

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -23,6 +24,7 @@ from unifg.answers.status import Status
 from unifg.errors import BackendError, GraphError
 from unifg.language.statement import Statement
 from unifg.language.variables import Data
+from unifg.machine.inner import inner
 from unifg.program.by_term import ByTerm
 from unifg.program.columns import Values
 from unifg.program.linearization import Linearization, all_finite
@@ -317,7 +319,7 @@ class SolveState:
             reached = None if step is None else program.linearize(program.retract(self.values, step))
             if step is None or reached is None or not reached.finite:
                 return
-            self.accept(reached, self.multipliers, float(np.linalg.norm(step)), 1.0, search=1)
+            self.accept(reached, self.multipliers, math.sqrt(inner(step, step)), 1.0, search=1)
 
     def keep_with(self, error: Exception) -> None:
         """Hand what has been reached along with an error, as its attribute ``reached``, and say so in a note."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.elimination.factorization import Factorization
+from unifg.machine.inner import inner
 from unifg.program.curvature import constraint_curvature
 from unifg.program.linearization import Linearization
 from unifg.program.passes import add_constraints
@@ -34,7 +35,7 @@ class ViolationModel:
         """Differentiate at ``lin``."""
         outside, normal = program.violation(lin.constraints), program.normal
         self._program = program
-        self.value = 0.5 * float(outside @ outside)
+        self.value = 0.5 * inner(outside, outside)
         self.gradient, held = descent(program, lin)
         self.entries = constraint_curvature(program, lin, outside)
         counted = (outside != 0.0) | program.equality
@@ -83,7 +84,7 @@ class ViolationModel:
         with self._program.systems.borrowed() as solver:
             while damping <= LARGEST_DAMPING:
                 if _definite(solver, self.damped(damping, self.size)):
-                    return 0.5 * float(self.gradient @ solver.solve(self.gradient)) <= enough
+                    return 0.5 * inner(self.gradient, solver.solve(self.gradient)) <= enough
                 damping *= GROWTH
         return False
 
