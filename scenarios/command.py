@@ -330,6 +330,9 @@ def _run_settings(
             files = [*outcome.write(folder), *([note(folder)] if note else [])]
         except OSError as error:
             return _refuse(f"--out {folder}: cannot write the results ({error})")
+        except KeyboardInterrupt:
+            print(f"unifg: interrupted while {folder} was written; each file there is whole", file=sys.stderr)
+            return INTERRUPTED
     print(outcome.summary)
     print()
     for file in files:

@@ -268,6 +268,34 @@ def test_an_end_asked_for_at_any_moment_loses_nothing(
     assert signal.getsignal(signal.SIGTERM) is before
 
 
+@pytest.mark.skipif(os.name == "nt", reason="signals work otherwise on Windows")
+def test_a_user_who_does_not_wait_for_the_results_is_told_what_there_is(
+    navigation: FakeNavigation, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second signal while results are written ends it there; what had been written stays."""
+    written = drives.write_metrics
+
+    def impatient(*arguments: object) -> Path:
+        done: Path = written(*arguments)  # type: ignore[arg-type]
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGTERM)
+        return done
+
+    monkeypatch.setattr(drives, "write_metrics", impatient)
+    monkeypatch.setattr(
+        navigation_scenario, "run_navigation", lambda settings, progress: told(navigation.log, progress)
+    )
+    assert run(tmp_path) == 130
+    assert f"interrupted while {tmp_path / 'out'} was written" in capsys.readouterr().err
+    assert [file.name for file in (tmp_path / "out").iterdir()] == ["metrics.json"]
+
+
+def told(log: EpisodeLog, progress: Progress) -> EpisodeLog:
+    """An episode that says that it is done."""
+    progress(1.0, "there")
+    return log
+
+
 @pytest.mark.parametrize(
     ("words", "absent"),
     [
