@@ -9,6 +9,7 @@ cores have other work.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import partial
 
@@ -42,7 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def several(solve: partial[object]) -> None:
+def several(solve: Callable[[], object]) -> None:
     """Solve a few times."""
     for _ in range(SOLVES):
         solve()

@@ -25,6 +25,7 @@ from unifg.scenarios import navigation as navigation_scenario
 from unifg.scenarios.commands import drives
 from unifg.scenarios.episode import run_ticks
 from unifg.scenarios.log.drive_log import EpisodeLog
+from unifg.scenarios.log.metrics import write_metrics
 from unifg.scenarios.navigation import NavigationSettings
 from unifg.scenarios.options import add_options, option, pose, positive, settings_of
 
@@ -273,10 +274,10 @@ def test_a_user_who_does_not_wait_for_the_results_is_told_what_there_is(
     navigation: FakeNavigation, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A second signal while results are written ends it there; what had been written stays."""
-    written = drives.write_metrics
+    written = write_metrics
 
-    def impatient(*arguments: object) -> Path:
-        done: Path = written(*arguments)  # type: ignore[arg-type]
+    def impatient(path: Path, numbers: dict[str, object]) -> Path:
+        done = written(path, numbers)
         for _ in range(2):
             os.kill(os.getpid(), signal.SIGTERM)
         return done
