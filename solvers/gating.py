@@ -18,7 +18,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri, fdtri
 
 from unifg.elimination.factorization import Factorization
 from unifg.program.linearization import Linearization
@@ -51,6 +50,8 @@ class Scatter:
         """
         if self.freedom < 1.0 or self.squared <= 0.0:
             return 1.0
+        from scipy.special import chdtri  # slow to load
+
         return min(1.0, self.squared / float(chdtri(self.freedom, 1.0 - CHANCE)))
 
     def contradicts(self, innovation: Array, size: int, count: int) -> BoolArray:
@@ -65,6 +66,8 @@ class Scatter:
         if rest < 1.0:
             return np.zeros(len(innovation), dtype=np.bool_)
         without = np.maximum(self.squared - innovation, np.finfo(np.float64).eps * self.squared) / rest
+        from scipy.special import fdtri
+
         limit = float(fdtri(size, rest, 1.0 - CHANCE / max(count, 1)))
         return innovation > size * limit * without
 
@@ -72,6 +75,8 @@ class Scatter:
         """Normalised squared innovation up to which a measurement left out agrees with those that count."""
         if self.freedom < 1.0:
             return np.inf
+        from scipy.special import fdtri
+
         return size * float(fdtri(size, self.freedom, 1.0 - CHANCE / max(count, 1))) * self.squared / self.freedom
 
 

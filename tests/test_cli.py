@@ -302,7 +302,18 @@ def told(log: EpisodeLog, progress: Progress) -> EpisodeLog:
     [
         (["--help"], ("pymunk", "meshcat", "matplotlib", "unifg.scenarios.navigation", "unifg.solvers")),
         (["run", "--help"], ("pymunk", "meshcat", "matplotlib", "unifg.scenarios.navigation", "unifg.solvers")),
-        (["solve", "--help"], ("pymunk", "meshcat", "matplotlib", "unifg.scenarios.navigation")),
+        (
+            ["solve", "--help"],
+            (
+                "pymunk",
+                "meshcat",
+                "matplotlib",
+                "scipy.special",
+                "scipy.ndimage",
+                "qpsolvers",
+                "unifg.scenarios.navigation",
+            ),
+        ),
         (["run", "navigation", "--help"], ("meshcat", "matplotlib", "unifg.scenarios.flight")),
     ],
 )

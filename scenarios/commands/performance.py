@@ -11,13 +11,11 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -27,6 +25,7 @@ import unifg as fg
 from unifg.errors import ScenarioError
 from unifg.models import obstacles, unicycle
 from unifg.pose_graphs import manhattan
+from unifg.scenarios.commands.host import machine
 from unifg.scenarios.commands.outcome import Progress
 from unifg.solvers.names import TABLE, backend
 from unifg.typing import Array
@@ -76,20 +75,6 @@ class Record:
         """As a file keeps it."""
         rounded = {name: [round(value, 4) for value in row] for name, row in self.ratios.items()}
         return json.dumps(asdict(self) | {"ratios": rounded})
-
-
-def machine() -> str:
-    """What has to be the same for two ratios to be compared."""
-    name = platform.processor() or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        name = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        pass  # systems that tell otherwise, or nothing
-    python = (
-        f"{platform.python_implementation()} {platform.python_version_tuple()[0]}.{platform.python_version_tuple()[1]}"
-    )
-    return f"{platform.system()}, {name}, {python}, numpy {np.__version__}, numba {metadata.version('numba')}"
 
 
 def reference() -> float:

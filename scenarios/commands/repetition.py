@@ -19,7 +19,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from unifg.errors import ScenarioError
-from unifg.scenarios.commands.performance import machine
+from unifg.scenarios.commands.host import machine
 from unifg.typing import Array
 from unifg.whole import write_whole
 

@@ -6,7 +6,6 @@ import warnings
 from typing import Any
 
 import numpy as np
-import qpsolvers
 import scipy.sparse as sp
 
 from unifg.errors import BackendError
@@ -35,6 +34,8 @@ class QpsolversRoute:
         Raises:
             BackendError: naming the installed ones.
         """
+        import qpsolvers  # and with it every solver it knows: not for those who ask for none of them
+
         if name not in qpsolvers.available_solvers:
             known = ", ".join(sorted(qpsolvers.available_solvers)) or "none"
             raise BackendError(
@@ -74,6 +75,8 @@ class QpsolversRoute:
             hessian = hessian.toarray()
             inequalities = None if inequalities is None else inequalities.toarray()
             equalities = None if equalities is None else equalities.toarray()
+        import qpsolvers
+
         problem = qpsolvers.Problem(
             hessian, gradient, inequalities, limits, equalities, lower[fixed] if len(fixed) else None
         )

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.special import erf
 
 from unifg.errors import ModelError
 from unifg.kernels.residuals import Residual, residual
@@ -82,6 +81,8 @@ def from_casadi(function: Any) -> Residual:
             lines.append(f"        w{given[0]} = {written[op].format(*(f'w{i}' for i in taken))}")
         else:
             raise ModelError(f"the CasADi function '{name}' contains the instruction {op}, which is not known here")
+    from scipy.special import erf  # not before a function is written: it takes a tenth of a second to load
+
     known: dict[str, Any] = {"np": np, "erf": erf, "rows_of": rows_of, "__name__": __name__}
     exec(compile("\n".join([*lines, "    return r"]), f"<CasADi function {name}>", "exec"), known)
     return residual(known[name], name=name)

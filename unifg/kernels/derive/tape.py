@@ -10,18 +10,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Container, Iterable, Sequence
+from typing import Any
 
 import numpy as np
-from scipy.special import erf
 
 from unifg.kernels.derive.operations import UNARY, Op
-from unifg.typing import Array
+from unifg.typing import Array, ArrayLike
 
-NUMPY = {
+
+def _erf(x: ArrayLike) -> Array:
+    """SciPy's error function; its module takes a tenth of a second to load, and few need it."""
+    from scipy.special import erf
+
+    found: Array = erf(x)
+    return found
+
+
+NUMPY: dict[Op, Callable[..., Any]] = {
     Op.NEGATE: np.negative, Op.ADD: np.add, Op.SUBTRACT: np.subtract, Op.MULTIPLY: np.multiply, Op.DIVIDE: np.divide,
     Op.SQRT: np.sqrt, Op.SIN: np.sin, Op.COS: np.cos, Op.TAN: np.tan, Op.ARCSIN: np.arcsin, Op.ARCCOS: np.arccos,
     Op.ARCTAN: np.arctan, Op.ARCTAN2: np.arctan2, Op.SINH: np.sinh, Op.COSH: np.cosh, Op.TANH: np.tanh,
-    Op.ARCSINH: np.arcsinh, Op.ARCCOSH: np.arccosh, Op.ARCTANH: np.arctanh, Op.ERF: erf,
+    Op.ARCSINH: np.arcsinh, Op.ARCCOSH: np.arccosh, Op.ARCTANH: np.arctanh, Op.ERF: _erf,
     Op.EXP: np.exp, Op.EXPM1: np.expm1, Op.LOG: np.log, Op.LOG1P: np.log1p, Op.POWER: np.power, Op.FMOD: np.fmod,
     Op.ABSOLUTE: np.absolute, Op.SIGN: np.sign, Op.FLOOR: np.floor, Op.RINT: np.rint, Op.MINIMUM: np.minimum,
     Op.MAXIMUM: np.maximum, Op.LESS: np.less, Op.LESS_EQUAL: np.less_equal, Op.EQUAL: np.equal,
