@@ -10,7 +10,8 @@
 #   make bench    measure everything again and rewrite the tables in docs/ (long)
 #   make results PAGE=control-cases    measure one page of docs/ again; without PAGE, list them
 #   make stale    name the pages of docs/ whose tables were measured on other sources
-#   make release-check    build sdist and wheel twice, compare and try them; fail for stale pages and kernels, too
+#   make release-build    build sdist and wheel twice, compare, try the wheel with every Python here (some minutes each)
+#   make release-check    the same, and fail for stale pages and kernels; with -k, go on to the end
 #   make kernels  compile everything anew into unifg/machine/kernels.zip, which spares a first use most of it (minutes)
 #   make mutants  change decisions one at a time and see whether a test notices (hours; FILES='scenarios/driving/drive_past.py')
 #   make examples run all scripts of examples/ and draw the pictures of docs/examples.md again
@@ -21,7 +22,7 @@
 #   make clean    remove everything made here
 #
 # Choose the interpreter with PYTHON=/path/to/python3, the number of test processes with WORKERS=4, and what pytest
-# gets besides with PYTEST='-k planner'.
+# gets besides with PYTEST='-k planner'; what release-build tries with RELEASE='--python 3.12 --newest'.
 
 # The first of these that is new enough; python3 when none is, so that the message below names its version.
 PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 python; do \
@@ -34,7 +35,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Matrices here are small: more threads per process only make the processes wait for each other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: docs kernels performance notebooks help demo test fuzz test-lowest processes lint types bench results stale release-check mutants fences clean offsets examples
+.PHONY: docs kernels performance notebooks help demo test fuzz test-lowest processes lint types bench results stale release-build release-pages release-kernels release-check mutants fences clean offsets examples
 .DELETE_ON_ERROR:
 
 help:
@@ -78,10 +79,16 @@ results: $(VENV)/ready-bench
 stale: $(VENV)/ready
 	@$(BIN)/python -m benchmarks.pages stale
 
-release-check: $(VENV)/ready
-	$(BIN)/python docs/check_release.py
+release-build: $(VENV)/ready
+	$(BIN)/python docs/check_release.py $(RELEASE)
+
+release-pages: $(VENV)/ready
 	@$(BIN)/python -m benchmarks.pages stale --strict
+
+release-kernels: $(VENV)/ready
 	@$(BIN)/unifg warmup --check
+
+release-check: release-build release-pages release-kernels
 
 kernels: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/unifg warmup --ship
