@@ -135,7 +135,9 @@ def test_the_compiled_loop_takes_the_steps_of_python(hessian: Hessian) -> None:
     for one, other in zip(mine, others, strict=True):
         assert one.converged, one.report()
         assert one.iterations == other.iterations > 3
-        np.testing.assert_allclose(course(one), course(other), rtol=1e-5)
+        # Against the course, not each cost: one passes by zero (-0.10 on the way from 34 to -5), where what differenced
+        # curvature rounds off, with NumPy 1.26 six times what it does with 2.4, is 2.6e-6.
+        np.testing.assert_allclose(course(one), course(other), rtol=0, atol=2e-7 * np.ptp(course(one)))
     for alone, watched in zip(mine[::2], mine[1::2], strict=True):
         np.testing.assert_allclose(course(alone), course(watched), rtol=1e-12)
         assert alone.history[-1].terms == pytest.approx(watched.history[-1].terms, rel=1e-6)
