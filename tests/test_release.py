@@ -1,10 +1,12 @@
-"""An sdist is the same whoever packs it, and when; what it may weigh is stated."""
+"""An sdist is the same whoever packs it, and when; what it may weigh is stated; what was not tried is said."""
 
 from __future__ import annotations
 
 import importlib.util
 import io
+import sys
 import tarfile
+from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -53,3 +55,70 @@ def test_sizes_are_stated(release: ModuleType) -> None:
     assert 1.0 < release.allowed("wheel") < release.allowed("sdist")
     with pytest.raises(SystemExit, match="does not say"):
         release.allowed("disc")
+
+
+def test_sizes_are_kept(release: ModuleType) -> None:
+    allowed = {
+        "unifg-1.whl": int(1e6 * release.allowed("wheel")),
+        "unifg-1.tar.gz": int(1e6 * release.allowed("sdist")),
+    }
+    assert list(release.too_large(allowed)) == []
+    (said,) = release.too_large(allowed | {"unifg-1.whl": allowed["unifg-1.whl"] + 1})
+    assert said.startswith("unifg-1.whl has")
+    (said,) = release.too_large(allowed | {"unifg-1.tar.gz": allowed["unifg-1.tar.gz"] + 1})
+    assert said.startswith("unifg-1.tar.gz has")
+
+
+def test_a_python_has_to_start_and_be_of_the_version(release: ModuleType, tmp_path: Path) -> None:
+    """Shims of version managers are on the path and start nothing; the path may name another version."""
+    shim = tmp_path / "python"
+    shim.write_text("#!/bin/sh\necho not installed >&2\nexit 127\n")
+    shim.chmod(0o755)
+    mine = f"{sys.version_info.major}.{sys.version_info.minor}"
+    assert release.interpreter(mine, [str(tmp_path / "none"), str(shim), sys.executable]) == sys.executable
+    assert release.interpreter("3.1", [sys.executable]) is None
+    assert mine in release.named() or sys.version_info > (3, 13)
+
+
+@pytest.mark.parametrize(
+    ("ends", "lowest", "code"),
+    [
+        ({}, True, 0),
+        ({"3.12-lowest": "no wheels"}, True, 0),
+        ({"3.12-newest": "no wheels"}, True, 1),
+        ({"3.11-lowest": "red"}, True, 1),
+        ({"3.11-lowest": "red"}, False, 0),
+    ],
+)
+def test_what_fails_and_what_is_not_there(
+    release: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    ends: dict[str, str],
+    lowest: bool,
+    code: int,
+) -> None:
+    """Only the lowest packages may be without wheels; everything that was not tried is said."""
+    words = {"no wheels": "ERROR: No matching distribution found for numpy==1.26", "red": "1 failed"}
+
+    def trial(_wheel: Path, _sdist: Path, _python: str, home: Path, _lowest: bool) -> str:
+        home.mkdir()
+        if home.name in ends:
+            raise release.Failed(words[ends[home.name]])
+        return "fine"
+
+    monkeypatch.setattr(release, "trial", trial)
+    monkeypatch.setattr(release, "interpreter", lambda minor, among: None if minor == "3.13" else "python")
+    assert release.installed(tmp_path, tmp_path, tmp_path, ["3.11", "3.12", "3.13"], lowest) == code
+    said = capsys.readouterr().out
+    assert "Python 3.13: NOT TRIED" in said
+    assert ("3.12 with the lowest packages: NOT TRIED" in said) == ("3.12-lowest" in ends)
+    assert ("failed: " in said) == (code == 1)
+
+
+def test_a_wheel_that_was_tried_nowhere_is_not_passed(
+    release: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(release, "interpreter", lambda minor, among: None)
+    assert release.installed(tmp_path, tmp_path, tmp_path, ["3.11"], lowest=True) == 1
