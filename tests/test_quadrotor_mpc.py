@@ -213,12 +213,12 @@ def test_a_failing_tick_does_not_end_the_flight() -> None:
     flight = Flight(short(0.5))
     tick, count = flight.pilot.tick, 0
 
-    def fail(reading: Reading, control: Array | None) -> object:
+    def fail(reading: Reading, control: Array | None, push: Array) -> object:
         nonlocal count
         count += 1
         if count == 5:
             raise ValueError("not today")
-        return tick(reading, control)
+        return tick(reading, control, push)
 
     flight.pilot.tick = fail  # type: ignore[assignment,method-assign]
     log = flight.run(silent)
@@ -229,7 +229,7 @@ def test_a_failing_tick_does_not_end_the_flight() -> None:
 
 
 def test_collisions_are_counted_and_many_end_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
-    def drop(reading: Reading, control: Array | None) -> object:
+    def drop(reading: Reading, control: Array | None, push: Array) -> object:
         raise ArithmeticError("engines off")
 
     def fall(*given: object) -> Array:
@@ -252,8 +252,8 @@ def test_arrival_needs_belief_and_truth(monkeypatch: pytest.MonkeyPatch) -> None
     there = np.concatenate([flight.world.layout.target, [1.0, 0.0, 0.0, 0.0], np.zeros(3)])
     tick = flight.pilot.tick
 
-    def dream(reading: Reading, control: Array | None) -> object:
-        plan = tick(reading, control)
+    def dream(reading: Reading, control: Array | None, push: Array) -> object:
+        plan = tick(reading, control, push)
         flight.pilot.belief = replace(flight.pilot.belief, state=there)
         return plan
 

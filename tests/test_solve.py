@@ -152,7 +152,7 @@ def test_bad_files_are_messages(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "nowhere.g2o: no such file" in capsys.readouterr().err
     for text, message in (
         ("VERTEX_SE2 0 0 0 0\n", "there is no edge"),
-        ("VERTEX_SE2 0 0\n", "line 1: VERTEX_SE2 has 2"),
+        ("VERTEX_SE2 0 0\n", "line 1: VERTEX_SE2: 2 fields, expected 4"),
     ):
         (tmp_path / "bad.g2o").write_text(text)
         assert command.main(["solve", str(tmp_path / "bad.g2o"), "--out", str(tmp_path)]) == 2

@@ -33,7 +33,7 @@ def decimal(word: str) -> float:
         ValueError: the word is no number.
     """
     if not word.isascii() or "_" in word:
-        raise ValueError(f"{reprlib.repr(word)} is no number")
+        raise FileFormatError(f"{reprlib.repr(word)} is no number")
     return float(word)
 
 
