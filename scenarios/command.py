@@ -356,9 +356,10 @@ def _progress_bar(name: str, begun: bool = False) -> Iterator[Progress]:
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         nonlocal wanted
-        if wanted or not begun:  # it does not come to an end, or has nothing to keep: stop at once
+        at_once = wanted or not begun  # it does not come to an end, or has nothing to keep
+        wanted = True  # also where a finaliser swallows the exception: the first tick is then the last
+        if at_once:
             raise KeyboardInterrupt
-        wanted = True
 
     with _bar(name) as show:
 

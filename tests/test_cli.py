@@ -1,6 +1,7 @@
 """The command line: arguments, exit status, files, without driving a real episode."""
 
 import argparse
+import contextlib
 import json
 import os
 import re
@@ -267,6 +268,29 @@ def test_an_end_asked_for_at_any_moment_loses_nothing(
     assert len(ticks) == (0 if when == "before" else 5)
     assert (tmp_path / "out" / "scene.html").exists() is (when != "before")
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals work otherwise on Windows")
+def test_an_end_that_a_finaliser_swallows_is_not_forgotten(
+    navigation: FakeNavigation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python prints and drops what is raised in finalisers, also the interrupt; the first tick is then the last."""
+    ticks: list[int] = []
+
+    def loop(settings: NavigationSettings, progress: Progress) -> EpisodeLog:
+        with contextlib.suppress(KeyboardInterrupt):  # as a finaliser does
+            os.kill(os.getpid(), signal.SIGTERM)
+
+        def tick(number: int) -> tuple[float, str] | None:
+            ticks.append(number)
+            return None if number == 4 else (number / 5, "driving")
+
+        return replace(navigation.log, interrupted=run_ticks(10, tick, progress))
+
+    monkeypatch.setattr(navigation_scenario, "run_navigation", loop)
+    assert run(tmp_path) == 130
+    assert ticks == [0]
+    assert (tmp_path / "out" / "scene.html").exists()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals work otherwise on Windows")
