@@ -372,3 +372,11 @@ def test_the_headline_says_once_and_shortly_why_goals_were_missed(monkeypatch: p
         outcomes=["lost: no beam came back"] * 2, solver="ipm", coupling="sequential", seed=0,
     )  # fmt: skip
     assert "no collision, lost  |" in drive_plot._title(log)
+
+
+def test_times_begin_where_ticks_do() -> None:
+    """A first tick of microseconds does not leave decades of the picture empty."""
+    log = episode(ticks=200)
+    log.solve_ms[0] = log.localise_ms[0] = 1e-3
+    ax = plot_times(log, log.solve_ms, {"localise": (log.localise_ms, "estimate")})
+    assert 0.3 < ax.get_ylim()[0] < 1.0 < log.localise_ms[1]

@@ -117,6 +117,9 @@ def plot_times(log: Timed, total: Array, parts: Mapping[str, tuple[Array, str]],
     p50, p99 = np.percentile(total, [50.0, 99.0])
     dashes(ax, (p50, p99), 0.9)
     ax.set_yscale("log")
+    spent = np.concatenate([values[values > 0.0] for values in (total, *(values for values, _ in parts.values()))])
+    if len(spent):  # a first tick, which has nothing to do yet, would leave decades empty
+        ax.set_ylim(bottom=0.5 * float(np.percentile(spent, 1.0)))
     ax.legend(loc="upper right", ncols=4, markerscale=3, borderpad=0.0)
     return over_time(log, ax, f"Time per tick: median {p50:.1f} ms, 99 % within {p99:.0f} ms", "time [ms]")
 
