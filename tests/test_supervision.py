@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from unifg.errors import ScenarioError
 from unifg.models import quadrotor
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.driving.drive_signals import RAMPS, DriveSignals
@@ -259,6 +260,17 @@ def test_motors_that_follow_late_are_named_and_wheels_of_the_wrong_size_are_not(
     for _ in range(3):
         steady.note(np.array([0.0, 0.0]), None)
     assert steady.seconds == 0.0, "wheels that say nothing accuse nobody"
+
+
+def test_numbers_that_no_motor_has_are_refused_and_ticks_without_any_say_nothing() -> None:
+    for dt, most in ((np.nan, MOST), (0.0, MOST), (DT, [np.nan, 0.1]), (DT, [0.1]), (DT, [-0.1, 0.1])):
+        with pytest.raises(ScenarioError, match="must"):
+            MotorLag(dt, np.array(most))
+    start = np.column_stack([np.minimum(1.0, 0.25 * np.arange(1, 13)), np.zeros(12)])
+    motors = following(0.3, start)
+    named = motors.seconds
+    motors.note(np.array([np.nan, 0.0]), np.zeros(2))
+    assert motors.seconds == named > 0.0
 
 
 # ----------------------------------------------------------------- the last stop

@@ -13,6 +13,7 @@ import math
 
 import numpy as np
 
+from unifg.errors import ScenarioError
 from unifg.typing import Array
 
 __all__ = ["MotorLag"]
@@ -35,7 +36,14 @@ class MotorLag:
         Args:
             dt: duration of a tick [s].
             most: (2,) greatest changes of v and omega in a tick by the data sheet [m/s, rad/s].
+
+        Raises:
+            ScenarioError: a number that no base can have.
         """
+        if not (math.isfinite(dt) and dt > 0.0):
+            raise ScenarioError(f"a tick must last a finite, positive time, got {dt!r} s")
+        if np.shape(most) != (2,) or not (np.isfinite(most).all() and np.min(most) >= 0.0):
+            raise ScenarioError(f"greatest changes of v and omega must be two finite numbers >= 0, got {most!r}")
         self._dt, self._most = dt, most
         self._follow = np.array([1.0 if lag == 0.0 else -math.expm1(-dt / lag) for lag in LAGS])[:, None]
         self._velocities = np.zeros((len(LAGS), 2))
@@ -56,9 +64,11 @@ class MotorLag:
         """Take in a tick.
 
         Args:
-            asked: (2,) velocities asked for [m/s, rad/s].
+            asked: (2,) velocities asked for [m/s, rad/s]; a tick in which they are not finite says nothing.
             done: (2,) mean velocities that the wheels have measured; None where they have not.
         """
+        if not np.isfinite(asked).all():
+            return
         expected = self._advance(asked)
         self._evidence *= math.exp(-self._dt / MEMORY)
         if done is None:
