@@ -20,6 +20,7 @@ import numpy as np
 from unifg.files.ros_map import OccupancyMap
 from unifg.scenarios.log.columns import columns
 from unifg.scenarios.log.drive_log import EpisodeLog
+from unifg.scenarios.log.metrics import strict
 from unifg.typing import Array
 from unifg.whole import beside
 
@@ -104,22 +105,13 @@ def _messages(log: EpisodeLog) -> Iterator[tuple[float, Message]]:
         true = [*_cylinders(log.obstacles[k]), *_cubes(log.boxes[k])]
         yield moment, ("/obstacles", _scene("true", true, moment))
         yield moment, ("/tracked", _scene("tracked", _cylinders(log.detected[k]), moment))
-        yield moment, ("/tick", {name: _jsonable(getattr(log, name)[k]) for name in _plain(log)})
+        yield moment, ("/tick", {name: strict(np.asarray(getattr(log, name)[k]).tolist()) for name in _plain(log)})
 
 
 def _plain(log: EpisodeLog) -> list[str]:
     """Columns that no other topic shows."""
     drawn = {"route", "horizon", "scan", "obstacles", "boxes", "detected"}
     return [name for name in columns(log) if name not in drawn]
-
-
-def _jsonable(value: Any) -> Any:
-    """The value with null for what is not finite."""
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, list):
-        return [_jsonable(entry) for entry in value]
-    return value if not isinstance(value, float) or math.isfinite(value) else None
 
 
 def _grid(occupancy: OccupancyMap, moment: float) -> dict[str, Any]:

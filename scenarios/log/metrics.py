@@ -25,6 +25,7 @@ __all__ = [
     "iterations",
     "spread",
     "statistics",
+    "strict",
     "table",
     "timing",
     "without_timings",
@@ -82,17 +83,17 @@ def write_metrics(path: str | Path, metrics: Mapping[str, object], *, sort_keys:
         The path written.
     """
     path = Path(path)
-    text = json.dumps(_strict(metrics), indent=2, sort_keys=sort_keys, allow_nan=False)
+    text = json.dumps(strict(metrics), indent=2, sort_keys=sort_keys, allow_nan=False)
     write_whole(path, text + "\n")
     return path
 
 
-def _strict(value: object) -> object:
+def strict(value: object) -> object:
     """The same value for a strict JSON reader, which knows neither NaN nor infinity."""
     if isinstance(value, Mapping):
-        return {str(key): _strict(item) for key, item in value.items()}
+        return {str(key): strict(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_strict(item) for item in value]
+        return [strict(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
