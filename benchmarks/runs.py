@@ -21,7 +21,7 @@ from unifg.errors import UnifgError
 from unifg.scenarios.campaigns.comparison import Key, Row
 from unifg.scenarios.campaigns.dispatch import finished
 from unifg.scenarios.campaigns.journal import Journal, lines_of
-from unifg.scenarios.campaigns.workers import Inline, Workers
+from unifg.scenarios.workers import Inline, Workers
 
 
 class Job(Protocol):

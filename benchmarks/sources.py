@@ -22,7 +22,7 @@ SOURCES = Sources(
     },
     apart=(
         "benchmarks.pages", "benchmarks.report", "benchmarks.sources", "unifg.warming", "unifg.solvers.choice",
-        "unifg.scenarios.campaigns.journal", "unifg.scenarios.campaigns.workers",
+        "unifg.scenarios.campaigns.journal", "unifg.scenarios.workers",
         "unifg.scenarios.campaigns.dispatch", "unifg.scenarios.campaigns.sources",
     ),
     bare=CHECKOUT / "tests",

@@ -6,7 +6,9 @@ controls; how they meet is the coupling.
 
 from __future__ import annotations
 
+import contextlib
 import logging
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -25,6 +27,7 @@ from unifg.scenarios.flying.flight_watch import FlightWatch
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.options import count, not_negative, option, positive, share
+from unifg.scenarios.seeing.readings import Reading
 from unifg.scenarios.worlds.air import QuadrotorWorld
 from unifg.scenarios.worlds.conditions import draw_conditions
 from unifg.scenarios.worlds.disturbance import DisturbanceModel
@@ -202,18 +205,29 @@ class Flight:
         left = float(np.linalg.norm(target - world.state[:3]))
         return 1.0 - left / float(np.linalg.norm(target - start)), f"{left:.1f} m to go"
 
+    @contextlib.contextmanager
+    def _going_on(self) -> Iterator[None]:
+        """A robot in the air has to go on, whatever fails."""
+        try:
+            yield
+        except (UnifgError, ArithmeticError, ValueError) as error:
+            logger.warning("the tick at %.2f s failed, the vehicle brakes: %s", self.world.time, error)
+
     def _decide(self, recorder: Recorder[FlightLog]) -> Array:
         """Sense, estimate, plan and record; the control (4,) to be flown."""
         pilot, world, watch = self.pilot, self.world, self.watch
-        reading = watch.look(self.faults.reading(world.sense(), world.time), world.time, self._control, pilot.belief)
-        verdict, guide = watch.verdict, pilot.controller.guide
-        guide.settings = replace(self._speed, speed=max(verdict.share, SLOWEST_SHARE) * self._speed.speed)
+        reading = watch.admit(self.faults.reading(world.sense(), world.time), world.time, self._control, pilot.belief)
         plan: Plan | None = None
+        told: Reading | None = None
         with counting() as new:
-            try:
-                plan = pilot.tick(reading, self._control, watch.felt.push)
-            except (UnifgError, ArithmeticError, ValueError) as error:  # a robot in the air has to go on
-                logger.warning("the tick at %.2f s failed, the vehicle brakes: %s", world.time, error)
+            with self._going_on():
+                told = pilot.recognise(reading, self._control, watch.felt.push)
+            watch.judge(told, pilot.belief)
+            verdict, guide = watch.verdict, pilot.controller.guide
+            guide.settings = replace(self._speed, speed=max(verdict.share, SLOWEST_SHARE) * self._speed.speed)
+            if told is not None:
+                with self._going_on():
+                    plan = pilot.decide(told)
         if self.faults.hold("solver-timeout", world.time):
             plan = None
         watch.planned(plan is not None and not plan.emergency)

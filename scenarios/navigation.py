@@ -129,7 +129,11 @@ def run_navigation(settings: NavigationSettings, progress: Progress | None = Non
 
 
 class Episode:
-    """World, robot and goals of one run."""
+    """World, robot and goals of one run.
+
+    Attributes:
+        carried: (3,) pose that a fault has put the robot down at in the last tick [m, m, rad]; None without one.
+    """
 
     def __init__(self, settings: NavigationSettings, *, rehearsal: bool = False) -> None:
         """Load the map, plan the legs, place the obstacles, wake the robot, and rehearse unless this is a rehearsal."""
@@ -182,6 +186,7 @@ class Episode:
         sigma = np.array(INITIAL_SIGMA)
         believed = self.start + sigma * belief.standard_normal(3)
         self.faults = DriveFaults(settings.faults, settings.seed)
+        self.carried: Array | None = None
         self._right, self._drawn = (self.occupancy, self.distance_map), drawn
         self.pilot = self._pilot(believed, sigma)
         if not rehearsal:
@@ -266,8 +271,10 @@ class Episode:
         """Move on from the last tick, scan, decide and record; the control to be driven, None at the last goal."""
         dt, goal, now = self.settings.controller.dt, self._goal, self.world.time
         faults = self.faults
+        self.carried = None
         if faults.carries(now):
-            self.world.carry(faults.elsewhere(self._right[1], self._free_places(), self.world.pose))
+            self.carried = faults.elsewhere(self._right[1], self._free_places(), self.world.pose)
+            self.world.carry(self.carried)
         self._swap_maps(now)
         odometry = None
         if number:

@@ -28,8 +28,8 @@ from unifg.scenarios.campaigns.journal import Journal, lines_of
 from unifg.scenarios.campaigns.performed import Order, WrongLibrary, perform
 from unifg.scenarios.campaigns.sources import fingerprint
 from unifg.scenarios.campaigns.statement import Statement, read, spawned, stated
-from unifg.scenarios.campaigns.workers import Inline, WorkerDied, WorkerNotStarted, Workers
 from unifg.scenarios.episode import silent
+from unifg.scenarios.workers import Inline, WorkerDied, WorkerNotStarted, Workers
 
 WALKS = "problems.short_walks"
 TESTS = Path(__file__).resolve().parent
@@ -469,7 +469,7 @@ def test_workers_are_processes_of_one_thread_that_are_replaced(tmp_path: Path) -
 
 
 def test_workers_that_cannot_start_are_no_lost_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    from unifg.scenarios.campaigns import workers as room
+    from unifg.scenarios import workers as room
 
     starts = list[int]()
 

@@ -15,6 +15,7 @@ from unifg.files.ros_map import OccupancyMap, save_map
 from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.fleet import run_fleet
 from unifg.scenarios.navigation import NavigationSettings
+from unifg.scenarios.worlds.faults import DRIVE_FAULTS, one_of
 from unifg.scenarios.worlds.plane import LidarModel, World
 
 
@@ -70,6 +71,33 @@ def places(tmp_path: Path) -> list[NavigationSettings]:
     ends = ((1.0, 1.8, 0.0), (7.5, 2.0, 0.0)), ((8.0, 1.9, np.pi), (1.5, 1.8, np.pi))
     return [NavigationSettings(map=tmp_path / "hall.yaml", start=start, goals=(goal,), seed=k)
             for k, (start, goal) in enumerate(ends)]  # fmt: skip
+
+
+def test_any_number_of_processes_drives_the_same(places: list[NavigationSettings]) -> None:
+    """One of them is carried elsewhere on the way, which the other processes have to know."""
+    kidnapped = one_of(DRIVE_FAULTS)("kidnapped@1.5")
+    third = replace(places[0], start=(4.4, 1.0, 0.0), goals=((6.0, 1.2, 0.0),), seed=7, faults=(kidnapped,))
+    robots = [*places, third]
+    alone, shared = run_fleet(robots), run_fleet(robots, workers=2)
+    for one, other in zip(alone, shared, strict=True):
+        assert one.outcomes == other.outcomes and one.ticks == other.ticks and one.collisions == other.collisions
+        assert np.array_equal(one.true_pose, other.true_pose) and np.array_equal(one.control, other.control)
+        assert np.array_equal(one.scan, other.scan, equal_nan=True)
+    step = np.abs(np.diff(alone[2].true_pose[:, :2], axis=0)).max()
+    assert step > 2.0, "it was carried"
+
+
+def test_what_goes_wrong_in_a_process_is_said_here(places: list[NavigationSettings]) -> None:
+    with pytest.raises(ScenarioError, match="at least one worker, got 0"):
+        run_fleet(places, workers=0)
+    with pytest.raises(ScenarioError, match=r"robot 1 cannot start at .*another one stands there"):
+        run_fleet([places[0], replace(places[0], seed=3)], workers=2)
+
+    def stop(done: float, words: str) -> None:
+        raise KeyboardInterrupt
+
+    logs = run_fleet(places, stop, workers=2)
+    assert [log.interrupted for log in logs] == [True, True] and min(log.ticks for log in logs) >= 1
 
 
 def test_two_robots_get_past_each_other(places: list[NavigationSettings]) -> None:

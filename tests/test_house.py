@@ -39,7 +39,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 # Inside scenarios/, where "" are the files that lie in no room: one per scenario.
 STOREYS: tuple[tuple[str, ...], ...] = (
-    ("options", "stopwatch", "ways"),
+    ("options", "stopwatch", "ways", "workers"),
     ("seeing",),
     ("supervision", "worlds"),
     ("driving", "flying", "safety"),

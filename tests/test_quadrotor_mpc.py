@@ -209,18 +209,19 @@ def test_an_interrupt_keeps_what_was_flown() -> None:
     assert (log.ticks, log.interrupted, log.succeeded) == (4, True, False)
 
 
-def test_a_failing_tick_does_not_end_the_flight() -> None:
+@pytest.mark.parametrize("stage", ["recognise", "decide"])
+def test_a_failing_tick_does_not_end_the_flight(stage: str) -> None:
     flight = Flight(short(0.5))
-    tick, count = flight.pilot.tick, 0
+    works, count = getattr(flight.pilot, stage), 0
 
-    def fail(reading: Reading, control: Array | None, push: Array) -> object:
+    def fail(*given: object) -> object:
         nonlocal count
         count += 1
         if count == 5:
             raise ValueError("not today")
-        return tick(reading, control, push)
+        return works(*given)
 
-    flight.pilot.tick = fail  # type: ignore[assignment,method-assign]
+    setattr(flight.pilot, stage, fail)
     log = flight.run(silent)
     assert log.ticks == 10
     assert [status == "failed" for status in log.statuses] == [k == 4 for k in range(10)]
@@ -229,7 +230,7 @@ def test_a_failing_tick_does_not_end_the_flight() -> None:
 
 
 def test_collisions_are_counted_and_many_end_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
-    def drop(reading: Reading, control: Array | None, push: Array) -> object:
+    def drop(reading: Reading) -> Plan:
         raise ArithmeticError("engines off")
 
     def fall(*given: object) -> Array:
@@ -240,7 +241,7 @@ def test_collisions_are_counted_and_many_end_the_flight(monkeypatch: pytest.Monk
     for most in (1, 3):
         monkeypatch.setattr(episode, "COLLISIONS", most)
         flight = Flight(short(1.5))
-        flight.pilot.tick = drop  # type: ignore[assignment,method-assign]
+        monkeypatch.setattr(flight.pilot, "decide", drop)
         logs.append(flight.run(silent))
     assert [log.collisions for log in logs] == [1, 1]
     assert logs[0].ticks < logs[1].ticks == 30
@@ -250,14 +251,14 @@ def test_collisions_are_counted_and_many_end_the_flight(monkeypatch: pytest.Monk
 def test_arrival_needs_belief_and_truth(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = Flight(short(0.2))
     there = np.concatenate([flight.world.layout.target, [1.0, 0.0, 0.0, 0.0], np.zeros(3)])
-    tick = flight.pilot.tick
+    decide = flight.pilot.decide
 
-    def dream(reading: Reading, control: Array | None, push: Array) -> object:
-        plan = tick(reading, control, push)
+    def dream(reading: Reading) -> Plan:
+        plan = decide(reading)
         flight.pilot.belief = replace(flight.pilot.belief, state=there)
         return plan
 
-    flight.pilot.tick = dream  # type: ignore[assignment,method-assign]
+    monkeypatch.setattr(flight.pilot, "decide", dream)
     assert not flight.run(silent).reached
     monkeypatch.setattr(episode, "REACHED_DISTANCE", 100.0)
     log = run_flight(short(0.2))

@@ -28,6 +28,7 @@ from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics
 from unifg.scenarios.navigation import Episode, NavigationSettings, askew
 from unifg.scenarios.seeing.belief import Belief, Landmarks
+from unifg.scenarios.seeing.line_tracker import LineTracker
 from unifg.scenarios.seeing.readings import Reading, Scan
 from unifg.scenarios.show.flight_plot import control
 from unifg.scenarios.show.flight_scene import flight_scene
@@ -474,16 +475,21 @@ def believed(spread: float = 1e-4) -> Belief:
     return Belief(state, spread * np.eye(9), quadrotor.Parameters(), np.zeros(7), Landmarks.none())
 
 
+def looked(watch: FlightWatch, reading: Reading | None, now: float, applied: Array | None, belief: Belief) -> None:
+    """One tick of a vehicle that takes the sensor's names for its own."""
+    watch.judge(watch.admit(reading, now, applied, belief), belief)
+
+
 def test_a_vehicle_that_sees_nothing_stops_in_time_and_lands_after_a_while() -> None:
     watch, dt, applied = FlightWatch(0.05, SPREAD), 0.05, np.array([0.0, 0.0, 0.0, 9.81])
     for tick in range(10):
-        watch.look(reading(), tick * dt, applied, believed())
+        looked(watch, reading(), tick * dt, applied, believed())
     assert watch.verdict.cause == ""
     blind = reading(ids=np.zeros(0, int), bearings=np.zeros(0), ranges=np.zeros(0), radii=np.zeros(0),
                     kinds=np.zeros(0, int), moving=np.zeros(0, bool))  # fmt: skip
     rested = landed = 0.0
     for tick in range(1, 200):
-        watch.look(blind, 0.5 + tick * dt, applied, believed())
+        looked(watch, blind, 0.5 + tick * dt, applied, believed())
         rested = rested or (tick * dt if watch.verdict.rests else 0.0)
         landed = landed or (tick * dt if watch.lands else 0.0)
     assert rested == pytest.approx(0.2) and watch.verdict.health is Health.LOST
@@ -506,21 +512,44 @@ def test_a_vehicle_that_sees_nothing_stops_in_time_and_lands_after_a_while() -> 
 def test_readings_say_what_is_the_matter(changed: dict[str, Any], cause: str) -> None:
     watch = FlightWatch(0.05, SPREAD)
     for tick in range(20):
-        watch.look(reading(**(changed if tick else {})), 0.05 * tick, HOVERED, believed())
+        looked(watch, reading(**(changed if tick else {})), 0.05 * tick, HOVERED, believed())
     assert watch.verdict.cause == cause
 
 
 def test_a_detector_that_sees_ghosts_is_not_followed() -> None:
     watch = FlightWatch(0.05, SPREAD)
     for tick in range(8):
-        watch.look(reading(ids=np.array([0, 1, 50 + 10 * tick]) + tick), 0.05 * tick, HOVERED, believed())
+        looked(watch, reading(ids=np.array([0, 1, 50 + 10 * tick]) + tick), 0.05 * tick, HOVERED, believed())
     assert watch.verdict.rests and watch.verdict.cause == "the detector sees what was not there before"
     lost = FlightWatch(0.05, SPREAD)
     for tick in range(3):
-        lost.look(reading(), 0.05 * tick, HOVERED, believed(4.0))
+        looked(lost, reading(), 0.05 * tick, HOVERED, believed(4.0))
     assert lost.verdict.health is Health.LOST and "decimetres" in lost.verdict.cause
-    lost.look(None, 0.2, None, believed(math.nan))
+    looked(lost, None, 0.2, None, believed(math.nan))
     assert lost.verdict.rests and lost.door.dropped["detector: nothing came"] == 1
+
+
+def test_the_watch_counts_what_the_vehicle_recognises_and_not_what_the_world_calls_it() -> None:
+    """Where association is unknown the names are those of its own tracks, and what has none is no stranger."""
+    watch, pilot = FlightWatch(0.05, SPREAD), LineTracker(association="unknown")
+    for tick in range(12):  # the world's names change at every tick, the places do not
+        seen = watch.admit(reading(ids=np.arange(3) + 100 * tick), 0.05 * tick, HOVERED, believed())
+        watch.judge(pilot.told(seen, believed().state), believed())
+    assert watch.verdict.cause == "" and watch.verdict.share == 1.0
+    for tick in range(12, 20):  # the same names, places that jump
+        seen = reading(
+            ids=np.arange(3), kinds=np.full(3, Landmarks.CYLINDER), ranges=np.full(3, 1.0 + 0.9 * (tick % 5))
+        )
+        watch.judge(pilot.told(watch.admit(seen, 0.05 * tick, HOVERED, believed()), believed().state), believed())
+    assert watch.verdict.cause == "the detector sees what was not there before"
+    flagged = FlightWatch(0.05, SPREAD)
+    for tick in range(20):  # all is called moving by the world, and rests by what the vehicle finds
+        seen = flagged.admit(reading(moving=np.ones(3, dtype=bool)), 0.05 * tick, HOVERED, believed())
+        flagged.judge(pilot.told(seen, believed().state), believed())
+    assert flagged.verdict.cause == ""
+    for _ in range(4):
+        flagged.judge(None, believed())
+    assert flagged.verdict.cause == "nothing is seen"
 
 
 def felt(force: Array, thrust: float = 9.81, count: int = 3, **changed: Any) -> Unmodelled:
@@ -561,7 +590,7 @@ def test_what_pushes_is_flown_against_at_once() -> None:
     assert watch.pushed(still) is still
     for tick in range(4):
         pushed = reading(force=np.array([0.0, 4.0 if tick else 0.0, 9.81]))
-        watch.look(pushed, 0.05 * tick, np.array([0.0, 0.0, 0.0, 9.81]), still)
+        looked(watch, pushed, 0.05 * tick, np.array([0.0, 0.0, 0.0, 9.81]), still)
     assert watch.verdict.cause == "a gust pushes" and watch.verdict.share < 1.0
     assert watch.pushed(still).parameters.wind == pytest.approx((0.0, 4.0), abs=0.01)
     assert watch.hover(still, least, most)[0] > 1.0, "it leans against it"
@@ -572,10 +601,10 @@ def test_a_landing_is_broken_off_when_all_is_well_again_but_not_near_the_floor()
         watch, here = FlightWatch(0.05, SPREAD), believed()
         here.state[2] = height
         for tick in range(60):
-            watch.look(None, 0.05 * tick, HOVERED, here)
+            looked(watch, None, 0.05 * tick, HOVERED, here)
         assert watch.lands
         for tick in range(60, 80):
-            watch.look(reading(), 0.05 * tick, HOVERED, here)
+            looked(watch, reading(), 0.05 * tick, HOVERED, here)
         assert watch.verdict.health is not Health.LOST and watch.lands is lands
 
 

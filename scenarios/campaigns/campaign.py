@@ -22,8 +22,8 @@ from unifg.scenarios.campaigns.journal import Journal, lines_of
 from unifg.scenarios.campaigns.performed import ERROR, FAILED, LOST, OK, Order, lost, perform
 from unifg.scenarios.campaigns.sources import fingerprint, library
 from unifg.scenarios.campaigns.statement import Statement, module_of, read
-from unifg.scenarios.campaigns.workers import Workers
 from unifg.scenarios.episode import Progress, silent
+from unifg.scenarios.workers import Workers
 
 __all__ = ["EPISODES", "MANIFEST", "Campaign", "code_of_scenario", "manifest_of", "replay_command", "run_campaign"]
 

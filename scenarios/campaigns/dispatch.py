@@ -9,7 +9,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future
 from typing import Any, TypeVar
 
 from unifg.errors import ScenarioError
-from unifg.scenarios.campaigns.workers import WorkerDied
+from unifg.scenarios.workers import WorkerDied
 
 __all__ = ["died", "finished"]
 

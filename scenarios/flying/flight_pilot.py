@@ -46,16 +46,23 @@ class Pilot:
         self.clock.seconds = {"estimate": 0.0, "plan": 0.0}
 
     def tick(self, reading: Reading, control: Array | None, push: Array = STILL) -> Plan:
-        """Decide.
+        """Recognise, then decide.
 
         Args:
             reading: of now.
             control: (4,) applied since the last reading; None at the first one.
             push: (2,) what was felt meanwhile and no model holds [m/s^2].
         """
+        return self.decide(self.recognise(reading, control, push))
+
+    def recognise(self, reading: Reading, control: Array | None, push: Array = STILL) -> Reading:
+        """Move on to a reading, arguments as of :meth:`tick`; it comes back with the names and flags known here."""
         self.clock.start()
         self.estimator.predict(reading, control, push)
-        reading = self.tracker.told(reading, self.estimator.window.present)
+        return self.tracker.told(reading, self.estimator.window.present)
+
+    def decide(self, reading: Reading) -> Plan:
+        """Estimate and plan with a reading that was recognised."""
         self.estimator.see(reading)
         self.belief = self.alone = self.estimator.estimate()
         movers = self.tracker.update(reading, self.alone.state)

@@ -72,8 +72,8 @@ class FlightWatch:
         """The last one."""
         return self.supervisor.verdict
 
-    def look(self, reading: Reading | None, now: float, applied: Array | None, belief: Belief) -> Reading:
-        """Let a reading in, and judge with the belief of the tick before.
+    def admit(self, reading: Reading | None, now: float, applied: Array | None, belief: Belief) -> Reading:
+        """Let a reading in, as far as it can be, and feel what no model holds.
 
         Args:
             reading: as it arrived.
@@ -82,14 +82,25 @@ class FlightWatch:
             belief: after the last tick.
         """
         seen = self.door.reading(reading, now, np.zeros(4) if applied is None else applied)
-        names = set(seen.ids[~seen.moving].tolist())
-        self._sight = 0.0 if len(names) else self._sight + self._dt
+        if applied is not None:
+            self.felt.note(seen.force, float(applied[3]), belief)
+        return seen
+
+    def judge(self, told: Reading | None, belief: Belief) -> None:
+        """Say how fast the vehicle may fly, by what it has recognised and the belief of the tick before.
+
+        Args:
+            told: what was admitted, with the names and flags the vehicle itself knows, -1 for what it has no name for;
+                None where that failed.
+            belief: after the last tick.
+        """
+        resting = np.zeros(0, dtype=np.intp) if told is None else told.ids[~told.moving]
+        self._sight = 0.0 if len(resting) else self._sight + self._dt
+        names = set(resting[resting >= 0].tolist())
         self._strangers.append(0 if self._first else len(names - self._known))
         self._known |= names
         self._first = False
         self._inertial = self._inertial + self._dt if "inertial unit" in self.door.refused else 0.0
-        if applied is not None:
-            self.felt.note(seen.force, float(applied[3]), belief)
         spread = float(np.linalg.eigvalsh(belief.covariance[:3, :3])[-1]) if _finite(belief) else math.inf
         signals = {
             "sight": self._sight, "spread": math.sqrt(max(spread, 0.0)), "plan": self._plan,
@@ -102,7 +113,6 @@ class FlightWatch:
         self.lands = self._resting > (BLIND_HOVER if verdict.health is Health.LOST else HOVER) or (
             self.lands and (waits or float(belief.state[2]) < COMMITTED)
         )
-        return seen
 
     def planned(self, sound: bool) -> None:
         """Whether the tick has a plan of its own."""
