@@ -135,8 +135,9 @@ $(VENV)-lowest/ready: pyproject.toml tests/lowest.py
 	@echo "Building $(VENV)-lowest with the lowest versions of all packages (once, some minutes)"
 	@$(PYTHON) -m venv $(VENV)-lowest
 	@$(PYTHON) tests/lowest.py > $(VENV)-lowest/lowest.txt
-	@$(VENV)-lowest/bin/python -m pip --disable-pip-version-check --quiet install --constraint $(VENV)-lowest/lowest.txt \
-		--editable ".[scenarios,test]"
+	@$(VENV)-lowest/bin/python -m pip --disable-pip-version-check --quiet --log $(VENV)-lowest/pip.log install \
+		--constraint $(VENV)-lowest/lowest.txt --editable ".[scenarios,test]" || { \
+		sed -n 's/^[^ ]* *//; /conflict is caused by/,/^To fix/p' $(VENV)-lowest/pip.log >&2; exit 1; }
 	@touch $@
 
 $(VENV)/ready-dev: $(VENV)/ready

@@ -86,6 +86,7 @@ def test_a_python_has_to_start_and_be_of_the_version(release: ModuleType, tmp_pa
         ({}, True, 0),
         ({"3.12-lowest": "no wheels"}, True, 0),
         ({"3.12-newest": "no wheels"}, True, 1),
+        ({"3.11-lowest": "no wheels"}, True, 1),  # of the oldest Python there have to be: a bound that nobody published
         ({"3.11-lowest": "red"}, True, 1),
         ({"3.11-lowest": "red"}, False, 0),
     ],
@@ -99,7 +100,7 @@ def test_what_fails_and_what_is_not_there(
     lowest: bool,
     code: int,
 ) -> None:
-    """Only the lowest packages may be without wheels; everything that was not tried is said."""
+    """Only the lowest packages of later Pythons may be without wheels; everything that was not tried is said."""
     words = {"no wheels": "ERROR: No matching distribution found for numpy==1.26", "red": "1 failed"}
 
     def trial(_wheel: Path, _sdist: Path, _python: str, home: Path, _lowest: bool) -> str:
