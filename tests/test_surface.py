@@ -6,6 +6,7 @@ import importlib
 import re
 import sys
 
+import pytest
 from fences import CHECKOUT
 
 sys.path.insert(0, str(CHECKOUT / "docs" / "site"))
@@ -33,3 +34,18 @@ def test_every_dependency_has_a_licence_on_the_page() -> None:
     named = set(re.findall(r"^\| ([\w.-]+) \|", page, flags=re.MULTILINE))
     assert {licences.plain(name) for name in licences.stated()} <= named, "python docs/site/licences.py"
     assert "unknown" not in page
+
+
+def test_what_is_not_installed_is_not_left_off_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """pymetis once went that way, without a word."""
+    monkeypatch.setattr(licences, "stated", lambda: {"numpy": "unifg", "no-such-package": "`unifg[metis]`"})
+    with pytest.raises(SystemExit, match=r"no-such-package.*pip install"):
+        licences.closure()
+
+
+def test_packages_of_other_platforms_are_not_on_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether colorama was listed depended on who else had installed it."""
+    monkeypatch.setattr(licences, "stated", lambda: {"numpy": "unifg", "scipy": "unifg"})
+    needs = {"scipy": ["numpy>=1", "colorama; sys_platform == 'beos'", "tqdm; extra == 'nice'"], "numpy": []}
+    monkeypatch.setattr(licences.metadata, "requires", needs.__getitem__)
+    assert licences.closure() == {"numpy": "unifg", "scipy": "unifg"}

@@ -1,6 +1,7 @@
 """Licences of everything that unifg needs or can use: `python docs/site/licences.py` rewrites docs/licences.md.
 
-Read from the metadata of what is installed, dependencies of dependencies included; run it where all extras are.
+Read from the metadata of what is installed, dependencies of dependencies included as far as this platform needs them; run
+it where all extras are.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ import tomllib
 from importlib import metadata
 from pathlib import Path
 
+from packaging.requirements import Requirement
+
 CHECKOUT = Path(__file__).resolve().parent.parent.parent
 PAGE = CHECKOUT / "docs" / "licences.md"
 # Extras; those for tests, style and this site stay with us.
@@ -17,7 +20,7 @@ USED = ("view", "scenarios", "casadi", "campaign", "mcap", "metis", "bench")
 HEAD = """# Licences
 
 unifg itself is under the [MIT licence](../LICENSE). It contains no code of others; scenes carry meshcat's viewer inside
-(MIT), with three.js (MIT). What it needs, what its extras add, and what these need in turn, as the metadata of the
+(MIT), with three.js (MIT). What it needs, what its extras add, and what these need in turn on Linux, as the metadata of the
 packages says; the page is made by `python docs/site/licences.py`.
 
 | package | version | licence | for |
@@ -44,19 +47,31 @@ def stated() -> dict[str, str]:
 
 
 def closure() -> dict[str, str]:
-    """These, and what they need."""
-    found, waiting = dict[str, str](), [(name, purpose) for name, purpose in stated().items()]
+    """These, and what they need here; what happens to be installed for others' sake is not among them.
+
+    Raises:
+        SystemExit: when something of it is not installed: the page would leave it out.
+    """
+    found, waiting, missing = dict[str, str](), [(name, purpose) for name, purpose in stated().items()], set[str]()
     waiting.sort(key=lambda pair: pair[1] != "unifg")
     while waiting:
         name, purpose = waiting.pop(0)
-        if plain(name) in found:
+        if name in found:
             continue
         try:
-            needed = metadata.requires(name) or []
+            needed = [Requirement(one) for one in metadata.requires(name) or []]
         except metadata.PackageNotFoundError:
-            continue  # for another platform
-        found[plain(name)] = purpose
-        waiting += [(_name(one), purpose if purpose != "unifg" else "unifg") for one in needed if "extra ==" not in one]
+            missing.add(name)
+            continue
+        found[name] = purpose
+        waiting += [
+            (plain(one.name), purpose) for one in needed if one.marker is None or one.marker.evaluate({"extra": ""})
+        ]
+    if missing:
+        raise SystemExit(
+            f"{', '.join(sorted(missing))}: not installed here, so nothing is known of their licences. "
+            f"Install all extras: pip install -e '.[{','.join(USED)}]'"
+        )
     return found
 
 
