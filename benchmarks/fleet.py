@@ -1,7 +1,7 @@
 """Robots that drive in one building at once, each on its own: success, contacts, and what a tick of all of them takes.
 
-    python -m benchmarks.fleet [--seeds 600:603] [--robots 1 2 5 10] [--processes 1 2] [--workers K] [--fresh] [--report]
-        [--any-code]
+    python -m benchmarks.fleet [--seeds 600:603] [--robots 1 2 5 10] [--processes 1 2] [--workers K] [--fresh]
+        [--report] [--any-code]
 
 Every seed draws as many routes through the building that ships with the package as there are robots, no two of which
 begin or end in one place; fewer robots drive the first of the same routes. Nobody tells anybody anything: the others

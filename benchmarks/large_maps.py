@@ -302,8 +302,11 @@ def driven(side: float) -> Iterator[str]:
         start = (first.x, first.y, float(path[0, 2]))
         goal = (last.x, last.y, float(path[-2, 2]))
         del field
-        began = time.process_time()
-        log = run_navigation(NavigationSettings(map=Path(folder) / "town.yaml", start=start, goals=(goal,)))
+        began, ends = time.process_time(), list[float]()
+        log = run_navigation(
+            NavigationSettings(map=Path(folder) / "town.yaml", start=start, goals=(goal,)),
+            lambda done, text: ends.append(time.process_time()),
+        )
     spent = time.process_time() - began
     metrics = episode_metrics(log)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
@@ -313,9 +316,13 @@ def driven(side: float) -> Iterator[str]:
         f"{1e3 * metrics['localisation_error_m']['mean']:.1f} mm on average; {spent:.0f} s of the processor with "
         f"reading the map, at most {peak:.2f} GB"
     )
-    for number, quarter in enumerate(np.array_split(log.tick_ms, 4), start=1):
+    quarters = zip(np.array_split(log.tick_ms, 4), np.array_split(1e3 * np.diff(ends[:-1]), 4), strict=True)
+    for number, (quarter, processor) in enumerate(quarters, start=1):
         p50, p99 = np.percentile(quarter, [50.0, 99.0])
-        yield f"quarter {number}: tick median {p50:.1f} ms, 99 % {p99:.1f} ms, at most {quarter.max():.1f} ms"
+        yield (
+            f"quarter {number}: tick median {p50:.1f} ms, 99 % {p99:.1f} ms, at most {quarter.max():.1f} ms; "
+            f"with world and lidar {np.median(processor):.2f} ms of the processor, {processor.mean():.2f} on average"
+        )
 
 
 def main(arguments: list[str] | None = None) -> int:

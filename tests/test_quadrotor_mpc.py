@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from unifg.errors import BackendError, ScenarioError
+from unifg.horizon import Plan
 from unifg.lie import SO3
 from unifg.scenarios import command
 from unifg.scenarios import flight as episode
