@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib
 import re
 import sys
+from importlib import metadata
 
 import pytest
+
 from fences import CHECKOUT
 
 sys.path.insert(0, str(CHECKOUT / "docs" / "site"))
@@ -47,5 +49,5 @@ def test_packages_of_other_platforms_are_not_on_the_page(monkeypatch: pytest.Mon
     """Whether colorama was listed depended on who else had installed it."""
     monkeypatch.setattr(licences, "stated", lambda: {"numpy": "unifg", "scipy": "unifg"})
     needs = {"scipy": ["numpy>=1", "colorama; sys_platform == 'beos'", "tqdm; extra == 'nice'"], "numpy": []}
-    monkeypatch.setattr(licences.metadata, "requires", needs.__getitem__)
+    monkeypatch.setattr(metadata, "requires", needs.__getitem__)
     assert licences.closure() == {"numpy": "unifg", "scipy": "unifg"}
