@@ -100,7 +100,7 @@ PAGES = {
         Page("ipopt", "Beside IPOPT", "benchmarks.against_ipopt", hours=0.1),
         Page("safety", "Flight that must keep its distance", "benchmarks.safe_campaign", hours=0.6),
         Page("wrong-closures", "Wrong loop closures", "benchmarks.wrong_closures", hours=4.0),
-        Page("endurance", "Long runs", "benchmarks.endurance", hours=0.2),
+        Page("endurance", "Long runs", "benchmarks.endurance", hours=0.9),
         Page("benchmarks", "Benchmarks", "benchmarks.elimination"),
     )
 }
