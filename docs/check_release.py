@@ -8,7 +8,7 @@ sources: with the newest of all packages, and with the lowest where these have w
 the oldest. What could not be tried is said.
 
 `--no-install` builds only, for the rest fetches packages; `--python 3.12` (repeated) chooses among the Pythons;
-`--newest` leaves the lowest packages out.
+`--newest` leaves the lowest packages out, `--lowest` the newest.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import tarfile
 import tempfile
 import time
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -63,7 +63,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Build what is released, twice, and try it.")
     parser.add_argument("--no-install", action="store_true", help="build and compare only")
     parser.add_argument("--python", action="append", choices=named(), help="one of those that the classifiers name")
-    parser.add_argument("--newest", action="store_true", help="leave the lowest packages out")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--newest", action="store_true", help="leave the lowest packages out")
+    which.add_argument("--lowest", action="store_true", help="leave the newest packages out")
     chosen = parser.parse_args()
     epoch = os.environ.get("SOURCE_DATE_EPOCH") or run("git", "log", "-1", "--format=%ct", cwd=CHECKOUT).strip()
     with tempfile.TemporaryDirectory() as home:
@@ -86,18 +88,19 @@ def main() -> int:
             return 0
         (wheel,) = (folder / name for name in first if name.endswith(".whl"))
         (sdist,) = (folder / name for name in first if name.endswith(".tar.gz"))
-        return installed(wheel, sdist, Path(home), chosen.python or named(), lowest=not chosen.newest)
+        cases = [case for case, left in (("newest", chosen.lowest), ("lowest", chosen.newest)) if not left]
+        return installed(wheel, sdist, Path(home), chosen.python or named(), cases)
 
 
-def installed(wheel: Path, sdist: Path, home: Path, wanted: Iterable[str], lowest: bool) -> int:
-    """Try a wheel with every Python that is there; 1 where none is, or one fails."""
+def installed(wheel: Path, sdist: Path, home: Path, wanted: Iterable[str], cases: Sequence[str]) -> int:
+    """Try a wheel with every Python that is there, for each of `cases`; 1 where there is none, or one fails."""
     failed, tried, oldest = list[str](), 0, named()[0]
     for minor in wanted:
         python = interpreter(minor, candidates(minor))
         if python is None:
             print(f"Python {minor}: NOT TRIED, none that builds environments was found on this machine")
             continue
-        for packages in ("newest", "lowest") if lowest else ("newest",):
+        for packages in cases:
             case = f"Python {minor} with the {packages} packages"
             began = time.monotonic()
             try:

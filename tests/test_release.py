@@ -80,15 +80,19 @@ def test_a_python_has_to_start_and_be_of_the_version(release: ModuleType, tmp_pa
     assert mine in release.named() or sys.version_info > (3, 13)
 
 
+BOTH = ["newest", "lowest"]
+
+
 @pytest.mark.parametrize(
-    ("ends", "lowest", "code"),
+    ("ends", "cases", "code"),
     [
-        ({}, True, 0),
-        ({"3.12-lowest": "no wheels"}, True, 0),
-        ({"3.12-newest": "no wheels"}, True, 1),
-        ({"3.11-lowest": "no wheels"}, True, 1),  # of the oldest Python there have to be: a bound that nobody published
-        ({"3.11-lowest": "red"}, True, 1),
-        ({"3.11-lowest": "red"}, False, 0),
+        ({}, BOTH, 0),
+        ({"3.12-lowest": "no wheels"}, BOTH, 0),
+        ({"3.12-newest": "no wheels"}, BOTH, 1),
+        ({"3.11-lowest": "no wheels"}, BOTH, 1),  # of the oldest Python there have to be: a bound that nobody published
+        ({"3.11-lowest": "red"}, BOTH, 1),
+        ({"3.11-lowest": "red"}, ["newest"], 0),
+        ({"3.11-newest": "red"}, ["lowest"], 0),
     ],
 )
 def test_what_fails_and_what_is_not_there(
@@ -97,7 +101,7 @@ def test_what_fails_and_what_is_not_there(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
     ends: dict[str, str],
-    lowest: bool,
+    cases: list[str],
     code: int,
 ) -> None:
     """Only the lowest packages of later Pythons may be without wheels; everything that was not tried is said."""
@@ -111,7 +115,7 @@ def test_what_fails_and_what_is_not_there(
 
     monkeypatch.setattr(release, "trial", trial)
     monkeypatch.setattr(release, "interpreter", lambda minor, among: None if minor == "3.13" else "python")
-    assert release.installed(tmp_path, tmp_path, tmp_path, ["3.11", "3.12", "3.13"], lowest) == code
+    assert release.installed(tmp_path, tmp_path, tmp_path, ["3.11", "3.12", "3.13"], cases) == code
     said = capsys.readouterr().out
     assert "Python 3.13: NOT TRIED" in said
     assert ("3.12 with the lowest packages: NOT TRIED" in said) == ("3.12-lowest" in ends)
@@ -122,4 +126,4 @@ def test_a_wheel_that_was_tried_nowhere_is_not_passed(
     release: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(release, "interpreter", lambda minor, among: None)
-    assert release.installed(tmp_path, tmp_path, tmp_path, ["3.11"], lowest=True) == 1
+    assert release.installed(tmp_path, tmp_path, tmp_path, ["3.11"], BOTH) == 1
