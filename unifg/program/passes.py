@@ -10,9 +10,11 @@ from __future__ import annotations
 from math import sqrt
 
 from unifg.kernels.robust import value_of, weight_of
-from unifg.kernels.whitening import whiten
+from unifg.kernels.whitening import FULL, whiten
 from unifg.machine.calls import call_residual, matrix, vector, vector_at
 from unifg.machine.jit import compiled, inlined
+from unifg.machine.vectors import address
+from unifg.program.pairs import PLANE, SPACE, add_plane, add_space, whiten_plane, whiten_space
 from unifg.program.table import (
     ACTIVE,
     ADDRESS,
@@ -29,6 +31,7 @@ from unifg.program.table import (
     KIND,
     LOSS,
     LOSS_AT,
+    PAIRED,
     PARAMETER,
     PARAMETERS,
     POSITION,
@@ -179,10 +182,13 @@ def linearize(
         target = residual if kind == COST else constraints
         blocks = jacobian if kind == COST else constraint_jacobian
         where = term[SEARCH] if search and term[SEARCH] != 0 else term[ADDRESS]
+        together = term[PAIRED] if term[WHITEN] & FULL else 0
+        apart = (term[WHITEN] & 1) * m * m
         total = 0.0
         for i in range(term[COUNT]):
             at = term[ROW] + i * m
-            r, J = vector(target, at, m), matrix(blocks, term[ENTRY] + i * m * width, m, width)
+            entry = term[ENTRY] + i * m * width
+            r, J = vector(target, at, m), matrix(blocks, entry, m, width)
             if kind == BOUND:
                 r[0] = values[gather[term[GATHER] + i]]
                 J[0, 0] = 1.0
@@ -204,7 +210,14 @@ def linearize(
                 for a in range(m):
                     total += _violation(r[a], lower[at + a], upper[at + a]) ** 2
                 continue
-            whiten(term[WHITEN], whiteners, term[WHITENER], i, r, J)
+            if together == PLANE:
+                first_weight = term[WHITENER] + i * apart
+                whiten_plane(address(whiteners), first_weight, address(residual), at, address(jacobian), entry)
+            elif together == SPACE:
+                first_weight = term[WHITENER] + i * apart
+                whiten_space(address(whiteners), first_weight, address(residual), at, address(jacobian), entry)
+            else:
+                whiten(term[WHITEN], whiteners, term[WHITENER], i, r, J)
             squared = 0.0
             for a in range(m):
                 squared += r[a] * r[a]
@@ -220,7 +233,7 @@ def linearize(
                 weight = weights[term[WEIGHT] + i] = weight_of(term[LOSS], first, second, squared)
                 if weight != 1.0:
                     _scale(sqrt(weight), r, J)
-            _accumulate(term, i, columns, positions, r, J, gradient, hessian)
+            _accumulate(term, i, columns, positions, r, J, residual, jacobian, gradient, hessian)
         norms[t] = sqrt(total)
     return cost
 
@@ -245,7 +258,7 @@ def weigh(
             r = vector(residual, term[ROW] + i * m, m)
             J = matrix(jacobian, term[ENTRY] + i * m * width, m, width)
             _scale(sqrt(weights[term[WEIGHT] + i]), r, J)
-            _accumulate(term, i, columns, positions, r, J, gradient, hessian)
+            _accumulate(term, i, columns, positions, r, J, residual, jacobian, gradient, hessian)
 
 
 @compiled
@@ -265,29 +278,49 @@ def _accumulate(
     positions: IntArray,
     r: Array,
     J: Array,
+    residual: Array,
+    jacobian: Array,
     gradient: Array,
     hessian: Array,
 ) -> None:
-    """Add J'r and the upper triangle of J'J of one factor."""
+    """Add J'r and the upper triangle of J'J of one factor, whose r and J stand in ``residual`` and ``jacobian``."""
     rows, width = J.shape
     column = term[COLUMN] + i * width
     at = term[POSITION] + i * (width * (width + 1) // 2)
-    for d in range(width):
-        total = 0.0
-        for a in range(rows):
-            total += J[a, d] * r[a]
-        gradient[columns[column + d]] += total
-        for e in range(d + 1):
-            where = positions[at + e]
-            if where != -1:
-                total = 0.0
-                for a in range(rows):
-                    total += J[a, d] * J[a, e]
-                if where >= 0:
-                    hessian[where] += total
-                else:
-                    hessian[-2 - where] += 2.0 * total
-        at += d + 1
+    if term[PAIRED] > 0:
+        corner = at + rows * (rows + 1) // 2
+        own, shared, other = positions[at], positions[corner], positions[corner + rows]
+        step, side = positions[at + 1] - own, positions[corner + 1] - shared
+        hop = positions[corner + 2 * rows + 1] - other
+        if rows == PLANE:
+            add_plane(
+                address(residual), term[ROW] + i * rows, address(jacobian), term[ENTRY] + i * rows * width,
+                address(gradient), columns[column], columns[column + rows],
+                address(hessian), own, step, other, hop, shared, side,
+            )  # fmt: skip
+        else:
+            add_space(
+                address(residual), term[ROW] + i * rows, address(jacobian), term[ENTRY] + i * rows * width,
+                address(gradient), columns[column], columns[column + rows],
+                address(hessian), own, step, other, hop, shared, side,
+            )  # fmt: skip
+    else:
+        for d in range(width):
+            total = 0.0
+            for a in range(rows):
+                total += J[a, d] * r[a]
+            gradient[columns[column + d]] += total
+            for e in range(d + 1):
+                where = positions[at + e]
+                if where != -1:
+                    total = 0.0
+                    for a in range(rows):
+                        total += J[a, d] * J[a, e]
+                    if where >= 0:
+                        hessian[where] += total
+                    else:
+                        hessian[-2 - where] += 2.0 * total
+            at += d + 1
 
 
 @compiled

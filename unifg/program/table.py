@@ -18,6 +18,7 @@ from unifg.kernels.steps import as_table, movable_parts
 from unifg.language.terms import Constraint, Cost, ScalarCost
 from unifg.machine.jit import compiled
 from unifg.program.columns import Columns
+from unifg.program.pairs import PLANE, SPACE, paired
 from unifg.program.term import CompiledTerm
 from unifg.typing import Array, IntArray
 
@@ -47,6 +48,7 @@ from unifg.typing import Array, IntArray
     ENTRY,  # first entry of the stacked Jacobian
     COLUMN,  # first column in TermArrays.columns
     POSITION,  # first place in TermArrays.positions
+    PAIRED,  # rows of factors whose products have loops of their own (unifg.program.pairs); 0: none
     PART,  # first row of TermArrays.parts
     PARTS,  # of the variables; 0: linear, or without a compiled retraction
     SECOND,  # address of the kernel's second derivatives; 0: to be differenced
@@ -54,7 +56,7 @@ from unifg.typing import Array, IntArray
     LOSS,  # which robust loss, or one of the words below
     LOSS_AT,  # where its two parameters stand in TermArrays.parameters
     FIELDS,
-) = range(32)
+) = range(33)
 
 COST, CONSTRAINT, BOUND, SCALAR = range(4)
 PYTHON, HELD = -1, -2  # losses whose formulas are Python; HELD: line searches keep the weights of a linearisation
@@ -213,6 +215,18 @@ class TermTable:
         for place, pair in losses.items():
             self.arrays.parameters[place : place + 2] = pair
         locate(fields, self.arrays.columns, self.arrays.unknown, normal.indptr, normal.indices, self.arrays.positions)
+        for row, term in zip(fields, self._terms, strict=True):
+            row[PAIRED] = self._paired(row, term)
+
+    def _paired(self, row: IntArray, term: CompiledTerm) -> int:
+        """How many rows a factor of a term has whose loops are of fixed size; 0 where they are not."""
+        rows, count, width = (int(row[field]) for field in (ROWS, COUNT, WIDTH))
+        if row[KIND] != COST or rows not in (PLANE, SPACE) or list(term.dims) != [rows, rows] or row[KEEP] >= 0:
+            return 0
+        pairs = width * (width + 1) // 2
+        columns = self.arrays.columns[row[COLUMN] : row[COLUMN] + count * width].reshape(count, width)
+        places = self.arrays.positions[row[POSITION] : row[POSITION] + count * pairs].reshape(count, pairs)
+        return rows if paired(columns, places, rows) else 0
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """In a copy the rows of the terms are those of the copy.
