@@ -11,6 +11,7 @@ import pytest
 import unifg as fg
 from episodes import room
 from unifg.models.distance_map import DistanceMap, SmoothField
+from unifg.scenarios.driving import drive_control
 from unifg.scenarios.driving.drive_control import LEFT_BEHIND, OFF_WALLS, PATIENCE, Controller, is_behind
 from unifg.scenarios.driving.drive_parts import along, disc_limits, in_world, predicted, wall_limits
 from unifg.scenarios.driving.drive_past import Smoother
@@ -130,6 +131,32 @@ def test_nobody_is_evaded_into_a_wall(
     states = [followed(np.array(pose), controller.loop.applied, one, SETTINGS.dt) for one in ways]
     roomy = max(states, key=lambda s: min(controller._room(s, centres, others.radius), controller._off_walls(s)))
     assert controller.field.distance(roomy[1:, :2]).min() < HULL, "room alone would have led into the wall"
+
+
+def test_an_evasion_is_kept_until_another_is_much_better(
+    controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Forwards or back from somebody who comes from the side, seen a little ahead and a little behind by turns."""
+
+    def senses() -> list[float]:
+        controller.forget()
+        controller.loop.applied = np.zeros(2)
+        found = []
+        for tick in range(8):
+            ahead = 0.01 if tick % 2 else -0.01
+            others = tracks((OPEN[0] + ahead, OPEN[1] + 0.8, 0.2), velocity=(0.0, -0.4), mover=True)
+            way = controller._way_out(np.array([OPEN[0], OPEN[1], 0.0]), others)
+            assert way.evades
+            found.append(float(np.sign(way.controls[5, 0])))
+        return found
+
+    assert len(set(senses())) == 1
+    before, here = senses()[-1], np.array([OPEN[0], OPEN[1], 0.0])
+    across = tracks((OPEN[0] + 0.3 * before, OPEN[1] + 0.8, 0.2), velocity=(0.0, -0.4), mover=True)
+    assert np.sign(controller._way_out(here, across).controls[5, 0]) == -before, "another is much better"
+    assert not controller._way_out(here, tracks()).evades
+    monkeypatch.setattr(drive_control, "COMMITTED", 0.0)
+    assert set(senses()) == {-1.0, 1.0}, "without that it would turn back and forth"
 
 
 # ---------------------------------------------------------------- how near it may come
@@ -461,6 +488,13 @@ def test_a_mover_is_expected_to_walk_on_and_not_trusted_to_leave() -> None:
     centres = predicted(SETTINGS, OPEN, away)[:, 0]
     assert np.all(centres[:, 0] == OPEN[0] + 1.5)
     assert centres[-1, 1] == pytest.approx(OPEN[1] + 0.2 * s.dt * s.horizon)
+
+
+def test_a_mover_is_kept_off_by_what_it_walks_until_the_robot_can_be_at_rest() -> None:
+    """Seen and decided in a tick, then braked from full speed: a base that brakes softly needs more room."""
+    assert SETTINGS.mover_surprise == 0.5
+    assert replace(SETTINGS, accelerations=(1.0, 2.1)).mover_surprise == pytest.approx(1.1)
+    assert replace(SETTINGS, speed=0.5).mover_surprise == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.9])

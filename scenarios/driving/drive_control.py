@@ -28,6 +28,7 @@ PURSUIT = 0.3  # [m] ahead of the robot, where a guess aims at the reference
 PURSUIT_TIME = 0.2  # [s] in which it would turn there
 ARRIVED = 0.05  # [m] to the end of the reference, where it only turns
 SETTLED = (fg.Status.CONVERGED, fg.Status.STOP_RULE)
+COMMITTED = 0.1  # [m] more room than the evasion of the last tick has another one to have
 OFF_WALLS = 0.015  # [m] from the hull to walls: less is touching, as far as maps and estimates can tell
 PATIENCE = 5  # ticks of being left behind before the plan starts over from the reference
 
@@ -47,6 +48,7 @@ class Controller:
         self.settings = s = settings
         self.field = SmoothField(distance_map)
         self._coming = np.zeros((0, 2))  # what would be driven next if nothing were decided any more
+        self._evasion: int | None = None  # number of the evasion that was the last tick's way out
         terms: list[Term] = [
             Following(s),
             ControlCost(s.weighted(s.control_sigma), s.weighted(s.rate_sigma), wanted=lambda now: now.given.wanted),
@@ -95,21 +97,24 @@ class Controller:
 
         Which is the best is judged by the least distance on the way, of discs and of walls alike, beyond what is to be
         kept from them. One that leads into a wall is taken only where each does: walls do not step aside, and what the
-        way out comes near to the plan may come near to as well.
+        way out comes near to the plan may come near to as well. The one of the last tick is kept while no other is much
+        better: who turns back and forth between two ways out takes neither.
         """
         s, last = self.settings, self.loop.applied
         controls = stopped(last, self._coming, s.most, s.horizon)
         rest = WayOut(followed(pose, last, controls, s.dt), controls)
         movers = tracks.at(tracks.mover)
         if not len(movers) or self._room(rest.states, predicted(s, pose, movers), movers.radius) >= 0.0:
+            self._evasion = None
             return rest
-        centres, best = predicted(s, pose, tracks), rest
+        centres, best, before, self._evasion = predicted(s, pose, tracks), rest, self._evasion, None
         most = self._worth(rest.states, centres, tracks.radius)
-        for way in evasions(last, s.most, s.box[1], s.horizon, s.dt):
+        for number, way in enumerate(evasions(last, s.most, s.box[1], s.horizon, s.dt)):
             states = followed(pose, last, way, s.dt)
-            room = self._worth(states, centres, tracks.radius)
-            if room > most:
-                most, best = room, WayOut(states, way, evades=True)
+            off_walls, room = self._worth(states, centres, tracks.radius)
+            worth = off_walls, room + (COMMITTED if number == before else 0.0)
+            if worth > most:
+                most, best, self._evasion = worth, WayOut(states, way, evades=True), number
         return best
 
     def _worth(self, states: Array, centres: Array, radii: Array) -> tuple[bool, float]:
@@ -149,6 +154,7 @@ class Controller:
 
     def forget(self) -> None:
         """Drop the warm start, as when a new route makes it misleading."""
+        self._evasion = None
         self.loop.forget()
 
     def judge(self, solution: fg.Solution, states: Array, controls: Array, now: Now[Drive], kept: Kept) -> Choice:

@@ -44,8 +44,7 @@ class ControllerSettings:
         disc_clearance: least distance of the hull to tracked discs [m].
         sigmas: by how many standard deviations of the estimate, along the normal, both distances are wider.
         mover_speed: at least this fast is a disc that has ever moved believed to be able to go on [m/s].
-        mover_surprise: for so long a disc that has ever moved may go anywhere before the robot has seen it, decided and
-            begun to act [s]; what it travels in that time is kept off, too.
+        mover_unseen: for so long a disc that has ever moved may go elsewhere before the robot has decided what to do [s].
         mover_margin: added to the soft margin around such discs [m].
         approach: rate at which the gap to such a disc may close, alpha of its barrier [1/s].
         avoidance: of walls and discs: "clearance" as a constraint, with a barrier to discs that have ever moved;
@@ -77,7 +76,7 @@ class ControllerSettings:
     disc_clearance: float = 0.06
     sigmas: float = 2.0
     mover_speed: float = 0.3
-    mover_surprise: float = 0.5
+    mover_unseen: float = 0.1
     mover_margin: float = 0.3
     approach: float = -math.log(0.88) / 0.1
     avoidance: str = option("clearance", choices=AVOIDANCES)
@@ -99,6 +98,14 @@ class ControllerSettings:
         """Standard deviations of costs of the controller, scaled by their common weight."""
         scaled: Array = np.array(sigma) / np.sqrt(self.control_weight)
         return scaled
+
+    @property
+    def mover_surprise(self) -> float:
+        """How long a disc that has ever moved may go anywhere before the robot can be at rest [s].
+
+        What it travels in that time is kept off, too: a base that brakes at 1 m/s^2 needs more room than one of 2.5.
+        """
+        return self.mover_unseen + min(self.speed, float(self.box[1][0])) / self.accelerations[0]
 
     @property
     def pace(self) -> Array:
