@@ -44,7 +44,7 @@ class ControllerSettings:
         disc_clearance: least distance of the hull to tracked discs [m].
         sigmas: by how many standard deviations of the estimate, along the normal, both distances are wider.
         mover_speed: at least this fast is a disc that has ever moved believed to be able to go on [m/s].
-        mover_unseen: for so long a disc that has ever moved may go elsewhere before the robot has decided what to do [s].
+        mover_unseen: for so long such a disc may go elsewhere before the robot has decided what to do [s].
         mover_margin: added to the soft margin around such discs [m].
         approach: rate at which the gap to such a disc may close, alpha of its barrier [1/s].
         avoidance: of walls and discs: "clearance" as a constraint, with a barrier to discs that have ever moved;
