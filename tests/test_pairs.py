@@ -116,3 +116,23 @@ def test_published_graphs(name: str, shared_data: Path) -> None:
     assert all(term.place[PAIRED] for term in program.terms)
     for found, expected in zip(*both(program, guess), strict=True):
         close(found, expected)
+
+
+@pytest.mark.parametrize("residual", [fg.between, fg.difference], ids=["between", "difference"])
+def test_one_formula_of_the_plane_says_what_the_functions_of_the_group_say(residual: Any) -> None:
+    """Far from the origin and close to a half turn, too; the batched functions are the reference."""
+    rng = np.random.default_rng(7)
+    x, y, measured = (fg.SE2.random(rng, (400,)) for _ in range(3))
+    y[:100] = fg.SE2.compose(fg.SE2.compose(x[:100], measured[:100]), fg.SE2.exp(1e-9 * rng.normal(size=(100, 3))))
+    x[100:200, :2], y[100:200, :2] = 1e3 * x[100:200, :2], 1e3 * y[100:200, :2]
+    y[200:300, 2] = x[200:300, 2] + measured[200:300, 2] + np.pi * (1.0 + 1e-6 * rng.normal(size=100))
+    kernel = residual.on(fg.SE2)
+    given = (x, y, measured) if residual is fg.between else (x, y)
+    seen = fg.SE2.between(x, y)
+    expected = fg.SE2.log(fg.SE2.between(measured, seen) if residual is fg.between else seen)
+    after = fg.SE2.right_jacobian_inverse(expected)
+    first = -after @ fg.SE2.adjoint(fg.SE2.between(y, x))
+    np.testing.assert_allclose(kernel(*given), expected, rtol=1e-12, atol=1e-12)
+    blocks = kernel.jacobian(*given)
+    np.testing.assert_allclose(blocks[0], first, rtol=1e-12, atol=2e-12)
+    np.testing.assert_allclose(blocks[1], after, rtol=1e-12, atol=1e-12)

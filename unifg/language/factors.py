@@ -19,7 +19,7 @@ from unifg.errors import GraphError
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.per_factor import per_factor
 from unifg.kernels.residuals import Residual, residual
-from unifg.lie import LieGroup, Manifold, Rn, rn
+from unifg.lie import LieGroup, Manifold, Rn, rn, se2
 from unifg.lie.functions import Functions, functions_of
 from unifg.machine.calls import local_matrix, local_vector, vector
 from unifg.machine.jit import compiled
@@ -62,6 +62,8 @@ def _relative(group: LieGroup, functions: Functions) -> Callable[..., None]:
     storage, dim = group.storage, group.dim
     between, log, adjoint = functions.between, functions.log, functions.adjoint
     inverse_jacobian = functions.right_jacobian_inverse
+    if (between, log, adjoint, inverse_jacobian) == (se2.between, se2.log, se2.adjoint, se2.right_jacobian_inverse):
+        return _planar_relative
 
     @compiled
     def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
@@ -87,6 +89,12 @@ def _relative(group: LieGroup, functions: Functions) -> Callable[..., None]:
                     J[i, dim + k] = after[i, k]
 
     return kernel
+
+
+@compiled
+def _planar_relative(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """The same in the plane."""
+    se2.write_relative(vector(v, 0, 3), vector(v, 3, 3), p, r, J)
 
 
 def _deviation(group: LieGroup, functions: Functions) -> Callable[..., None]:
