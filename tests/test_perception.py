@@ -211,6 +211,34 @@ def test_mover_that_waited_is_followed_when_it_goes_on() -> None:
     assert max(away) < 0.05
 
 
+@pytest.mark.parametrize("waits", [5.0, 12.0])
+def test_a_mover_that_has_stood_for_long_stands(waits: float) -> None:
+    """Ten seconds in one place; and when it goes on then, that is seen as of any other."""
+    occupancy = hall(pillar=True)
+    mover = Obstacle(np.array([6.5, 4.0]), 0.2, np.array([4.0, 4.0]), 0.3)
+    world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(4))
+    tracker, rng = DiscTracker(field(occupancy)), np.random.default_rng(5)
+    watch(world, tracker, 41, np.zeros(3), rng)  # it has come to the robot and waits from then on
+    assert tracker.tracks().mover.tolist() == [True]
+    tracks = watch(world, tracker, round(10.0 * waits), np.zeros(3), rng)
+    assert tracks.mover.tolist() == [waits < 10.0] and not tracks.velocity.any()
+    x, y = world.obstacle_states()[0, :2]
+    assert np.hypot(*(tracks.centre[0] - [x, y])) < 0.04
+    world.carry(np.array([2.0, 6.5, 0.0]))
+    again = [watch(world, tracker, 1, np.zeros(3), rng) for _ in range(12)]
+    assert any(seen.mover.any() for seen in again)
+
+
+@pytest.mark.parametrize("speed", [0.1, 0.3])
+def test_one_who_goes_to_and_fro_stays_a_mover(speed: float) -> None:
+    occupancy = hall(pillar=True)
+    mover = Obstacle(np.array([4.0, 5.5]), 0.2, np.array([4.8, 5.5]), speed)
+    world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(4), courteous=False)
+    tracker, rng = DiscTracker(field(occupancy)), np.random.default_rng(5)
+    watch(world, tracker, 60, np.zeros(3), rng)
+    assert all(watch(world, tracker, 10, np.zeros(3), rng).mover.all() for _ in range(20))
+
+
 def test_memory_of_things_out_of_view() -> None:
     """A fixed disc behind a pillar is remembered; a mover is forgotten after a second and a half."""
     occupancy = hall(pillar=True)

@@ -3,8 +3,9 @@
 `unifg.scenarios.seeing.discs` finds discs in one scan; here they become tracks. Each track runs two small Kalman
 filters side by side, one of a disc that stands still and one of a disc at constant velocity (Bar-Shalom, Li,
 Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, chapter 6). A track is still until
-its velocity is beyond doubt. Things out of view are remembered while they stand still, and forgotten soon
-once they move.
+its velocity is beyond doubt, and again once it was seen in one place for long: a disc half hidden behind another
+seems to move while the robot passes, and nobody should wait for it ever after. Things out of view are remembered
+while they stand still, and forgotten soon once they move.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ _SURPRISE = 6.0  # squared innovation, in variances, that only a change of motio
 _FIRST_SPEED = 0.2  # [m/s]; standard deviation of the velocity of a new track, per axis
 _DRIFT = 0.03  # [m/sqrt(s)]; how fast the memory of a standing disc fades
 _CLEAR_LIMIT = 3  # scans in a row that see through a remembered disc before it is dropped
+_SETTLED = 10.0  # [s]; what was seen for so long ...
+_HOME = 0.15  # [m]; ... no farther than this from one place stands still, whatever it did before
 _PATIENCE = 1.5  # [s]; a mover unseen for longer is forgotten
 _RADIUS_SIGMA_FLOOR = 0.008  # [m]; a radius is never held for better known
 
@@ -50,6 +53,8 @@ class _Filters(Rows):
     clear: IntArray
     moving: BoolArray
     has_moved: BoolArray
+    home: Array  # (m, 2) the place it has not left for the time stayed, while it was seen
+    stayed: Array
 
     @staticmethod
     def of(discs: Discs, identity: IntArray) -> _Filters:
@@ -62,7 +67,7 @@ class _Filters(Rows):
         return _Filters(
             mean, covariance, discs.centre.copy(), variance, discs.radius.copy(), discs.radius_sigma**-2.0, identity,
             np.ones(count, dtype=np.intp), np.zeros(count), np.zeros(count, dtype=np.intp),
-            np.zeros(count, dtype=bool), np.zeros(count, dtype=bool),
+            np.zeros(count, dtype=bool), np.zeros(count, dtype=bool), discs.centre.copy(), np.zeros(count),
         )  # fmt: skip
 
 
@@ -181,6 +186,7 @@ class DiscTracker:
         rows.unseen[track] = 0.0
         rows.clear[track] = 0
         self._judge_motion(track, variance)
+        self._settle(track, dt)
 
     def _judge_motion(self, track: IntArray, variance: Array) -> None:
         """Decide which tracks move: velocity beyond doubt to begin, plainly slow to end."""
@@ -194,6 +200,20 @@ class DiscTracker:
         moved = track[moving]
         rows.anchor[moved] = rows.mean[moved, 0]
         rows.anchor_variance[moved] = variance[moving]
+
+    def _settle(self, track: IntArray, dt: float) -> None:
+        """Take for standing what has not left its place for long."""
+        rows = self._rows
+        left = np.linalg.norm(rows.mean[track, 0] - rows.home[track], axis=1) > _HOME
+        rows.home[track[left]] = rows.mean[track[left], 0]
+        rows.stayed[track] = np.where(left, 0.0, rows.stayed[track] + dt)
+        settled = track[rows.has_moved[track] & (rows.stayed[track] > _SETTLED)]
+        rows.has_moved[settled] = rows.moving[settled] = False
+        rows.mean[settled, 1] = 0.0
+        rows.covariance[settled, 0, 1] = rows.covariance[settled, 1, 0] = 0.0
+        rows.covariance[settled, 1, 1] = _FIRST_SPEED**2
+        rows.anchor[settled] = rows.mean[settled, 0]
+        rows.anchor_variance[settled] = rows.covariance[settled, 0, 0]
 
     def _review(self, missed: BoolArray, scan: Scan, pose: Array, dt: float) -> None:
         """Age the tracks that were not seen; drop those seen through, gone or found by chance."""

@@ -22,7 +22,7 @@ class Tracks(Rows):
         radius: (m,) [m].
         identity: (m,) number of the track, kept for its lifetime.
         unseen: (m,) time since the track was last seen [s].
-        mover: (m,) whether it has ever moved; what stands now may go on.
+        mover: (m,) whether it has moved, and not stood in one place since for long; what stands now may go on.
     """
 
     centre: Array
