@@ -111,16 +111,17 @@ class Controller:
         most = self._worth(rest.states, centres, tracks.radius)
         for number, way in enumerate(evasions(last, s.most, s.box[1], s.horizon, s.dt)):
             states = followed(pose, last, way, s.dt)
-            off_walls, room = self._worth(states, centres, tracks.radius)
-            worth = off_walls, room + (COMMITTED if number == before else 0.0)
+            off_walls, clear, room = self._worth(states, centres, tracks.radius)
+            worth = off_walls, clear, room + (COMMITTED if number == before else 0.0)
             if worth > most:
                 most, best, self._evasion = worth, WayOut(states, way, evades=True), number
         return best
 
-    def _worth(self, states: Array, centres: Array, radii: Array) -> tuple[bool, float]:
-        """How good a way out is, the greater the better: whether it touches no wall, and its least distance."""
-        walls = self._off_walls(states)
-        return walls + self.settings.wall_clearance >= OFF_WALLS, min(self._room(states, centres, radii), walls)
+    def _worth(self, states: Array, centres: Array, radii: Array) -> tuple[bool, bool, float]:
+        """How good a way out is, the greater the better: whether it touches no wall, nobody, and its least distance."""
+        walls, room = self._off_walls(states), self._room(states, centres, radii)
+        clear = room + self.settings.disc_clearance >= 0.0
+        return walls + self.settings.wall_clearance >= OFF_WALLS, clear, min(room, walls)
 
     def _room(self, states: Array, centres: Array, radii: Array) -> float:
         """Least gap between the hull at states (N + 1, 3) and discs at centres (N, k, 2), beyond what is to be kept."""
