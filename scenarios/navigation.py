@@ -242,12 +242,12 @@ class Episode:
         )
         self._outcomes = ["time ran out"] * len(self.goals)
         self._goal, self._driven, self._dead_reckoning = 0, 0.0, self.pilot.pose
-        self._begun, self._helpless = 0.0, 0.0
+        self._begun, self._allowed, self._helpless = 0.0, 0.0, 0.0
 
     @property
     def longest(self) -> int:
-        """Ticks that the drive may take."""
-        return int(sum(map(_longest, self.legs)) / self.settings.controller.dt)
+        """Ticks that the drive may take, if no detour is more than twice as long as its way."""
+        return int(2.0 * sum(map(_longest, self.legs)) / self.settings.controller.dt)
 
     def finish(self, interrupted: bool) -> EpisodeLog:
         """Close the log."""
@@ -320,7 +320,8 @@ class Episode:
         leg = self.legs[goal]
         if leg.blocked is not None and not pilot.verdict.cause:
             return str(leg.blocked)
-        if self.world.time - self._begun > _longest(leg):
+        self._allowed = max(self._allowed, _longest(leg))  # of the longest way so far: what is left gets short
+        if self.world.time - self._begun > self._allowed:
             return "timed out" + (f": {pilot.verdict.cause}" if pilot.verdict.cause else "")
         return None
 
@@ -330,7 +331,7 @@ class Episode:
 
     def _begin_leg(self, goal: int) -> None:
         """Plan to a goal from where the robot believes to be; without a way it is given up at the next tick."""
-        self._begun = self.world.time
+        self._begun, self._allowed = self.world.time, 0.0
         self.pilot.forget()
         try:
             self.legs[goal] = self._route(self._freed(self.pilot.pose), self.goals[goal])

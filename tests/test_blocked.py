@@ -69,6 +69,23 @@ def test_a_closed_corridor_is_not_hit_and_said_to_be_blocked(
     assert episode_metrics(log)["outcomes"] == log.outcomes and not log.succeeded
 
 
+def test_the_time_for_a_goal_is_that_of_the_longest_way_so_far(tmp_path: Path) -> None:
+    """A detour that is nearly driven is short again, and no reason to give the goal up."""
+    drive = navigation.Episode(settings(tmp_path, corridor(), 1.0, 10.0))
+    drive.begin()
+    leg = drive.legs[0]
+    direct, short = leg.path, leg.path[-3:]
+    detour = np.concatenate([direct, direct[::-1], direct])
+    asked = [(direct, 10.0), (detour, 90.0), (short, 120.0), (short, 160.0), (short, 180.0)]
+    found = []
+    for path, now in asked:
+        leg.path, drive.world._space.time = path, now
+        found.append(drive._outcome(0))
+    assert found == [None, None, None, None, "timed out"]  # 27 m in 108 s, and a minute
+    drive._begin_leg(0)
+    assert drive._outcome(0) is None
+
+
 @pytest.mark.parametrize(("cells", "passes"), [(8, False), (9, False), (11, True)])
 def test_a_door_is_passed_or_refused(tmp_path: Path, cells: int, passes: bool) -> None:
     chosen = settings(tmp_path, corridor(cells), 4.8, 7.2)
