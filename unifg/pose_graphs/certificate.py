@@ -178,8 +178,9 @@ class _Judge:
         greatest = 1e3 * self.weight
         if not self.weight > 0.0:  # every map costs nothing
             return _Verdict(cost, 0.0, tolerance, 0.0, np.zeros((problem.count, dim + 1)))
+        largest = (tolerance - beyond) / frames * (1.0 - 1e-9)  # that still proves what is asked
         while not (system.factor(entries, shift * lifted) and system.definite):
-            shift *= 10.0
+            shift = largest if shift < largest else 10.0 * shift
             if not shift < greatest:
                 return _Verdict(cost, np.inf, tolerance, -np.inf, np.zeros((problem.count, dim + 1)))
         proven = beyond + shift * frames
