@@ -55,26 +55,30 @@ def run_fleet(
         raise ScenarioError(f"robots that drive together need one sampling time, got {sorted(dts)} s")
     shares = [range(first, len(robots), workers) for first in range(min(workers, len(robots)))]
     pools: list[Executor] = [Workers(1) for _ in shares] if len(shares) > 1 else [Inline()]
+    name = id(pools)  # of this drive, in a process that may have several
     try:
-        return _driven(robots, shares, pools, progress or silent)
+        return _driven(name, robots, shares, pools, progress or silent)
     finally:
+        _parts.pop(name, None)  # where it ended by an exception
         for pool in pools:
             pool.shutdown(cancel_futures=True)
 
 
 def _driven(
-    robots: Sequence[NavigationSettings], shares: Sequence[range], pools: Sequence[Executor], progress: Progress
+    name: int,
+    robots: Sequence[NavigationSettings],
+    shares: Sequence[range],
+    pools: Sequence[Executor],
+    progress: Progress,
 ) -> list[EpisodeLog]:
     """Tick until all have ended, each share in its pool."""
-    name = id(pools)  # of this drive, in a process that may have several
     longest = max(_all([pool.submit(_begin, name, robots, mine) for pool, mine in zip(pools, shares, strict=True)]))
     told: dict[int, _Told] = {}
 
     def tick(count: int) -> tuple[float, str] | None:
-        found = _all([pool.submit(_go_on, name, count, dict(told)) for pool in pools])
-        told.clear()
-        for decided in found:
-            told.update(decided)
+        nonlocal told
+        found = _all([pool.submit(_go_on, name, count, told) for pool in pools])
+        told = {number: one for decided in found for number, one in decided.items()}
         if not told:
             return None
         return 1.0 - len(told) / len(robots), f"{len(told)} robots under way"
@@ -100,11 +104,10 @@ class _Told:
 
 @dataclass
 class _Part:
-    """All robots' worlds, who is driven from here, and who of them is still under way."""
+    """All robots' worlds, and who is driven from here."""
 
     fleet: list[Episode]
-    mine: list[int]
-    driving: list[int]
+    mine: Sequence[int]
 
 
 _parts: dict[int, _Part] = {}  # of this process
@@ -122,7 +125,7 @@ def _begin(name: int, robots: Sequence[NavigationSettings], mine: Sequence[int])
             x, y, _ = one.start
             raise ScenarioError(f"robot {number + 1} cannot start at ({x:g}, {y:g}): another one stands there")
         one.begin()
-    _parts[name] = _Part(fleet, list(mine), list(mine))
+    _parts[name] = _Part(fleet, mine)
     return max(one.longest for one in fleet)
 
 
@@ -136,10 +139,10 @@ def _go_on(name: int, count: int, told: Mapping[int, _Told]) -> dict[int, _Told]
     dt = fleet[0].settings.controller.dt
     for _ in zip_longest(*(fleet[number].world.stepping(*told[number].command, dt) for number in sorted(told))):
         pass  # a substep of all
-    if count:
-        part.driving = [number for number in part.driving if number in told]
     decided: dict[int, _Told] = {}
-    for number in part.driving:
+    for number in part.mine:
+        if count and number not in told:  # it has ended
+            continue
         command = fleet[number].decide(count)
         if command is not None:
             decided[number] = _Told(command, fleet[number].carried)

@@ -12,6 +12,7 @@ import pytest
 
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, save_map
+from unifg.scenarios import fleet
 from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.fleet import run_fleet
 from unifg.scenarios.navigation import NavigationSettings
@@ -98,6 +99,14 @@ def test_what_goes_wrong_in_a_process_is_said_here(places: list[NavigationSettin
 
     logs = run_fleet(places, stop, workers=2)
     assert [log.interrupted for log in logs] == [True, True] and min(log.ticks for log in logs) >= 1
+
+    def fail(done: float, words: str) -> None:
+        raise OSError("nobody listens")
+
+    for workers in (1, 2):
+        with pytest.raises(OSError, match="nobody listens"):
+            run_fleet(places, fail, workers=workers)
+    assert not fleet._parts, "worlds of a drive that failed are let go"
 
 
 def test_two_robots_get_past_each_other(places: list[NavigationSettings]) -> None:
