@@ -4,9 +4,9 @@
         [--any-code]
 
 The campaigns are benchmarks/campaigns/department.toml (his Table I) and factory.toml (Table II), and for the same legs
-with other planners department-others.toml and factory-others.toml; what is on file in out/benchmarks/campaigns is not
-repeated, and all of it is on the page. Thirty runs a leg with two couplings take some three hours of one core, those of
-the four other planners some six.
+with other planners department-others.toml and factory-others.toml. What is on file in out/benchmarks/campaigns or kept in
+benchmarks/campaigns/rows is not repeated; all of it is on the page, and all of it is kept. Thirty runs a leg with two
+couplings take some two hours of one core, those of the four other planners some six.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.kept_rows import ROWS, keep, restore
 from benchmarks.large_maps import CAMPAIGNS
 from benchmarks.report import OUT, command, machine, publish, table
 from unifg.scenarios.campaigns.account import differences
-from unifg.scenarios.campaigns.campaign import code_of_scenario, replay_command, run_campaign
+from unifg.scenarios.campaigns.campaign import code_of_scenario, replay_command, run_campaign, write_manifest
 from unifg.scenarios.campaigns.comparison import interval, share
 from unifg.scenarios.campaigns.document import Heading, Table, Words
 from unifg.scenarios.campaigns.performed import OK
@@ -325,12 +326,16 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     sheets = {}
     for name in CAMPAIGN_NAMES:
-        folder = OUT / "campaigns" / name
+        folder, archive = OUT / "campaigns" / name, ROWS / f"{name}.jsonl.xz"
+        whole = read(CAMPAIGNS / f"{name}.toml")
+        restore(archive, folder)
         if not options.report and name in options.campaigns:
             couplings = options.couplings if name in PAPER else COUPLINGS
-            statement = _some(read(CAMPAIGNS / f"{name}.toml"), options.runs, couplings)
-            run_campaign(statement, folder, workers=options.workers, any_code=options.any_code)
+            some = _some(whole, options.runs, couplings)
+            run_campaign(some, folder, workers=options.workers, any_code=options.any_code)
+            keep(folder, archive)
         if folder.is_dir():
+            write_manifest(folder, whole, code_of_scenario("navigation"))  # not of this command's part alone
             sheets[name] = load(folder, options.any_code, failed_too=True)
     codes = {sheet.code for sheet in sheets.values()}
     publish("experiments", rendered(sheets), None if codes == {code_of_scenario("navigation")} else codes)

@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 
 from benchmarks.experiments import beside, drivers, leg_by_leg, rendered
+from benchmarks.kept_rows import ROWS, keep, restore
 from benchmarks.large_maps import CAMPAIGNS
 from benchmarks.localisation import LOG, made, mapped, real_ticks, replayed
+from unifg.errors import ScenarioError
 from unifg.files.carmen import read_carmen
+from unifg.scenarios.campaigns.campaign import EPISODES
+from unifg.scenarios.campaigns.journal import Journal, lines_of
 from unifg.scenarios.campaigns.performed import FAILED, OK
 from unifg.scenarios.campaigns.sheet import Combination, Failure, Sheet
 from unifg.scenarios.campaigns.statement import read
@@ -95,6 +99,37 @@ def test_others_drive_the_same_legs_on_the_same_seeds() -> None:
         legs = [next(axis for axis in made.axes if axis.name == "leg") for made in (ours, others)]
         assert legs[0] == legs[1]
         assert {episode.settings["planner"] for episode in others.episodes()} == {"teb", "mppi", "dwa", "pursuit"}
+
+
+def test_rows_that_are_kept_come_back_once(tmp_path: Path) -> None:
+    """Of an episode that was run twice the last is kept; what is on file stays; a second time adds nothing."""
+    ran, archive = tmp_path / "ran", tmp_path / "rows" / "department.jsonl.xz"
+    with Journal(ran / EPISODES) as journal:
+        for line in ('{"key": "b", "seconds": 1}', '{"key": "a", "seconds": 2}', '{"key": "b", "seconds": 3}'):
+            journal.add(line)
+    keep(ran, archive)
+    first = archive.read_bytes()
+    fresh = tmp_path / "fresh"
+    with Journal(fresh / EPISODES) as journal:
+        journal.add('{"key": "a", "seconds": 4}')
+    assert restore(archive, fresh) == 1
+    assert [(row["key"], row["seconds"]) for row in lines_of(fresh / EPISODES)] == [("a", 4), ("b", 3)]
+    assert restore(archive, fresh) == 0 and restore(tmp_path / "none.xz", fresh) == 0
+    assert restore(archive, tmp_path / "empty") == 2
+    keep(tmp_path / "empty", archive)
+    assert archive.read_bytes() == first, "the same rows are the same bytes"
+    archive.write_bytes(first[: len(first) // 2])
+    with pytest.raises(ScenarioError, match=r"department\.jsonl\.xz: is damaged"):
+        restore(archive, fresh)
+
+
+@pytest.mark.parametrize("name", ["department", "department-others", "factory", "factory-others"])
+def test_rows_in_the_checkout_are_of_the_campaigns(name: str, tmp_path: Path) -> None:
+    if not restore(ROWS / f"{name}.jsonl.xz", tmp_path):
+        pytest.skip("none is kept")
+    known = {episode.key for episode in read(CAMPAIGNS / f"{name}.toml").episodes()}
+    keys = [row["key"] for row in lines_of(tmp_path / EPISODES)]
+    assert known.issuperset(keys) and len(set(keys)) == len(keys)
 
 
 @pytest.mark.data

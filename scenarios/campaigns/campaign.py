@@ -25,7 +25,10 @@ from unifg.scenarios.campaigns.statement import Statement, module_of, read
 from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.workers import Workers
 
-__all__ = ["EPISODES", "MANIFEST", "Campaign", "code_of_scenario", "manifest_of", "replay_command", "run_campaign"]
+__all__ = [
+    "EPISODES", "MANIFEST", "Campaign", "code_of_scenario", "manifest_of", "replay_command", "run_campaign",
+    "write_manifest",
+]  # fmt: skip
 
 EPISODES, MANIFEST = "episodes.jsonl", "campaign.json"
 
@@ -105,7 +108,7 @@ def run_campaign(
         known = {episode.key for episode in statement.episodes()}
         done = _on_file(found, known, code, again, any_code)
         _remark_changes(found, statement, code, done)
-        _write_manifest(folder, statement, code)
+        write_manifest(folder, statement, code)
         found.outcomes = Counter(done.values())
         orders = _orders(statement, code, done)
         meter = _Meter(found, progress)
@@ -212,7 +215,12 @@ def _remark_changes(found: Campaign, statement: Statement, code: str, done: dict
         )
 
 
-def _write_manifest(folder: Path, statement: Statement, code: str) -> None:
+def write_manifest(folder: Path, statement: Statement, code: str) -> None:
+    """Say in the folder of a campaign which one it is, and by which code it was run last.
+
+    Raises:
+        ScenarioError: the folder cannot be written.
+    """
     said = {
         "campaign": statement.given,
         "base": str(statement.base),

@@ -183,7 +183,8 @@ class LocalPlanner(ABC, Generic[Own]):
         change, (least, most) = s.most, s.box
         last = np.broadcast_to(self.applied, wanted[..., 0, :].shape)
         for k in range(wanted.shape[-2]):
-            last = np.clip(np.clip(wanted[..., k, :], least, most), last - change, last + change)
+            wish = np.minimum(np.maximum(wanted[..., k, :], least), most)  # np.clip takes twice as long
+            last = np.minimum(np.maximum(wish, last - change), last + change)
             made[..., k, :] = last
         return made
 

@@ -28,12 +28,17 @@ def nearest_on(now: Situation, points: Array) -> tuple[Array, Array]:
     Returns:
         (M,) and (M,) [m].
     """
-    begin, span = now.reference[:-1, :2], np.diff(now.reference[:, :2], axis=0)
+    x, y = np.ascontiguousarray(points.T)
+    closest, left = np.full(len(points), np.inf), np.zeros(len(points))
     arc = now.along()
-    length = np.diff(arc)
-    offset = points[:, None] - begin
-    share = np.clip(np.einsum("mki,ki->mk", offset, span) / np.maximum(length**2, 1e-18), 0.0, 1.0)
-    gap = np.hypot(*np.moveaxis(offset - share[..., None] * span, 2, 0))
-    nearest = np.argmin(gap, axis=1)
-    rows = np.arange(len(points))
-    return gap[rows, nearest], arc[-1] - (arc[nearest] + share[rows, nearest] * length[nearest])
+    # One segment after the other: all at once is an array of a hundred thousand vectors, four times slower.
+    for (bx, by), (sx, sy), passed, length in zip(
+        now.reference[:-1, :2], np.diff(now.reference[:, :2], axis=0), arc, np.diff(arc), strict=False
+    ):
+        dx, dy = x - bx, y - by
+        share = np.minimum(np.maximum((dx * sx + dy * sy) / max(length**2, 1e-18), 0.0), 1.0)
+        gap = np.square(dx - share * sx) + np.square(dy - share * sy)
+        closer = gap < closest
+        closest = np.where(closer, gap, closest)
+        left = np.where(closer, arc[-1] - (passed + share * length), left)
+    return np.sqrt(closest), left

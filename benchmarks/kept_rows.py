@@ -1,0 +1,55 @@
+"""Rows of campaigns that take longer than one sitting, kept in the checkout beside the files that state them.
+
+To read them: ``xz -dc benchmarks/campaigns/rows/department.jsonl.xz``.
+"""
+
+from __future__ import annotations
+
+import json
+import lzma
+from pathlib import Path
+
+from benchmarks.large_maps import CAMPAIGNS
+from unifg.errors import ScenarioError
+from unifg.scenarios.campaigns.campaign import EPISODES
+from unifg.scenarios.campaigns.journal import Journal, lines_of
+
+__all__ = ["ROWS", "keep", "restore"]
+
+ROWS = CAMPAIGNS / "rows"
+
+
+def keep(folder: Path, archive: Path) -> None:
+    """Pack the rows of a campaign's folder, of each episode the last; the same rows give the same bytes."""
+    last = {row["key"]: row for row in lines_of(folder / EPISODES)}
+    text = "".join(json.dumps(last[key]) + "\n" for key in sorted(last))
+    archive.parent.mkdir(parents=True, exist_ok=True)
+    beside = archive.with_suffix(".new")
+    beside.write_bytes(lzma.compress(text.encode(), preset=9))
+    beside.replace(archive)
+
+
+def restore(archive: Path, folder: Path) -> int:
+    """Add to a campaign's folder the rows of episodes that are kept and not on file there.
+
+    Returns:
+        How many were added.
+
+    Raises:
+        ScenarioError: the archive is damaged, or the folder cannot be written or is in use.
+    """
+    if not archive.is_file():
+        return 0
+    try:
+        kept = {
+            str(json.loads(line)["key"]): line for line in lzma.decompress(archive.read_bytes()).decode().splitlines()
+        }
+    except (lzma.LZMAError, ValueError, KeyError, TypeError) as error:
+        raise ScenarioError(f"{archive}: is damaged ({error}); take it from the repository again") from None
+    on_file = {str(row.get("key")) for row in lines_of(folder / EPISODES)}
+    missing = [line for key, line in kept.items() if key not in on_file]
+    if missing:
+        with Journal(folder / EPISODES) as journal:
+            for line in missing:
+                journal.add(line)
+    return len(missing)
