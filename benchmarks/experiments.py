@@ -4,9 +4,9 @@
         [--any-code]
 
 The campaigns are benchmarks/campaigns/department.toml (his Table I) and factory.toml (Table II), and for the same legs
-with other planners department-others.toml and factory-others.toml. What is on file in out/benchmarks/campaigns or kept in
-benchmarks/campaigns/rows is not repeated; all of it is on the page, and all of it is kept. Thirty runs a leg with two
-couplings take some two hours of one core, those of the four other planners some six.
+with other planners department-others.toml and factory-others.toml. What is on file in out/benchmarks/campaigns or kept
+in benchmarks/campaigns/rows is not repeated; all of it is on the page, and kept. Thirty runs a leg with two couplings
+take some two hours of one core, those of the four other planners some six.
 """
 
 from __future__ import annotations
