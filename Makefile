@@ -51,6 +51,7 @@ test: $(VENV)/ready
 
 # What is old calls what is new in ways that have since been deprecated.
 test-lowest: $(VENV)-lowest/ready
+	$(ONE_THREAD) $(VENV)-lowest/bin/unifg warmup
 	$(ONE_THREAD) $(VENV)-lowest/bin/python -m pytest -n $(WORKERS) --dist loadgroup -W ignore::DeprecationWarning $(PYTEST)
 
 fuzz: $(VENV)/ready

@@ -14,6 +14,7 @@ Every entry that can differ from zero is written by name: a step touches 90 of t
 from __future__ import annotations
 
 from unifg.lie import so3
+from unifg.lie.rn import minus
 from unifg.lie.series import k_value
 from unifg.machine.calls import local_matrix, local_vector
 from unifg.machine.jit import compiled
@@ -170,7 +171,7 @@ def _straight(x: Array, after: int, blow: tuple[float, float, float], h: float, 
     """Write the rows of the position, begin those of the velocity with what does not depend on the state; clear J."""
     half = 0.5 * h
     for i in range(3):
-        r[i] = x[after + i] - x[i] - half * (x[7 + i] + x[after + 7 + i])
+        r[i] = minus(minus(x[after + i], x[i]), half * (x[7 + i] + x[after + 7 + i]))
         r[6 + i] = x[after + 7 + i] - x[7 + i] - h * blow[i]
     if len(J):
         for i in range(9):

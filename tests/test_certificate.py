@@ -124,7 +124,9 @@ def test_a_folded_loop_is_refused_and_unfolded(name: str, count: int, turns: int
     assert refused.chi2 - refused.gap <= certify(right).chi2
     assert refused.least_eigenvalue == pytest.approx(np.linalg.eigvalsh(dense_dual(folded, refused.poses))[0], rel=1e-3)
     found = certify(folded, staircase=True)
-    assert found.certified and found.rank > folded.group.point_dim
+    assert found.certified
+    # Two dimensions more hold a way out and the optimum; a slope that is not small there sends the staircase on.
+    assert folded.group.point_dim < found.rank <= folded.group.point_dim + 2
     assert solved(folded.with_poses(found.poses)).chi2() == pytest.approx(right.chi2(), rel=1e-6)
     assert np.array_equal(found.poses[0], folded.poses[0])  # the anchor stays
 

@@ -12,6 +12,8 @@ import pytest
 import unifg as fg
 from problems import offsets
 from unifg.kernels.differences import gradient_and_hessian, jacobian
+from unifg.lie.rn import minus
+from unifg.machine.jit import compiled
 from unifg.models import quadrotor, unicycle
 from unifg.program.curvature import lagrangian_hessian
 from unifg.typing import Array
@@ -203,6 +205,17 @@ def test_shipped_kernels_do_not_round_far_out(name: str) -> None:
         for offset in (0.0, 5e6)
     ]
     np.testing.assert_allclose(at[1], at[0], rtol=0.0, atol=1e-14)
+
+
+@compiled
+def _defect(y: float, x: float, moved: float) -> float:
+    return minus(minus(y, x), moved)
+
+
+def test_what_may_be_reordered_is_kept_from_it() -> None:
+    """``minus(y, x) - moved`` is not: the outer operation's liberty is enough to make y - (x + moved) of it."""
+    moved = 0.1234567890123456
+    assert _defect(5e6 + 0.25, 5e6, moved) == 0.25 - moved
 
 
 @pytest.mark.parametrize("asked", ["soft", "hard goal", "obstacle"])

@@ -17,7 +17,10 @@ from unifg.typing import Array, ArrayLike
 
 @in_order
 def minus(a: float, b: float) -> float:
-    """Return ``a - b`` as it stands: of (y - x) - b a compiler would make y - (x + b), which is rounded far out."""
+    """Return ``a - b`` as it stands: of (y - x) - b a compiler would make y - (x + b), which is rounded far out.
+
+    It takes *both* to keep it from that, ``minus(minus(y, x), b)``: the liberties of either are enough.
+    """
     return a - b
 
 

@@ -201,13 +201,14 @@ class Relaxation:
             whole[system.free] = step[:, :, 0]
             trial = _retract(point, basis, whole)
             lower = self.cost(trial)
+            if promised <= STILL * cost:
+                # Here rounding decides which cost is lower. The multipliers are as exact as the slope, though, which a
+                # last step by Newton's method squares, so that it is taken unless it is no such step any more.
+                return trial if lower <= cost * (1.0 + 1e3 * STILL) else point
             if lower <= cost:
                 point, cost, damping = trial, lower, (0.1 * damping if damping > FRAME * scale else 0.0)
-            elif promised > STILL * cost:
+            else:
                 damping = max(10.0 * damping, FRAME * scale)
-                continue
-            if promised <= STILL * cost:
-                return point
         return point
 
 
