@@ -227,7 +227,8 @@ def test_the_log_of_a_mower_without_a_map(shared_data: Path) -> None:
     for k in range(4):
         near = np.flatnonzero(beacon == k)[:150]
         A = np.column_stack([2.0 * path[near, :2], -np.ones(len(near))])
-        first.append(np.linalg.lstsq(A, np.sum(path[near, :2] ** 2, axis=1) - log.measured[near] ** 2, rcond=None)[0][:2])
+        target = np.sum(path[near, :2] ** 2, axis=1) - log.measured[near] ** 2
+        first.append(np.linalg.lstsq(A, target, rcond=None)[0][:2])
     solution = LevenbergMarquardt().solve(graph, {x: path, b: np.array(first), long: [[1.0, 0.0]]})
     assert solution.status.name == "CONVERGED" and abs(solution[long][0, 0] - 1.066) < 2e-3
 

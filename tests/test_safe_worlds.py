@@ -29,9 +29,7 @@ def test_loops_are_stepped_exactly(loops: Loops) -> None:
     a = np.array([[0.0, 1.0 / loops.lag], [-loops.gain, -1.0 / loops.lag]])  # of rate and lag rate'
     exact = np.array([expm(SUBSTEP * share * a) for share in np.linspace(0.0, 1.0, 2001)])
     np.testing.assert_allclose(loops.step()[:4].reshape(2, 2), exact[-1], atol=1e-12, rtol=1e-12)
-    np.testing.assert_allclose(
-        loops.step()[5:7], trapezoid(exact[:, 0], dx=1.0 / 2000, axis=0), rtol=1e-6, atol=1e-12
-    )
+    np.testing.assert_allclose(loops.step()[5:7], trapezoid(exact[:, 0], dx=1.0 / 2000, axis=0), rtol=1e-6, atol=1e-12)
     kept = np.exp(-SUBSTEP * np.linspace(0.0, 1.0, 2001) / loops.lag)
     np.testing.assert_allclose(loops.step()[[4, 7]], [kept[-1], trapezoid(kept, dx=1.0 / 2000)], rtol=1e-6)
 
