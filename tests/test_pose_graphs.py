@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 import unifg as fg
 from unifg.errors import GraphError
@@ -24,6 +26,7 @@ from unifg.pose_graphs import (
     odometric,
     sphere,
 )
+from unifg.pose_graphs.components import components
 from unifg.solvers import GaussNewton, LevenbergMarquardt
 from unifg.typing import Array
 
@@ -334,3 +337,12 @@ def test_gtsam_optimum_of_the_toy_graph(shared_data: Path) -> None:
     folder = shared_data / "pose_graphs"
     before, after = (read_pose_graph(folder / f"gtsam_{name}ToyGraph.txt") for name in ("noisy", "optimizedNoisy"))
     assert distance(fg.SE2, solved(before).poses, after.poses) < 3e-3
+
+
+def test_parts_are_those_of_a_reference() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        count, pairs = int(rng.integers(1, 60)), int(rng.integers(0, 70))
+        first, second = rng.integers(0, count, (2, pairs))
+        tied = coo_array((np.ones(pairs), (first, second)), shape=(count, count))
+        assert np.array_equal(components(count, first, second), connected_components(tied, directed=False)[1])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from llvmlite import ir
 from numba import types
@@ -22,6 +23,7 @@ RESIDUAL = (VECTOR, VECTOR, VECTOR, VECTOR, MATRIX)
 """Types of a residual: variables, parameters, table, residual (written), Jacobian (written)."""
 RETRACTION = (VECTOR, VECTOR, VECTOR)
 """Types of a retraction: point, step, moved point (written)."""
+_addresses: WeakKeyDictionary[Callable[..., Any], dict[tuple[Any, ...], int]] = WeakKeyDictionary()
 
 
 def address(function: Callable[..., Any], arguments: tuple[Any, ...]) -> int:
@@ -29,10 +31,13 @@ def address(function: Callable[..., Any], arguments: tuple[Any, ...]) -> int:
 
     The caller keeps ``function`` alive for as long as the address is used.
     """
-    dispatcher: Any = function
-    dispatcher.compile(types.void(*arguments))
-    result = dispatcher.overloads[arguments]
-    return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
+    known = _addresses.setdefault(function, {})
+    if arguments not in known:
+        dispatcher: Any = function
+        dispatcher.compile(types.void(*arguments))
+        result = dispatcher.overloads[arguments]
+        known[arguments] = int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
+    return known[arguments]
 
 
 def _primitive(generator: Callable[..., Any]) -> Any:

@@ -8,8 +8,6 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from unifg.answers.graph import Graph
 from unifg.errors import GraphError
@@ -18,6 +16,7 @@ from unifg.kernels.robust import Loss
 from unifg.language.factors import ManifoldResidual, between
 from unifg.language.variables import Family
 from unifg.lie import SE2, SE3, LieGroup, Rn
+from unifg.pose_graphs.components import components
 from unifg.pose_graphs.residuals import bearing, bearing_range, chart_between, distance, sighting
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -219,11 +218,7 @@ class PoseGraph:
         count = len(self.poses)
         rows = [self.edges.first, *(seen.pose for seen in self.sightings.values())]
         columns = [self.edges.second, *(count + seen.landmark for seen in self.sightings.values())]
-        row, column = np.concatenate(rows), np.concatenate(columns)
-        total = count + len(self.landmarks)
-        adjacency = coo_matrix((np.ones(len(row)), (row, column)), shape=(total, total))
-        part: IntArray = connected_components(adjacency, directed=False)[1].astype(np.intp)
-        return part
+        return components(count + len(self.landmarks), np.concatenate(rows), np.concatenate(columns))
 
     def _relative(self, residual: str) -> ManifoldResidual:
         if residual not in _RELATIVE:

@@ -301,8 +301,11 @@ def _joined(parts: list[IntArray]) -> IntArray:
 def locate(
     fields: IntArray, columns: IntArray, unknown: IntArray, indptr: IntArray, indices: IntArray, positions: IntArray
 ) -> None:
-    """Find every pair of columns of every factor in a matrix compressed by columns."""
-    at = 0
+    """Find every pair of columns of every factor in a matrix compressed by columns.
+
+    Unknowns of one variable stand side by side: the next pair is one row further on, or as far down the next column.
+    """
+    at = low = column_before = 0
     for t in range(len(fields)):
         width = fields[t, WIDTH]
         for i in range(fields[t, COUNT]):
@@ -312,12 +315,17 @@ def locate(
                     a, b = unknown[columns[column + d]], unknown[columns[column + e]]
                     positions[at] = -1
                     if a >= 0 and b >= 0:
-                        low, high = indptr[max(a, b)], indptr[max(a, b) + 1] - 1
-                        while low < high:
-                            middle = (low + high) // 2
-                            if indices[middle] < min(a, b):
-                                low = middle + 1
-                            else:
-                                high = middle
+                        beside, wanted = max(a, b), min(a, b)
+                        begin, high = indptr[beside], indptr[beside + 1] - 1
+                        low = low + 1 if beside == column_before else begin + low - indptr[column_before]
+                        if low > high or indices[low] != wanted:
+                            low = begin
+                            while low < high:
+                                middle = (low + high) // 2
+                                if indices[middle] < wanted:
+                                    low = middle + 1
+                                else:
+                                    high = middle
+                        column_before = beside
                         positions[at] = -2 - low if a == b and d != e else low
                     at += 1

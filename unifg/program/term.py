@@ -108,6 +108,8 @@ class CompiledTerm:
     """
 
     parameters: Array
+    whitener: Array
+    whitening: int
     _packed: Array
 
     def __init__(self, term: Term, columns: Columns) -> None:
@@ -133,6 +135,7 @@ class CompiledTerm:
         self._taken = tuple(range(len(term.arguments)))
         self.trace: Trace | None = None
         self._changes = 0
+        self._weighed = False
         self.bind({})
         self.route = "" if not term.residual.rows or isinstance(term, ScalarCost) else self._choose_single()
         self._require_stated_size()
@@ -540,17 +543,9 @@ class CompiledTerm:
 
     def _bind_parameters(self, data: Bound) -> None:
         term = self.term
-        self.whitening = 0
-        self.whitener: Array = np.zeros(0)
-        if isinstance(term, Cost):
-            if term.sigma is not None:
-                self.whitener = reciprocals(self.name, resolve(term.sigma, data), self.count, self.size)
-                self.whitening = DIAGONAL
-            if term.information is not None:
-                self.whitener = square_roots(self.name, resolve(term.information, data), self.count, self.size)
-                self.whitening = FULL
-            if self.whitening and len(self.whitener) > 1:
-                self.whitening |= 1
+        if not self._weighed:
+            self.whitening, self.whitener = self._weights(data)
+            self._weighed = not (isinstance(term, Cost) and {type(term.sigma), type(term.information)} & {Data})
         if isinstance(term, Constraint):
             self.lower = self._limit(resolve(term.lower, data), "lower", -np.inf)
             self.upper = self._limit(resolve(term.upper, data), "upper", np.inf)
@@ -558,6 +553,15 @@ class CompiledTerm:
         self.parameter_count = self.parameter_spread = 0
         if self.kernel is not None:
             self._pack(self.kernel)
+
+    def _weights(self, data: Bound) -> tuple[int, Array]:
+        """How residuals are whitened, and what by."""
+        term, how, by = self.term, 0, np.zeros(0)
+        if isinstance(term, Cost) and term.sigma is not None:
+            how, by = DIAGONAL, reciprocals(self.name, resolve(term.sigma, data), self.count, self.size)
+        if isinstance(term, Cost) and term.information is not None:
+            how, by = FULL, square_roots(self.name, resolve(term.information, data), self.count, self.size)
+        return how | (how > 0 and len(by) > 1), by
 
     def _pack(self, kernel: Kernel) -> None:
         """Put the kernel's parameters side by side, and after them the constants in the place of variables."""
