@@ -12,6 +12,7 @@ import pytest
 
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, save_map
+from unifg.machine.tally import tally
 from unifg.scenarios import fleet
 from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.fleet import run_fleet
@@ -80,10 +81,12 @@ def test_any_number_of_processes_drives_the_same(places: list[NavigationSettings
     third = replace(places[0], start=(4.4, 1.0, 0.0), goals=((6.0, 1.2, 0.0),), seed=7, faults=(kidnapped,))
     robots = [*places, third]
     alone, shared = run_fleet(robots), run_fleet(robots, workers=2)
+    # Code rounds otherwise in the process that compiles it, docs/limitations.md.
+    near = 1e-5 if tally.compiled else 0.0
     for one, other in zip(alone, shared, strict=True):
         assert one.outcomes == other.outcomes and one.ticks == other.ticks and one.collisions == other.collisions
-        assert np.array_equal(one.true_pose, other.true_pose) and np.array_equal(one.control, other.control)
-        assert np.array_equal(one.scan, other.scan, equal_nan=True)
+        for what in ("true_pose", "control", "scan"):
+            np.testing.assert_allclose(getattr(one, what), getattr(other, what), rtol=0.0, atol=near, err_msg=what)
     step = np.abs(np.diff(alone[2].true_pose[:, :2], axis=0)).max()
     assert step > 2.0, "it was carried"
 
