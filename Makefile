@@ -35,7 +35,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Matrices here are small: more threads per process only make the processes wait for each other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: docs kernels performance notebooks help demo test fuzz test-lowest processes lint types bench results stale release-build release-pages release-kernels release-check mutants fences clean offsets examples
+.PHONY: docs kernels performance notebooks help demo test fuzz test-lowest processes lint style types mypy pyright bench results stale release-build release-pages release-kernels release-check mutants fences clean offsets examples
 .DELETE_ON_ERROR:
 
 help:
@@ -61,13 +61,17 @@ processes: $(VENV)/ready
 	$(PIP) install joblib dask
 	UNIFG_EVERY_START=1 $(ONE_THREAD) $(BIN)/python -m pytest tests/test_processes.py
 
-lint: $(VENV)/ready-dev
-	$(BIN)/ruff check --output-format concise .
-	$(BIN)/mypy
-	$(BIN)/basedpyright
+lint: style types
 
-types: $(VENV)/ready-dev
+style: $(VENV)/ready-dev
+	$(BIN)/ruff check --output-format concise .
+
+types: mypy pyright
+
+mypy: $(VENV)/ready-dev
 	$(BIN)/mypy
+
+pyright: $(VENV)/ready-dev
 	$(BIN)/basedpyright
 
 bench: $(VENV)/ready-bench

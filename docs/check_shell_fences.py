@@ -1,8 +1,8 @@
 """Run the shell commands shown in README.md and docs/*.md in a scratch copy of the checkout: `make fences`.
 
 The commands of one page run in order, as a reader would type them, with the tools of the environment
-this script runs in. `unifg ...` runs for real. A few commands cannot be repeated here and are replaced
-by what can be checked of them:
+this script runs in; pages run side by side, and what one printed stands together. `unifg ...` runs for
+real. A few commands cannot be repeated here and are replaced by what can be checked of them:
 
     git clone ...           the scratch copy is already there, one directory below where the page starts
     make TARGET             make --dry-run TARGET: the target exists (tests and demo have runs of their own)
@@ -13,6 +13,7 @@ Every other command runs as it stands. A fence is left out only by `<!-- skip: r
 """
 
 import argparse
+import io
 import os
 import re
 import shutil
@@ -20,7 +21,10 @@ import signal
 import subprocess
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
+from typing import TextIO
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(CHECKOUT / "tests"))  # one reader of fences serves the tests and this script
@@ -60,7 +64,7 @@ def rewrite(line: str) -> str:
     return changed
 
 
-def scratch_copy(parent: Path) -> Path:
+def scratch_copy(parent: Path, told: TextIO) -> Path:
     """Clone the checkout; where it holds uncommitted changes, copy what a commit of them would hold."""
     target = parent / "unifg"
     git = ["git", "-C", str(CHECKOUT)]
@@ -68,7 +72,7 @@ def scratch_copy(parent: Path) -> Path:
     if status.returncode == 0 and not status.stdout:
         subprocess.run(["git", "clone", "--quiet", str(CHECKOUT), str(target)], check=True)
     elif status.returncode == 0:
-        print("The checkout holds uncommitted changes: checking a copy of it as it stands")
+        print("The checkout holds uncommitted changes: checking a copy of it as it stands", file=told)
         listing = subprocess.run(
             [*git, "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
             capture_output=True, text=True, check=True,
@@ -84,8 +88,8 @@ def scratch_copy(parent: Path) -> Path:
     return target
 
 
-def run_fence(fence: Fence, directory: Path, seconds: float) -> tuple[Path, str | None]:
-    """Run one fence in a directory.
+def run_fence(fence: Fence, directory: Path, seconds: float, told: TextIO) -> tuple[Path, str | None]:
+    """Run one fence in a directory; what it prints is added to ``told``.
 
     Returns:
         The directory the fence ended in, and what went wrong, if anything.
@@ -103,15 +107,21 @@ def run_fence(fence: Fence, directory: Path, seconds: float) -> tuple[Path, str 
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
         "MPLBACKEND": "Agg",
     }
-    process = subprocess.Popen(
-        ["bash", str(file)], cwd=directory, env=environment, stdin=subprocess.DEVNULL, start_new_session=True
-    )
-    try:
-        status = process.wait(timeout=seconds)
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        return directory, f"{fence.place}: not finished after {seconds:.0f} s"
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as printed:
+        process = subprocess.Popen(
+            ["bash", str(file)],
+            cwd=directory, env=environment, stdin=subprocess.DEVNULL, stdout=printed, stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )  # fmt: skip
+        try:
+            status = process.wait(timeout=seconds)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            return directory, f"{fence.place}: not finished after {seconds:.0f} s"
+        finally:
+            printed.seek(0)
+            told.write(printed.read())
     if status:
         failed = failed_at.read_text(encoding="utf-8").split()[0] if failed_at.exists() else fence.place
         failed_at.unlink(missing_ok=True)
@@ -121,29 +131,30 @@ def run_fence(fence: Fence, directory: Path, seconds: float) -> tuple[Path, str 
     return directory, None
 
 
-def check_page(page: Path, seconds: float) -> tuple[int, int, list[str]]:
+def check_page(page: Path, seconds: float) -> tuple[int, int, list[str], str]:
     """Run the shell fences of a page.
 
     Returns:
-        How many were run, how many were skipped, and the failures.
+        How many were run, how many were skipped, the failures, and what is to be shown.
     """
+    told = io.StringIO()
     blocks = [fence for fence in fences(page) if fence.language in SHELL]
     run = skipped = 0
     failures: list[str] = []
     with tempfile.TemporaryDirectory(prefix="unifg-fences-") as parent:
-        directory = scratch_copy(Path(parent)) if blocks else Path(parent)
+        directory = scratch_copy(Path(parent), told) if blocks else Path(parent)
         if any("git clone" in fence.code for fence in blocks):
             directory = Path(parent)
         for fence in blocks:
             if fence.skip is not None:
-                print(f"--- {fence.place}: skipped: {fence.skip}", flush=True)
+                print(f"--- {fence.place}: skipped: {fence.skip}", file=told)
                 skipped += 1
                 continue
-            print(f"--- {fence.place}", fence.code, sep="\n", end="", flush=True)
-            directory, failure = run_fence(fence, directory, seconds)
+            print(f"--- {fence.place}", fence.code, sep="\n", end="", file=told)
+            directory, failure = run_fence(fence, directory, seconds, told)
             run += 1
             failures += [failure] if failure else []
-    return run, skipped, failures
+    return run, skipped, failures, told.getvalue()
 
 
 def main() -> int:
@@ -151,11 +162,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Run the shell commands shown in the documentation.")
     parser.add_argument("pages", nargs="*", type=Path, help="pages to check (default: README.md and docs/*.md)")
     parser.add_argument("--seconds", type=float, default=300.0, help="time limit of one fence [s]")
+    parser.add_argument("--workers", type=int, default=2, help="pages at once")
     options = parser.parse_args()
     run, skipped, failures = 0, 0, list[str]()
-    for page in [page.resolve() for page in options.pages] or documents():
-        counts = check_page(page, options.seconds)
-        run, skipped, failures = run + counts[0], skipped + counts[1], failures + counts[2]
+    pages = [page.resolve() for page in options.pages] or documents()
+    with ThreadPoolExecutor(options.workers) as pool:
+        for counts in pool.map(partial(check_page, seconds=options.seconds), pages):
+            run, skipped, failures = run + counts[0], skipped + counts[1], failures + counts[2]
+            print(counts[3], end="", flush=True)
     print(f"=== shell fences: {run} run, {skipped} skipped, {len(failures)} failed")
     for failure in failures:
         print(failure)
