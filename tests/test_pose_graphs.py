@@ -13,6 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 import unifg as fg
+from unifg.elimination.components import components
 from unifg.errors import GraphError
 from unifg.files.pose_graph import read_pose_graph
 from unifg.pose_graphs import (
@@ -26,7 +27,6 @@ from unifg.pose_graphs import (
     odometric,
     sphere,
 )
-from unifg.pose_graphs.components import components
 from unifg.solvers import GaussNewton, LevenbergMarquardt
 from unifg.typing import Array
 

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unifg.answers.graph import Graph
+from unifg.elimination.components import components
 from unifg.errors import GraphError
 from unifg.kernels.residuals import Residual
 from unifg.kernels.robust import Loss
 from unifg.language.factors import ManifoldResidual, between
 from unifg.language.variables import Family
 from unifg.lie import SE2, SE3, LieGroup, Rn
-from unifg.pose_graphs.components import components
 from unifg.pose_graphs.residuals import bearing, bearing_range, chart_between, distance, sighting
 from unifg.typing import Array, BoolArray, IntArray
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from unifg.elimination.components import components
 from unifg.smoothing.state import State
 from unifg.typing import IntArray
 
@@ -39,9 +38,7 @@ def enough(state: State, variable: int) -> bool:
     rows.append((cliques["size"] - cliques["pivot_rows"])[priors].astype(np.int64))
     single.append(np.ones(len(priors), dtype=bool))  # a prior speaks of where its variables are
     pairs = np.concatenate(ties)
-    shape = (count + total, count + total)
-    tied = coo_array((np.ones(len(pairs)), (pairs[:, 0] + count, pairs[:, 1])), shape=shape)
-    label = connected_components(tied, directed=False)[1]
+    label = components(count + total, pairs[:, 0] + count, np.ascontiguousarray(pairs[:, 1]))
     here = label[variable]
     alive = variables["alive"][:count].astype(bool) & (label[:count] == here)
     spoken = label[count:] == here
