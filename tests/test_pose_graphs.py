@@ -27,6 +27,7 @@ from unifg.pose_graphs import (
     odometric,
     sphere,
 )
+from unifg.pose_graphs.certificate import certify
 from unifg.solvers import GaussNewton, LevenbergMarquardt
 from unifg.typing import Array
 
@@ -337,6 +338,18 @@ def test_gtsam_optimum_of_the_toy_graph(shared_data: Path) -> None:
     folder = shared_data / "pose_graphs"
     before, after = (read_pose_graph(folder / f"gtsam_{name}ToyGraph.txt") for name in ("noisy", "optimizedNoisy"))
     assert distance(fg.SE2, solved(before).poses, after.poses) < 3e-3
+
+
+@pytest.mark.parametrize("wrong", [-1, 7, 10**12])
+def test_a_measurement_of_a_pose_that_is_not_there(wrong: int) -> None:
+    """Compiled code would read whatever stands there."""
+    pose_graph = manhattan(7).pose_graph
+    second = pose_graph.edges.second.copy()
+    second[3] = wrong
+    damaged = replace(pose_graph, edges=replace(pose_graph.edges, second=second))
+    for ask in (damaged.parts, damaged.anchors, lambda: certify(damaged)):
+        with pytest.raises(GraphError, match=f"an edge, number 3, names position {wrong}, and there are 7 poses"):
+            ask()
 
 
 def test_parts_are_those_of_a_reference() -> None:

@@ -214,8 +214,16 @@ class PoseGraph:
         return np.sort(np.concatenate([poses, loose])), landmarks
 
     def parts(self) -> IntArray:
-        """(n + k,) number of the connected part of every pose, then of every landmark."""
+        """(n + k,) number of the connected part of every pose, then of every landmark.
+
+        Raises:
+            GraphError: a measurement speaks of a pose or landmark that there is not.
+        """
         count = len(self.poses)
+        _require("an edge", "poses", (self.edges.first, self.edges.second), count)
+        for kind, seen in self.sightings.items():
+            _require(f"a sighting of kind {kind!r}", "poses", (seen.pose,), count)
+            _require(f"a sighting of kind {kind!r}", "landmarks", (seen.landmark,), len(self.landmarks))
         rows = [self.edges.first, *(seen.pose for seen in self.sightings.values())]
         columns = [self.edges.second, *(count + seen.landmark for seen in self.sightings.values())]
         return components(count + len(self.landmarks), np.concatenate(rows), np.concatenate(columns))
@@ -237,6 +245,14 @@ class PoseGraph:
         seen = sum(map(len, self.sightings.values()))
         more = f", {len(self.landmarks)} landmarks, {seen} sightings" if len(self.landmarks) else ""
         return f"<PoseGraph: {len(self.poses)} poses in {self.group.name}, {len(self.edges)} edges{more}>"
+
+
+def _require(who: str, what: str, places: tuple[IntArray, ...], count: int) -> None:
+    for positions in places:
+        wrong = np.flatnonzero((positions < 0) | (positions >= count))
+        if len(wrong):
+            k = int(wrong[0])
+            raise GraphError(f"{who}, number {k}, names position {positions[k]}, and there are {count} {what}", index=k)
 
 
 def _squared(function: Residual, batch: Edges | Sightings, *points: Any) -> Array:

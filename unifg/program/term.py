@@ -545,7 +545,9 @@ class CompiledTerm:
         term = self.term
         if not self._weighed:
             self.whitening, self.whitener = self._weights(data)
-            self._weighed = not (isinstance(term, Cost) and {type(term.sigma), type(term.information)} & {Data})
+            self._weighed = not (
+                isinstance(term, Cost) and (isinstance(term.sigma, Data) or isinstance(term.information, Data))
+            )
         if isinstance(term, Constraint):
             self.lower = self._limit(resolve(term.lower, data), "lower", -np.inf)
             self.upper = self._limit(resolve(term.upper, data), "upper", np.inf)
