@@ -85,11 +85,7 @@ class Peer:
 
     def optimizer(self, ordering: str) -> Any:
         """Gauss-Newton with default thresholds."""
-        import gtsam
-
-        parameters = gtsam.GaussNewtonParams()
-        parameters.setOrderingType(ordering)
-        return gtsam.GaussNewtonOptimizer(self.graph, self.start, parameters)
+        return _optimizer(self.graph, self.start, ordering)
 
     def iterate(self, ordering: str, count: int) -> tuple[float, float]:
         """Mean time of ``count`` iterations from the start [s], and chi2 at their end."""
@@ -103,9 +99,7 @@ class Peer:
     def solve(self, ordering: str) -> tuple[float, int, float]:
         """Time of a whole solve from ordering to GTSAM's default thresholds [s], iterations and chi2."""
         begin = time.perf_counter()
-        optimizer = self.optimizer(ordering)
-        optimizer.optimize()
-        return time.perf_counter() - begin, int(optimizer.iterations()), 2.0 * optimizer.error()
+        return _optimized(self.optimizer(ordering), begin)
 
     @staticmethod
     def solve_file(path: Path, spatial: bool, ordering: str) -> tuple[float, int, float]:
@@ -117,11 +111,7 @@ class Peer:
         prior: Any = gtsam.PriorFactorPose3 if spatial else gtsam.PriorFactorPose2
         first: Any = start.atPose3(0) if spatial else start.atPose2(0)
         graph.add(prior(0, first, gtsam.noiseModel.Isotropic.Sigma(6 if spatial else 3, ANCHOR)))
-        parameters = gtsam.GaussNewtonParams()
-        parameters.setOrderingType(ordering)
-        optimizer = gtsam.GaussNewtonOptimizer(graph, start, parameters)
-        optimizer.optimize()
-        return time.perf_counter() - begin, int(optimizer.iterations()), 2.0 * optimizer.error()
+        return _optimized(_optimizer(graph, start, ordering), begin)
 
     def marginals(self, poses: Array) -> Any:
         """GTSAM's marginals at (n, storage) poses."""
@@ -154,6 +144,20 @@ class Peer:
         count = len(covariance) // len(back)
         order = (len(back) * np.arange(count)[:, None] + back).ravel()
         return np.asarray(covariance[order[:, None], order])
+
+
+def _optimizer(graph: Any, start: Any, ordering: str) -> Any:
+    import gtsam
+
+    parameters = gtsam.GaussNewtonParams()
+    parameters.setOrderingType(ordering)
+    return gtsam.GaussNewtonOptimizer(graph, start, parameters)
+
+
+def _optimized(optimizer: Any, begin: float) -> tuple[float, int, float]:
+    """Time since the beginning [s], iterations and chi2, at the optimum."""
+    optimizer.optimize()
+    return time.perf_counter() - begin, int(optimizer.iterations()), 2.0 * optimizer.error()
 
 
 def joint(marginals: Any, first: int, second: int) -> Array:

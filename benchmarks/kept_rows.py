@@ -50,6 +50,5 @@ def restore(archive: Path, folder: Path) -> int:
     missing = [line for key, line in kept.items() if key not in on_file]
     if missing:
         with Journal(folder / EPISODES) as journal:
-            for line in missing:
-                journal.add(line)
+            journal.add("\n".join(missing))  # on the disk at once, or not at all
     return len(missing)
