@@ -58,6 +58,7 @@ from unifg.lie import (
     wrap_angle,
 )
 from unifg.machine.jit import compiled
+from unifg.machine.threads import use_threads
 from unifg.smoothing import FixedLag, Incremental
 from unifg.typing import Numbers as _Numbers
 
@@ -129,6 +130,7 @@ __all__ = [
     "prior",
     "residual",
     "solve",
+    "use_threads",
     "warmup",
     "wrap_angle",
 ]

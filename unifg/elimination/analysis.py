@@ -105,7 +105,7 @@ def analyse(
             "give a permutation"
         )
     order, bounds, parent, passed, _ = tree
-    table, scalar_order, rows, relative, runs, slots, waiting = lay_out(
+    table, scalar_order, rows, relative, runs, slots, part, waiting = lay_out(
         indptr, indices, starts, pointer, neighbours, order, bounds, parent, passed
     )
     largest = int((table[:, PIVOTS] + table[:, ROWS]).max(initial=0))
@@ -129,6 +129,7 @@ def analyse(
         signs=NOTHING,
         work=NOTHING,
         state=np.zeros(0, np.int64),
+        part=part,
     )
     return Structure(plan, panels + waiting + SLACK, starts, order, bounds, parent, kind)
 

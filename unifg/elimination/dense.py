@@ -9,7 +9,21 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.machine.jit import compiled
-from unifg.machine.vectors import Address, blend, get, inverse_root, lane, load, minus, pack, plus, splat, store, times
+from unifg.machine.vectors import (
+    Address,
+    blend,
+    get,
+    inverse_root,
+    lane,
+    load,
+    minus,
+    pack,
+    plus,
+    put,
+    splat,
+    store,
+    times,
+)
 
 VANISHED = 8.9e-16  # pivots below this part of their original diagonal are rounding errors
 STRIP, DEPTH = 64, 192  # columns and products handled together: what stays in the second-level cache
@@ -78,7 +92,7 @@ def subtract_products(
 @compiled
 def subtract_signed(
     numbers: Address, target: int, stride: int, size: int, left: int, step: int, depth: int,
-    signs: Address, first: int, rows: int,
+    signs: Address, first: int, start: int, rows: int,
 ) -> None:  # fmt: skip
     """Upper triangle of target -= left' S left, in blocks of four rows.
 
@@ -92,7 +106,8 @@ def subtract_signed(
         depth: its rows.
         signs: diagonal of S, from ``first`` on.
         first: see above.
-        rows: rows of the target to subtract from.
+        start: first row of the target to subtract from, a multiple of four.
+        rows: one past the last.
     """
     begin = 0
     while begin < depth:
@@ -102,7 +117,7 @@ def subtract_signed(
         base = left + begin * step
         for strip in range(0, size, STRIP):
             last = strip + STRIP if strip + STRIP < size else size
-            for i in range(0, rows if rows < last else last, 4):
+            for i in range(start, rows if rows < last else last, 4):
                 j = i if i > strip else strip
                 subtract_products(
                     numbers, target + i * stride + j, stride, 4 if rows - i > 4 else rows - i, last - j,
@@ -116,7 +131,7 @@ def eliminate(
     numbers: Address, panel: int, stride: int, begin: int, end: int, columns: int,
     scale: Address, pivots: Address, signs: Address, first: int,
 ) -> int:  # fmt: skip
-    """Eliminate pivots begin..end of a panel within its columns begin..columns.
+    """Eliminate pivots begin..end of a panel within its columns begin..columns; others are left to :func:`complete`.
 
     Args:
         numbers: address of the array of the panel.
@@ -138,7 +153,7 @@ def eliminate(
         corner = panel + top * (stride + 1)
         subtract_signed(
             numbers, corner, stride, columns - top, panel + begin * stride + top, stride, top - begin,
-            signs, first + begin, height,
+            signs, first + begin, 0, height,
         )  # fmt: skip
         # The corner, in registers: L D L' first, roots afterwards, so that pivots wait for one division each.
         c1, c2, c3 = corner + stride, corner + 2 * stride, corner + 3 * stride
@@ -176,8 +191,18 @@ def eliminate(
         roots = inverse_root(pack(x00, x11, x22, x33))
         s0, s1 = 1.0 if x00 > 0.0 else -1.0, 1.0 if x11 > 0.0 else -1.0
         s2, s3 = 1.0 if x22 > 0.0 else -1.0, 1.0 if x33 > 0.0 else -1.0
-        store(pivots, at, roots)
-        store(signs, at, pack(s0, s1, s2, s3))
+        if height > 3:
+            store(pivots, at, roots)
+            store(signs, at, pack(s0, s1, s2, s3))
+        else:  # what follows belongs to another front, perhaps to another thread
+            put(pivots, at, lane(roots, 0))
+            put(signs, at, s0)
+            if height > 1:
+                put(pivots, at + 1, lane(roots, 1))
+                put(signs, at + 1, s1)
+            if height > 2:
+                put(pivots, at + 2, lane(roots, 2))
+                put(signs, at + 2, s2)
         g0, g1, g2, g3 = s0 * lane(roots, 0), s1 * lane(roots, 1), s2 * lane(roots, 2), s3 * lane(roots, 3)
         # All columns, the corner's included: below the diagonal of the corner no one looks.
         for j in range(0, columns - top, 4):
@@ -197,4 +222,81 @@ def eliminate(
                         y3 = load(numbers, t3)
                         e3 = minus(minus(minus(y3, f03, y0), f13, e1), f23, e2)
                         store(numbers, t3, blend(times(g3, e3), y3, rest))
+        if columns == end:  # below the diagonal no one looks but `complete`
+            if height > 1:
+                put(numbers, c1, f01)
+            if height > 2:
+                put(numbers, c2, f02)
+                put(numbers, c2 + 1, f12)
+            if height > 3:
+                put(numbers, c3, f03)
+                put(numbers, c3 + 1, f13)
+                put(numbers, c3 + 2, f23)
     return -1
+
+
+@compiled
+def complete(
+    numbers: Address, panel: int, stride: int, begin: int, end: int, start: int, stop: int,
+    pivots: Address, signs: Address, first: int,
+) -> None:  # fmt: skip
+    """Bring columns start..stop up to date with pivots begin..end, eliminated by :func:`eliminate` up to ``end``.
+
+    Columns are independent of each other: apart by a multiple of eight, they may be completed at once.
+
+    Args:
+        numbers: address of the array of the panel.
+        panel: its offset.
+        stride: length of its rows.
+        begin: first pivot, from 0.
+        end: one past the last.
+        start: first column, beyond the pivots.
+        stop: one past the last.
+        pivots: 1 / diagonal; the panel's first pivot is at ``first`` here and in the next one.
+        signs: its signs.
+        first: see above.
+    """
+    for strip in range(start, stop, STRIP):
+        last = strip + STRIP if strip + STRIP < stop else stop
+        for top in range(begin, end, 4):
+            height = 4 if end - top > 4 else end - top
+            corner = panel + top * (stride + 1)
+            r0 = panel + top * stride
+            done = begin
+            while done < top:
+                sign, same = get(signs, first + done), done + 1
+                while same < top and get(signs, first + same) == sign:
+                    same += 1
+                subtract_products(
+                    numbers, r0 + strip, stride, height, last - strip, panel + done * stride + top,
+                    panel + done * stride + strip, stride, same - done, sign,
+                )  # fmt: skip
+                done = same
+            at, c1, c2, c3 = first + top, corner + stride, corner + 2 * stride, corner + 3 * stride
+            r1, r2, r3 = r0 + stride, r0 + 2 * stride, r0 + 3 * stride
+            g0, g1, g2, g3 = get(signs, at) * get(pivots, at), 0.0, 0.0, 0.0
+            f01, f02, f12, f03, f13, f23 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            if height > 1:
+                g1, f01 = get(signs, at + 1) * get(pivots, at + 1), get(numbers, c1)
+            if height > 2:
+                g2 = get(signs, at + 2) * get(pivots, at + 2)
+                f02, f12 = get(numbers, c2), get(numbers, c2 + 1)
+            if height > 3:
+                g3 = get(signs, at + 3) * get(pivots, at + 3)
+                f03, f13, f23 = get(numbers, c3), get(numbers, c3 + 1), get(numbers, c3 + 2)
+            for j in range(strip, last, 4):
+                rest = last - j
+                y0 = load(numbers, r0 + j)
+                store(numbers, r0 + j, blend(times(g0, y0), y0, rest))
+                if height > 1:
+                    y1 = load(numbers, r1 + j)
+                    e1 = minus(y1, f01, y0)
+                    store(numbers, r1 + j, blend(times(g1, e1), y1, rest))
+                    if height > 2:
+                        y2 = load(numbers, r2 + j)
+                        e2 = minus(minus(y2, f02, y0), f12, e1)
+                        store(numbers, r2 + j, blend(times(g2, e2), y2, rest))
+                        if height > 3:
+                            y3 = load(numbers, r3 + j)
+                            e3 = minus(minus(minus(y3, f03, y0), f13, e1), f23, e2)
+                            store(numbers, r3 + j, blend(times(g3, e3), y3, rest))

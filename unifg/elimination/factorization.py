@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from unifg.elimination import fronts, substitution
+from unifg.elimination import fronts, sharing, substitution
 from unifg.elimination.analysis import SLACK, Ordering, Structure, analyse
 from unifg.elimination.far import block_of, blocks_of_pairs, heights
 from unifg.elimination.inverse import invert, locate
@@ -27,6 +27,7 @@ from unifg.elimination.plan import (
 from unifg.elimination.symmetric import Symmetric
 from unifg.elimination.tree import EliminationTree
 from unifg.errors import UnifgError
+from unifg.machine.threads import threads
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["Factorization", "Ordering"]
@@ -139,7 +140,7 @@ class Factorization:
         data = _numbers(data, self.pattern.nnz, "data")
         added = NOTHING if added is None else _numbers(added, self.pattern.size, "added")
         self._forget()
-        self._ready = bool(fronts.factor(self.plan, data, added))
+        self._ready = bool((sharing.factor_at_once if self._shared else fronts.factor)(self.plan, data, added))
         return self._ready
 
     def adopt(self, success: bool) -> None:
@@ -182,7 +183,7 @@ class Factorization:
         if right.ndim == 1:
             right = _numbers(right, self.pattern.size, "the right-hand side")
             out = np.empty(len(right))
-            substitution.solve(self.plan, right, out)
+            (sharing.solve_at_once if self._shared else substitution.solve)(self.plan, right, out)
             return out
         rows = np.array(right.T, dtype=np.float64, order="C")
         if rows.ndim != 2 or rows.shape[1] != self.pattern.size:
@@ -379,6 +380,11 @@ class Factorization:
             invert(self.plan, owner, wanted, panels, int(self.plan.shape[PANELS]))
             done |= wanted
         return panels
+
+    @property
+    def _shared(self) -> bool:
+        """Whether several threads work on it."""
+        return threads() > 1 and len(self.plan.part) > 0
 
     def _forget(self) -> None:
         self._ready = False

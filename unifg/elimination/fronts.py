@@ -9,7 +9,7 @@ method is then the block tridiagonal recursion, without an index.
 from __future__ import annotations
 
 from unifg.elimination.assembly import add_row
-from unifg.elimination.dense import eliminate, subtract_signed
+from unifg.elimination.dense import complete, eliminate, subtract_signed
 from unifg.elimination.plan import (
     CHILD,
     DIRECT,
@@ -32,11 +32,13 @@ from unifg.elimination.plan import (
     ZERO,
     Plan,
 )
-from unifg.machine.jit import compiled
+from unifg.machine.jit import compiled, inlined
 from unifg.machine.vectors import Address, address, get, put, splat, store
-from unifg.typing import Array
+from unifg.typing import Array, IntArray
 
+ALL = -1  # in the place of a part
 BLOCK = 96  # pivots eliminated before the rest of a panel is brought up to date
+WIDE = 192  # columns of a front beyond which its pivots are eliminated among themselves before its other columns follow
 
 
 @compiled
@@ -66,16 +68,19 @@ def eliminate_front(
     begin = 0
     while begin < width:
         end = begin + BLOCK if begin + BLOCK < width else width
-        failed = eliminate(numbers, panel, stride, begin, end, columns, scale, pivots, signs, first)
+        within = columns if columns <= WIDE else end
+        failed = eliminate(numbers, panel, stride, begin, end, within, scale, pivots, signs, first)
         if failed >= 0:
             return failed
+        if within < columns:
+            complete(numbers, panel, stride, begin, end, end, columns, pivots, signs, first)
         if end < width:
             subtract_signed(
                 numbers, panel + end * (stride + 1), stride, columns - end, panel + begin * stride + end,
-                stride, end - begin, signs, first + begin, width - end,
+                stride, end - begin, signs, first + begin, 0, width - end,
             )  # fmt: skip
         begin = end
-    subtract_signed(numbers, update, apart, columns - width, panel + width, stride, width, signs, first, rows)
+    subtract_signed(numbers, update, apart, columns - width, panel + width, stride, width, signs, first, 0, rows)
     return -1
 
 
@@ -88,64 +93,126 @@ def factor(plan: Plan, data: Array, added: Array) -> bool:
         data: (nnz,) upper triangle in the order of the pattern.
         added: (n,) added to the diagonal, or empty.
     """
-    fronts, state = plan.fronts, plan.state
-    numbers, pivots, signs, scale = (
-        address(plan.numbers), address(plan.pivots), address(plan.signs), address(plan.work),
-    )  # fmt: skip
-    slots, relative, runs, order = plan.slots, plan.relative, plan.runs, plan.order
-    state[POSITIVE], state[NEGATIVE], state[ZERO], state[FAILED] = 0, 0, 0, -1
-    state[SURPRISES], state[SURPRISE] = 0, -1
-    negative = 0
+    numbers = address(plan.numbers)
+    clear(numbers, 0, plan.shape[PANELS])
+    scatter(plan, numbers, data, 0, len(plan.slots))
+    size_up(plan, numbers, added, 0, plan.shape[FRONTS])
+    return eliminate_part(plan, ALL, plan.state)
+
+
+@compiled
+def clear(numbers: Address, start: int, stop: int) -> None:
+    """Write zeros to start..stop, and up to three more."""
     zero = splat(0.0)
-    for i in range(0, plan.shape[PANELS], 4):
+    for i in range(start, stop, 4):
         store(numbers, i, zero)
-    for e in range(len(slots)):
+
+
+@compiled
+def scatter(plan: Plan, numbers: Address, data: Array, start: int, stop: int) -> None:
+    """Write entries start..stop of a matrix where they belong in the panels."""
+    slots = plan.slots
+    for e in range(start, stop):
         put(numbers, get(slots, e), get(data, e))
-    # Sizes of the pivots before anything is subtracted.
-    for s in range(plan.shape[FRONTS]):
+
+
+@compiled
+def size_up(plan: Plan, numbers: Address, added: Array, start: int, stop: int) -> None:
+    """Add to the diagonal of fronts start..stop, and note the sizes of the pivots before anything is subtracted."""
+    fronts, order, scale = plan.fronts, plan.order, address(plan.work)
+    for s in range(start, stop):
         at = fronts[s, PANEL]
         for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
             if len(added):
                 put(numbers, at, get(numbers, at) + get(added, get(order, i)))
             put(scale, i, abs(get(numbers, at)))
             at += fronts[s, STRIDE] + 1
+
+
+@inlined
+def clear_update(plan: Plan, numbers: Address, s: int, start: int, stop: int) -> None:
+    """Write zeros to rows start..stop of the update matrix of a front, where it has one of its own."""
+    update, apart, zero = plan.fronts[s, UPDATE], plan.fronts[s, UPDATE_STRIDE], splat(0.0)
+    if plan.fronts[s, DIRECT] == 0:
+        for i in range(start, stop):
+            for j in range(update + i * apart + i // 4 * 4, update + (i + 1) * apart, 4):
+                store(numbers, j, zero)
+
+
+@inlined
+def add_child(plan: Plan, numbers: Address, s: int, child: int, start: int, stop: int) -> None:
+    """Add rows start..stop of the update matrix of a child to a front, where it is not written there in any case."""
+    fronts, relative, runs = plan.fronts, plan.relative, plan.runs
+    if fronts[child, DIRECT] == 1:
+        return
+    width, panel, stride, update, apart = (
+        fronts[s, PIVOTS], fronts[s, PANEL], fronts[s, STRIDE], fronts[s, UPDATE], fronts[s, UPDATE_STRIDE],
+    )  # fmt: skip
+    size, index, step = fronts[child, ROWS], fronts[child, INDEX], fronts[child, UPDATE_STRIDE]
+    source = fronts[child, UPDATE] + start * step
+    for i in range(start, stop):
+        row = get(relative, index + i)
+        target = panel + row * stride if row < width else update + (row - width) * apart - width
+        add_row(numbers, source, i, size, target, relative, runs, index)
+        source += step
+
+
+@inlined
+def begin_count(state: IntArray) -> None:
+    """Nothing has been eliminated, nothing has failed."""
+    state[POSITIVE], state[NEGATIVE], state[ZERO], state[FAILED] = 0, 0, 0, -1
+    state[SURPRISES], state[SURPRISE] = 0, -1
+
+
+@inlined
+def count_front(plan: Plan, s: int, failed: int, state: IntArray) -> None:
+    """Count the pivots of a front that has been eliminated, up to the one that vanished."""
+    first, order = plan.fronts[s, FIRST], plan.order
+    width = failed if failed >= 0 else plan.fronts[s, PIVOTS]
+    negative = 0
+    for i in range(first, first + width):
+        sign = get(plan.signs, i)
+        if sign < 0.0:
+            negative += 1
+        if get(plan.expected, i) * sign < 0.0:
+            if state[SURPRISES] == 0:
+                state[SURPRISE] = order[i]
+            state[SURPRISES] += 1
+    state[POSITIVE] += width - negative
+    state[NEGATIVE] += negative
+    if failed >= 0:
+        state[ZERO] = 1
+        state[FAILED] = order[first + failed]
+
+
+@compiled
+def eliminate_part(plan: Plan, part: int, state: IntArray) -> bool:
+    """Eliminate the fronts of one part, or of ALL, whose children have been eliminated or belong to it.
+
+    Args:
+        plan: with a matrix in its panels.
+        part: see above.
+        state: (6,) receives what ``plan.state`` holds, of these fronts.
+    """
+    fronts, shared = plan.fronts, plan.part
+    numbers, pivots, signs, scale = (
+        address(plan.numbers), address(plan.pivots), address(plan.signs), address(plan.work),
+    )  # fmt: skip
+    begin_count(state)
     for s in range(plan.shape[FRONTS]):
-        first, width, rows, panel, stride = (
-            fronts[s, FIRST], fronts[s, PIVOTS], fronts[s, ROWS], fronts[s, PANEL], fronts[s, STRIDE],
-        )  # fmt: skip
-        update, apart = fronts[s, UPDATE], fronts[s, UPDATE_STRIDE]
-        if fronts[s, DIRECT] == 0:
-            for i in range(rows):
-                for j in range(update + i * apart + i // 4 * 4, update + (i + 1) * apart, 4):
-                    store(numbers, j, zero)
+        if part != ALL and shared[s] != part:
+            continue
+        width, rows = fronts[s, PIVOTS], fronts[s, ROWS]
+        clear_update(plan, numbers, s, 0, rows)
         child = fronts[s, CHILD]
         while child >= 0:
-            if fronts[child, DIRECT] == 0:
-                size, index, source = fronts[child, ROWS], fronts[child, INDEX], fronts[child, UPDATE]
-                step = fronts[child, UPDATE_STRIDE]
-                for i in range(size):
-                    row = get(relative, index + i)
-                    target = panel + row * stride if row < width else update + (row - width) * apart - width
-                    add_row(numbers, source, i, size, target, relative, runs, index)
-                    source += step
+            add_child(plan, numbers, s, child, 0, fronts[child, ROWS])
             child = fronts[child, SIBLING]
         failed = eliminate_front(
-            numbers, panel, stride, width, width + rows, update, apart, rows, scale, pivots, signs, first
+            numbers, fronts[s, PANEL], fronts[s, STRIDE], width, width + rows, fronts[s, UPDATE],
+            fronts[s, UPDATE_STRIDE], rows, scale, pivots, signs, fronts[s, FIRST],
         )  # fmt: skip
+        count_front(plan, s, failed, state)
         if failed >= 0:
-            width = failed
-        for i in range(first, first + width):
-            sign = get(signs, i)
-            if sign < 0.0:
-                negative += 1
-            if get(plan.expected, i) * sign < 0.0:
-                if state[SURPRISES] == 0:
-                    state[SURPRISE] = order[i]
-                state[SURPRISES] += 1
-        if failed >= 0:
-            state[POSITIVE], state[NEGATIVE] = first + width - negative, negative
-            state[ZERO] = 1
-            state[FAILED] = order[first + failed]
             return False
-    state[POSITIVE], state[NEGATIVE] = len(order) - negative, negative
     return True

@@ -82,7 +82,7 @@ def invert(plan: Plan, owner: IntArray, wanted: BoolArray, panels: Array, free: 
                 for j in range(i + 1, k + 1):
                     value += get(numbers, source + j) * get(inverse, row + j)
                 put(inverse, row + i, -value * get(pivots, first + i))
-        subtract_signed(inverse, result, q, w, unit, q, w, signs, first, w)
+        subtract_signed(inverse, result, q, w, unit, q, w, signs, first, 0, w)
         for i in range(0, w, 4):
             subtract_products(
                 inverse, result + i * (q + 1), q, 4 if w - i > 4 else w - i, w - i, across + i, turned + i, q, r, -1.0

@@ -21,17 +21,19 @@ from unifg.elimination.plan import (
     UPDATE,
     UPDATE_STRIDE,
 )
+from unifg.elimination.subtrees import PARTS, share_out
 from unifg.machine.jit import compiled
 from unifg.typing import IntArray
 
 Narrow = NDArray[np.int32]
+BEYOND = 4  # numbers between what different threads write
 
 
 @compiled
 def lay_out(
     indptr: IntArray, indices: IntArray, starts: IntArray, pointer: IntArray, neighbours: IntArray,
     order: IntArray, bounds: IntArray, parent: IntArray, passed: IntArray,
-) -> tuple[IntArray, IntArray, Narrow, Narrow, Narrow, Narrow, int]:  # fmt: skip
+) -> tuple[IntArray, IntArray, Narrow, Narrow, Narrow, Narrow, IntArray, int]:  # fmt: skip
     """Lay out the fronts of a tree.
 
     Args:
@@ -46,8 +48,8 @@ def lay_out(
         passed: see above.
 
     Returns:
-        ``fronts``, ``order``, ``rows``, ``relative``, ``runs``, ``slots`` of a `Plan`, and how many numbers its update
-        matrices hold.
+        ``fronts``, ``order``, ``rows``, ``relative``, ``runs``, ``slots``, ``part`` of a `Plan`, and how many numbers
+        its update matrices hold.
     """
     nodes, count, scalars = len(order), len(parent), len(indptr) - 1
     fronts = np.empty((count + 1, COLUMNS), np.int64)
@@ -78,8 +80,15 @@ def lay_out(
         fronts[s, FIRST] = offset[bounds[s]]
         w, r = offset[bounds[s + 1]] - offset[bounds[s]], passed[s]
         fronts[s, PIVOTS], fronts[s, ROWS], fronts[s, STRIDE] = w, r, (w + r + 3) // 4 * 4
-        fronts[s + 1, PANEL] = fronts[s, PANEL] + w * fronts[s, STRIDE]
         fronts[s + 1, INDEX] = fronts[s, INDEX] + r
+    shared = share_out(fronts, parent)
+    part = filled(count, PARTS)
+    for s in range(len(shared)):
+        part[s] = shared[s]
+    for s in range(count):
+        # Kernels write back up to three numbers beyond a row: not into what another thread works on.
+        apart = BEYOND if s + 1 < count and part[s + 1] != part[s] else 0
+        fronts[s + 1, PANEL] = fronts[s, PANEL] + fronts[s, PIVOTS] * fronts[s, STRIDE] + apart
     fronts[count, FIRST] = scalars
     # Rows: every node walks up from its earlier neighbours to its own front, in order, so lists come sorted.
     size = fronts[count, INDEX]
@@ -99,15 +108,16 @@ def lay_out(
                         rows[fill[s]] = i
                         fill[s] += 1
                     s = parent[s]
-    # Update matrices go straight into the parent's panel where they are its leading part; else on one of two stacks, of
-    # which a front uses one and its children the other.
-    top, peak = filled(2, 0), filled(2, 0)
+    # Update matrices go straight into the parent's panel where they are its leading part; else on one of two stacks of
+    # their part, of which a front uses one and its children the other. What is passed to another part stays.
+    top, peak = filled(2 * PARTS + 2, 0), filled(2 * PARTS + 2, 0)
     for s in range(count):
+        stack = 2 * part[s] + level[s]
+        beside = 2 * part[s] + 1 - level[s]
         child = fronts[s, CHILD]
         while child >= 0:
-            if fronts[child, DIRECT] == 0:
-                if fronts[child, UPDATE] < top[1 - level[s]]:
-                    top[1 - level[s]] = fronts[child, UPDATE]
+            if fronts[child, DIRECT] == 0 and part[child] == part[s] and fronts[child, UPDATE] < top[beside]:
+                top[beside] = fronts[child, UPDATE]
             child = fronts[child, SIBLING]
         p, r, begin = parent[s], passed[s], fronts[s, INDEX]
         if p >= 0:
@@ -123,19 +133,24 @@ def lay_out(
                 follows = i + 1 < begin + r and relative[i + 1] == relative[i] + 1
                 runs[i] = runs[i + 1] + 1 if follows else 1
         leading = p >= 0 and r > 0 and r <= fronts[p, PIVOTS] and relative[begin + r - 1] == r - 1
+        leading = leading and part[p] == part[s]
         if r > 0 and rows[begin] == fronts[s + 1, FIRST] and rows[begin + r - 1] == fronts[s + 1, FIRST] + r - 1:
             fronts[s, ADJACENT] = 1
         if leading:
             fronts[s, DIRECT] = 1
             fronts[s, UPDATE], fronts[s, UPDATE_STRIDE] = fronts[p, PANEL], fronts[p, STRIDE]
         else:
-            fronts[s, UPDATE], fronts[s, UPDATE_STRIDE] = top[level[s]], (r + 3) // 4 * 4
-            top[level[s]] += r * fronts[s, UPDATE_STRIDE]
-            if top[level[s]] > peak[level[s]]:
-                peak[level[s]] = top[level[s]]
+            fronts[s, UPDATE], fronts[s, UPDATE_STRIDE] = top[stack], (r + 3) // 4 * 4
+            top[stack] += r * fronts[s, UPDATE_STRIDE]
+            if top[stack] > peak[stack]:
+                peak[stack] = top[stack]
+    waiting = 0
+    for stack in range(2 * PARTS + 2):
+        top[stack] = waiting
+        waiting += peak[stack] + (BEYOND if peak[stack] > 0 and len(shared) > 0 else 0)
     for s in range(count):
         if fronts[s, DIRECT] == 0:
-            fronts[s, UPDATE] += fronts[count, PANEL] + (peak[0] if level[s] == 1 else 0)
+            fronts[s, UPDATE] += fronts[count, PANEL] + top[2 * part[s] + level[s]]
     # Entries belong to the front that eliminates the earlier of their two scalars: one list of entries per front.
     total = indptr[scalars]
     following, row_of = np.empty(total, np.int32), np.empty(total, np.int32)
@@ -163,4 +178,4 @@ def lay_out(
                 a, b = b, a
             slots[e] = fronts[s, PANEL] + (a - base) * stride + local[b]
             e = int(following[e])
-    return fronts, scalar_order, rows, relative, runs, slots, peak[0] + peak[1]
+    return fronts, scalar_order, rows, relative, runs, slots, shared, waiting

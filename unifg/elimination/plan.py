@@ -41,6 +41,7 @@ class Plan(NamedTuple):
         signs: (n,) S.
         work: (n + largest front) for solves.
         state: positive, negative, vanished pivots, failed scalar or -1, unexpected signs and the first of them or -1.
+        part: (S,) part of each front, see :mod:`unifg.elimination.subtrees`; empty where the work is not shared out.
     """
 
     shape: IntArray
@@ -56,3 +57,4 @@ class Plan(NamedTuple):
     signs: Array
     work: Array
     state: IntArray
+    part: IntArray

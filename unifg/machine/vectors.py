@@ -20,7 +20,7 @@ from unifg.typing import Array
 
 WIDTH = 4
 Vector: TypeAlias = Any  # a value of `kind`, inside compiled code only
-Address: TypeAlias = int  # of doubles that an array keeps alive
+Address: TypeAlias = int  # of doubles, or of integers, that an array keeps alive
 LANES = ir.VectorType(ir.DoubleType(), WIDTH)
 INDEX = ir.IntType(64)
 FLAGS = ("contract", "reassoc", "nsz")
@@ -181,6 +181,22 @@ def _inverse_root(typing_context: Any, vector: Any) -> Any:
     return kind(kind), generate
 
 
+def _advance(typing_context: Any, counters: Any, offset: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        pointer = builder.gep(builder.inttoptr(values[0], INDEX.as_pointer()), [values[1]])
+        return builder.atomic_rmw("add", pointer, ir.Constant(INDEX, 1), "seq_cst")
+
+    return types.int64(counters, types.int64), generate
+
+
+def _present(typing_context: Any, counters: Any, offset: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        pointer = builder.gep(builder.inttoptr(values[0], INDEX.as_pointer()), [values[1]])
+        return builder.load_atomic(pointer, "seq_cst", 8)
+
+    return types.int64(counters, types.int64), generate
+
+
 def _total(typing_context: Any, vector: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         lanes = [builder.extract_element(values[0], ir.Constant(ir.IntType(32), k)) for k in range(WIDTH)]
@@ -204,3 +220,6 @@ pack = cast(Callable[[float, float, float, float], Vector], intrinsic(_pack))
 lane = cast(Callable[[Vector, int], float], intrinsic(_lane))
 inverse_root = cast(Callable[[Vector], Vector], intrinsic(_inverse_root))  # 1 / sqrt(abs(vector))
 total = cast(Callable[[Vector], float], intrinsic(_total))
+# Of 64-bit integers at an address that other threads may read and write at the same time.
+advance = cast(Callable[[Address, int], int], intrinsic(_advance))  # integers[offset] += 1; what it was
+present = cast(Callable[[Address, int], int], intrinsic(_present))  # integers[offset], and all that was written before

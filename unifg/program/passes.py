@@ -13,7 +13,8 @@ from unifg.kernels.robust import value_of, weight_of
 from unifg.kernels.whitening import FULL, whiten
 from unifg.machine.calls import call_residual, matrix, vector, vector_at
 from unifg.machine.jit import compiled, inlined
-from unifg.machine.vectors import address
+from unifg.machine.threads import wait_for
+from unifg.machine.vectors import Address, address, advance
 from unifg.program.pairs import PLANE, SPACE, add_plane, add_space, whiten_plane, whiten_space
 from unifg.program.table import (
     ACTIVE,
@@ -152,7 +153,7 @@ def evaluate(
 
 
 @compiled
-def linearize(
+def linearize_share(
     terms: TermArrays,
     values: Array,
     search: bool,
@@ -166,12 +167,10 @@ def linearize(
     gradient: Array,
     hessian: Array,
     scratch: Array,
+    share: int,
+    shares: int,
 ) -> float:
-    """Residuals, Jacobians, gradient and J'J in one pass, scaled by the square roots of robust weights.
-
-    Factors whose loss is Python stop after whitening, see :func:`weigh`; returns the cost of all others. ``scratch``
-    holds a factor's variables, then J with all its columns for terms that keep only some.
-    """
+    """Do what :func:`linearize` does with one of several shares of the factors of every term, counted from 0."""
     fields, gather, sizes, parameters = terms.fields, terms.gather, terms.sizes, terms.parameters
     whiteners, active, columns, positions = terms.whiteners, terms.active, terms.columns, terms.positions
     lower, upper, parameters = terms.lower, terms.upper, terms.parameters
@@ -185,7 +184,7 @@ def linearize(
         together = term[PAIRED] if term[WHITEN] & FULL else 0
         apart = (term[WHITEN] & 1) * m * m
         total = 0.0
-        for i in range(term[COUNT]):
+        for i in range(term[COUNT] * share // shares, term[COUNT] * (share + 1) // shares):
             at = term[ROW] + i * m
             entry = term[ENTRY] + i * m * width
             r, J = vector(target, at, m), matrix(blocks, entry, m, width)
@@ -236,6 +235,99 @@ def linearize(
             _accumulate(term, i, columns, positions, r, J, residual, jacobian, gradient, hessian)
         norms[t] = sqrt(total)
     return cost
+
+
+@compiled
+def linearize(
+    terms: TermArrays,
+    values: Array,
+    search: bool,
+    residual: Array,
+    jacobian: Array,
+    constraints: Array,
+    constraint_jacobian: Array,
+    squares: Array,
+    weights: Array,
+    norms: Array,
+    gradient: Array,
+    hessian: Array,
+    scratch: Array,
+) -> float:
+    """Residuals, Jacobians, gradient and J'J in one pass, scaled by the square roots of robust weights.
+
+    Factors whose loss is Python stop after whitening, see :func:`weigh`; returns the cost of all others. ``scratch``
+    holds a factor's variables, then J with all its columns for terms that keep only some.
+    """
+    return linearize_share(
+        terms, values, search, residual, jacobian, constraints, constraint_jacobian, squares, weights, norms,
+        gradient, hessian, scratch, 0, 1,
+    )  # fmt: skip
+
+
+@compiled
+def linearize_at_once(
+    terms: TermArrays,
+    values: Array,
+    search: bool,
+    residual: Array,
+    jacobian: Array,
+    constraints: Array,
+    constraint_jacobian: Array,
+    squares: Array,
+    weights: Array,
+    costs: Array,
+    norms: Array,
+    gradient: Array,
+    hessian: Array,
+    slopes: Array,
+    curvatures: Array,
+    scratch: Array,
+    counters: Address,
+) -> bool:
+    """What one of several threads does of :func:`linearize`: shares of the factors, then of the sums of all shares.
+
+    Args:
+        terms: as there, and so the next eight.
+        values: see above.
+        search: see above.
+        residual: see above.
+        jacobian: see above.
+        constraints: see above.
+        constraint_jacobian: see above.
+        squares: see above.
+        weights: see above.
+        costs: (S,) receives the cost of each of S shares.
+        norms: (S, T) receives their norms of each term.
+        gradient: (n,) need not be zero.
+        hessian: (nnz,) need not be zero.
+        slopes: (S - 1, n) room for the gradients of all shares but the first.
+        curvatures: (S - 1, nnz) room for their J'J.
+        scratch: (S, .) as there.
+        counters: of two integers for each of two phases, zero.
+    """
+    shares, size, entries = len(costs), len(gradient), len(hessian)
+    k = advance(counters, 0)
+    while k < shares:
+        slope, curvature = (gradient, hessian) if k == 0 else (slopes[k - 1], curvatures[k - 1])
+        slope[:], curvature[:] = 0.0, 0.0
+        costs[k] = linearize_share(
+            terms, values, search, residual, jacobian, constraints, constraint_jacobian, squares, weights, norms[k],
+            slope, curvature, scratch[k], k, shares,
+        )  # fmt: skip
+        advance(counters, 1)
+        k = advance(counters, 0)
+    wait_for(counters, 0, shares)
+    k = advance(counters, 2)
+    while k < shares:
+        for share in range(shares - 1):
+            for i in range(size * k // shares, size * (k + 1) // shares):
+                gradient[i] += slopes[share, i]
+            for i in range(entries * k // shares, entries * (k + 1) // shares):
+                hessian[i] += curvatures[share, i]
+        advance(counters, 3)
+        k = advance(counters, 2)
+    wait_for(counters, 1, shares)
+    return True
 
 
 @compiled

@@ -7,6 +7,7 @@ costs; rows of constraints read ``lower <= g <= upper``. Columns are tangent coo
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from time import perf_counter
 from typing import Any, NamedTuple, TypeVar, cast
@@ -20,6 +21,7 @@ from unifg.language.statement import Statement
 from unifg.language.terms import Constraint, Cost, ScalarCost
 from unifg.language.variables import Data, Family
 from unifg.machine.buffers import Buffers
+from unifg.machine.threads import at_once, threads
 from unifg.program import passes
 from unifg.program.binding import Binding
 from unifg.program.by_term import ByTerm, Places
@@ -36,6 +38,7 @@ from unifg.turns import Turn
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 T = TypeVar("T")
+WORTH = 150_000  # entries of Jacobians below which threads bring nothing
 
 
 class Reader(NamedTuple):
@@ -118,6 +121,7 @@ class Program:
         self._read = GuessReader(graph, self.columns, self.retraction)
         self._names = [term.name for term in stacked]
         self.scratch = np.empty(self.table.scratch)
+        self._apart: tuple[Array, ...] | None = None  # room of the threads that share a pass
         self.buffers = Buffers([*self.table.sizes, self.columns.width, self.normal.nnz])
         self._watched: list[CompiledTerm] = []
         self.python_seconds = 0.0
@@ -312,7 +316,7 @@ class Program:
     def _linearize(self, values: Values, search: bool) -> Linearization:
         table = self.table
         residual, jacobian, constraints, constraint_jacobian, gradient, hessian = self.buffers.take()
-        gradient[:], hessian[:] = 0.0, 0.0
+        shared = threads() > 1 and len(jacobian) + len(constraint_jacobian) > WORTH
         squares, weights = np.empty(table.weights), np.empty(table.weights)
         size = np.empty(len(table.arrays.fields))
         found = np.empty(table.scalars)
@@ -325,21 +329,15 @@ class Program:
                     self.rows_of(term, residual, constraints)[:] = term.residual(values)
                     self._entries_of(term, jacobian, constraint_jacobian, term.jacobians(values, search=search))
                 self.python_seconds += perf_counter() - began
-            cost = passes.linearize(
-                table.arrays,
-                values.flat,
-                search,
-                residual,
-                jacobian,
-                constraints,
-                constraint_jacobian,
-                squares,
+            given = (
+                table.arrays, values.flat, search, residual, jacobian, constraints, constraint_jacobian, squares,
                 weights,
-                size,
-                gradient,
-                hessian,
-                self.scratch,
-            )
+            )  # fmt: skip
+            if shared:
+                cost = self._linearize_at_once(given, size, gradient, hessian)
+            else:
+                gradient[:], hessian[:] = 0.0, 0.0
+                cost = passes.linearize(*given, size, gradient, hessian, self.scratch)
             if table.weighed:
                 for loss, part in table.weighed:
                     weights[part] = loss.weight(squares[part])
@@ -350,6 +348,19 @@ class Program:
         norms, scalars = self.norms(size, found), self.by_scalar(found)
         arrays = residual, jacobian, constraints, constraint_jacobian, gradient, hessian
         return Linearization(values, cost, *arrays, norms, weights, concavity, squares, scalars, rounding)
+
+    def _linearize_at_once(self, given: tuple[Any, ...], size: Array, gradient: Array, hessian: Array) -> float:
+        """The pass over all terms, a share of the factors of each for every thread; sums are added up in order."""
+        count = threads()
+        if self._apart is None or len(self._apart[1]) != count:
+            rows = (count - 1, len(gradient)), (count - 1, len(hessian)), (count, len(self.scratch))
+            self._apart = np.empty(count), np.empty((count, len(size))), *(np.empty(shape) for shape in rows)
+        costs, norms, *room = self._apart
+        counters = np.zeros(4, np.int64)
+        into = costs, norms, gradient, hessian, *room, counters.ctypes.data
+        at_once([partial(passes.linearize_at_once, *given, *into)] * count)
+        size[:] = np.sqrt(np.square(norms).sum(axis=0))
+        return float(costs.sum())
 
     def _add_scalars(
         self, values: Values, found: Array, gradient: Array, hessian: Array, concavity: Array, rounding: Array

@@ -1,0 +1,201 @@
+"""Solves that share their work among threads: the same answers, and nothing torn."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import numba
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.elimination.factorization import Factorization
+from unifg.elimination.fronts import WIDE
+from unifg.elimination.plan import PIVOTS, ROWS
+from unifg.elimination.sharing import row_of
+from unifg.elimination.subtrees import PARTS
+from unifg.elimination.symmetric import Symmetric
+from unifg.errors import UnifgError
+from unifg.machine.threads import at_once, threads
+from unifg.pose_graphs import PoseGraph, manhattan, sphere
+from unifg.solvers import GaussNewton
+from unifg.typing import Array
+
+
+@pytest.fixture(autouse=True)
+def one_thread_afterwards() -> Iterator[None]:
+    yield
+    fg.use_threads(1)
+
+
+@pytest.fixture(scope="module")
+def lattice() -> PoseGraph:
+    ball = sphere(50, 50)
+    return ball.pose_graph.with_poses(ball.truth)
+
+
+def system(pose_graph: PoseGraph) -> tuple[Factorization, Array]:
+    """A factorisation, and the Hessian it is of."""
+    graph, _, guess = pose_graph.graph()
+    program = graph.compile()
+    return Factorization(program.normal, program.blocks), program.linearize(guess).hessian.copy()
+
+
+def test_parts_of_a_tree_are_eliminated_to_the_bit(lattice: PoseGraph) -> None:
+    factorization, hessian = system(lattice)
+    right = np.random.default_rng(0).normal(size=factorization.pattern.size)
+    assert factorization.factor(hessian)
+    part, panels, inertia = factorization.plan.part, factorization.plan.numbers.copy(), factorization.inertia
+    solved, seen = factorization.solve(right), list[Array]()
+    wide = factorization.plan.fronts[:-1][part == PARTS][:, [PIVOTS, ROWS]].sum(axis=1) > WIDE
+    assert len(set(part.tolist())) > 3 and wide.any(), "nothing is shared out here"
+    for count in (2, 3, 5):
+        fg.use_threads(count)
+        for _ in range(3):
+            factorization.plan.numbers[:] = np.nan
+            factorization.plan.numbers[factorization.plan.shape[3] :] = 0.0
+            assert factorization.factor(hessian)
+            assert factorization.inertia == inertia and factorization.failure == -1 and factorization.unexpected == -1
+            seen.append(factorization.solve(right))
+            held = factorization.plan.shape[3]
+            assert np.array_equal(factorization.plan.numbers[:held], panels[:held])
+    np.testing.assert_allclose(seen[0], solved, rtol=0.0, atol=1e-12 * abs(solved).max())
+    assert all(np.array_equal(other, seen[0]) for other in seen)
+
+
+def test_what_fails_fails_at_the_same_pivot(lattice: PoseGraph) -> None:
+    """Wherever it stands: a diagonal entry of zero in each of many columns, and an infinite one."""
+    factorization, hessian = system(lattice)
+    pattern = factorization.pattern
+    for column, entry in ((3, 0.0), (700, 0.0), (pattern.size - 2, 0.0), (1500, np.inf)):
+        damaged = hessian.copy()
+        rows = pattern.indices[pattern.indptr[column] : pattern.indptr[column + 1]]
+        damaged[pattern.indptr[column] + int(np.flatnonzero(rows == column)[0])] = entry
+        found = []
+        for count in (1, 2):
+            fg.use_threads(count)
+            found.append((factorization.factor(damaged), factorization.inertia, factorization.failure))
+        assert found[0] == found[1]
+
+
+def test_signs_that_nobody_announced_are_told_alike(lattice: PoseGraph) -> None:
+    _, hessian = system(lattice)
+    graph, _, _ = lattice.graph()
+    program = graph.compile()
+    announced = np.zeros(program.size, dtype=bool)
+    announced[[100, 1000, 2000]] = True
+    factorization = Factorization(program.normal, program.blocks, negative=announced)
+    found = []
+    for count in (1, 2):
+        fg.use_threads(count)
+        assert factorization.factor(hessian)
+        found.append((factorization.unexpected, factorization.inertia))
+    assert found[0] == found[1] and found[0][0] in (100, 1000, 2000)
+
+
+def test_chunks_of_a_triangle_cover_it_once_in_rows_of_eight() -> None:
+    for chunks, rows, columns in ((1, 40, 40), (4, 40, 40), (16, 450, 450), (16, 96, 700), (7, 9, 9), (3, 0, 5)):
+        rows_of = [row_of(k, chunks, rows, columns) for k in range(chunks + 1)]
+        assert rows_of[0] == 0 and rows_of[-1] == rows and rows_of == sorted(rows_of)
+        assert all(row % 8 == 0 for row in rows_of[:-1])
+    entries = [row_of(k + 1, 4, 400, 400) * (800 - row_of(k + 1, 4, 400, 400)) / 2 for k in range(4)]
+    assert np.diff(entries, prepend=0.0) == pytest.approx(20_000, rel=0.1)
+
+
+def test_two_threads_that_solve_share_one_crew(lattice: PoseGraph) -> None:
+    """Each with two more hands, on a graph of its own."""
+    graphs = [lattice.graph() for _ in range(2)]
+    fg.use_threads(2)
+    runs = [GaussNewton().prepare(graph) for graph, _, _ in graphs]
+    alone = [run.solve(guess)[x] for run, (_, x, guess) in zip(runs, graphs, strict=True)]
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(3):
+            found = list(pool.map(lambda k: runs[k].solve(graphs[k][2])[graphs[k][1]], range(2)))
+            assert all(np.array_equal(a, b) for a, b in zip(found, alone, strict=True))
+
+
+def test_threads_that_were_sent_away_leave() -> None:
+    before = threading.active_count()
+    fg.use_threads(4)
+    assert threading.active_count() == before + 3
+    fg.use_threads(1)
+    for thread in [thread for thread in threading.enumerate() if thread.name.startswith("unifg ")]:
+        thread.join(5.0)
+    assert threading.active_count() == before
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this platform")
+def test_a_forked_child_has_threads_of_its_own() -> None:
+    script = (
+        "import os, warnings, unifg as fg\n"
+        "from unifg.machine.threads import at_once, threads\n"
+        "warnings.simplefilter('ignore')\n"
+        "fg.use_threads(3)\n"
+        "at_once([int] * 3)\n"
+        "child = os.fork()\n"
+        "if child == 0:\n"
+        "    os._exit(0 if at_once([int] * 9) == [0] * 9 and threads() == 3 else 1)\n"
+        "raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))\n"
+    )
+    assert subprocess.run([sys.executable, "-c", script], timeout=120).returncode == 0
+
+
+def test_little_work_is_not_shared_out() -> None:
+    factorization, _ = system(manhattan(40).pose_graph)
+    assert not len(factorization.plan.part)
+    empty = Factorization(
+        Symmetric.of_blocks(np.zeros(1, dtype=np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))
+    )
+    assert not len(empty.plan.part)
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def apart(x: Array, y: Array, r: Array) -> None:
+    for k in range(7):
+        r[k] = 1e-3 * (y[k] - x[k])
+
+
+@pytest.mark.parametrize("robust", [None, fg.Huber(1.0)], ids=["squares", "Huber"])
+def test_a_solve_with_threads_repeats_itself(lattice: PoseGraph, robust: fg.Loss | None) -> None:
+    """With a function of one's own beside the shipped ones, and one factor left out."""
+    graph, x, guess = lattice.graph(robust=robust)
+    edges = lattice.edges
+    active = np.ones(len(edges), dtype=bool)
+    active[17] = False
+    graph.minimize(fg.residual(apart, rows=7), x[edges.first], x[edges.second], active=active, name="own")
+    run = GaussNewton().prepare(graph)
+    program = graph.compile()
+    alone, single = run.solve(guess), program.linearize(guess)
+    fg.use_threads(2)
+    first, second, shared = run.solve(guess), run.solve(guess), program.linearize(guess)
+    assert np.array_equal(first[x], second[x]) and first.iterations == alone.iterations
+    np.testing.assert_allclose(first[x], alone[x], atol=1e-9)
+    assert np.array_equal(shared.residual, single.residual) and np.array_equal(shared.jacobian, single.jacobian)
+    np.testing.assert_allclose(shared.hessian, single.hessian, rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(shared.gradient, single.gradient, rtol=1e-12, atol=1e-8)
+    assert shared.cost == pytest.approx(single.cost, rel=1e-12)
+    assert shared.norms == pytest.approx(single.norms, rel=1e-12)
+
+
+def test_the_number_of_threads_is_one_of_some() -> None:
+    for wrong in (0, -1, 2.0, True, "2", None):
+        with pytest.raises(UnifgError, match="at least 1, got"):
+            fg.use_threads(wrong)  # type: ignore[arg-type]
+    assert threads() == 1
+
+
+def test_jobs_are_answered_in_order_and_failures_passed_on() -> None:
+    def fail() -> int:
+        raise ValueError("no")
+
+    for count in (1, 3):
+        fg.use_threads(count)
+        assert at_once([partial(int, k) for k in range(20)]) == list(range(20))
+        with pytest.raises(ValueError, match="no"):
+            at_once([partial(int, 1), fail, partial(int, 2)])

@@ -1,0 +1,361 @@
+"""Numeric elimination and substitution by several threads.
+
+All threads walk through the same phases: write the matrix, eliminate the parts of the tree, then one by one the fronts
+above them. The chunks of a phase write to different places; whoever is free takes the next one, and nobody goes on
+before all are done. A thread that comes late finds nothing left to do, and none waits for one that has not begun.
+
+Factors are the same to the bit as those of one thread, whatever the number of threads. A solution is the same for every
+number of threads from two on: what parts take from the right-hand side above them is added up part by part.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from math import sqrt
+
+import numpy as np
+
+from unifg.elimination.dense import complete, eliminate, subtract_signed
+from unifg.elimination.fronts import (
+    BLOCK,
+    WIDE,
+    add_child,
+    begin_count,
+    clear,
+    clear_update,
+    count_front,
+    eliminate_front,
+    eliminate_part,
+    factor,
+    scatter,
+    size_up,
+)
+from unifg.elimination.plan import (
+    CHILD,
+    FAILED,
+    FIRST,
+    FRONTS,
+    INDEX,
+    PANEL,
+    PANELS,
+    PIVOTS,
+    ROWS,
+    SCALARS,
+    SIBLING,
+    STRIDE,
+    SURPRISE,
+    UPDATE,
+    UPDATE_STRIDE,
+    Plan,
+)
+from unifg.elimination.substitution import backward, forward, solve
+from unifg.elimination.subtrees import PARTS
+from unifg.machine.jit import compiled
+from unifg.machine.threads import at_once, threads, wait_for
+from unifg.machine.vectors import Address, address, advance, get, put
+from unifg.typing import Array, IntArray
+
+MOST = 16  # chunks of a phase
+FEWEST = 20_000.0  # multiplications of a chunk
+SOLVED = 1_000_000  # numbers in all panels below which one thread is through with a substitution before two have begun
+APART = 8  # columns and rows: kernels write back up to three numbers beyond a chunk's last one
+
+
+@compiled
+def chunks_of(work: float) -> int:
+    """How many chunks so many multiplications are worth."""
+    return max(1, min(MOST, int(work / FEWEST)))
+
+
+@compiled
+def row_of(chunk: int, chunks: int, rows: int, columns: int) -> int:
+    """First row of a chunk of the upper triangle of (rows, columns), of which all chunks hold as many entries."""
+    if chunk >= chunks:
+        return rows
+    share = (rows * columns - 0.5 * rows * rows) * chunk / chunks
+    row = int(columns - sqrt(max(0.0, float(columns) * columns - 2.0 * share))) // APART * APART
+    return min(row, rows)
+
+
+@compiled
+def column_of(chunk: int, chunks: int, start: int, stop: int) -> int:
+    """First column of a chunk of start..stop."""
+    return stop if chunk >= chunks else start + (stop - start) * chunk // chunks // APART * APART
+
+
+@compiled
+def phases_of(plan: Plan) -> int:
+    """How many phases :func:`work_on` has at most."""
+    count = 5
+    for s in range(plan.shape[FRONTS]):
+        if plan.part[s] == PARTS:
+            count += 3 + 3 * (plan.fronts[s, PIVOTS] // BLOCK + 1)
+            child = plan.fronts[s, CHILD]
+            while child >= 0:
+                count += 1
+                child = plan.fronts[child, SIBLING]
+    return count
+
+
+@compiled
+def work_on(plan: Plan, data: Array, added: Array, counters: Address, told: IntArray) -> bool:
+    """What one of several threads does, see the module.
+
+    Args:
+        plan: with parts.
+        data: as for :func:`fronts.factor`.
+        added: as above.
+        counters: of two integers for each phase, zero: chunks taken and chunks done.
+        told: (PARTS + 1, 6) receives what ``plan.state`` holds, of each part and of the fronts above them.
+    """
+    numbers = address(plan.numbers)
+    panels, entries, count = plan.shape[PANELS], len(plan.slots), plan.shape[FRONTS]
+    k = advance(counters, 0)
+    while k < MOST:
+        start, stop = panels * k // MOST // 4 * 4, panels * (k + 1) // MOST // 4 * 4
+        clear(numbers, start, panels if k == MOST - 1 else stop)
+        advance(counters, 1)
+        k = advance(counters, 0)
+    wait_for(counters, 0, MOST)
+    k = advance(counters, 2)
+    while k < MOST:
+        scatter(plan, numbers, data, entries * k // MOST, entries * (k + 1) // MOST)
+        advance(counters, 3)
+        k = advance(counters, 2)
+    wait_for(counters, 1, MOST)
+    k = advance(counters, 4)
+    while k < MOST:
+        size_up(plan, numbers, added, count * k // MOST, count * (k + 1) // MOST)
+        advance(counters, 5)
+        k = advance(counters, 4)
+    wait_for(counters, 2, MOST)
+    k = advance(counters, 6)
+    while k < PARTS:
+        eliminate_part(plan, k, told[k])
+        advance(counters, 7)
+        k = advance(counters, 6)
+    wait_for(counters, 3, PARTS)
+    phase = 4
+    if advance(counters, 2 * phase) == 0:
+        begin_count(told[PARTS])
+        advance(counters, 2 * phase + 1)
+    wait_for(counters, phase, 1)
+    phase += 1
+    for s in range(count):
+        if plan.part[s] == PARTS:
+            phase = _front(plan, numbers, s, counters, phase, told[PARTS])
+    for part in range(PARTS + 1):
+        if told[part, FAILED] >= 0:
+            return False
+    return True
+
+
+@compiled
+def _front(plan: Plan, numbers: Address, s: int, counters: Address, phase: int, state: IntArray) -> int:
+    """Take part in the elimination of a front above all parts; the next phase."""
+    fronts, pivots, signs, scale = plan.fronts, address(plan.pivots), address(plan.signs), address(plan.work)
+    first, width, rows, panel, stride, update, apart = (
+        fronts[s, FIRST], fronts[s, PIVOTS], fronts[s, ROWS], fronts[s, PANEL], fronts[s, STRIDE], fronts[s, UPDATE],
+        fronts[s, UPDATE_STRIDE],
+    )  # fmt: skip
+    columns = width + rows
+    chunks = chunks_of(0.5 * rows * rows)
+    k = advance(counters, 2 * phase)
+    while k < chunks:
+        clear_update(plan, numbers, s, row_of(k, chunks, rows, rows), row_of(k + 1, chunks, rows, rows))
+        advance(counters, 2 * phase + 1)
+        k = advance(counters, 2 * phase)
+    wait_for(counters, phase, chunks)
+    phase += 1
+    child = fronts[s, CHILD]
+    while child >= 0:
+        size = fronts[child, ROWS]
+        chunks = chunks_of(2.0 * size * size)
+        k = advance(counters, 2 * phase)
+        while k < chunks:
+            add_child(plan, numbers, s, child, row_of(k, chunks, size, size), row_of(k + 1, chunks, size, size))
+            advance(counters, 2 * phase + 1)
+            k = advance(counters, 2 * phase)
+        wait_for(counters, phase, chunks)
+        phase += 1
+        child = fronts[child, SIBLING]
+    if columns <= WIDE:
+        if advance(counters, 2 * phase) == 0:
+            failed = eliminate_front(
+                numbers, panel, stride, width, columns, update, apart, rows, scale, pivots, signs, first
+            )
+            count_front(plan, s, failed, state)
+            advance(counters, 2 * phase + 1)
+        wait_for(counters, phase, 1)
+        return phase + 1
+    begin = 0
+    while begin < width:
+        end = begin + BLOCK if begin + BLOCK < width else width
+        if advance(counters, 2 * phase) == 0:
+            failed = eliminate(numbers, panel, stride, begin, end, end, scale, pivots, signs, first)
+            if failed >= 0 or end == width:
+                count_front(plan, s, failed, state)
+            advance(counters, 2 * phase + 1)
+        wait_for(counters, phase, 1)
+        phase += 1
+        if state[FAILED] >= 0:
+            return phase
+        beyond = columns - end
+        chunks = chunks_of(0.5 * (end - begin) * (end - begin) * beyond)
+        k = advance(counters, 2 * phase)
+        while k < chunks:
+            start, stop = column_of(k, chunks, end, columns), column_of(k + 1, chunks, end, columns)
+            complete(numbers, panel, stride, begin, end, start, stop, pivots, signs, first)
+            advance(counters, 2 * phase + 1)
+            k = advance(counters, 2 * phase)
+        wait_for(counters, phase, chunks)
+        phase += 1
+        if end < width:
+            below = width - end
+            chunks = chunks_of((below * beyond - 0.5 * below * below) * (end - begin))
+            k = advance(counters, 2 * phase)
+            while k < chunks:
+                subtract_signed(
+                    numbers, panel + end * (stride + 1), stride, beyond, panel + begin * stride + end, stride,
+                    end - begin, signs, first + begin, row_of(k, chunks, below, beyond),
+                    row_of(k + 1, chunks, below, beyond),
+                )  # fmt: skip
+                advance(counters, 2 * phase + 1)
+                k = advance(counters, 2 * phase)
+            wait_for(counters, phase, chunks)
+            phase += 1
+        begin = end
+    chunks = chunks_of(0.5 * rows * rows * width)
+    k = advance(counters, 2 * phase)
+    while k < chunks:
+        subtract_signed(
+            numbers, update, apart, rows, panel + width, stride, width, signs, first,
+            row_of(k, chunks, rows, rows), row_of(k + 1, chunks, rows, rows),
+        )  # fmt: skip
+        advance(counters, 2 * phase + 1)
+        k = advance(counters, 2 * phase)
+    wait_for(counters, phase, chunks)
+    return phase + 1
+
+
+def factor_at_once(plan: Plan, data: Array, added: Array) -> bool:
+    """What :func:`fronts.factor` does, to the bit, by as many threads as there are."""
+    told = np.empty((PARTS + 1, len(plan.state)), np.int64)
+    counters = np.zeros(2 * phases_of(plan), np.int64)
+    share = partial(work_on, plan, data, added, counters.ctypes.data, told)
+    if not all(at_once([share] * threads())):
+        return bool(factor(plan, data, added))  # which stops where the first pivot vanishes, and says where
+    plan.state[:] = told.sum(axis=0)
+    plan.state[FAILED] = -1
+    surprised = np.isin(plan.order, told[told[:, SURPRISE] >= 0, SURPRISE])
+    plan.state[SURPRISE] = plan.order[np.argmax(surprised)] if surprised.any() else -1
+    return True
+
+
+@compiled
+def _sweep(
+    plan: Plan, part: int, x: Address, numbers: Address, pivots: Address, signs: Address, space: int, back: bool
+) -> None:
+    """Forward or backward substitution through the fronts of a part.
+
+    Args:
+        plan: factorised.
+        part: see above.
+        x: address of the right-hand side in the order of elimination, and of room for a front.
+        numbers: address of the panels.
+        pivots: of the inverse diagonal.
+        signs: of its signs.
+        space: offset of the room.
+        back: see above.
+    """
+    fronts, rows, count = plan.fronts, plan.rows, plan.shape[FRONTS]
+    for k in range(count):
+        s = count - 1 - k if back else k
+        if plan.part[s] != part:
+            continue
+        first, width, below, panel, stride = (
+            fronts[s, FIRST], fronts[s, PIVOTS], fronts[s, ROWS], fronts[s, PANEL], fronts[s, STRIDE],
+        )  # fmt: skip
+        index = fronts[s, INDEX]
+        for i in range(width):
+            put(x, space + i, get(x, first + i))
+        for i in range(below):
+            put(x, space + width + i, get(x, get(rows, index + i)))
+        if back:
+            backward(x, space, numbers, panel, stride, width, width + below, pivots, first)
+        else:
+            forward(x, space, numbers, panel, stride, width, width + below, pivots, signs, first)
+            for i in range(below):
+                put(x, get(rows, index + i), get(x, space + width + i))
+        for i in range(width):
+            put(x, first + i, get(x, space + i))
+
+
+@compiled
+def substitute(plan: Plan, right: Array, out: Array, own: Array, counters: Address) -> bool:
+    """What one of several threads does for a solution.
+
+    Args:
+        plan: factorised, with parts.
+        right: (n,) right-hand side.
+        out: (n,) receives the solution.
+        own: (PARTS, n + room for a front) what each part works in.
+        counters: of two integers for each of three phases, zero.
+    """
+    fronts, order, scalars, count = plan.fronts, plan.order, plan.shape[SCALARS], plan.shape[FRONTS]
+    numbers, pivots, signs, x = address(plan.numbers), address(plan.pivots), address(plan.signs), address(plan.work)
+    k = advance(counters, 0)
+    while k < PARTS:
+        mine = own[k]
+        for s in range(count):
+            if plan.part[s] == k:
+                for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
+                    mine[i] = right[order[i]]
+            elif plan.part[s] == PARTS:
+                for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
+                    mine[i] = 0.0
+        _sweep(plan, k, address(mine), numbers, pivots, signs, scalars, False)
+        advance(counters, 1)
+        k = advance(counters, 0)
+    wait_for(counters, 0, PARTS)
+    if advance(counters, 2) == 0:
+        for s in range(count):
+            if plan.part[s] == PARTS:
+                for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
+                    total = right[order[i]]
+                    for part in range(PARTS):
+                        total += own[part, i]
+                    put(x, i, total)
+        _sweep(plan, PARTS, x, numbers, pivots, signs, scalars, False)
+        _sweep(plan, PARTS, x, numbers, pivots, signs, scalars, True)
+        for s in range(count):
+            if plan.part[s] == PARTS:
+                for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
+                    out[order[i]] = get(x, i)
+        advance(counters, 3)
+    wait_for(counters, 1, 1)
+    k = advance(counters, 4)
+    while k < PARTS:
+        mine = own[k]
+        for s in range(count):
+            if plan.part[s] == PARTS:
+                for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
+                    mine[i] = get(x, i)
+        _sweep(plan, k, address(mine), numbers, pivots, signs, scalars, True)
+        for s in range(count):
+            if plan.part[s] == k:
+                for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
+                    out[order[i]] = mine[i]
+        advance(counters, 5)
+        k = advance(counters, 4)
+    wait_for(counters, 2, PARTS)
+    return True
+
+
+def solve_at_once(plan: Plan, right: Array, out: Array) -> None:
+    """What :func:`substitution.solve` does, by as many threads as there are; ``out`` is not ``right``."""
+    if plan.shape[PANELS] < SOLVED:
+        solve(plan, right, out)
+        return
+    own, counters = np.empty((PARTS, len(plan.work))), np.zeros(6, np.int64)
+    at_once([partial(substitute, plan, right, out, own, counters.ctypes.data)] * threads())

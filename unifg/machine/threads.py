@@ -1,0 +1,180 @@
+"""How many threads share the work of one solve: one, unless more are asked for.
+
+Compiled passes let other threads run, so that the parts of a large pass can run at once. What is shared out, and how,
+does not depend on the machine: the same number of threads gives the same answer.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from unifg.errors import UnifgError
+from unifg.machine.jit import compiled
+from unifg.machine.vectors import Address, present
+
+__all__ = ["at_once", "threads", "use_threads", "wait_for"]
+
+T = TypeVar("T")
+PATIENCE = 2_000_000  # looks for a change, about a millisecond, before a thread goes to sleep
+
+
+@compiled
+def changes(integers: Address, at: int, old: int) -> bool:
+    """Look for a while whether an integer that another thread writes is still ``old``; True when it is not."""
+    for _ in range(PATIENCE):
+        if present(integers, at) != old:
+            return True
+    return False
+
+
+@compiled
+def wait_for(counters: Address, phase: int, chunks: int) -> None:
+    """Return when all chunks of a phase are done; each has two counters, of chunks taken and of chunks done."""
+    while present(counters, 2 * phase + 1) < chunks:
+        pass
+
+
+class Batch(Generic[T]):
+    """Jobs of one call of :func:`at_once`, and what they answered."""
+
+    def __init__(self, jobs: Sequence[Callable[[], T]]) -> None:
+        """Nobody has begun with any of them."""
+        self.waiting = deque(enumerate(jobs))
+        self.begun = list[int]()
+        self.ended = np.zeros(len(jobs), np.int64)
+        self.results = dict[int, T]()
+        self.failures = dict[int, BaseException]()
+
+    def work(self) -> None:
+        """Take one job after the other until none is left."""
+        while True:
+            try:
+                k, job = self.waiting.popleft()
+            except IndexError:
+                return
+            self.begun.append(k)
+            try:
+                self.results[k] = job()
+            except BaseException as failure:
+                self.failures[k] = failure
+            finally:
+                self.ended[k] = 1
+
+
+class Crew:
+    """Threads that look out for new jobs for a while before they sleep: to wake one takes longer than many a pass."""
+
+    def __init__(self, count: int) -> None:
+        """Start so many threads; they end with the process, or when they are told to leave."""
+        self.batches = deque[Batch[Any]]()
+        self.posted = np.zeros(1, np.int64)
+        self.bell = threading.Condition()
+        self.leaving = False
+        self.size = count
+        changes(self.posted.ctypes.data, 0, 1)  # compiled, where it has not been, before anybody waits for it
+        for k in range(count):
+            threading.Thread(target=self._stay, name=f"unifg {k + 1}", daemon=True).start()
+
+    def post(self, batch: Batch[Any], copies: int) -> None:
+        """Call so many threads to a batch."""
+        self.batches.extend([batch] * copies)
+        self._ring()
+
+    def leave(self) -> None:
+        """Let all threads end when they have done what has been posted."""
+        self.leaving = True
+        self._ring()
+
+    def finish(self, batch: Batch[Any]) -> None:
+        """Wait for all jobs of a batch that have begun."""
+        for k in tuple(batch.begun):
+            if not batch.ended[k] and not changes(batch.ended.ctypes.data, k, 0):
+                with self.bell:
+                    self.bell.wait_for(lambda k=k: bool(batch.ended[k]))  # type: ignore[misc]
+
+    def _ring(self) -> None:
+        with self.bell:
+            self.posted[0] += 1
+            self.bell.notify_all()
+
+    def _stay(self) -> None:
+        while True:
+            seen = int(self.posted[0])
+            try:
+                batch = self.batches.popleft()
+            except IndexError:
+                if self.leaving:
+                    return
+                if not changes(self.posted.ctypes.data, 0, seen):
+                    with self.bell:
+                        self.bell.wait_for(lambda seen=seen: self.posted[0] != seen)  # type: ignore[misc]
+                continue
+            batch.work()
+            del batch  # or its arrays would live until the next one
+            with self.bell:
+                self.bell.notify_all()
+
+
+_crew: Crew | None = None
+
+
+def use_threads(count: int) -> None:
+    """Let large solves of this process use several threads: least squares' linearisation and elimination.
+
+    Args:
+        count: threads, at least one; one is the default, and right where several processes share a machine.
+
+    Raises:
+        UnifgError: it is no such number.
+    """
+    global _crew
+    if not isinstance(count, int) or isinstance(count, bool) or count < 1:
+        raise UnifgError(f"use_threads takes a whole number of threads, at least 1, got {count!r}")
+    if count == threads():
+        return
+    last, _crew = _crew, Crew(count - 1) if count > 1 else None
+    if last is not None:
+        last.leave()
+
+
+def threads() -> int:
+    """How many there are."""
+    return 1 if _crew is None else 1 + _crew.size
+
+
+def at_once(jobs: Sequence[Callable[[], T]]) -> list[T]:
+    """Results of jobs in their order; whoever is free, this thread among them, takes the next one.
+
+    Raises:
+        BaseException: what the first job that failed has raised, when none is at work any more.
+    """
+    crew = _crew
+    if crew is None or len(jobs) < 2:
+        return [job() for job in jobs]
+    batch = Batch(jobs)
+    crew.post(batch, min(crew.size, len(jobs) - 1))
+    try:
+        batch.work()
+    finally:  # what jobs write to may be gone when this returns
+        batch.waiting.clear()
+        crew.finish(batch)
+    if batch.failures:
+        raise batch.failures[min(batch.failures)]
+    return [batch.results[k] for k in range(len(jobs))]
+
+
+def _after_fork() -> None:
+    """In a forked child there are no threads, whatever the crew believes."""
+    global _crew
+    if _crew is not None:
+        _crew = Crew(_crew.size)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
