@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -120,14 +120,19 @@ def test_two_threads_that_solve_share_one_crew(lattice: PoseGraph) -> None:
             assert all(np.array_equal(a, b) for a, b in zip(found, alone, strict=True))
 
 
+def hands() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name.startswith("unifg ")]
+
+
 def test_threads_that_were_sent_away_leave() -> None:
-    before = threading.active_count()
-    fg.use_threads(4)
-    assert threading.active_count() == before + 3
-    fg.use_threads(1)
-    for thread in [thread for thread in threading.enumerate() if thread.name.startswith("unifg ")]:
+    for thread in hands():  # of the tests before
         thread.join(5.0)
-    assert threading.active_count() == before
+    fg.use_threads(4)
+    assert len(hands()) == 3
+    fg.use_threads(1)
+    for thread in hands():
+        thread.join(5.0)
+    assert not hands()
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this platform")
@@ -194,8 +199,9 @@ def test_jobs_are_answered_in_order_and_failures_passed_on() -> None:
     def fail() -> int:
         raise ValueError("no")
 
+    jobs: list[Callable[[], int]] = [partial(int, 1), fail, partial(int, 2)]
     for count in (1, 3):
         fg.use_threads(count)
         assert at_once([partial(int, k) for k in range(20)]) == list(range(20))
         with pytest.raises(ValueError, match="no"):
-            at_once([partial(int, 1), fail, partial(int, 2)])
+            at_once(jobs)
