@@ -22,7 +22,7 @@ from benchmarks.kept_rows import ROWS, keep, restore
 from benchmarks.large_maps import CAMPAIGNS
 from benchmarks.report import OUT, command, machine, publish, table
 from unifg.scenarios.campaigns.account import differences
-from unifg.scenarios.campaigns.campaign import code_of_scenario, replay_command, run_campaign, write_manifest
+from unifg.scenarios.campaigns.campaign import EPISODES, code_of_scenario, replay_command, run_campaign, write_manifest
 from unifg.scenarios.campaigns.comparison import interval, share
 from unifg.scenarios.campaigns.document import Heading, Table, Words
 from unifg.scenarios.campaigns.performed import OK
@@ -327,13 +327,14 @@ def main(arguments: list[str] | None = None) -> int:
     sheets = {}
     for name in CAMPAIGN_NAMES:
         folder, archive = OUT / "campaigns" / name, ROWS / f"{name}.jsonl.xz"
+        store = folder / EPISODES
         whole = read(CAMPAIGNS / f"{name}.toml")
-        restore(archive, folder)
+        restore(archive, store)
         if not options.report and name in options.campaigns:
             couplings = options.couplings if name in PAPER else COUPLINGS
             some = _some(whole, options.runs, couplings)
             run_campaign(some, folder, workers=options.workers, any_code=options.any_code)
-            keep(folder, archive)
+            keep(store, archive)
         if folder.is_dir():
             write_manifest(folder, whole, code_of_scenario("navigation"))  # not of this command's part alone
             sheets[name] = load(folder, options.any_code, failed_too=True)

@@ -1,4 +1,4 @@
-"""Rows of campaigns that take longer than one sitting, kept in the checkout beside the files that state them.
+"""Rows of what takes longer to run than one sitting, kept in the checkout.
 
 To read them: ``xz -dc benchmarks/campaigns/rows/department.jsonl.xz``.
 """
@@ -11,7 +11,6 @@ from pathlib import Path
 
 from benchmarks.large_maps import CAMPAIGNS
 from unifg.errors import ScenarioError
-from unifg.scenarios.campaigns.campaign import EPISODES
 from unifg.scenarios.campaigns.journal import Journal, lines_of
 
 __all__ = ["ROWS", "keep", "restore"]
@@ -19,9 +18,9 @@ __all__ = ["ROWS", "keep", "restore"]
 ROWS = CAMPAIGNS / "rows"
 
 
-def keep(folder: Path, archive: Path) -> None:
-    """Pack the rows of a campaign's folder, of each episode the last; the same rows give the same bytes."""
-    last = {row["key"]: row for row in lines_of(folder / EPISODES)}
+def keep(store: Path, archive: Path) -> None:
+    """Pack the rows of a file of one object a line, of each key the last; the same rows give the same bytes."""
+    last = {str(row["key"]): row for row in lines_of(store)}
     text = "".join(json.dumps(last[key]) + "\n" for key in sorted(last))
     archive.parent.mkdir(parents=True, exist_ok=True)
     beside = archive.with_suffix(".new")
@@ -29,14 +28,14 @@ def keep(folder: Path, archive: Path) -> None:
     beside.replace(archive)
 
 
-def restore(archive: Path, folder: Path) -> int:
-    """Add to a campaign's folder the rows of episodes that are kept and not on file there.
+def restore(archive: Path, store: Path) -> int:
+    """Add to a file of one object a line the rows that are kept and whose keys are not there.
 
     Returns:
         How many were added.
 
     Raises:
-        ScenarioError: the archive is damaged, or the folder cannot be written or is in use.
+        ScenarioError: the archive is damaged, or the file cannot be written or is in use.
     """
     if not archive.is_file():
         return 0
@@ -46,9 +45,9 @@ def restore(archive: Path, folder: Path) -> int:
         }
     except (lzma.LZMAError, ValueError, KeyError, TypeError) as error:
         raise ScenarioError(f"{archive}: is damaged ({error}); take it from the repository again") from None
-    on_file = {str(row.get("key")) for row in lines_of(folder / EPISODES)}
+    on_file = {str(row.get("key")) for row in lines_of(store)}
     missing = [line for key, line in kept.items() if key not in on_file]
     if missing:
-        with Journal(folder / EPISODES) as journal:
+        with Journal(store) as journal:
             journal.add("\n".join(missing))  # on the disk at once, or not at all
     return len(missing)

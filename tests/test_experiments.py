@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -101,22 +102,24 @@ def test_others_drive_the_same_legs_on_the_same_seeds() -> None:
         assert {episode.settings["planner"] for episode in others.episodes()} == {"teb", "mppi", "dwa", "pursuit"}
 
 
-def test_rows_that_are_kept_come_back_once(tmp_path: Path) -> None:
+@pytest.mark.parametrize("keys", [("a", "b"), (["city", 0.1], ["city", 0.3])], ids=["names", "settings"])
+def test_rows_that_are_kept_come_back_once(keys: tuple[object, object], tmp_path: Path) -> None:
     """Of an episode that was run twice the last is kept; what is on file stays; a second time adds nothing."""
-    ran, archive = tmp_path / "ran", tmp_path / "rows" / "department.jsonl.xz"
-    with Journal(ran / EPISODES) as journal:
-        for line in ('{"key": "b", "seconds": 1}', '{"key": "a", "seconds": 2}', '{"key": "b", "seconds": 3}'):
-            journal.add(line)
+    ran, archive = tmp_path / "ran.jsonl", tmp_path / "rows" / "department.jsonl.xz"
+    a, b = keys
+    with Journal(ran) as journal:
+        for key, seconds in ((b, 1), (a, 2), (b, 3)):
+            journal.add(json.dumps({"key": key, "seconds": seconds}))
     keep(ran, archive)
     first = archive.read_bytes()
-    fresh = tmp_path / "fresh"
-    with Journal(fresh / EPISODES) as journal:
-        journal.add('{"key": "a", "seconds": 4}')
+    fresh = tmp_path / "fresh" / "rows.jsonl"
+    with Journal(fresh) as journal:
+        journal.add(json.dumps({"key": a, "seconds": 4}))
     assert restore(archive, fresh) == 1
-    assert [(row["key"], row["seconds"]) for row in lines_of(fresh / EPISODES)] == [("a", 4), ("b", 3)]
+    assert [(row["key"], row["seconds"]) for row in lines_of(fresh)] == [(a, 4), (b, 3)]
     assert restore(archive, fresh) == 0 and restore(tmp_path / "none.xz", fresh) == 0
-    assert restore(archive, tmp_path / "empty") == 2
-    keep(tmp_path / "empty", archive)
+    assert restore(archive, tmp_path / "empty.jsonl") == 2
+    keep(tmp_path / "empty.jsonl", archive)
     assert archive.read_bytes() == first, "the same rows are the same bytes"
     archive.write_bytes(first[: len(first) // 2])
     with pytest.raises(ScenarioError, match=r"department\.jsonl\.xz: is damaged"):
@@ -125,7 +128,7 @@ def test_rows_that_are_kept_come_back_once(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["department", "department-others", "factory", "factory-others"])
 def test_rows_in_the_checkout_are_of_the_campaigns(name: str, tmp_path: Path) -> None:
-    if not restore(ROWS / f"{name}.jsonl.xz", tmp_path):
+    if not restore(ROWS / f"{name}.jsonl.xz", tmp_path / EPISODES):
         pytest.skip("none is kept")
     known = {episode.key for episode in read(CAMPAIGNS / f"{name}.toml").episodes()}
     keys = [row["key"] for row in lines_of(tmp_path / EPISODES)]
