@@ -2,7 +2,7 @@
 
     python -m benchmarks.elimination [--only SECTION ...] [--rounds R]
 
-Everything runs in one thread on one core, candidates in turn (:mod:`benchmarks.timing`). Results go to
+Everything but two threads runs in one thread on one core, candidates in turn (:mod:`benchmarks.timing`). Results go to
 docs/benchmarks.json with versions, machine, date and the state of the code, and from there to docs/benchmarks.md, where
 the previous run stands beside the new one; fewer than 15 rounds, or no gtsam, are only printed. Exit code 1 when
 something is slower than its floor.
@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks import chains, growth, gtsam_peer, marginals, own_residuals, pose_graphs
+from benchmarks import chains, growth, gtsam_peer, marginals, own_residuals, pose_graphs, two_threads
 from benchmarks.report import CHECKOUT, code_digest, command, listing, machine, publish
 from benchmarks.section import Result, Section, met
 from benchmarks.timing import number, pin, shown
@@ -27,6 +27,7 @@ PACKAGES = ("unifg", "numpy", "scipy", "numba", "gtsam")
 
 SECTIONS = {
     "pose-graphs": Section("Pose graphs", pose_graphs.measure, pose_graphs.render),
+    "two-threads": Section("Two threads", two_threads.measure, two_threads.render),
     "growth": Section("Growth with size", growth.measure, growth.render),
     "chains": Section("Chains of control", chains.measure, chains.render),
     "marginals": Section("Marginal covariances", marginals.measure, marginals.render),

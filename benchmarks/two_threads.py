@@ -1,70 +1,106 @@
-"""What two threads gain: that solve two graphs, one each, and that share the work of one solve (`fg.use_threads`).
+"""What two threads gain: that share the work of one solve (`fg.use_threads`), and that solve two graphs, one each.
 
-    python -m benchmarks.two_threads [--rounds N]
-
-Ratios of the time of one thread to that of two, of rounds in turn. Compiled loops release the interpreter's lock, what
-stands around them does not. It says nothing on a machine whose two cores have other work; a second core that has
-rested needs some tenths of a second, so that solves are repeated for half a second before they count.
+Wall time of one thread over that of two. Nothing is gained on a machine whose two cores have other work, and a second
+core that has rested needs some tenths of a second, so that everything is repeated for a while before it counts.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
 
 import unifg as fg
-from benchmarks.pose_graphs import cases
-from benchmarks.report import command
+from benchmarks.pose_graphs import Case, cases
+from benchmarks.report import listing
+from benchmarks.section import Result, goal
+from benchmarks.timing import all_cores, interleave, milliseconds, shown, spread
+from unifg.elimination.factorization import Factorization
 from unifg.elimination.fronts import BLOCK, WIDE
 from unifg.elimination.plan import PIVOTS, ROWS, Plan
-from unifg.elimination.subtrees import PARTS
+from unifg.elimination.subtrees import PARTS, WORTH
+from unifg.lie import SE3
 from unifg.solvers import GaussNewton
 
-SOLVES = 8
-SECONDS = 0.5  # before solves count, and for which they do
+ROUNDS = 7  # at most
+BEFORE, WHILE = 0.3, 0.2  # how long something is repeated before it counts, and while it does [s]
 CORES = 2, 4, 8
+WANTED = 1.6  # times, of graphs in space
+PIECES = {"linearise": "linearise", "eliminate": "eliminate", "substitute": "substitute", "solve": "whole solve"}
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measure, and print a line for each graph."""
-    parser = command(__doc__)
-    parser.add_argument("--rounds", type=int, default=7, metavar="N")
-    rounds = parser.parse_args(arguments).rounds
-    with ThreadPoolExecutor(2) as pool:
-        for case in cases():
-            graphs = [case.pose_graph.graph() for _ in range(2)]
-            solves = [partial(GaussNewton().prepare(graph).solve, guess) for graph, _, guess in graphs]
-            gained = np.zeros(rounds)
-            for k in range(rounds):
-                begin = time.perf_counter()
-                for solve in solves:
-                    several(solve)
-                alone = time.perf_counter()
-                wait([pool.submit(several, solve) for solve in solves])
-                gained[k] = (alone - begin) / (time.perf_counter() - alone)
-            print(f"{case.name}, two graphs: {np.median(gained):.2f} ({gained.min():.2f} .. {gained.max():.2f})")
-            shared = np.array([steady(solves[0], 1) / steady(solves[0], 2) for _ in range(rounds)])
-            print(f"{case.name}, one solve: {np.median(shared):.2f} ({shared.min():.2f} .. {shared.max():.2f})")
+def measure(rounds: int, small: bool = False) -> Result:
+    """All graphs."""
+    rounds = min(rounds, ROUNDS)
+    before, during = (0.0, 0.01) if small else (BEFORE, WHILE)
+    with all_cores():
+        rows = [measure_case(case, rounds, before, during) for case in cases(small)]
+    goals = [
+        goal(f"{row['graph']}, one solve by two threads", "times faster than by one", row["ratio"]["solve"], WANTED)
+        for row in rows
+        if row["space"]
+    ]
+    return {"rows": rows, "rounds": rounds, "goals": goals}
+
+
+def measure_case(case: Case, rounds: int, before: float, during: float) -> Result:
+    """One graph."""
+    graphs = [case.pose_graph.graph() for _ in range(2)]
+    solves = [partial(GaussNewton().prepare(graph).solve, guess) for graph, _, guess in graphs]
+    graph, _, guess = graphs[0]
+    program = graph.compile()
+    factorization = Factorization(program.normal, program.blocks)
+    hessian = program.linearize(guess).hessian.copy()
+    factorization.factor(hessian)
+    right = np.random.default_rng(0).normal(size=program.size)
+    pieces: dict[str, Callable[[], object]] = {
+        "linearise": partial(program.linearize, guess),
+        "eliminate": partial(factorization.factor, hessian),
+        "substitute": partial(factorization.solve, right),
+        "solve": solves[0],
+    }
+
+    def shared(piece: Callable[[], object], count: int) -> float:
+        fg.use_threads(count)
+        try:
+            return steady(piece, before, during)
+        finally:
             fg.use_threads(1)
-            plan = graphs[0][0].compile().systems.normal().plan
-            if len(plan.part):
-                told = ", ".join(f"{speedup(plan, cores):.2f} on {cores}" for cores in CORES)
-                print(f"{case.name}, elimination by its multiplications: {told} cores")
-    return 0
+
+    def apart(solve: Callable[[], object], other: Callable[[], object]) -> float:
+        with ThreadPoolExecutor(2) as pool:
+            told = [pool.submit(steady, each, before, during) for each in (solve, other)]
+            return max(future.result() for future in told)
+
+    times = interleave(
+        {
+            f"{name} {count}": partial(shared, piece, count) for name, piece in pieces.items() for count in (1, 2)
+        } | {"apart": partial(apart, solves[0], solves[1])},
+        rounds,
+        warm=0,
+    )  # fmt: skip
+    plan = graph.compile().systems.normal().plan
+    return {
+        "graph": case.name,
+        "space": case.pose_graph.group is SE3,
+        "shared": len(plan.part) > 0,
+        "alone": {name: milliseconds(times[f"{name} 1"]) for name in pieces},
+        "ratio": {name: spread(times[f"{name} 1"] / times[f"{name} 2"]) for name in pieces},
+        "apart": spread(2.0 * times["solve 1"] / times["apart"]),
+        "cores": [speedup(plan, cores) for cores in CORES] if len(plan.part) else None,
+    }
 
 
-def steady(solve: Callable[[], object], threads: int) -> float:
-    """Median time of a solve with so many threads, once these have been at work for a while [s]."""
-    fg.use_threads(threads)
+def steady(action: Callable[[], object], before: float, during: float) -> float:
+    """Median time of an action once it has been repeated for a while [s]."""
     times = list[float]()
     begin = time.perf_counter()
-    while (now := time.perf_counter()) < begin + 2.0 * SECONDS:
-        solve()
-        if now > begin + SECONDS:
+    while (now := time.perf_counter()) < begin + before + during or not times:
+        action()
+        if now >= begin + before:
             times.append(time.perf_counter() - now)
     return float(np.median(times))
 
@@ -88,11 +124,27 @@ def speedup(plan: Plan, cores: int) -> float:
     return float(alone / (load.max() + shared))
 
 
-def several(solve: Callable[[], object]) -> None:
-    """Solve a few times."""
-    for _ in range(SOLVES):
-        solve()
+def _gain(name: str) -> Callable[[Result], str]:
+    return lambda row: shown(row["ratio"][name])
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+COLUMNS: dict[str, Callable[[Result], str]] = {
+    "whole solve by one thread [ms]": lambda row: shown(row["alone"]["solve"]),
+    **{f"{title}, times faster": _gain(name) for name, title in PIECES.items()},
+    f"eliminate on {CORES[0]} / {CORES[1]} / {CORES[2]} cores, by its multiplications": lambda row: (
+        " / ".join(f"{times:.1f}" for times in row["cores"]) if row["cores"] else "too small to be shared"
+    ),
+    "two graphs in two threads, times faster": lambda row: shown(row["apart"]),
+}
+
+
+def render(result: Result) -> str:
+    """A table, and what its columns are."""
+    text = (
+        "Wall time of one thread over that of two on two cores, `fg.use_threads(2)`. What more cores would gain is "
+        "counted, not measured: every part of the elimination tree by the core that is free first, then the fronts "
+        "above them one by one, of which diagonal blocks are one core's work. An elimination of fewer than "
+        f"{WORTH / 1e6:.0f} million multiplications is not shared out. The last column: two graphs stated apart, each "
+        f"solved by a thread of its own, against one after the other. {result['rounds']} rounds."
+    )
+    return "\n\n".join([listing(("graph",), {(row["graph"],): row for row in result["rows"]}, COLUMNS), text])
