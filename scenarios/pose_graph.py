@@ -20,6 +20,7 @@ from unifg.errors import ScenarioError
 from unifg.files.contents import legible
 from unifg.files.pose_graph import read_pose_graph
 from unifg.kernels.robust import DCS, Cauchy, Huber, Loss, TruncatedLeastSquares, Tukey
+from unifg.machine.threads import threads, use_threads
 from unifg.pose_graphs.certificate import Certificate, certify
 from unifg.pose_graphs.information import REPAIRS, Repair, indefinite
 from unifg.pose_graphs.initialise import chordal, lago, odometric, starts
@@ -71,6 +72,7 @@ class SolveSettings:
         repair_information: what to do about information matrices with negative eigenvalues: leave these measurements
             out, or keep what is left without them. By default such a file is refused.
         max_iterations: before giving up.
+        threads: that share the work of a large graph; no more than there are free cores.
         no_scene: leave out the scene and the picture, which take longer than the solve.
         certify: see whether another map could be better, by the dual of the chordal relaxation.
         staircase: where that finds a way down, follow it and solve again from there.
@@ -84,6 +86,7 @@ class SolveSettings:
     tolerance: Literal["optimum", "map"] = option("optimum")
     repair_information: Repair | None = option(None, choices=REPAIRS)
     max_iterations: int = option(100, metavar="N")
+    threads: int = option(1, metavar="N")
     no_scene: bool = option(False)
     certify: bool = option(False)
     staircase: bool = option(False)
@@ -149,7 +152,17 @@ def solve_file(settings: SolveSettings, progress: Progress = silent) -> SolvedGr
         ScenarioError: the settings do not fit each other or the file.
         FileFormatError: the file cannot be read.
         GraphError: the measurements do not determine the poses.
+        UnifgError: there cannot be so many threads.
     """
+    before = threads()
+    use_threads(settings.threads)
+    try:
+        return _solve_file(settings, progress)
+    finally:
+        use_threads(before)
+
+
+def _solve_file(settings: SolveSettings, progress: Progress) -> SolvedGraph:
     clock = Stopwatch()
     progress(0.0, f"reading {legible(settings.file.name)}")
     read = read_pose_graph(settings.file, repair=settings.repair_information)

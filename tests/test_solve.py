@@ -13,10 +13,11 @@ import pytest
 
 import unifg as fg
 from scenes import commands_of, data_of
-from unifg.errors import GraphError, ScenarioError
+from unifg.errors import GraphError, ScenarioError, UnifgError
 from unifg.files.g2o import read_g2o, write_g2o
 from unifg.files.toro import write_toro
 from unifg.files.tum import read_tum
+from unifg.machine.threads import threads
 from unifg.pose_graphs import Edges, PoseGraph, Sightings, manhattan, sphere
 from unifg.scenarios import command
 from unifg.scenarios.pose_graph import SolveSettings, robust_loss, solve_file
@@ -80,6 +81,24 @@ def test_every_way_to_the_same_optimum(city: Path, solver: str, init: str) -> No
     np.testing.assert_array_equal(solved.steps[0], solved.before.poses)
     np.testing.assert_array_equal(solved.steps[-1], solved.after.poses)
     assert solved.step_numbers[-1] == solved.solution.iterations
+
+
+def test_a_graph_by_two_threads_and_then_one_again(city: Path, globe: Path) -> None:
+    """Also when it could not be solved."""
+    during = set[int]()
+
+    def watch(done: float, text: str) -> None:
+        during.add(threads())
+
+    assert solve_file(SolveSettings(city, threads=2), watch).solution.converged
+    assert during == {2} and threads() == 1
+    with pytest.raises(ScenarioError, match="lago"):
+        solve_file(
+            SolveSettings(write_g2o(city.with_name("globe.g2o"), sphere(4, 8).pose_graph), init="lago", threads=2)
+        )
+    assert threads() == 1
+    with pytest.raises(UnifgError, match="at least 1, got 0"):
+        solve_file(SolveSettings(city, threads=0))
 
 
 def test_residuals_have_their_own_optima(globe: Path) -> None:
