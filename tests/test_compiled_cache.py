@@ -198,3 +198,25 @@ def test_processes_compile_at_once_and_one_is_killed(tmp_path: Path) -> None:
     runs[0].wait()
     assert runs[1].wait(timeout=120) == 0
     assert not [file for file in tmp_path.rglob("*.code") if read_sealed(file) is None]
+
+
+def test_what_is_read_needs_no_compiler_until_a_function_of_ones_own_does() -> None:
+    script = (
+        "import sys\n"
+        "import numba, numpy as np\n"
+        "from unifg.machine.tally import tally\n"
+        "from unifg.pose_graphs import manhattan\n"
+        "from unifg.solvers import GaussNewton\n"
+        "def solve():\n"
+        "    graph, x, guess = manhattan(20).pose_graph.graph()\n"
+        "    return GaussNewton().solve(graph, guess)[x]\n"
+        "first = solve()\n"
+        "assert tally.read and not tally.generated, tally.generated\n"
+        "assert 'numba.np.linalg' not in sys.modules\n"
+        "matrix = np.array([[2.0, 1.0], [1.0, 3.0]])\n"
+        "assert abs(numba.njit(lambda m: np.linalg.inv(m))(matrix) - np.linalg.inv(matrix)).max() < 1e-15\n"
+        "assert (solve() == first).all()\n"
+    )
+    for _ in range(2):  # what was generated the first time is read the second time
+        ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
+    assert ended.returncode == 0, ended.stderr

@@ -34,6 +34,7 @@ from numba import types
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.core.dispatcher import Dispatcher
 from numba.core.registry import cpu_target
+from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 from numba.core.sigutils import normalize_signature
 
@@ -171,7 +172,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
     def load_overload(self, signature: Any, target: Any) -> Any:
         if shipped.recorder is not None:
             return None
-        target.refresh()
+        self._ready(target)
         name = f"{self._py_func.__module__}.{self._py_func.__qualname__}"
         path = self._file(signature, target.codegen())
         found = None if path is None else self._read(path, signature, target)
@@ -185,6 +186,16 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         self._keep(path, half)
         tally.generated.append(name)
         return found
+
+    def _ready(self, target: Any) -> None:
+        """Set up what code needs to run: with Numba's own types, and what can be made of them, a third of a second.
+
+        The library's own code needs its memory alone. The rest waits for something to compile, which asks for it.
+        """
+        if self._py_func.__module__.startswith("unifg."):
+            rtsys.initialize(target)
+        else:
+            target.refresh()
 
     def save_overload(self, signature: Any, result: Any) -> None:
         result = result._replace(type_annotation="")  # half of what would be written, and nobody reads it
