@@ -22,7 +22,7 @@ from unifg.elimination.sharing import row_of
 from unifg.elimination.subtrees import PARTS
 from unifg.elimination.symmetric import Symmetric
 from unifg.errors import UnifgError
-from unifg.machine.threads import at_once, threads
+from unifg.machine.threads import at_once, cores, threads
 from unifg.pose_graphs import PoseGraph, manhattan, sphere
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
@@ -139,7 +139,7 @@ def test_threads_that_were_sent_away_leave() -> None:
 def test_a_forked_child_has_threads_of_its_own() -> None:
     script = (
         "import os, warnings, unifg as fg\n"
-        "from unifg.machine.threads import at_once, threads\n"
+        "from unifg.machine.threads import at_once, cores, threads\n"
         "warnings.simplefilter('ignore')\n"
         "fg.use_threads(3)\n"
         "at_once([int] * 3)\n"
@@ -193,6 +193,15 @@ def test_the_number_of_threads_is_one_of_some() -> None:
         with pytest.raises(UnifgError, match="at least 1, got"):
             fg.use_threads(wrong)  # type: ignore[arg-type]
     assert threads() == 1
+
+
+def test_more_threads_than_cores_are_said(caplog: pytest.LogCaptureFixture) -> None:
+    fg.use_threads(1)
+    assert not caplog.messages
+    fg.use_threads(cores() + 1)
+    (said,) = caplog.messages
+    assert said.startswith(f"use_threads({cores() + 1}): this process may use {cores()} cores")
+    assert threads() == cores() + 1
 
 
 def test_jobs_are_answered_in_order_and_failures_passed_on() -> None:

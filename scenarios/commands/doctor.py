@@ -25,6 +25,7 @@ from unifg.errors import UnifgError
 from unifg.machine import shipped
 from unifg.machine.jit import folder_of
 from unifg.machine.objects import read_sealed
+from unifg.machine.threads import cores
 from unifg.scenarios.commands import performance
 from unifg.scenarios.commands.outcome import Progress
 
@@ -152,10 +153,11 @@ def _cache(roots: list[Path]) -> Iterator[Finding]:
 
 
 def _threads() -> Iterator[Finding]:
-    affinity = getattr(os, "sched_getaffinity", None)
-    cores = f"{len(affinity(0))} of {os.cpu_count()}" if affinity else f"{os.cpu_count()}"
     stated = ", ".join(f"{name}={value}" for name, value in performance.threads().items())
-    yield Finding("threads", f"{cores} cores for this process; {stated or 'no limit on threads of linear algebra'}")
+    yield Finding(
+        "threads",
+        f"{cores()} of {os.cpu_count()} cores for this process; {stated or 'no limit on threads of linear algebra'}",
+    )
     if "OMP_NUM_THREADS" not in performance.threads():
         yield Finding(
             "threads", "matrices here are small: OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 spares what waits for others",

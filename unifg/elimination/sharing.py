@@ -51,8 +51,9 @@ from unifg.elimination.plan import (
 from unifg.elimination.substitution import backward, forward, solve
 from unifg.elimination.subtrees import PARTS
 from unifg.machine.jit import compiled
-from unifg.machine.threads import at_once, threads, wait_for
+from unifg.machine.threads import at_once, threads
 from unifg.machine.vectors import Address, address, advance, get, put
+from unifg.machine.waiting import wait_for
 from unifg.typing import Array, IntArray
 
 MOST = 16  # chunks of a phase

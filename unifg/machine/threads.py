@@ -6,6 +6,7 @@ does not depend on the machine: the same number of threads gives the same answer
 
 from __future__ import annotations
 
+import logging
 import os
 import threading
 from collections import deque
@@ -15,29 +16,13 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from unifg.errors import UnifgError
-from unifg.machine.jit import compiled
-from unifg.machine.vectors import Address, present
+from unifg.machine.waiting import changes
 
-__all__ = ["at_once", "threads", "use_threads", "wait_for"]
+__all__ = ["at_once", "cores", "threads", "use_threads"]
 
 T = TypeVar("T")
-PATIENCE = 2_000_000  # looks for a change, about a millisecond, before a thread goes to sleep
 
-
-@compiled
-def changes(integers: Address, at: int, old: int) -> bool:
-    """Look for a while whether an integer that another thread writes is still ``old``; True when it is not."""
-    for _ in range(PATIENCE):
-        if present(integers, at) != old:
-            return True
-    return False
-
-
-@compiled
-def wait_for(counters: Address, phase: int, chunks: int) -> None:
-    """Return when all chunks of a phase are done; each has two counters, of chunks taken and of chunks done."""
-    while present(counters, 2 * phase + 1) < chunks:
-        pass
+logger = logging.getLogger("unifg")
 
 
 class Batch(Generic[T]):
@@ -127,6 +112,8 @@ _crew: Crew | None = None
 def use_threads(count: int) -> None:
     """Let large solves of this process use several threads: least squares' linearisation and elimination.
 
+    A warning is logged where there are fewer cores.
+
     Args:
         count: threads, at least one; one is the default, and right where several processes share a machine.
 
@@ -138,6 +125,11 @@ def use_threads(count: int) -> None:
         raise UnifgError(f"use_threads takes a whole number of threads, at least 1, got {count!r}")
     if count == threads():
         return
+    if count > cores():
+        logger.warning(
+            "use_threads(%d): this process may use %d cores; threads that wait take time from those that work",
+            count, cores(),
+        )  # fmt: skip
     last, _crew = _crew, Crew(count - 1) if count > 1 else None
     if last is not None:
         last.leave()
@@ -146,6 +138,11 @@ def use_threads(count: int) -> None:
 def threads() -> int:
     """How many there are."""
     return 1 if _crew is None else 1 + _crew.size
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def at_once(jobs: Sequence[Callable[[], T]]) -> list[T]:

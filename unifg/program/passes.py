@@ -13,8 +13,8 @@ from unifg.kernels.robust import value_of, weight_of
 from unifg.kernels.whitening import FULL, whiten
 from unifg.machine.calls import call_residual, matrix, vector, vector_at
 from unifg.machine.jit import compiled, inlined
-from unifg.machine.threads import wait_for
 from unifg.machine.vectors import Address, address, advance
+from unifg.machine.waiting import wait_for
 from unifg.program.pairs import PLANE, SPACE, add_plane, add_space, whiten_plane, whiten_space
 from unifg.program.table import (
     ACTIVE,
