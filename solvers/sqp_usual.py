@@ -30,9 +30,8 @@ from unifg.solvers.globalize.line_search import SHORTEST, Taken
 from unifg.solvers.globalize.merit import ARMIJO, RowPrices
 from unifg.solvers.globalize.sizes import largest
 from unifg.solvers.quadratic_programs.graph_route import HOPELESS, TIGHTEST, GraphRoute, minimize_quadratic
-from unifg.solvers.quadratic_programs.osqp_route import FINER
 from unifg.solvers.quadratic_programs.routes import LEFT, USABLE, Subproblems
-from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, largest_residual
+from unifg.solvers.quadratic_programs.subproblem import FINER, QP, QPAnswer, largest_residual
 from unifg.typing import Array, BoolArray, IntArray
 
 NOISE, ROUNDING = 1e-8, 1e-13  # of the merit: per unit of price, and relative

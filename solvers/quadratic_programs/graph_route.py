@@ -45,6 +45,9 @@ class GraphRoute:
         self.program = program
         self.system = program.systems.kkt(program.equality)
 
+    def begin(self) -> None:
+        """Nothing is left of a solve."""
+
     def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
         """Solve to ``accuracy`` and measure."""
         program = self.program

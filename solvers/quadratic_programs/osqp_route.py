@@ -24,7 +24,7 @@ import osqp
 
 from unifg.program.program import Program
 from unifg.solvers.quadratic_programs.scaling import Scaling
-from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, qp_error
+from unifg.solvers.quadratic_programs.subproblem import FINER, QP, QPAnswer, qp_error
 from unifg.typing import Array
 
 INFINITY = 1e20  # OSQP treats larger limits as absent
@@ -32,7 +32,6 @@ TIGHTEST = 1e-13
 RHO, ALPHA = 0.1, 1.8
 EQUALITIES = 2.0  # their rows are so much longer; rho goes with the square
 DIGITS = 1e-2  # accuracy asked for at first
-FINER = 0.01  # than the accuracy asked for, as the interior points are; a polish gives it or fails
 FINEST = 1e-9  # asked of the iterations; what lies beyond is left to the polish
 EVERY = 10  # iterations between looks at it
 WORTH = 30.0  # iterations of an interior point

@@ -45,6 +45,9 @@ class QpsolversRoute:
         self.name = name
         self._dense = name in qpsolvers.dense_solvers and name not in qpsolvers.sparse_solvers
 
+    def begin(self) -> None:
+        """Nothing is left of a solve."""
+
     def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
         """Solve and measure; ``multipliers`` and ``accuracy`` are not used: interior points start cold."""
         hessian = self._full(qp)

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from unifg.answers.requirements import require
+from unifg.elimination.symmetric import Symmetric
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.solvers.globalize.sizes import largest
 from unifg.solvers.quadratic_programs.exact_hessian import ExactHessian, holds
 from unifg.solvers.quadratic_programs.graph_route import GraphRoute, Polish
-from unifg.solvers.quadratic_programs.osqp_route import FINER, OsqpRoute
-from unifg.solvers.quadratic_programs.piqp_route import ElasticRoute, PiqpRoute
-from unifg.solvers.quadratic_programs.qpsolvers_route import QpsolversRoute
 from unifg.solvers.quadratic_programs.scaling import Scaling
-from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, Route, solve_convex, subproblem
+from unifg.solvers.quadratic_programs.subproblem import FINER, QP, QPAnswer, Route, solve_convex, subproblem
 from unifg.solvers.ta.linear_graphs import EliminationRoute
 from unifg.typing import Array
+
+if TYPE_CHECKING:
+    from unifg.solvers.quadratic_programs.piqp_route import ElasticRoute
 
 GOOD_ENOUGH = 1e-5  # QP error that is always accepted from the fallback
 USABLE = 1e-3  # QP error below which a step may still be tried
@@ -65,9 +67,9 @@ class Subproblems:
         linear = bool(program.equality.all()) and qp != "elimination"
         self.fallback = None if fallback is None else _route(program, fallback, qp_iterations)
         self.first = _route(program, "graph" if linear else qp, qp_iterations)
-        self.elastic = None if fallback is None else ElasticRoute(program, self.pattern)
+        self.elastic = None if fallback is None else _elastic(program, self.pattern)
         self._polish = Polish(program)
-        self._scaled = scaling and not isinstance(self.first, EliminationRoute)
+        self._scaled = scaling and self.first.name != "elimination"
         self.scaling = self._neutral = Scaling.none(program)
         self._misses = self._resting = 0
         self._first_answered = False
@@ -80,11 +82,11 @@ class Subproblems:
         """
         self._misses = self._resting = 0
         for route in (self.first, self.fallback, self.elastic):
-            if isinstance(route, (OsqpRoute, PiqpRoute, ElasticRoute)):
+            if route is not None:
                 route.begin()
         if self._scaled:
             self.scaling = Scaling.of(self.program, lin, self._neutral)
-        if isinstance(self.first, EliminationRoute):
+        if self.first.name == "elimination":
             require(self.program, "SQP(qp='elimination')", "equalities")
 
     def subproblem(self, lin: Linearization, multipliers: Array, damping: float) -> QP:
@@ -165,11 +167,29 @@ class Subproblems:
 
 
 def _route(program: Program, name: str, osqp_iterations: int | None) -> Route:
-    """The engine, OSQP and PIQP are called directly, everything else through qpsolvers."""
+    """The engine, OSQP and PIQP are called directly, everything else through qpsolvers.
+
+    What stands outside, and SciPy's matrices with it, is loaded when it is asked for.
+    """
     if name == "graph":
         return GraphRoute(program)
     if name == "elimination":
         return EliminationRoute(program)
     if name == "osqp":
+        from unifg.solvers.quadratic_programs.osqp_route import OsqpRoute
+
         return OsqpRoute(program, osqp_iterations)
-    return PiqpRoute(program) if name == "piqp" else QpsolversRoute(program, name)
+    if name == "piqp":
+        from unifg.solvers.quadratic_programs.piqp_route import PiqpRoute
+
+        return PiqpRoute(program)
+    from unifg.solvers.quadratic_programs.qpsolvers_route import QpsolversRoute
+
+    return QpsolversRoute(program, name)
+
+
+def _elastic(program: Program, pattern: Symmetric) -> ElasticRoute:
+    """The last resort, by PIQP."""
+    from unifg.solvers.quadratic_programs.piqp_route import ElasticRoute
+
+    return ElasticRoute(program, pattern)

@@ -22,6 +22,8 @@ from unifg.program.program import Program
 from unifg.solvers.globalize.sizes import largest
 from unifg.typing import Array, BoolArray
 
+FINER = 0.01  # than the accuracy asked for: what interior points reach, and OSQP with a polish or not at all
+
 
 @dataclass(frozen=True)
 class QP:
@@ -132,6 +134,10 @@ class Route(Protocol):
     """A way of solving subproblems that share one pattern."""
 
     name: str
+
+    def begin(self) -> None:
+        """Forget what the last solve of the program has left."""
+        ...
 
     def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
         """Solve, starting from the step zero and ``multipliers`` if the route can."""

@@ -18,7 +18,6 @@ from functools import cached_property
 from typing import Literal, TypeAlias
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
 
 from unifg.errors import UnifgError
 from unifg.typing import Array
@@ -253,6 +252,8 @@ def _enforce(
     name: str, d: int, separator: dict[str, int], hard: Sequence[LinearFactor]
 ) -> tuple[Array, Array, Array, list[Factor]]:
     """Coordinates of a variable that constraints determine, those they leave free, and what is left of the rows."""
+    from scipy.linalg import qr, solve_triangular  # slow to load, here and below
+
     rows, right = _stack(hard, {name: d, **separator})
     scale = np.concatenate([np.full(factor.rows, factor.size or 1.0) for factor in hard])
     rows, right = rows / scale[:, None], right / scale
@@ -281,6 +282,8 @@ def _by_qr(
     name: str, rows: Array, right: Array, k: int, separator: dict[str, int], zero: bool
 ) -> tuple[Array, Array, list[Factor]]:
     """Minimise 1/2 |rows (z, d_s) - right|^2 over z: z = constant + slope d_s, and the rows that remain."""
+    from scipy.linalg import qr, solve_triangular
+
     constant, slope = np.zeros(k), np.zeros((k, rows.shape[1] - k))
     rank = 0
     size = float(np.abs(rows).max(initial=0.0))
@@ -304,6 +307,8 @@ def _by_cholesky(
     name: str, hessian: Array, gradient: Array, k: int, separator: dict[str, int]
 ) -> tuple[Array, Array, list[Factor]]:
     """Minimise 1/2 y'Gy + g'y, y = (z, d_s), over z: z = constant + slope d_s, and the factor that remains."""
+    from scipy.linalg import cho_factor, cho_solve
+
     constant, slope = np.zeros(k), np.zeros((k, len(gradient) - k))
     if k:
         try:
@@ -356,6 +361,8 @@ def _linear(name: str, kind: str, rows: Array, right: Array, separator: dict[str
 
 def _triangle(rows: Array, right: Array) -> tuple[Array, Array]:
     """Fewer rows with the same least squares, but for a constant."""
+    from scipy.linalg import qr
+
     q, r = qr(rows, mode="economic")
     return r, q.T @ right
 

@@ -400,6 +400,9 @@ class EliminationRoute:
         """Remember the program."""
         self.program = program
 
+    def begin(self) -> None:
+        """Nothing is left of a solve."""
+
     def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
         """Solve and measure; a direct method needs neither ``multipliers`` to start from nor an ``accuracy``."""
         primal = primal_graph(qp)

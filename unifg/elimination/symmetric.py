@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse as sp
 
 from unifg.machine.jit import compiled
 from unifg.typing import Array, IntArray
+
+if TYPE_CHECKING:
+    import scipy.sparse as sp
 
 
 def scatter(slots: IntArray, numbers: Array, size: int) -> Array:
@@ -83,6 +86,8 @@ class Symmetric:
 
     def matrix(self, data: Array) -> sp.csc_matrix:
         """Upper triangle as a SciPy matrix sharing ``data``."""
+        import scipy.sparse as sp  # slow to load
+
         return sp.csc_matrix((data, self.indices, self.indptr), shape=(self.size, self.size))
 
     @cached_property

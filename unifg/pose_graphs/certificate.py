@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse.linalg import LinearOperator, eigsh
 
 from unifg.errors import GraphError
 from unifg.pose_graphs.linear import BlockQuadratic
@@ -193,6 +192,8 @@ class _Judge:
             whole[:] = 0.0
             whole[places] = right.ravel()
             return system.solve(whole)[places]
+
+        from scipy.sparse.linalg import LinearOperator, eigsh  # slow to load, and seldom needed
 
         operator = LinearOperator((len(places), len(places)), matvec=inverse, dtype=np.float64)
         start = np.random.default_rng(0).standard_normal(len(places))

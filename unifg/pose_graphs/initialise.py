@@ -11,14 +11,13 @@ from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import breadth_first_order, dijkstra, minimum_spanning_tree
 
 from unifg.errors import GraphError
 from unifg.kernels.robust import Loss
 from unifg.lie import SE2, SE3, SO3, LieGroup
 from unifg.pose_graphs.linear import block_least_squares
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
+from unifg.pose_graphs.spanning import spanning_tree
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["Start", "best_guess", "chordal", "lago", "odometric", "starts"]
@@ -248,21 +247,8 @@ def _tree(pose_graph: PoseGraph, fixed: IntArray, cost: Array, shortest: bool) -
         GraphError: a pose cannot be reached.
     """
     edges, count = pose_graph.edges, len(pose_graph.poses)
-    low, high = np.minimum(edges.first, edges.second), np.maximum(edges.first, edges.second)
-    keys = low * (count + 1) + high
-    order = np.lexsort((np.arange(len(keys)), cost, keys))  # one edge for each pair
-    pairs, place = np.unique(keys[order], return_index=True)
-    chosen = order[place]
-    rows = np.concatenate([low[chosen], np.full(len(fixed), count)])
-    columns = np.concatenate([high[chosen], fixed])
-    costs = np.concatenate([cost[chosen], np.full(len(fixed), 1e-6 * cost.min(initial=1.0))])
-    size = count + 1
-    adjacency = coo_matrix((costs, (rows, columns)), shape=(size, size)).tocsr()
-    if shortest:
-        found = dijkstra(adjacency, directed=False, indices=count, return_predecessors=True)[1]
-    else:
-        found = breadth_first_order(minimum_spanning_tree(adjacency), count, directed=False)[1]
-    unreached = np.flatnonzero(found[:count] < 0)
+    parent, edge, forward = spanning_tree(edges.first, edges.second, cost, fixed, count, shortest)
+    unreached = np.flatnonzero(parent < 0)
     if unreached.size:
         lost = int(unreached[0])
         raise GraphError(
@@ -271,11 +257,4 @@ def _tree(pose_graph: PoseGraph, fixed: IntArray, cost: Array, shortest: bool) -
             family="poses",
             index=lost,
         )
-    parent = found.astype(np.intp)
-    parent[count] = count
-    nodes, above = np.arange(count), parent[:count]
-    inner = above != count
-    edge = np.full(count, -1, dtype=np.intp)
-    wanted = np.minimum(nodes, above) * (count + 1) + np.maximum(nodes, above)
-    edge[inner] = chosen[np.searchsorted(pairs, wanted[inner])]
-    return parent, edge, np.where(edge >= 0, edges.first[edge] == above, False)
+    return parent, edge, forward

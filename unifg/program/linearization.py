@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse as sp
 
 from unifg.elimination.symmetric import scatter
 from unifg.machine.jit import compiled
@@ -17,6 +17,9 @@ from unifg.program.passes import times, transposed_times
 from unifg.program.table import COLUMN, COUNT, ROWS, WIDTH, TermTable
 from unifg.program.term import CompiledTerm
 from unifg.typing import Array, IntArray
+
+if TYPE_CHECKING:
+    import scipy.sparse as sp
 
 
 @dataclass
@@ -181,6 +184,8 @@ class Rows:
 
     def matrix(self, entries: Array) -> sp.csc_matrix:
         """The Jacobian over the unknowns as a SciPy matrix."""
+        import scipy.sparse as sp  # slow to load
+
         _, indices, starts = self._compressed
         return sp.csc_matrix((self.compress(entries), indices, starts), shape=(self.count, self._unknowns))
 
