@@ -214,7 +214,7 @@ def _slopes_of_two_steps(m: Manifold, x: Array, d: Array, units: Array) -> tuple
 
 def _group_claims(g: LieGroup, x: Array, y: Array, z: Array, d: Array, units: Array) -> Iterator[_Claim]:
     """The axioms of groups."""
-    from scipy.linalg import expm  # a tenth of the time that importing unifg takes
+    from scipy.linalg import expm  # slow to load
 
     e = np.broadcast_to(g.identity(), x.shape)
     one, eye = np.broadcast_to(np.eye(g.dim), (len(x), g.dim, g.dim)), np.eye(g.dim)
