@@ -48,7 +48,7 @@ from unifg.elimination.plan import (
     UPDATE_STRIDE,
     Plan,
 )
-from unifg.elimination.substitution import backward, forward, solve
+from unifg.elimination.substitution import backward, forward
 from unifg.elimination.subtrees import PARTS
 from unifg.machine.jit import compiled
 from unifg.machine.threads import at_once, threads
@@ -58,7 +58,6 @@ from unifg.typing import Array, IntArray
 
 MOST = 16  # chunks of a phase
 FEWEST = 20_000.0  # multiplications of a chunk
-SOLVED = 1_000_000  # numbers in all panels below which one thread is through with a substitution before two have begun
 APART = 8  # columns and rows: kernels write back up to three numbers beyond a chunk's last one
 
 
@@ -355,8 +354,5 @@ def substitute(plan: Plan, right: Array, out: Array, own: Array, counters: Addre
 
 def solve_at_once(plan: Plan, right: Array, out: Array) -> None:
     """What :func:`substitution.solve` does, by as many threads as there are; ``out`` is not ``right``."""
-    if plan.shape[PANELS] < SOLVED:
-        solve(plan, right, out)
-        return
     own, counters = np.empty((PARTS, len(plan.work))), np.zeros(6, np.int64)
     at_once([partial(substitute, plan, right, out, own, counters.ctypes.data)] * threads())
