@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from unifg.elimination.dense import subtract_products, subtract_signed
 from unifg.elimination.plan import FIRST, FRONTS, INDEX, PANEL, PIVOTS, ROWS, STRIDE, Plan
+from unifg.machine.bisect import first_not_below
 from unifg.machine.jit import compiled
 from unifg.machine.vectors import address, get, load, minus, put, splat, store, times
 from unifg.typing import Array, BoolArray, IntArray
@@ -118,14 +119,9 @@ def locate(plan: Plan, owner: IntArray, scalars: IntArray, places: IntArray) -> 
             if b < fronts[s, FIRST] + fronts[s, PIVOTS]:
                 column = b - fronts[s, FIRST]
             else:
-                low, high = fronts[s, INDEX], fronts[s, INDEX] + fronts[s, ROWS]
-                while low < high:
-                    middle = (low + high) // 2
-                    if rows[middle] < b:
-                        low = middle + 1
-                    else:
-                        high = middle
-                if low == fronts[s, INDEX] + fronts[s, ROWS] or rows[low] != b:
+                end = fronts[s, INDEX] + fronts[s, ROWS]
+                low = first_not_below(rows, fronts[s, INDEX], end, b)
+                if low == end or rows[low] != b:
                     return False
                 column = fronts[s, PIVOTS] + low - fronts[s, INDEX]
             places[i, j] = fronts[s, PANEL] + (a - fronts[s, FIRST]) * fronts[s, STRIDE] + column

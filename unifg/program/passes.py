@@ -209,11 +209,10 @@ def linearize_share(
                 for a in range(m):
                     total += _violation(r[a], lower[at + a], upper[at + a]) ** 2
                 continue
+            first_weight = term[WHITENER] + i * apart
             if together == PLANE:
-                first_weight = term[WHITENER] + i * apart
                 whiten_plane(address(whiteners), first_weight, address(residual), at, address(jacobian), entry)
             elif together == SPACE:
-                first_weight = term[WHITENER] + i * apart
                 whiten_space(address(whiteners), first_weight, address(residual), at, address(jacobian), entry)
             else:
                 whiten(term[WHITEN], whiteners, term[WHITENER], i, r, J)

@@ -16,6 +16,7 @@ from unifg.kernels.kernel import Kernel
 from unifg.kernels.robust import Loss, form_of
 from unifg.kernels.steps import as_table, movable_parts
 from unifg.language.terms import Constraint, Cost, ScalarCost
+from unifg.machine.bisect import first_not_below
 from unifg.machine.jit import compiled
 from unifg.program.columns import Columns
 from unifg.program.pairs import PLANE, SPACE, paired
@@ -319,13 +320,7 @@ def locate(
                         begin, high = indptr[beside], indptr[beside + 1] - 1
                         low = low + 1 if beside == column_before else begin + low - indptr[column_before]
                         if low > high or indices[low] != wanted:
-                            low = begin
-                            while low < high:
-                                middle = (low + high) // 2
-                                if indices[middle] < wanted:
-                                    low = middle + 1
-                                else:
-                                    high = middle
+                            low = first_not_below(indices, begin, high, wanted)
                         column_before = beside
                         positions[at] = -2 - low if a == b and d != e else low
                     at += 1
