@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.sparse import coo_array
+from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 
 from unifg.pose_graphs.spanning import spanning_tree
@@ -24,7 +24,7 @@ def tangle(count: int, edges: int, seed: int) -> Edges:
     )
 
 
-def lightest(edges: Edges, count: int) -> coo_array:
+def lightest(edges: Edges, count: int) -> coo_matrix:
     """Of edges beside each other the cheapest, none from a node to itself; both ways."""
     best: dict[tuple[int, int], float] = {}
     for i, j, cost in zip(*(array.tolist() for array in edges), strict=True):
@@ -32,7 +32,7 @@ def lightest(edges: Edges, count: int) -> coo_array:
             pair = min(i, j), max(i, j)
             best[pair] = min(cost, best.get(pair, np.inf))
     pairs = np.array(list(best)).reshape(-1, 2)
-    return coo_array((list(best.values()), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return coo_matrix((list(best.values()), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
 
 
 def check(edges: Edges, parent: IntArray, edge: IntArray, forward: BoolArray, roots: IntArray) -> IntArray:
@@ -75,8 +75,8 @@ def test_trees_are_as_light_and_paths_as_short_as_scipys(count: int, edges: int,
             np.testing.assert_allclose(walked[depth >= 0], lengths[depth >= 0], rtol=1e-12)
         else:
             held = np.full(count + 1, 1e-9)  # of an edge from each root to one node above them
-            above = coo_array((held[: len(roots)], (roots, np.full(len(roots), count))), shape=(count + 1, count + 1))
-            grown = coo_array((matrix.data, (matrix.row, matrix.col)), shape=(count + 1, count + 1)) + above
+            above = coo_matrix((held[: len(roots)], (roots, np.full(len(roots), count))), shape=(count + 1, count + 1))
+            grown = coo_matrix((matrix.data, (matrix.row, matrix.col)), shape=(count + 1, count + 1)) + above
             reached = np.append(depth >= 0, True)
             grown = grown.tocsr()[reached][:, reached]
             weight = minimum_spanning_tree(grown).sum() - 1e-9 * len(roots)
