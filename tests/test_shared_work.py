@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -193,6 +195,32 @@ def test_the_number_of_threads_is_one_of_some() -> None:
         with pytest.raises(UnifgError, match="at least 1, got"):
             fg.use_threads(wrong)  # type: ignore[arg-type]
     assert threads() == 1
+
+
+def test_nobody_returns_while_somebody_has_taken_a_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A helper that is held up between taking a job and beginning with it: what it writes to would be gone."""
+    helped = list[str]()
+
+    class Slow(deque[object]):
+        def popleft(self) -> object:
+            taken = super().popleft()
+            if threading.current_thread() is not threading.main_thread():
+                time.sleep(0.2)
+            return taken
+
+    def job() -> int:
+        helped.append(threading.current_thread().name)
+        time.sleep(0.01)
+        return 7
+
+    fg.use_threads(3)
+    monkeypatch.setattr("unifg.machine.threads.deque", Slow)
+    for _ in range(5):
+        helped.clear()
+        assert at_once([job] * 6) == [7] * 6 and len(helped) == 6
+        if len(set(helped)) > 1:
+            break
+    assert len(set(helped)) > 1, "nobody has helped"
 
 
 def test_more_threads_than_cores_are_said(caplog: pytest.LogCaptureFixture) -> None:

@@ -28,13 +28,21 @@ logger = logging.getLogger("unifg")
 class Batch(Generic[T]):
     """Jobs of one call of :func:`at_once`, and what they answered."""
 
-    def __init__(self, jobs: Sequence[Callable[[], T]]) -> None:
+    def __init__(self, jobs: Sequence[Callable[[], T]], helpers: int) -> None:
         """Nobody has begun with any of them."""
         self.waiting = deque(enumerate(jobs))
-        self.begun = list[int]()
-        self.ended = np.zeros(len(jobs), np.int64)
+        self.entered = list[int]()
+        self.left = np.zeros(helpers, np.int64)
         self.results = dict[int, T]()
         self.failures = dict[int, BaseException]()
+
+    def help(self, helper: int) -> None:
+        """Work as one of the helpers, who say so before they look for a job: none is taken unseen."""
+        self.entered.append(helper)
+        try:
+            self.work()
+        finally:
+            self.left[helper] = 1
 
     def work(self) -> None:
         """Take one job after the other until none is left."""
@@ -43,13 +51,10 @@ class Batch(Generic[T]):
                 k, job = self.waiting.popleft()
             except IndexError:
                 return
-            self.begun.append(k)
             try:
                 self.results[k] = job()
             except BaseException as failure:
                 self.failures[k] = failure
-            finally:
-                self.ended[k] = 1
 
 
 class Crew:
@@ -57,7 +62,7 @@ class Crew:
 
     def __init__(self, count: int) -> None:
         """Start so many threads; they end with the process, or when they are told to leave."""
-        self.batches = deque[Batch[Any]]()
+        self.calls = deque[tuple[Batch[Any], int]]()
         self.posted = np.zeros(1, np.int64)
         self.bell = threading.Condition()
         self.leaving = False
@@ -66,9 +71,9 @@ class Crew:
         for k in range(count):
             threading.Thread(target=self._stay, name=f"unifg {k + 1}", daemon=True).start()
 
-    def post(self, batch: Batch[Any], copies: int) -> None:
-        """Call so many threads to a batch."""
-        self.batches.extend([batch] * copies)
+    def post(self, batch: Batch[Any]) -> None:
+        """Call for the helpers of a batch."""
+        self.calls.extend((batch, helper) for helper in range(len(batch.left)))
         self._ring()
 
     def leave(self) -> None:
@@ -77,11 +82,12 @@ class Crew:
         self._ring()
 
     def finish(self, batch: Batch[Any]) -> None:
-        """Wait for all jobs of a batch that have begun."""
-        for k in tuple(batch.begun):
-            if not batch.ended[k] and not changes(batch.ended.ctypes.data, k, 0):
+        """Let nobody begin with a job any more, and wait for all helpers that may have."""
+        batch.waiting.clear()
+        for k in tuple(batch.entered):
+            if not batch.left[k] and not changes(batch.left.ctypes.data, k, 0):
                 with self.bell:
-                    self.bell.wait_for(lambda k=k: bool(batch.ended[k]))  # type: ignore[misc]
+                    self.bell.wait_for(lambda k=k: bool(batch.left[k]))  # type: ignore[misc]
 
     def _ring(self) -> None:
         with self.bell:
@@ -92,7 +98,7 @@ class Crew:
         while True:
             seen = int(self.posted[0])
             try:
-                batch = self.batches.popleft()
+                batch, helper = self.calls.popleft()
             except IndexError:
                 if self.leaving:
                     return
@@ -100,7 +106,7 @@ class Crew:
                     with self.bell:
                         self.bell.wait_for(lambda seen=seen: self.posted[0] != seen)  # type: ignore[misc]
                 continue
-            batch.work()
+            batch.help(helper)
             del batch  # or its arrays would live until the next one
             with self.bell:
                 self.bell.notify_all()
@@ -154,12 +160,11 @@ def at_once(jobs: Sequence[Callable[[], T]]) -> list[T]:
     crew = _crew
     if crew is None or len(jobs) < 2:
         return [job() for job in jobs]
-    batch = Batch(jobs)
-    crew.post(batch, min(crew.size, len(jobs) - 1))
+    batch = Batch(jobs, min(crew.size, len(jobs) - 1))
+    crew.post(batch)
     try:
         batch.work()
     finally:  # what jobs write to may be gone when this returns
-        batch.waiting.clear()
         crew.finish(batch)
     if batch.failures:
         raise batch.failures[min(batch.failures)]
