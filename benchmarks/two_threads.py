@@ -86,7 +86,6 @@ def measure_case(case: Case, rounds: int, before: float, during: float) -> Resul
     return {
         "graph": case.name,
         "space": case.pose_graph.group is SE3,
-        "shared": len(plan.part) > 0,
         "alone": {name: milliseconds(times[f"{name} 1"]) for name in pieces},
         "ratio": {name: spread(times[f"{name} 1"] / times[f"{name} 2"]) for name in pieces},
         "apart": spread(2.0 * times["solve 1"] / times["apart"]),

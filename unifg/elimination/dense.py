@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.machine.jit import compiled
+from unifg.machine.jit import compiled, inlined
 from unifg.machine.vectors import (
     Address,
     blend,
@@ -126,6 +126,51 @@ def subtract_signed(
         begin = end
 
 
+@inlined
+def finish_rows(
+    numbers: Address, row: int, stride: int, start: int, stop: int, height: int,
+    g0: float, g1: float, g2: float, g3: float,
+    f01: float, f02: float, f12: float, f03: float, f13: float, f23: float,
+) -> None:  # fmt: skip
+    """Solve with a corner of up to four pivots, L D L' of it known, for columns start..stop of its rows.
+
+    Args:
+        numbers: address of the array of the panel.
+        row: offset of the corner's first row.
+        stride: length of its rows.
+        start: first column, from that offset on.
+        stop: one past the last.
+        height: rows of the corner.
+        g0: sign over root of the first pivot, and so on.
+        g1: see above.
+        g2: see above.
+        g3: see above.
+        f01: L', first row, second column, and so on.
+        f02: see above.
+        f12: see above.
+        f03: see above.
+        f13: see above.
+        f23: see above.
+    """
+    for j in range(start, stop, 4):
+        rest, t0 = stop - j, row + j
+        t1, t2, t3 = t0 + stride, t0 + 2 * stride, t0 + 3 * stride
+        y0 = load(numbers, t0)
+        store(numbers, t0, blend(times(g0, y0), y0, rest))
+        if height > 1:
+            y1 = load(numbers, t1)
+            e1 = minus(y1, f01, y0)
+            store(numbers, t1, blend(times(g1, e1), y1, rest))
+            if height > 2:
+                y2 = load(numbers, t2)
+                e2 = minus(minus(y2, f02, y0), f12, e1)
+                store(numbers, t2, blend(times(g2, e2), y2, rest))
+                if height > 3:
+                    y3 = load(numbers, t3)
+                    e3 = minus(minus(minus(y3, f03, y0), f13, e1), f23, e2)
+                    store(numbers, t3, blend(times(g3, e3), y3, rest))
+
+
 @compiled
 def eliminate(
     numbers: Address, panel: int, stride: int, begin: int, end: int, columns: int,
@@ -205,23 +250,9 @@ def eliminate(
                 put(signs, at + 2, s2)
         g0, g1, g2, g3 = s0 * lane(roots, 0), s1 * lane(roots, 1), s2 * lane(roots, 2), s3 * lane(roots, 3)
         # All columns, the corner's included: below the diagonal of the corner no one looks.
-        for j in range(0, columns - top, 4):
-            rest, t1, t2, t3 = columns - top - j, c1 + j, c2 + j, c3 + j
-            y0 = load(numbers, corner + j)
-            z0 = times(g0, y0)
-            store(numbers, corner + j, blend(z0, y0, rest))
-            if height > 1:
-                y1 = load(numbers, t1)
-                e1 = minus(y1, f01, y0)
-                store(numbers, t1, blend(times(g1, e1), y1, rest))
-                if height > 2:
-                    y2 = load(numbers, t2)
-                    e2 = minus(minus(y2, f02, y0), f12, e1)
-                    store(numbers, t2, blend(times(g2, e2), y2, rest))
-                    if height > 3:
-                        y3 = load(numbers, t3)
-                        e3 = minus(minus(minus(y3, f03, y0), f13, e1), f23, e2)
-                        store(numbers, t3, blend(times(g3, e3), y3, rest))
+        finish_rows(
+            numbers, corner, stride, 0, columns - top, height, g0, g1, g2, g3, f01, f02, f12, f03, f13, f23
+        )  # fmt: skip
         if columns == end:  # below the diagonal no one looks but `complete`
             if height > 1:
                 put(numbers, c1, f01)
@@ -273,7 +304,6 @@ def complete(
                 )  # fmt: skip
                 done = same
             at, c1, c2, c3 = first + top, corner + stride, corner + 2 * stride, corner + 3 * stride
-            r1, r2, r3 = r0 + stride, r0 + 2 * stride, r0 + 3 * stride
             g0, g1, g2, g3 = get(signs, at) * get(pivots, at), 0.0, 0.0, 0.0
             f01, f02, f12, f03, f13, f23 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             if height > 1:
@@ -284,19 +314,6 @@ def complete(
             if height > 3:
                 g3 = get(signs, at + 3) * get(pivots, at + 3)
                 f03, f13, f23 = get(numbers, c3), get(numbers, c3 + 1), get(numbers, c3 + 2)
-            for j in range(strip, last, 4):
-                rest = last - j
-                y0 = load(numbers, r0 + j)
-                store(numbers, r0 + j, blend(times(g0, y0), y0, rest))
-                if height > 1:
-                    y1 = load(numbers, r1 + j)
-                    e1 = minus(y1, f01, y0)
-                    store(numbers, r1 + j, blend(times(g1, e1), y1, rest))
-                    if height > 2:
-                        y2 = load(numbers, r2 + j)
-                        e2 = minus(minus(y2, f02, y0), f12, e1)
-                        store(numbers, r2 + j, blend(times(g2, e2), y2, rest))
-                        if height > 3:
-                            y3 = load(numbers, r3 + j)
-                            e3 = minus(minus(minus(y3, f03, y0), f13, e1), f23, e2)
-                            store(numbers, r3 + j, blend(times(g3, e3), y3, rest))
+            finish_rows(
+                numbers, r0, stride, strip, last, height, g0, g1, g2, g3, f01, f02, f12, f03, f13, f23
+            )  # fmt: skip

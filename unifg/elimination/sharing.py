@@ -52,8 +52,8 @@ from unifg.elimination.substitution import backward, forward
 from unifg.elimination.subtrees import PARTS
 from unifg.machine.jit import compiled
 from unifg.machine.threads import at_once, threads
-from unifg.machine.vectors import Address, address, advance, get, put
-from unifg.machine.waiting import wait_for
+from unifg.machine.vectors import Address, address, get, put
+from unifg.machine.waiting import first_chunk, next_chunk, wait_for
 from unifg.typing import Array, IntArray
 
 MOST = 16  # chunks of a phase
@@ -110,35 +110,31 @@ def work_on(plan: Plan, data: Array, added: Array, counters: Address, told: IntA
     """
     numbers = address(plan.numbers)
     panels, entries, count = plan.shape[PANELS], len(plan.slots), plan.shape[FRONTS]
-    k = advance(counters, 0)
+    k = first_chunk(counters, 0)
     while k < MOST:
         start, stop = panels * k // MOST // 4 * 4, panels * (k + 1) // MOST // 4 * 4
         clear(numbers, start, panels if k == MOST - 1 else stop)
-        advance(counters, 1)
-        k = advance(counters, 0)
+        k = next_chunk(counters, 0)
     wait_for(counters, 0, MOST)
-    k = advance(counters, 2)
+    k = first_chunk(counters, 1)
     while k < MOST:
         scatter(plan, numbers, data, entries * k // MOST, entries * (k + 1) // MOST)
-        advance(counters, 3)
-        k = advance(counters, 2)
+        k = next_chunk(counters, 1)
     wait_for(counters, 1, MOST)
-    k = advance(counters, 4)
+    k = first_chunk(counters, 2)
     while k < MOST:
         size_up(plan, numbers, added, count * k // MOST, count * (k + 1) // MOST)
-        advance(counters, 5)
-        k = advance(counters, 4)
+        k = next_chunk(counters, 2)
     wait_for(counters, 2, MOST)
-    k = advance(counters, 6)
+    k = first_chunk(counters, 3)
     while k < PARTS:
         eliminate_part(plan, k, told[k])
-        advance(counters, 7)
-        k = advance(counters, 6)
+        k = next_chunk(counters, 3)
     wait_for(counters, 3, PARTS)
     phase = 4
-    if advance(counters, 2 * phase) == 0:
+    if first_chunk(counters, phase) == 0:
         begin_count(told[PARTS])
-        advance(counters, 2 * phase + 1)
+        next_chunk(counters, phase)
     wait_for(counters, phase, 1)
     phase += 1
     for s in range(count):
@@ -160,80 +156,75 @@ def _front(plan: Plan, numbers: Address, s: int, counters: Address, phase: int, 
     )  # fmt: skip
     columns = width + rows
     chunks = chunks_of(0.5 * rows * rows)
-    k = advance(counters, 2 * phase)
+    k = first_chunk(counters, phase)
     while k < chunks:
         clear_update(plan, numbers, s, row_of(k, chunks, rows, rows), row_of(k + 1, chunks, rows, rows))
-        advance(counters, 2 * phase + 1)
-        k = advance(counters, 2 * phase)
+        k = next_chunk(counters, phase)
     wait_for(counters, phase, chunks)
     phase += 1
     child = fronts[s, CHILD]
     while child >= 0:
         size = fronts[child, ROWS]
         chunks = chunks_of(2.0 * size * size)
-        k = advance(counters, 2 * phase)
+        k = first_chunk(counters, phase)
         while k < chunks:
             add_child(plan, numbers, s, child, row_of(k, chunks, size, size), row_of(k + 1, chunks, size, size))
-            advance(counters, 2 * phase + 1)
-            k = advance(counters, 2 * phase)
+            k = next_chunk(counters, phase)
         wait_for(counters, phase, chunks)
         phase += 1
         child = fronts[child, SIBLING]
     if columns <= WIDE:
-        if advance(counters, 2 * phase) == 0:
+        if first_chunk(counters, phase) == 0:
             failed = eliminate_front(
                 numbers, panel, stride, width, columns, update, apart, rows, scale, pivots, signs, first
             )
             count_front(plan, s, failed, state)
-            advance(counters, 2 * phase + 1)
+            next_chunk(counters, phase)
         wait_for(counters, phase, 1)
         return phase + 1
     begin = 0
     while begin < width:
         end = begin + BLOCK if begin + BLOCK < width else width
-        if advance(counters, 2 * phase) == 0:
+        if first_chunk(counters, phase) == 0:
             failed = eliminate(numbers, panel, stride, begin, end, end, scale, pivots, signs, first)
             if failed >= 0 or end == width:
                 count_front(plan, s, failed, state)
-            advance(counters, 2 * phase + 1)
+            next_chunk(counters, phase)
         wait_for(counters, phase, 1)
         phase += 1
         if state[FAILED] >= 0:
             return phase
         beyond = columns - end
         chunks = chunks_of(0.5 * (end - begin) * (end - begin) * beyond)
-        k = advance(counters, 2 * phase)
+        k = first_chunk(counters, phase)
         while k < chunks:
             start, stop = column_of(k, chunks, end, columns), column_of(k + 1, chunks, end, columns)
             complete(numbers, panel, stride, begin, end, start, stop, pivots, signs, first)
-            advance(counters, 2 * phase + 1)
-            k = advance(counters, 2 * phase)
+            k = next_chunk(counters, phase)
         wait_for(counters, phase, chunks)
         phase += 1
         if end < width:
             below = width - end
             chunks = chunks_of((below * beyond - 0.5 * below * below) * (end - begin))
-            k = advance(counters, 2 * phase)
+            k = first_chunk(counters, phase)
             while k < chunks:
                 subtract_signed(
                     numbers, panel + end * (stride + 1), stride, beyond, panel + begin * stride + end, stride,
                     end - begin, signs, first + begin, row_of(k, chunks, below, beyond),
                     row_of(k + 1, chunks, below, beyond),
                 )  # fmt: skip
-                advance(counters, 2 * phase + 1)
-                k = advance(counters, 2 * phase)
+                k = next_chunk(counters, phase)
             wait_for(counters, phase, chunks)
             phase += 1
         begin = end
     chunks = chunks_of(0.5 * rows * rows * width)
-    k = advance(counters, 2 * phase)
+    k = first_chunk(counters, phase)
     while k < chunks:
         subtract_signed(
             numbers, update, apart, rows, panel + width, stride, width, signs, first,
             row_of(k, chunks, rows, rows), row_of(k + 1, chunks, rows, rows),
         )  # fmt: skip
-        advance(counters, 2 * phase + 1)
-        k = advance(counters, 2 * phase)
+        k = next_chunk(counters, phase)
     wait_for(counters, phase, chunks)
     return phase + 1
 
@@ -304,7 +295,7 @@ def substitute(plan: Plan, right: Array, out: Array, own: Array, counters: Addre
     """
     fronts, order, scalars, count = plan.fronts, plan.order, plan.shape[SCALARS], plan.shape[FRONTS]
     numbers, pivots, signs, x = address(plan.numbers), address(plan.pivots), address(plan.signs), address(plan.work)
-    k = advance(counters, 0)
+    k = first_chunk(counters, 0)
     while k < PARTS:
         mine = own[k]
         for s in range(count):
@@ -315,10 +306,9 @@ def substitute(plan: Plan, right: Array, out: Array, own: Array, counters: Addre
                 for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
                     mine[i] = 0.0
         _sweep(plan, k, address(mine), numbers, pivots, signs, scalars, False)
-        advance(counters, 1)
-        k = advance(counters, 0)
+        k = next_chunk(counters, 0)
     wait_for(counters, 0, PARTS)
-    if advance(counters, 2) == 0:
+    if first_chunk(counters, 1) == 0:
         for s in range(count):
             if plan.part[s] == PARTS:
                 for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
@@ -332,9 +322,9 @@ def substitute(plan: Plan, right: Array, out: Array, own: Array, counters: Addre
             if plan.part[s] == PARTS:
                 for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
                     out[order[i]] = get(x, i)
-        advance(counters, 3)
+        next_chunk(counters, 1)
     wait_for(counters, 1, 1)
-    k = advance(counters, 4)
+    k = first_chunk(counters, 2)
     while k < PARTS:
         mine = own[k]
         for s in range(count):
@@ -346,8 +336,7 @@ def substitute(plan: Plan, right: Array, out: Array, own: Array, counters: Addre
             if plan.part[s] == k:
                 for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
                     out[order[i]] = mine[i]
-        advance(counters, 5)
-        k = advance(counters, 4)
+        k = next_chunk(counters, 2)
     wait_for(counters, 2, PARTS)
     return True
 

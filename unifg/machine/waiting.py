@@ -1,11 +1,14 @@
-"""How threads wait for each other in compiled code: they look at what another one is going to change."""
+"""How threads that share a pass get along in compiled code: they take chunks of a phase, and wait for each other.
+
+Each phase has two counters, of chunks taken and of chunks done. Who waits looks at what another one is going to change.
+"""
 
 from __future__ import annotations
 
 from unifg.machine.jit import compiled
-from unifg.machine.vectors import Address, present
+from unifg.machine.vectors import Address, advance, present
 
-__all__ = ["changes", "wait_for"]
+__all__ = ["changes", "first_chunk", "next_chunk", "wait_for"]
 
 PATIENCE = 2_000_000  # looks for a change, about a millisecond
 
@@ -20,7 +23,20 @@ def changes(integers: Address, at: int, old: int) -> bool:
 
 
 @compiled
+def first_chunk(counters: Address, phase: int) -> int:
+    """Take a chunk of a phase; a number beyond the last one where none is left."""
+    return advance(counters, 2 * phase)
+
+
+@compiled
+def next_chunk(counters: Address, phase: int) -> int:
+    """Say that a chunk of a phase is done, and take another."""
+    advance(counters, 2 * phase + 1)
+    return advance(counters, 2 * phase)
+
+
+@compiled
 def wait_for(counters: Address, phase: int, chunks: int) -> None:
-    """Return when all chunks of a phase are done; each has two counters, of chunks taken and of chunks done."""
+    """Return when all chunks of a phase are done."""
     while present(counters, 2 * phase + 1) < chunks:
         pass

@@ -13,8 +13,8 @@ from unifg.kernels.robust import value_of, weight_of
 from unifg.kernels.whitening import FULL, whiten
 from unifg.machine.calls import call_residual, matrix, vector, vector_at
 from unifg.machine.jit import compiled, inlined
-from unifg.machine.vectors import Address, address, advance
-from unifg.machine.waiting import wait_for
+from unifg.machine.vectors import Address, address
+from unifg.machine.waiting import first_chunk, next_chunk, wait_for
 from unifg.program.pairs import PLANE, SPACE, add_plane, add_space, whiten_plane, whiten_space
 from unifg.program.table import (
     ACTIVE,
@@ -305,7 +305,7 @@ def linearize_at_once(
         counters: of two integers for each of two phases, zero.
     """
     shares, size, entries = len(costs), len(gradient), len(hessian)
-    k = advance(counters, 0)
+    k = first_chunk(counters, 0)
     while k < shares:
         slope, curvature = (gradient, hessian) if k == 0 else (slopes[k - 1], curvatures[k - 1])
         slope[:], curvature[:] = 0.0, 0.0
@@ -313,18 +313,16 @@ def linearize_at_once(
             terms, values, search, residual, jacobian, constraints, constraint_jacobian, squares, weights, norms[k],
             slope, curvature, scratch[k], k, shares,
         )  # fmt: skip
-        advance(counters, 1)
-        k = advance(counters, 0)
+        k = next_chunk(counters, 0)
     wait_for(counters, 0, shares)
-    k = advance(counters, 2)
+    k = first_chunk(counters, 1)
     while k < shares:
         for share in range(shares - 1):
             for i in range(size * k // shares, size * (k + 1) // shares):
                 gradient[i] += slopes[share, i]
             for i in range(entries * k // shares, entries * (k + 1) // shares):
                 hessian[i] += curvatures[share, i]
-        advance(counters, 3)
-        k = advance(counters, 2)
+        k = next_chunk(counters, 1)
     wait_for(counters, 1, shares)
     return True
 
