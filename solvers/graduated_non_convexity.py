@@ -5,10 +5,12 @@ within reach, and sharpen step by step. By the duality of
 Black and Rangarajan the weights of a surrogate are those its reweighted least squares would find, so any least-squares
 backend does.
 
-Each surrogate is solved from the guess and from the solution of the one before, and the cheaper answer counts: a wrong
+Each surrogate is solved from the solution of the one before, and from the guess, and the cheaper answer counts: a wrong
 measurement that was believed once bends the trajectory, and everything that started from there would stay bent; where
-odometry is weak, the guess alone misses what the surrogates found step by step. Dynamic covariance scaling, a loss with
-the same bound, takes a few iterations from the guess and sometimes finds what graduation did not.
+odometry is weak, the guess alone misses what the surrogates found step by step. While every measurement is heard
+there is nothing to escape from: the guess led to nothing cheaper then on any graph that was tried, so surrogates follow
+each other in longer strides and from each other alone. Dynamic covariance scaling, a loss with the same bound,
+takes a few iterations from the guess and sometimes finds what graduation did not.
 
 Answers are compared by the cost of the graph as stated, once its noise has the size that is found
 (:class:`unifg.solvers.gating.Scatter`): sum of rho(r^2 / s^2), s^2 being the variance of unit weight, at most one. By
@@ -27,6 +29,7 @@ import logging
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import islice
 
 import numpy as np
 
@@ -53,6 +56,8 @@ FEWER = 0.7  # share of the measurements to take back or out where all were too 
 HALF = 0.5  # smaller weights mean that a measurement was left out
 LESS = 1e-9  # share of the cost by which a solution must be better
 ROUGH = 1e-2  # tolerance of the stages: a share of 1e-4 of the cost
+HEARD = 1e-2  # share of the strongest pull, below which a measurement that is farther off is not heard
+STRIDE = 2  # surrogates at a time while all are
 RIVALS = 3  # other answers that are named, at most
 ROUNDS = 20  # of taking back or out
 DECIDED = 1e-3  # a truncated loss is done when every weight is this close to zero or one
@@ -105,6 +110,14 @@ class _Stage:
         return self.now.weight(squared)
 
     @property
+    def heard(self) -> bool:
+        """Whether no factor pulls much less for being farther off than another one."""
+        pulls = self.now.weight(self.squared) * np.sqrt(self.squared)
+        strongest = int(pulls.argmax()) if len(pulls) else 0
+        farther = self.squared > self.squared[strongest : strongest + 1]
+        return bool((pulls[farther] >= HEARD * pulls[strongest : strongest + 1]).all())
+
+    @property
     def decided(self) -> bool:
         """Whether every factor counts in full or not at all."""
         weights = self.now.weight(self.squared)
@@ -123,10 +136,11 @@ class GraduatedNonConvexity(Backend):
     trusted, such as odometry, are stated without a loss.
 
     Attributes:
-        solver: the least-squares backend inside. Its options hold for the first solve, without the losses, and for the
-            last ones, with the losses themselves. Damping does not help here: from odometry far off it ends early.
+        solver: the least-squares backend inside. Its options hold for the last solves, with the losses themselves.
+            Damping does not help here: from odometry far off it ends early.
         growth: how much sharper each surrogate is than the one before (1.4 in the paper).
-        stage_iterations: iterations of the backend for each surrogate, at most; a rough answer will do.
+        stage_iterations: iterations of the backend without the losses and for each surrogate, at most; a rough answer
+            will do.
     """
 
     constraints = "none"
@@ -195,7 +209,6 @@ class _Search:
         self._options, self._stages, self._data = options, stages, data
         self.history = _History(callback)
         solver = options.solver
-        self._plain = solver.bound(staged)
         rough = max(solver.tolerance, ROUGH)
         self._run = replace(solver, max_iterations=options.stage_iterations, tolerance=rough).bound(staged)
         self._last = solver.bound(graph)
@@ -222,34 +235,37 @@ class _Search:
         return self._concluded(self._revised(answer))
 
     def _graduated(self, guess: AnyGuess) -> Solution:
-        """Through the surrogates, each from the guess."""
+        """Without the losses, then through their surrogates."""
         stages = self._stages
-        solution = self.history.add(self._plain, guess, self._data, restart=True)
+        solution = self._from(guess)
         # The largest residual on the way from the guess: the solution without losses may hide an outlier by spreading
         # it over many weak measurements.
         paths = [stage.goal.surrogates(stage.largest, self._options.growth) for stage in stages]
-        for stage, path in zip(stages, paths, strict=True):
-            stage.now = next(path)
-        while any(stage.now is not stage.goal for stage in stages) and solution.status is not Status.INTERRUPTED:
-            solution = self._better(guess, solution)
+        stride = 1
+        while solution.status is not Status.INTERRUPTED:
+            for stage, path in zip(stages, paths, strict=True):
+                stage.now = next(islice(path, stride - 1, None), stage.goal)
+            if all(stage.now is stage.goal for stage in stages):
+                break
+            solution = self._from(solution.values)
+            stride = STRIDE
+            if not all(stage.heard for stage in stages):
+                solution, stride = self._or_from(guess, solution), 1
             if all(stage.decided for stage in stages):
                 break
-            for stage, path in zip(stages, paths, strict=True):
-                stage.now = next(path, stage.goal)
         return solution
 
-    def _better(self, guess: AnyGuess, before: Solution) -> Solution:
-        """Solve the present surrogate from the guess and from the solution of the one before."""
-        anew = self._from(guess)
+    def _or_from(self, guess: AnyGuess, found: Solution) -> Solution:
+        """The answer of the present surrogate, or one from the guess that costs no more."""
+        if found.status is Status.INTERRUPTED:
+            return found
         seen = [stage.squared for stage in self._stages]
-        on = self._from(before.values)
-        if Status.INTERRUPTED in (anew.status, on.status):
-            return on
-        if anew.cost <= on.cost:
-            for stage, squared in zip(self._stages, seen, strict=True):
-                stage.squared = squared
+        anew = self._from(guess)
+        if anew.status is Status.INTERRUPTED or anew.cost <= found.cost:
             return anew
-        return on
+        for stage, squared in zip(self._stages, seen, strict=True):
+            stage.squared = squared
+        return found
 
     def _from(self, start: AnyGuess) -> Solution:
         """Solve the present stage; with damping, where weights of zero leave something undetermined."""

@@ -16,7 +16,7 @@ from benchmarks import gtsam_peer
 from benchmarks.wrong_closures import COLUMNS, METHODS, Job, aligned_error, attempt
 from problems.closures import Claim, with_wrong_closures
 from unifg.answers.history import Iteration
-from unifg.answers.solution import NotConverged
+from unifg.answers.solution import AnyGuess, NotConverged, Solution
 from unifg.errors import BackendError, GraphError
 from unifg.files.g2o import read_g2o
 from unifg.kernels.robust import Graduated, Loss
@@ -127,6 +127,40 @@ def test_graduation_finds_what_a_plain_robust_solve_misses() -> None:
     assert history[-1].number == solution.iterations
     assert solution.solver == "GraduatedNonConvexity (GaussNewton)"
     assert graph.terms[0].robust == fg.TruncatedLeastSquares(3.0)  # type: ignore[attr-defined]
+
+
+def test_surrogates_begin_at_the_guess_once_a_measurement_is_not_heard(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, _, _, guess = line_with_outliers()
+    solves: list[tuple[bool, float, bool]] = []  # from the guess, mu, whether all were heard afterwards
+    plain = graduated_non_convexity._Search._from
+
+    def watched(self: graduated_non_convexity._Search, start: AnyGuess) -> Solution:
+        found, stage = plain(self, start), self._stages[0]
+        solves.append((start is guess, getattr(stage.now, "mu", 0.0), stage.heard))
+        return found
+
+    monkeypatch.setattr(graduated_non_convexity._Search, "_from", watched)
+    GraduatedNonConvexity(growth=1.3).solve(graph, guess, check=True)
+    assert solves.pop(0)[:2] == (True, 0.0)
+    assert solves.pop()[0]  # the rival
+    first = next(k for k, solve in enumerate(solves) if not solve[2])
+    assert first > 2
+    assert not any(anew for anew, _, _ in solves[:first])
+    sharper = [b[1] / a[1] for a, b in pairwise(solves[: first + 1])]
+    np.testing.assert_allclose(sharper, 1.3**2)
+    assert solves[first + 1][:2] == (True, solves[first][1])
+    assert not solves[first + 2][0]
+    assert solves[first + 2][1] == pytest.approx(1.3 * solves[first][1])
+
+
+def test_a_measurement_is_heard_while_it_pulls() -> None:
+    stage = graduated_non_convexity._Stage(fg.GemanMcClure(1.0))
+    stage.now = fg.GemanMcClure(1.0, mu=4.0)
+    for distance, heard in ((2.0, True), (8.0, True), (20.0, False)):
+        stage.weight(np.array([0.0, 1e-9, 1.0, distance**2]))  # what is believed pulls little, and is not meant
+        assert stage.heard == heard
+    stage.weight(np.zeros(0))
+    assert stage.heard
 
 
 def test_data_and_interruptions_reach_the_stages() -> None:
