@@ -8,6 +8,8 @@ import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
 
+from unifg.elimination.analysis import SLACK
+from unifg.elimination.dense import MANY, subtract_signed
 from unifg.elimination.factorization import Factorization, Ordering
 from unifg.elimination.symmetric import Symmetric
 from unifg.errors import UnifgError
@@ -104,6 +106,34 @@ graphs = st.integers(2, 14).flatmap(
         st.integers(0, nodes // 3),
     )
 )
+
+
+@pytest.mark.parametrize(("size", "depth", "start"), [(333, 96, 0), (701, 200, 0), (520, 100, 136)])
+def test_rows_side_by_side_give_the_same_bits(rng: np.random.Generator, size: int, depth: int, start: int) -> None:
+    step, stride = size + 3, size + 5
+    numbers = rng.normal(size=step * depth + stride * size + SLACK)
+    signs = np.repeat([1.0, -1.0, 1.0], [depth // 2, 9, depth - depth // 2 - 9])
+    factor = numbers[: step * depth].reshape(depth, step)[:, :size]
+    place = step * depth
+
+    def subtract(rows: int) -> Array:
+        """So many rows in a call."""
+        mine = numbers.copy()
+        for first in range(start, size, rows):
+            subtract_signed(
+                mine.ctypes.data, place, stride, size, 0, step, depth, signs.ctypes.data, 0, first,
+                min(first + rows, size),
+            )  # fmt: skip
+        assert np.array_equal(mine[:place], numbers[:place])
+        assert np.array_equal(mine[place + stride * size :], numbers[place + stride * size :])
+        return np.triu(mine[place : place + stride * size].reshape(size, stride)[:, :size])[start:]
+
+    target = numbers[place : place + stride * size].reshape(size, stride)[:, :size]
+    together = subtract(size)
+    np.testing.assert_allclose(
+        together, np.triu(target - factor.T @ (signs[:, None] * factor))[start:], rtol=1e-9, atol=1e-9
+    )
+    assert np.array_equal(together, subtract(MANY - 8))
 
 
 @given(graphs, st.integers(0, 2**32 - 1))

@@ -11,6 +11,7 @@ import numpy as np
 from unifg.machine.jit import compiled, inlined
 from unifg.machine.vectors import (
     Address,
+    address,
     blend,
     get,
     inverse_root,
@@ -27,41 +28,46 @@ from unifg.machine.vectors import (
 
 VANISHED = 8.9e-16  # pivots below this part of their original diagonal are rounding errors
 STRIP, DEPTH = 64, 192  # columns and products handled together: what stays in the second-level cache
+MANY, DEEP = 64, 32  # rows and products from which on putting factors side by side pays
 
 
 @compiled
 def subtract_products(
     numbers: Address, target: int, stride: int, height: int, length: int,
-    left: int, right: int, step: int, depth: int, sign: float,
+    factors: Address, left: int, skip: int, right: int, step: int, hop: int, depth: int, sign: float,
 ) -> None:  # fmt: skip
     """target[i, j] -= sign * sum_k left[k, i] right[k, j] over i < height <= 4, j < length, k < depth.
 
     Up to three numbers beyond the last column are written as they were.
 
     Args:
-        numbers: address of the array all three matrices live in.
-        target: offset of the target.
+        numbers: address of the array of the target.
+        target: its offset.
         stride: length of its rows.
         height: its rows.
         length: its columns.
+        factors: address of the array of both factors.
         left: offset of the left factor.
+        skip: from one of its rows to the next.
         right: offset of the right factor.
-        step: length of the rows of both.
-        depth: their rows.
+        step: from one of its rows to the next.
+        hop: from eight of its columns to the next eight.
+        depth: rows of both.
         sign: see above.
     """
-    zero = splat(0.0)
+    zero, columns = splat(0.0), right
     for j in range(0, length, 8):
         a0, a1, a2, a3, b0, b1, b2, b3 = zero, zero, zero, zero, zero, zero, zero, zero
-        p, q = left, right + j
+        p, q = left, columns
+        columns += hop
         for _ in range(depth):
-            v, w = load(numbers, q), load(numbers, q + 4)
-            x0, x1, x2, x3 = get(numbers, p), get(numbers, p + 1), get(numbers, p + 2), get(numbers, p + 3)
+            v, w = load(factors, q), load(factors, q + 4)
+            x0, x1, x2, x3 = get(factors, p), get(factors, p + 1), get(factors, p + 2), get(factors, p + 3)
             a0, b0 = plus(a0, x0, v), plus(b0, x0, w)
             a1, b1 = plus(a1, x1, v), plus(b1, x1, w)
             a2, b2 = plus(a2, x2, v), plus(b2, x2, w)
             a3, b3 = plus(a3, x3, v), plus(b3, x3, w)
-            p += step
+            p += skip
             q += step
         rest, t = length - j, target + j
         if rest < 8:
@@ -94,7 +100,7 @@ def subtract_signed(
     numbers: Address, target: int, stride: int, size: int, left: int, step: int, depth: int,
     signs: Address, first: int, start: int, rows: int,
 ) -> None:  # fmt: skip
-    """Upper triangle of target -= left' S left, in blocks of four rows.
+    """Upper triangle of target -= left' S left, in blocks of four rows; up to four numbers left of it are written.
 
     Args:
         numbers: address of the array both matrices live in.
@@ -115,15 +121,49 @@ def subtract_signed(
         while end < depth and end < begin + DEPTH and get(signs, first + end) == sign:
             end += 1
         base = left + begin * step
-        for strip in range(0, size, STRIP):
-            last = strip + STRIP if strip + STRIP < size else size
-            for i in range(start, rows if rows < last else last, 4):
-                j = i if i > strip else strip
-                subtract_products(
-                    numbers, target + i * stride + j, stride, 4 if rows - i > 4 else rows - i, last - j,
-                    base + i, base + j, step, end - begin, sign,
-                )  # fmt: skip
+        if rows - start >= MANY and end - begin >= DEEP:
+            _subtract_side_by_side(numbers, target, stride, size, base, step, end - begin, sign, start, rows)
+        else:
+            for strip in range(0, size, STRIP):
+                last = strip + STRIP if strip + STRIP < size else size
+                for i in range(start, rows if rows < last else last, 4):
+                    j = i if i > strip else strip
+                    subtract_products(
+                        numbers, target + i * stride + j, stride, 4 if rows - i > 4 else rows - i, last - j,
+                        numbers, base + i, step, base + j, step, 8, end - begin, sign,
+                    )  # fmt: skip
         begin = end
+
+
+@compiled
+def _subtract_side_by_side(
+    numbers: Address, target: int, stride: int, size: int, left: int, step: int, depth: int, sign: float,
+    start: int, rows: int,
+) -> None:  # fmt: skip
+    """The same for one sign; a strip of the factor is copied before it is used for all rows, and columns for each.
+
+    Rows of a large front are so far apart that every eight numbers of the factor come from another page.
+    """
+    room = np.empty(depth * (STRIP + 4))
+    copy, columns = address(room), depth * STRIP
+    for strip in range(start // STRIP * STRIP, size, STRIP):
+        last, at = strip + STRIP if strip + STRIP < size else size, 0
+        for j in range(strip, last, 8):
+            source = left + j
+            for _ in range(depth):
+                store(copy, at, load(numbers, source))
+                store(copy, at + 4, load(numbers, source + 4))
+                at, source = at + 8, source + step
+        for i in range(start, rows if rows < last else last, 4):
+            at, source = columns, left + i
+            for _ in range(depth):
+                store(copy, at, load(numbers, source))
+                at, source = at + 4, source + step
+            j = i // 8 * 8 if i > strip else strip  # of eight columns up to four are below the diagonal
+            subtract_products(
+                numbers, target + i * stride + j, stride, 4 if rows - i > 4 else rows - i, last - j,
+                copy, columns, 4, (j - strip) * depth, 8, 8 * depth, depth, sign,
+            )  # fmt: skip
 
 
 @inlined
@@ -299,8 +339,8 @@ def complete(
                 while same < top and get(signs, first + same) == sign:
                     same += 1
                 subtract_products(
-                    numbers, r0 + strip, stride, height, last - strip, panel + done * stride + top,
-                    panel + done * stride + strip, stride, same - done, sign,
+                    numbers, r0 + strip, stride, height, last - strip, numbers, panel + done * stride + top, stride,
+                    panel + done * stride + strip, stride, 8, same - done, sign,
                 )  # fmt: skip
                 done = same
             at, c1, c2, c3 = first + top, corner + stride, corner + 2 * stride, corner + 3 * stride

@@ -71,7 +71,9 @@ def invert(plan: Plan, owner: IntArray, wanted: BoolArray, panels: Array, free: 
         for i in range(across, unit, 4):
             store(inverse, i, zero)
         for i in range(0, r, 4):
-            subtract_products(inverse, across + i * q, q, 4 if r - i > 4 else r - i, w, known + i, turned, q, r, 1.0)
+            subtract_products(
+                inverse, across + i * q, q, 4 if r - i > 4 else r - i, w, inverse, known + i, q, turned, q, 8, r, 1.0
+            )
         # U^-T, and the negative of Z_KK.
         for i in range(unit, result + w * q, 4):
             store(inverse, i, zero)
@@ -86,8 +88,9 @@ def invert(plan: Plan, owner: IntArray, wanted: BoolArray, panels: Array, free: 
         subtract_signed(inverse, result, q, w, unit, q, w, signs, first, 0, w)
         for i in range(0, w, 4):
             subtract_products(
-                inverse, result + i * (q + 1), q, 4 if w - i > 4 else w - i, w - i, across + i, turned + i, q, r, -1.0
-            )
+                inverse, result + i * (q + 1), q, 4 if w - i > 4 else w - i, w - i, inverse, across + i, q, turned + i,
+                q, 8, r, -1.0,
+            )  # fmt: skip
         for i in range(w):
             row = panel + i * stride
             for j in range(i, w):
