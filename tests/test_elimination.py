@@ -116,6 +116,9 @@ def test_rows_side_by_side_give_the_same_bits(rng: np.random.Generator, size: in
     factor = numbers[: step * depth].reshape(depth, step)[:, :size]
     place = step * depth
 
+    def square(numbers: Array) -> Array:
+        return numbers[place : place + stride * size].reshape(size, stride)[:, :size]
+
     def subtract(rows: int) -> Array:
         """So many rows in a call."""
         mine = numbers.copy()
@@ -126,12 +129,12 @@ def test_rows_side_by_side_give_the_same_bits(rng: np.random.Generator, size: in
             )  # fmt: skip
         assert np.array_equal(mine[:place], numbers[:place])
         assert np.array_equal(mine[place + stride * size :], numbers[place + stride * size :])
-        return np.triu(mine[place : place + stride * size].reshape(size, stride)[:, :size])[start:]
+        assert np.array_equal(np.tril(square(mine), -4), np.tril(square(numbers), -4))
+        return np.triu(square(mine))[start:]
 
-    target = numbers[place : place + stride * size].reshape(size, stride)[:, :size]
     together = subtract(size)
     np.testing.assert_allclose(
-        together, np.triu(target - factor.T @ (signs[:, None] * factor))[start:], rtol=1e-9, atol=1e-9
+        together, np.triu(square(numbers) - factor.T @ (signs[:, None] * factor))[start:], rtol=1e-9, atol=1e-9
     )
     assert np.array_equal(together, subtract(MANY - 8))
 

@@ -7,10 +7,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 import numba
 import numpy as np
@@ -20,14 +18,19 @@ import unifg as fg
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.fronts import WIDE
 from unifg.elimination.plan import PIVOTS, ROWS
-from unifg.elimination.sharing import row_of
+from unifg.elimination.sharing import PLAN, row_of
 from unifg.elimination.subtrees import PARTS
 from unifg.elimination.symmetric import Symmetric
 from unifg.errors import UnifgError
-from unifg.machine.threads import at_once, cores, threads
+from unifg.machine.jit import compiled
+from unifg.machine.mailbox import ENTERED, LEFT, POSTED, arguments_at, arrays, empty_mailbox, entrance, lead, serve
+from unifg.machine.threads import cores, share, threads
+from unifg.machine.vectors import Address, address, advance, present
+from unifg.machine.waiting import first_chunk, next_chunk, wait_for
 from unifg.pose_graphs import PoseGraph, manhattan, sphere
+from unifg.program.passes import TERM_ARRAYS
 from unifg.solvers import GaussNewton
-from unifg.typing import Array
+from unifg.typing import Array, IntArray
 
 
 @pytest.fixture(autouse=True)
@@ -140,14 +143,18 @@ def test_threads_that_were_sent_away_leave() -> None:
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this platform")
 def test_a_forked_child_has_threads_of_its_own() -> None:
     script = (
-        "import os, warnings, unifg as fg\n"
-        "from unifg.machine.threads import at_once, cores, threads\n"
+        "import os, threading, warnings, numpy as np, unifg as fg\n"
+        "from unifg.pose_graphs import sphere\n"
+        "from unifg.solvers import GaussNewton\n"
         "warnings.simplefilter('ignore')\n"
         "fg.use_threads(3)\n"
-        "at_once([int] * 3)\n"
+        "graph, x, guess = sphere(50, 50).pose_graph.graph()\n"
+        "run = GaussNewton(max_iterations=1).prepare(graph)\n"
+        "here = run.solve(guess)[x]\n"
         "child = os.fork()\n"
         "if child == 0:\n"
-        "    os._exit(0 if at_once([int] * 9) == [0] * 9 and threads() == 3 else 1)\n"
+        "    hands = sum(t.name.startswith('unifg ') and t.is_alive() for t in threading.enumerate())\n"
+        "    os._exit(0 if np.array_equal(run.solve(guess)[x], here) and hands == 2 else 1)\n"
         "raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))\n"
     )
     assert subprocess.run([sys.executable, "-c", script], timeout=120).returncode == 0
@@ -197,30 +204,99 @@ def test_the_number_of_threads_is_one_of_some() -> None:
     assert threads() == 1
 
 
-def test_nobody_returns_while_somebody_has_taken_a_job(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A helper that is held up between taking a job and beginning with it: what it writes to would be gone."""
-    helped = list[str]()
+CHUNKS = 40
+_of_counting = arguments_at((arrays(numba.int64), arrays(numba.int64), numba.int64))
 
-    class Slow(deque[object]):
-        def popleft(self) -> object:
-            taken = super().popleft()
-            if threading.current_thread() is not threading.main_thread():
-                time.sleep(0.2)
-            return taken
 
-    def job() -> int:
-        helped.append(threading.current_thread().name)
-        time.sleep(0.01)
-        return 7
+@compiled
+def counting(where: Address) -> None:
+    """Chunks of a pass by two phases, of which the second reads what the first has written."""
+    first, second, counters = _of_counting(where)
+    k = first_chunk(counters, 0)
+    while k < CHUNKS:
+        for _ in range(1000):
+            first[k] += 1
+        k = next_chunk(counters, 0)
+    wait_for(counters, 0, CHUNKS)
+    k = first_chunk(counters, 1)
+    while k < CHUNKS:
+        second[k] += first[CHUNKS - 1 - k]
+        k = next_chunk(counters, 1)
+    wait_for(counters, 1, CHUNKS)
 
+
+def count(box: IntArray | None = None) -> IntArray:
+    """The answer of that pass: a thousand everywhere."""
+    first, second, counters = np.zeros(CHUNKS, np.int64), np.zeros(CHUNKS, np.int64), np.zeros(4, np.int64)
+    given = first, second, counters.ctypes.data
+    if box is None:
+        share(entrance(counting), given)
+    else:
+        lead(box, entrance(counting), given)
+    return second
+
+
+def test_a_pass_is_done_whoever_comes() -> None:
+    for helpers in (1, 2, 4):
+        fg.use_threads(helpers)
+        for pause in (0.0, 0.01) * 10:  # threads that look out, and threads that sleep
+            time.sleep(pause)
+            assert (count() == 1000).all()
+
+
+def test_passes_of_many_callers_do_not_mix() -> None:
     fg.use_threads(3)
-    monkeypatch.setattr("unifg.machine.threads.deque", Slow)
-    for _ in range(5):
-        helped.clear()
-        assert at_once([job] * 6) == [7] * 6 and len(helped) == 6
-        if len(set(helped)) > 1:
-            break
-    assert len(set(helped)) > 1, "nobody has helped"
+    with ThreadPoolExecutor(4) as pool:
+        for found in pool.map(lambda _: count(), range(400)):
+            assert (found == 1000).all()
+
+
+def test_who_finds_a_closed_call_does_nothing() -> None:
+    box = empty_mailbox()
+    assert (count(box) == 1000).all()
+    assert box[POSTED] == 2
+    assert serve(box, 0) == 0
+    assert box[ENTERED] == box[LEFT] == 0
+
+
+@compiled
+def held_up(box: IntArray, calls: int) -> bool:
+    """A helper that enters each call and is held up before it looks whether it is still open.
+
+    Returns:
+        Whether nobody returned from a call meanwhile.
+    """
+    where, seen, alone = address(box), 0, True
+    for _ in range(calls):
+        while present(where, POSTED) % 2 == 0 or present(where, POSTED) == seen:
+            pass
+        seen = present(where, POSTED)
+        advance(where, ENTERED)
+        for _ in range(500_000):
+            alone = alone and present(where, POSTED) <= seen + 1
+        advance(where, LEFT)
+    return alone
+
+
+def test_nobody_returns_while_somebody_is_inside() -> None:
+    """A helper that is held up on its way in: what it looks at would be gone, or another call would be open."""
+    box, calls = empty_mailbox(), 20
+    held_up(box, 0)
+    told = list[bool]()
+    helper = threading.Thread(target=lambda: told.append(held_up(box, calls)))
+    helper.start()
+    while helper.is_alive():
+        assert (count(box) == 1000).all()
+    helper.join()
+    assert told == [True] and box[ENTERED] == box[LEFT] == calls
+
+
+def test_arguments_have_the_types_they_are_read_by(lattice: PoseGraph) -> None:
+    """Compiled code takes what stands at an address for what it expects there."""
+    factorization, _ = system(lattice)
+    graph, _, _ = lattice.graph()
+    assert numba.typeof(factorization.plan) == PLAN
+    assert numba.typeof(graph.compile().table.arrays) == TERM_ARRAYS
 
 
 def test_more_threads_than_cores_are_said(caplog: pytest.LogCaptureFixture) -> None:
@@ -230,15 +306,3 @@ def test_more_threads_than_cores_are_said(caplog: pytest.LogCaptureFixture) -> N
     (said,) = caplog.messages
     assert said.startswith(f"use_threads({cores() + 1}): this process may use {cores()} cores")
     assert threads() == cores() + 1
-
-
-def test_jobs_are_answered_in_order_and_failures_passed_on() -> None:
-    def fail() -> int:
-        raise ValueError("no")
-
-    jobs: list[Callable[[], int]] = [partial(int, 1), fail, partial(int, 2)]
-    for count in (1, 3):
-        fg.use_threads(count)
-        assert at_once([partial(int, k) for k in range(20)]) == list(range(20))
-        with pytest.raises(ValueError, match="no"):
-            at_once(jobs)

@@ -32,6 +32,7 @@ from unifg.lie.manifold import LieGroup
 from unifg.machine.jit import folder_of, processor
 from unifg.machine.shipped import versions
 from unifg.machine.tally import Tally, counting
+from unifg.machine.threads import cores, threads, use_threads
 from unifg.models import obstacles, unicycle
 from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.models.lidar import endpoint, endpoint_loss
@@ -113,6 +114,7 @@ def jobs() -> Iterator[Job]:
     for simulated, name in ((manhattan(60, outliers=0.1), "plane"), (sphere(4, 8, outliers=0.1), "space")):
         yield f"pose graph in {name}", partial(_pose_graph, simulated)
         yield f"smoothing in {name}", partial(_smooth, simulated)
+    yield "several threads", _share
 
 
 def _backends() -> Iterator[tuple[Solver, str]]:
@@ -206,6 +208,19 @@ def _pose_graph(simulated: Simulated) -> None:
         solution.report()
     graph, x, guess = found.graph(robust=TruncatedLeastSquares(1.0))
     GraduatedNonConvexity().solve(graph, guess)
+
+
+def _share() -> None:
+    """What threads share of a solve, where there can be some."""
+    count = threads()
+    if cores() < 2:
+        return
+    use_threads(2)
+    try:
+        graph, _, guess = sphere(40, 40, seed=0).pose_graph.graph()
+        backend("gn", max_iterations=1).solve(graph, guess)
+    finally:
+        use_threads(count)
 
 
 def _smooth(simulated: Simulated) -> None:

@@ -100,7 +100,7 @@ def subtract_signed(
     numbers: Address, target: int, stride: int, size: int, left: int, step: int, depth: int,
     signs: Address, first: int, start: int, rows: int,
 ) -> None:  # fmt: skip
-    """Upper triangle of target -= left' S left, in blocks of four rows; up to four numbers left of it are written.
+    """Upper triangle of target -= left' S left, in blocks of four rows.
 
     Args:
         numbers: address of the array both matrices live in.
@@ -159,11 +159,18 @@ def _subtract_side_by_side(
             for _ in range(depth):
                 store(copy, at, load(numbers, source))
                 at, source = at + 4, source + step
-            j = i // 8 * 8 if i > strip else strip  # of eight columns up to four are below the diagonal
-            subtract_products(
-                numbers, target + i * stride + j, stride, 4 if rows - i > 4 else rows - i, last - j,
-                copy, columns, 4, (j - strip) * depth, 8, 8 * depth, depth, sign,
-            )  # fmt: skip
+            j, height = i if i > strip else strip, 4 if rows - i > 4 else rows - i
+            if j % 8 != 0:  # the diagonal begins in the midst of eight columns
+                subtract_products(
+                    numbers, target + i * stride + j, stride, height, 4 if last - j > 4 else last - j,
+                    copy, columns, 4, (j - 4 - strip) * depth + 4, 8, 8 * depth, depth, sign,
+                )  # fmt: skip
+                j += 4
+            if j < last:
+                subtract_products(
+                    numbers, target + i * stride + j, stride, height, last - j,
+                    copy, columns, 4, (j - strip) * depth, 8, 8 * depth, depth, sign,
+                )  # fmt: skip
 
 
 @inlined

@@ -10,10 +10,11 @@ number of threads from two on: what parts take from the right-hand side above th
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache
 from math import sqrt
 
 import numpy as np
+from numba import float64, int8, int32, int64
 
 from unifg.elimination.dense import complete, eliminate, subtract_signed
 from unifg.elimination.fronts import (
@@ -51,11 +52,20 @@ from unifg.elimination.plan import (
 from unifg.elimination.substitution import backward, forward
 from unifg.elimination.subtrees import PARTS
 from unifg.machine.jit import compiled
-from unifg.machine.threads import at_once, threads
+from unifg.machine.mailbox import arguments_at, arrays, bundle, entrance
+from unifg.machine.threads import share
 from unifg.machine.vectors import Address, address, get, put
 from unifg.machine.waiting import first_chunk, next_chunk, wait_for
 from unifg.typing import Array, IntArray
 
+PLAN = bundle(
+    Plan,
+    (
+        arrays(int64), arrays(int64, 2), arrays(int64), arrays(int32), arrays(int32), arrays(int32), arrays(int32),
+        arrays(int8), *[arrays(float64)] * 4, arrays(int64), arrays(int64),
+    ),
+)  # fmt: skip
+"""Type of a plan."""
 MOST = 16  # chunks of a phase
 FEWEST = 20_000.0  # multiplications of a chunk
 APART = 8  # columns and rows: kernels write back up to three numbers beyond a chunk's last one
@@ -98,7 +108,7 @@ def phases_of(plan: Plan) -> int:
 
 
 @compiled
-def work_on(plan: Plan, data: Array, added: Array, counters: Address, told: IntArray) -> bool:
+def work_on(plan: Plan, data: Array, added: Array, counters: Address, told: IntArray) -> None:
     """What one of several threads does, see the module.
 
     Args:
@@ -140,10 +150,6 @@ def work_on(plan: Plan, data: Array, added: Array, counters: Address, told: IntA
     for s in range(count):
         if plan.part[s] == PARTS:
             phase = _front(plan, numbers, s, counters, phase, told[PARTS])
-    for part in range(PARTS + 1):
-        if told[part, FAILED] >= 0:
-            return False
-    return True
 
 
 @compiled
@@ -229,20 +235,6 @@ def _front(plan: Plan, numbers: Address, s: int, counters: Address, phase: int, 
     return phase + 1
 
 
-def factor_at_once(plan: Plan, data: Array, added: Array) -> bool:
-    """What :func:`fronts.factor` does, to the bit, by as many threads as there are."""
-    told = np.empty((PARTS + 1, len(plan.state)), np.int64)
-    counters = np.zeros(2 * phases_of(plan), np.int64)
-    share = partial(work_on, plan, data, added, counters.ctypes.data, told)
-    if not all(at_once([share] * threads())):
-        return bool(factor(plan, data, added))  # which stops where the first pivot vanishes, and says where
-    plan.state[:] = told.sum(axis=0)
-    plan.state[FAILED] = -1
-    surprised = np.isin(plan.order, told[told[:, SURPRISE] >= 0, SURPRISE])
-    plan.state[SURPRISE] = plan.order[np.argmax(surprised)] if surprised.any() else -1
-    return True
-
-
 @compiled
 def _sweep(
     plan: Plan, part: int, x: Address, numbers: Address, pivots: Address, signs: Address, space: int, back: bool
@@ -283,7 +275,7 @@ def _sweep(
 
 
 @compiled
-def substitute(plan: Plan, right: Array, out: Array, own: Array, counters: Address) -> bool:
+def substitute(plan: Plan, right: Array, out: Array, own: Array, counters: Address) -> None:
     """What one of several threads does for a solution.
 
     Args:
@@ -338,10 +330,44 @@ def substitute(plan: Plan, right: Array, out: Array, own: Array, counters: Addre
                     out[order[i]] = mine[i]
         k = next_chunk(counters, 2)
     wait_for(counters, 2, PARTS)
+
+
+_of_factor = arguments_at((PLAN, arrays(float64), arrays(float64), int64, arrays(int64, 2)))
+_of_substitution = arguments_at((PLAN, arrays(float64), arrays(float64), arrays(float64, 2), int64))
+
+
+@compiled
+def _factor_share(where: Address) -> None:
+    plan, data, added, counters, told = _of_factor(where)
+    work_on(plan, data, added, counters, told)
+
+
+@compiled
+def _substitution_share(where: Address) -> None:
+    plan, right, out, own, counters = _of_substitution(where)
+    substitute(plan, right, out, own, counters)
+
+
+@cache
+def _entrances() -> tuple[Address, Address]:
+    return entrance(_factor_share), entrance(_substitution_share)
+
+
+def factor_at_once(plan: Plan, data: Array, added: Array) -> bool:
+    """What :func:`fronts.factor` does, to the bit, by as many threads as there are."""
+    told = np.empty((PARTS + 1, len(plan.state)), np.int64)
+    counters = np.zeros(2 * phases_of(plan), np.int64)
+    share(_entrances()[0], (plan, data, added, counters.ctypes.data, told))
+    if told[:, FAILED].max() >= 0:
+        return bool(factor(plan, data, added))  # which stops where the first pivot vanishes, and says where
+    plan.state[:] = told.sum(axis=0)
+    plan.state[FAILED] = -1
+    surprised = np.isin(plan.order, told[told[:, SURPRISE] >= 0, SURPRISE])
+    plan.state[SURPRISE] = plan.order[np.argmax(surprised)] if surprised.any() else -1
     return True
 
 
 def solve_at_once(plan: Plan, right: Array, out: Array) -> None:
     """What :func:`substitution.solve` does, by as many threads as there are; ``out`` is not ``right``."""
     own, counters = np.empty((PARTS, len(plan.work))), np.zeros(6, np.int64)
-    at_once([partial(substitute, plan, right, out, own, counters.ctypes.data)] * threads())
+    share(_entrances()[1], (plan, right, out, own, counters.ctypes.data))

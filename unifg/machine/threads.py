@@ -9,107 +9,52 @@ from __future__ import annotations
 import logging
 import os
 import threading
-from collections import deque
-from collections.abc import Callable, Sequence
-from typing import Any, Generic, TypeVar
-
-import numpy as np
+from typing import Any
 
 from unifg.errors import UnifgError
-from unifg.machine.waiting import changes
+from unifg.machine.mailbox import empty_mailbox, lead, serve
+from unifg.machine.vectors import Address
 
-__all__ = ["at_once", "cores", "threads", "use_threads"]
-
-T = TypeVar("T")
+__all__ = ["cores", "share", "threads", "use_threads"]
 
 logger = logging.getLogger("unifg")
 
 
-class Batch(Generic[T]):
-    """Jobs of one call of :func:`at_once`, and what they answered."""
-
-    def __init__(self, jobs: Sequence[Callable[[], T]], helpers: int) -> None:
-        """Nobody has begun with any of them."""
-        self.waiting = deque(enumerate(jobs))
-        self.entered = list[int]()
-        self.left = np.zeros(helpers, np.int64)
-        self.results = dict[int, T]()
-        self.failures = dict[int, BaseException]()
-
-    def help(self, helper: int) -> None:
-        """Work as one of the helpers, who say so before they look for a job: none is taken unseen."""
-        self.entered.append(helper)
-        try:
-            self.work()
-        finally:
-            self.left[helper] = 1
-
-    def work(self) -> None:
-        """Take one job after the other until none is left."""
-        while True:
-            try:
-                k, job = self.waiting.popleft()
-            except IndexError:
-                return
-            try:
-                self.results[k] = job()
-            except BaseException as failure:
-                self.failures[k] = failure
-
-
 class Crew:
-    """Threads that look out for new jobs for a while before they sleep: to wake one takes longer than many a pass."""
+    """Threads that look out for calls for a while before they sleep: to wake one takes longer than many a pass."""
 
     def __init__(self, count: int) -> None:
         """Start so many threads; they end with the process, or when they are told to leave."""
-        self.calls = deque[tuple[Batch[Any], int]]()
-        self.posted = np.zeros(1, np.int64)
-        self.bell = threading.Condition()
-        self.leaving = False
         self.size = count
-        changes(self.posted.ctypes.data, 0, 1)  # compiled, where it has not been, before anybody waits for it
+        self.mailbox = empty_mailbox()
+        self.calling = threading.Lock()
+        self.bell = threading.Condition()
+        self.asleep = 0
+        self.rung = 0
+        self.leaving = False
         for k in range(count):
             threading.Thread(target=self._stay, name=f"unifg {k + 1}", daemon=True).start()
 
-    def post(self, batch: Batch[Any]) -> None:
-        """Call for the helpers of a batch."""
-        self.calls.extend((batch, helper) for helper in range(len(batch.left)))
-        self._ring()
-
-    def leave(self) -> None:
-        """Let all threads end when they have done what has been posted."""
-        self.leaving = True
-        self._ring()
-
-    def finish(self, batch: Batch[Any]) -> None:
-        """Let nobody begin with a job any more, and wait for all helpers that may have."""
-        batch.waiting.clear()
-        for k in tuple(batch.entered):
-            if not batch.left[k] and not changes(batch.left.ctypes.data, k, 0):
-                with self.bell:
-                    self.bell.wait_for(lambda k=k: bool(batch.left[k]))  # type: ignore[misc]
-
-    def _ring(self) -> None:
+    def wake(self) -> None:
+        """Let all threads look out again."""
         with self.bell:
-            self.posted[0] += 1
+            self.rung += 1
             self.bell.notify_all()
 
+    def leave(self) -> None:
+        """Let all threads end when they have done what they are at."""
+        self.leaving = True
+        self.wake()
+
     def _stay(self) -> None:
-        while True:
-            seen = int(self.posted[0])
-            try:
-                batch, helper = self.calls.popleft()
-            except IndexError:
-                if self.leaving:
-                    return
-                if not changes(self.posted.ctypes.data, 0, seen):
-                    with self.bell:
-                        self.bell.wait_for(lambda seen=seen: self.posted[0] != seen)  # type: ignore[misc]
-                continue
-            batch.help(helper)
-            del batch  # or its arrays would live until the next one
+        seen = 0
+        while not self.leaving:
+            seen = serve(self.mailbox, seen)
             with self.bell:
-                self.bell.notify_all()
+                self.asleep += 1
+                rung = self.rung
+                self.bell.wait_for(lambda rung=rung: self.rung != rung or self.leaving)  # type: ignore[misc]
+                self.asleep -= 1
 
 
 _crew: Crew | None = None
@@ -151,24 +96,23 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def at_once(jobs: Sequence[Callable[[], T]]) -> list[T]:
-    """Results of jobs in their order; whoever is free, this thread among them, takes the next one.
+def share(entrance: Address, arguments: tuple[Any, ...]) -> None:
+    """Do a compiled pass with all threads there are; alone, where they help another caller.
 
-    Raises:
-        BaseException: what the first job that failed has raised, when none is at work any more.
+    Args:
+        entrance: of the pass, see :func:`unifg.machine.mailbox.entrance`.
+        arguments: of the pass, by which those who take part share the work out: it is done whoever comes.
     """
     crew = _crew
-    if crew is None or len(jobs) < 2:
-        return [job() for job in jobs]
-    batch = Batch(jobs, min(crew.size, len(jobs) - 1))
-    crew.post(batch)
+    if crew is None or not crew.calling.acquire(blocking=False):
+        lead(empty_mailbox(), entrance, arguments)
+        return
     try:
-        batch.work()
-    finally:  # what jobs write to may be gone when this returns
-        crew.finish(batch)
-    if batch.failures:
-        raise batch.failures[min(batch.failures)]
-    return [batch.results[k] for k in range(len(jobs))]
+        if crew.asleep:
+            crew.wake()
+        lead(crew.mailbox, entrance, arguments)
+    finally:
+        crew.calling.release()
 
 
 def _after_fork() -> None:

@@ -16,7 +16,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
 
-from unifg.typing import Array
+from unifg.typing import Array, IntArray
 
 WIDTH = 4
 Vector: TypeAlias = Any  # a value of `kind`, inside compiled code only
@@ -205,7 +205,7 @@ def _total(typing_context: Any, vector: Any) -> Any:
     return types.float64(kind), generate
 
 
-address = cast(Callable[[Array], Address], intrinsic(_address_of))  # of the first element
+address = cast(Callable[[Array | IntArray], Address], intrinsic(_address_of))  # of the first element
 load = cast(Callable[[Array | Address, int], Vector], intrinsic(_load))  # array[offset : offset + 4]
 store = cast(Callable[[Array | Address, int, Vector], None], intrinsic(_store))  # array[offset : offset + 4] = vector
 get = cast(Callable[[Any, int], Any], intrinsic(_get))  # array[offset]

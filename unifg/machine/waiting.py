@@ -1,6 +1,6 @@
 """How threads that share a pass get along in compiled code: they take chunks of a phase, and wait for each other.
 
-Each phase has two counters, of chunks taken and of chunks done. Who waits looks at what another one is going to change.
+Each phase has two counters, of chunks taken and of chunks done.
 """
 
 from __future__ import annotations
@@ -8,18 +8,7 @@ from __future__ import annotations
 from unifg.machine.jit import compiled
 from unifg.machine.vectors import Address, advance, present
 
-__all__ = ["changes", "first_chunk", "next_chunk", "wait_for"]
-
-PATIENCE = 2_000_000  # looks for a change, about a millisecond
-
-
-@compiled
-def changes(integers: Address, at: int, old: int) -> bool:
-    """Look for a while whether an integer that another thread writes is still ``old``; True when it is not."""
-    for _ in range(PATIENCE):
-        if present(integers, at) != old:
-            return True
-    return False
+__all__ = ["first_chunk", "next_chunk", "wait_for"]
 
 
 @compiled

@@ -9,10 +9,13 @@ from __future__ import annotations
 
 from math import sqrt
 
+from numba import boolean, float64, int32, int64, uint8
+
 from unifg.kernels.robust import value_of, weight_of
 from unifg.kernels.whitening import FULL, whiten
 from unifg.machine.calls import call_residual, matrix, vector, vector_at
 from unifg.machine.jit import compiled, inlined
+from unifg.machine.mailbox import arguments_at, arrays, bundle
 from unifg.machine.vectors import Address, address
 from unifg.machine.waiting import first_chunk, next_chunk, wait_for
 from unifg.program.pairs import PLANE, SPACE, add_plane, add_space, whiten_plane, whiten_space
@@ -264,7 +267,7 @@ def linearize(
 
 
 @compiled
-def linearize_at_once(
+def _linearize_together(
     terms: TermArrays,
     values: Array,
     search: bool,
@@ -282,7 +285,7 @@ def linearize_at_once(
     curvatures: Array,
     scratch: Array,
     counters: Address,
-) -> bool:
+) -> None:
     """What one of several threads does of :func:`linearize`: shares of the factors, then of the sums of all shares.
 
     Args:
@@ -324,7 +327,35 @@ def linearize_at_once(
                 hessian[i] += curvatures[share, i]
         k = next_chunk(counters, 1)
     wait_for(counters, 1, shares)
-    return True
+
+
+TERM_ARRAYS = bundle(
+    TermArrays,
+    (
+        arrays(int64, 2), arrays(int64, 2), *[arrays(int64)] * 4, arrays(int32), arrays(int64, 2), arrays(uint8),
+        *[arrays(float64)] * 4,
+    ),
+)  # fmt: skip
+"""Type of what compiled loops read."""
+_of_linearize = arguments_at(
+    (
+        TERM_ARRAYS, arrays(float64), boolean, *[arrays(float64)] * 7, arrays(float64, 2), *[arrays(float64)] * 2,
+        *[arrays(float64, 2)] * 3, int64,
+    )
+)  # fmt: skip
+
+
+@compiled
+def linearize_at_once(where: Address) -> None:
+    """What one of several threads does of :func:`linearize`, by the address of its arguments."""
+    (
+        terms, values, search, residual, jacobian, constraints, constraint_jacobian, squares, weights, costs, norms,
+        gradient, hessian, slopes, curvatures, scratch, counters,
+    ) = _of_linearize(where)  # fmt: skip
+    _linearize_together(
+        terms, values, search, residual, jacobian, constraints, constraint_jacobian, squares, weights, costs, norms,
+        gradient, hessian, slopes, curvatures, scratch, counters,
+    )  # fmt: skip
 
 
 @compiled

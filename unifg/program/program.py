@@ -7,7 +7,7 @@ costs; rows of constraints read ``lower <= g <= upper``. Columns are tangent coo
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import cache
 from itertools import pairwise
 from time import perf_counter
 from typing import Any, NamedTuple, TypeVar, cast
@@ -21,7 +21,8 @@ from unifg.language.statement import Statement
 from unifg.language.terms import Constraint, Cost, ScalarCost
 from unifg.language.variables import Data, Family
 from unifg.machine.buffers import Buffers
-from unifg.machine.threads import at_once, threads
+from unifg.machine.mailbox import entrance
+from unifg.machine.threads import share, threads
 from unifg.program import passes
 from unifg.program.binding import Binding
 from unifg.program.by_term import ByTerm, Places
@@ -358,7 +359,7 @@ class Program:
         costs, norms, *room = self._apart
         counters = np.zeros(4, np.int64)
         into = costs, norms, gradient, hessian, *room, counters.ctypes.data
-        at_once([partial(passes.linearize_at_once, *given, *into)] * count)
+        share(_entrance(), (*given, *into))
         size[:] = np.sqrt(np.square(norms).sum(axis=0))
         return float(costs.sum())
 
@@ -524,6 +525,12 @@ def _slices(terms: Sequence[CompiledTerm]) -> list[slice]:
     """Rows of each term in the stack."""
     ends = np.cumsum([0] + [term.count * term.size for term in terms]).tolist()
     return [slice(start, end) for start, end in pairwise(ends)]
+
+
+@cache
+def _entrance() -> int:
+    """Of a linearisation that is shared."""
+    return entrance(passes.linearize_at_once)
 
 
 def _stacked(parts: list[Array]) -> Array:
