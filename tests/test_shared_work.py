@@ -29,6 +29,8 @@ from unifg.machine.vectors import Address, address, advance, present
 from unifg.machine.waiting import first_chunk, next_chunk, wait_for
 from unifg.pose_graphs import PoseGraph, manhattan, sphere
 from unifg.program.passes import TERM_ARRAYS
+from unifg.program.shares import Shares
+from unifg.program.table import COUNT, PAIRED, POSITION, WIDTH
 from unifg.solvers import GaussNewton
 from unifg.typing import Array, IntArray
 
@@ -195,6 +197,54 @@ def test_a_solve_with_threads_repeats_itself(lattice: PoseGraph, robust: fg.Loss
     np.testing.assert_allclose(shared.gradient, single.gradient, rtol=1e-12, atol=1e-8)
     assert shared.cost == pytest.approx(single.cost, rel=1e-12)
     assert shared.norms == pytest.approx(single.norms, rel=1e-12)
+
+
+def test_entries_that_several_shares_write_to_stand_beside_the_matrix(lattice: PoseGraph) -> None:
+    """Each entry is written in place by the first share that has it, and by every other one in a place of its own."""
+    graph, _, _ = lattice.graph()
+    program = graph.compile()
+    table, entries = program.table, program.normal.nnz
+    for count in (2, 3):
+        shares = Shares(table, program.columns.width, entries, count)
+        many = len(shares.contested)
+        assert 0 < many < 0.05 * entries
+        written: dict[int, set[int]] = {}
+        for row in table.arrays.fields:
+            pairs, factors = int(row[WIDTH] * (row[WIDTH] + 1) // 2), int(row[COUNT])
+            at = slice(int(row[POSITION]), int(row[POSITION]) + factors * pairs)
+            old, new = (places[at].reshape(factors, pairs) for places in (table.arrays.positions, shares.positions))
+            for k in range(count):
+                own = slice(factors * k // count, factors * (k + 1) // count)
+                beside = new[own] >= entries
+                ranks = new[own][beside] - entries
+                assert (ranks // many == k - 1).all()
+                assert np.array_equal(shares.contested[ranks % many], old[own][beside])
+                assert np.array_equal(new[own][~beside], old[own][~beside])
+                for place in np.unique(new[own]).tolist():
+                    written.setdefault(place, set()).add(k)
+        assert all(len(by) == 1 for place, by in written.items() if place >= 0)
+
+
+def test_shares_that_meet_in_parts_of_blocks() -> None:
+    """Positions alone in another share than the steps: beside the matrix, rows of blocks do not follow each other."""
+    count = 9000
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Product(position=fg.Rn(2), heading=fg.Rn(1)), count)
+    here, there = np.arange(count - 1), np.arange(1, count)
+    moved = np.tile([0.1, 0.0, 0.01], (count - 1, 1))
+    graph.minimize(fg.between, x[here], x[there], graph.data("moved", moved, each=True), sigma=0.1, name="steps")
+    graph.minimize(fg.prior, x[::-1].position, np.zeros((count, 2)), sigma=10.0, name="beacons")
+    graph.minimize(fg.prior, x[0], np.zeros(3), sigma=1.0, name="start")
+    program = graph.compile()
+    guess = {x: np.random.default_rng(0).normal(size=(count, 3))}
+    single = program.linearize(guess)
+    assert program.table.arrays.fields[0, PAIRED] == 3
+    fg.use_threads(2)
+    shared = program.linearize(guess)
+    assert program._shares is not None and len(program._shares.contested) == program.normal.nnz
+    np.testing.assert_allclose(shared.hessian, single.hessian, rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(shared.gradient, single.gradient, rtol=1e-12, atol=1e-8)
+    assert np.array_equal(shared.jacobian, single.jacobian)
 
 
 def test_the_number_of_threads_is_one_of_some() -> None:

@@ -20,7 +20,9 @@ from unifg.typing import IntArray
 PLANE, SPACE = 3, 6  # rows of the factors with loops of their own
 
 Whiten: TypeAlias = Callable[[Address, int, Address, int, Address, int], None]
-Add: TypeAlias = Callable[[Address, int, Address, int, Address, int, int, Address, int, int, int, int, int, int], None]
+Add: TypeAlias = Callable[
+    [Address, int, Address, int, Address, int, int, Address, int, int, int, int, int, int, int], None
+]
 
 
 def _whitening(dim: int) -> Whiten:
@@ -68,7 +70,7 @@ def _adding(dim: int) -> Add:
     def add(
         residual: Address, row: int, jacobian: Address, entry: int,
         gradient: Address, first: int, second: int,
-        hessian: Address, own: int, step: int, other: int, hop: int, shared: int, side: int,
+        hessian: Address, own: int, step: int, other: int, hop: int, shared: int, side: int, across: int,
     ) -> None:  # fmt: skip
         """Add J'r and the upper triangle of J'J of one factor.
 
@@ -88,6 +90,7 @@ def _adding(dim: int) -> Add:
             shared: place of the first entry of both variables, negative where one is fixed.
             side: from there to the entry of the first variable's second coordinate: 1 where the first variable comes
                 first in the matrix, else a column later.
+            across: from the same place to the entry of the second variable's second coordinate.
         """
         products = local_vector(room)
         for d in range(width):
@@ -128,7 +131,7 @@ def _adding(dim: int) -> Add:
             for d in range(dim):
                 for e in range(dim):
                     put(hessian, at + e, get(hessian, at + e) + products[(dim + d) * width + e])
-                at += hop + d
+                at += across + d
         elif shared >= 0:
             at = shared
             for e in range(dim):
@@ -158,6 +161,7 @@ def paired(columns: IntArray, positions: IntArray, dim: int) -> bool:
         own, step = positions[i, 0], positions[i, 1] - positions[i, 0]
         shared, side = positions[i, corner], positions[i, corner + 1] - positions[i, corner]
         other, hop = positions[i, corner + dim], positions[i, below + dim] - positions[i, corner + dim]
+        across = positions[i, below] - shared
         if own < -1 or other < -1 or shared < -1:
             return False
         for d in range(dim):
@@ -172,7 +176,7 @@ def paired(columns: IntArray, positions: IntArray, dim: int) -> bool:
             for e in range(dim):
                 at = -1
                 if shared >= 0:
-                    at = shared + (d * hop + grown + e if side == 1 else e * side + e * (e - 1) // 2 + d)
+                    at = shared + (d * across + grown + e if side == 1 else e * side + e * (e - 1) // 2 + d)
                 if positions[i, base + e] != at:
                     return False
     return True

@@ -282,14 +282,14 @@ def _linearize_together(
     gradient: Array,
     hessian: Array,
     slopes: Array,
-    curvatures: Array,
+    contested: IntArray,
     scratch: Array,
     counters: Address,
 ) -> None:
     """What one of several threads does of :func:`linearize`: shares of the factors, then of the sums of all shares.
 
     Args:
-        terms: as there, and so the next eight.
+        terms: as there, and so the next eight; places as :func:`unifg.program.shares.apart` has them.
         values: see above.
         search: see above.
         residual: see above.
@@ -301,32 +301,40 @@ def _linearize_together(
         costs: (S,) receives the cost of each of S shares.
         norms: (S, T) receives their norms of each term.
         gradient: (n,) need not be zero.
-        hessian: (nnz,) need not be zero.
+        hessian: (nnz + (S - 1) C,) need not be zero; behind the entries is room for what all shares but the first
+            one add to those that several write to.
         slopes: (S - 1, n) room for the gradients of all shares but the first.
-        curvatures: (S - 1, nnz) room for their J'J.
+        contested: (C,) entries that several shares write to.
         scratch: (S, .) as there.
-        counters: of two integers for each of two phases, zero.
+        counters: of two integers for each of three phases, zero.
     """
-    shares, size, entries = len(costs), len(gradient), len(hessian)
+    shares, size, many, entries = len(costs), len(gradient), len(contested), len(hessian)
+    nnz = entries - (shares - 1) * many
     k = first_chunk(counters, 0)
     while k < shares:
-        slope, curvature = (gradient, hessian) if k == 0 else (slopes[k - 1], curvatures[k - 1])
-        slope[:], curvature[:] = 0.0, 0.0
-        costs[k] = linearize_share(
-            terms, values, search, residual, jacobian, constraints, constraint_jacobian, squares, weights, norms[k],
-            slope, curvature, scratch[k], k, shares,
-        )  # fmt: skip
+        for i in range(entries * k // shares, entries * (k + 1) // shares):
+            hessian[i] = 0.0
+        slope = gradient if k == 0 else slopes[k - 1]
+        slope[:] = 0.0
         k = next_chunk(counters, 0)
     wait_for(counters, 0, shares)
     k = first_chunk(counters, 1)
     while k < shares:
+        costs[k] = linearize_share(
+            terms, values, search, residual, jacobian, constraints, constraint_jacobian, squares, weights, norms[k],
+            gradient if k == 0 else slopes[k - 1], hessian, scratch[k], k, shares,
+        )  # fmt: skip
+        k = next_chunk(counters, 1)
+    wait_for(counters, 1, shares)
+    k = first_chunk(counters, 2)
+    while k < shares:
         for share in range(shares - 1):
             for i in range(size * k // shares, size * (k + 1) // shares):
                 gradient[i] += slopes[share, i]
-            for i in range(entries * k // shares, entries * (k + 1) // shares):
-                hessian[i] += curvatures[share, i]
-        k = next_chunk(counters, 1)
-    wait_for(counters, 1, shares)
+            for i in range(many * k // shares, many * (k + 1) // shares):
+                hessian[contested[i]] += hessian[nnz + share * many + i]
+        k = next_chunk(counters, 2)
+    wait_for(counters, 2, shares)
 
 
 TERM_ARRAYS = bundle(
@@ -340,7 +348,7 @@ TERM_ARRAYS = bundle(
 _of_linearize = arguments_at(
     (
         TERM_ARRAYS, arrays(float64), boolean, *[arrays(float64)] * 7, arrays(float64, 2), *[arrays(float64)] * 2,
-        *[arrays(float64, 2)] * 3, int64,
+        arrays(float64, 2), arrays(int64), arrays(float64, 2), int64,
     )
 )  # fmt: skip
 
@@ -350,11 +358,11 @@ def linearize_at_once(where: Address) -> None:
     """What one of several threads does of :func:`linearize`, by the address of its arguments."""
     (
         terms, values, search, residual, jacobian, constraints, constraint_jacobian, squares, weights, costs, norms,
-        gradient, hessian, slopes, curvatures, scratch, counters,
+        gradient, hessian, slopes, contested, scratch, counters,
     ) = _of_linearize(where)  # fmt: skip
     _linearize_together(
         terms, values, search, residual, jacobian, constraints, constraint_jacobian, squares, weights, costs, norms,
-        gradient, hessian, slopes, curvatures, scratch, counters,
+        gradient, hessian, slopes, contested, scratch, counters,
     )  # fmt: skip
 
 
@@ -411,18 +419,19 @@ def _accumulate(
         corner = at + rows * (rows + 1) // 2
         own, shared, other = positions[at], positions[corner], positions[corner + rows]
         step, side = positions[at + 1] - own, positions[corner + 1] - shared
-        hop = positions[corner + 2 * rows + 1] - other
+        below = corner + rows + 1
+        hop, across = positions[below + rows] - other, positions[below] - shared
         if rows == PLANE:
             add_plane(
                 address(residual), term[ROW] + i * rows, address(jacobian), term[ENTRY] + i * rows * width,
                 address(gradient), columns[column], columns[column + rows],
-                address(hessian), own, step, other, hop, shared, side,
+                address(hessian), own, step, other, hop, shared, side, across,
             )  # fmt: skip
         else:
             add_space(
                 address(residual), term[ROW] + i * rows, address(jacobian), term[ENTRY] + i * rows * width,
                 address(gradient), columns[column], columns[column + rows],
-                address(hessian), own, step, other, hop, shared, side,
+                address(hessian), own, step, other, hop, shared, side, across,
             )  # fmt: skip
     else:
         for d in range(width):

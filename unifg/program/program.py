@@ -32,6 +32,7 @@ from unifg.program.limits import outside
 from unifg.program.linearization import Evaluation, Linearization, Rows
 from unifg.program.retraction import Retraction
 from unifg.program.scalars import add_scalars, evaluate_scalars
+from unifg.program.shares import Shares
 from unifg.program.systems import Systems
 from unifg.program.table import ENTRY, PARAMETER, ROW, WIDTH, TermArrays, TermTable
 from unifg.program.term import CompiledTerm
@@ -122,7 +123,7 @@ class Program:
         self._read = GuessReader(graph, self.columns, self.retraction)
         self._names = [term.name for term in stacked]
         self.scratch = np.empty(self.table.scratch)
-        self._apart: tuple[Array, ...] | None = None  # room of the threads that share a pass
+        self._shares: Shares | None = None
         self.buffers = Buffers([*self.table.sizes, self.columns.width, self.normal.nnz])
         self._watched: list[CompiledTerm] = []
         self.python_seconds = 0.0
@@ -316,8 +317,10 @@ class Program:
 
     def _linearize(self, values: Values, search: bool) -> Linearization:
         table = self.table
-        residual, jacobian, constraints, constraint_jacobian, gradient, hessian = self.buffers.take()
-        shared = threads() > 1 and len(jacobian) + len(constraint_jacobian) > WORTH
+        shares = self._shared()
+        buffers = self.buffers if shares is None else shares.buffers
+        residual, jacobian, constraints, constraint_jacobian, gradient, room = buffers.take()
+        hessian = room if shares is None else room[: self.normal.nnz]
         squares, weights = np.empty(table.weights), np.empty(table.weights)
         size = np.empty(len(table.arrays.fields))
         found = np.empty(table.scalars)
@@ -334,8 +337,8 @@ class Program:
                 table.arrays, values.flat, search, residual, jacobian, constraints, constraint_jacobian, squares,
                 weights,
             )  # fmt: skip
-            if shared:
-                cost = self._linearize_at_once(given, size, gradient, hessian)
+            if shares is not None:
+                cost = _linearize_at_once(shares, given, size, gradient, room)
             else:
                 gradient[:], hessian[:] = 0.0, 0.0
                 cost = passes.linearize(*given, size, gradient, hessian, self.scratch)
@@ -350,18 +353,14 @@ class Program:
         arrays = residual, jacobian, constraints, constraint_jacobian, gradient, hessian
         return Linearization(values, cost, *arrays, norms, weights, concavity, squares, scalars, rounding)
 
-    def _linearize_at_once(self, given: tuple[Any, ...], size: Array, gradient: Array, hessian: Array) -> float:
-        """The pass over all terms, a share of the factors of each for every thread; sums are added up in order."""
+    def _shared(self) -> Shares | None:
+        """Shares of the factors for every thread, where that is worth it."""
         count = threads()
-        if self._apart is None or len(self._apart[1]) != count:
-            rows = (count - 1, len(gradient)), (count - 1, len(hessian)), (count, len(self.scratch))
-            self._apart = np.empty(count), np.empty((count, len(size))), *(np.empty(shape) for shape in rows)
-        costs, norms, *room = self._apart
-        counters = np.zeros(4, np.int64)
-        into = costs, norms, gradient, hessian, *room, counters.ctypes.data
-        share(_entrance(), (*given, *into))
-        size[:] = np.sqrt(np.square(norms).sum(axis=0))
-        return float(costs.sum())
+        if count == 1 or self.table.entries + self.table.constraint_entries <= WORTH:
+            return None
+        if self._shares is None or self._shares.count != count:
+            self._shares = Shares(self.table, self.columns.width, self.normal.nnz, count)
+        return self._shares
 
     def _add_scalars(
         self, values: Values, found: Array, gradient: Array, hessian: Array, concavity: Array, rounding: Array
@@ -525,6 +524,16 @@ def _slices(terms: Sequence[CompiledTerm]) -> list[slice]:
     """Rows of each term in the stack."""
     ends = np.cumsum([0] + [term.count * term.size for term in terms]).tolist()
     return [slice(start, end) for start, end in pairwise(ends)]
+
+
+def _linearize_at_once(shares: Shares, given: tuple[Any, ...], size: Array, gradient: Array, hessian: Array) -> float:
+    """The pass over all terms, a share of the factors of each for every thread; sums are added up in order."""
+    counters = np.zeros(6, np.int64)
+    terms, *rest = given
+    into = shares.costs, shares.norms, gradient, hessian, shares.slopes, shares.contested, shares.scratch
+    share(_entrance(), (terms._replace(positions=shares.positions), *rest, *into, counters.ctypes.data))
+    size[:] = np.sqrt(np.square(shares.norms).sum(axis=0))
+    return float(shares.costs.sum())
 
 
 @cache

@@ -217,16 +217,21 @@ class TermTable:
             self.arrays.parameters[place : place + 2] = pair
         locate(fields, self.arrays.columns, self.arrays.unknown, normal.indptr, normal.indices, self.arrays.positions)
         for row, term in zip(fields, self._terms, strict=True):
-            row[PAIRED] = self._paired(row, term)
+            row[PAIRED] = self._paired(row, term, self.arrays.positions)
 
-    def _paired(self, row: IntArray, term: CompiledTerm) -> int:
+    def pairs_at(self, positions: IntArray) -> bool:
+        """Whether terms whose loops are of fixed size could have them at other places, too."""
+        rows = zip(self._fields, self._terms, strict=True)
+        return all(self._paired(row, term, positions) == row[PAIRED] for row, term in rows if row[PAIRED])
+
+    def _paired(self, row: IntArray, term: CompiledTerm, positions: IntArray) -> int:
         """How many rows a factor of a term has whose loops are of fixed size; 0 where they are not."""
         rows, count, width = (int(row[field]) for field in (ROWS, COUNT, WIDTH))
         if row[KIND] != COST or rows not in (PLANE, SPACE) or list(term.dims) != [rows, rows] or row[KEEP] >= 0:
             return 0
         pairs = width * (width + 1) // 2
         columns = self.arrays.columns[row[COLUMN] : row[COLUMN] + count * width].reshape(count, width)
-        places = self.arrays.positions[row[POSITION] : row[POSITION] + count * pairs].reshape(count, pairs)
+        places = positions[row[POSITION] : row[POSITION] + count * pairs].reshape(count, pairs)
         return rows if paired(columns, places, rows) else 0
 
     def __setstate__(self, state: dict[str, Any]) -> None:
