@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks import chains, growth, gtsam_peer, marginals, own_residuals, pose_graphs, two_threads
+from benchmarks import chains, growth, gtsam_peer, large_fronts, marginals, own_residuals, pose_graphs, two_threads
 from benchmarks.report import CHECKOUT, code_digest, command, listing, machine, publish
 from benchmarks.section import Result, Section, met
 from benchmarks.timing import number, pin, shown
@@ -28,6 +28,7 @@ PACKAGES = ("unifg", "numpy", "scipy", "numba", "gtsam")
 SECTIONS = {
     "pose-graphs": Section("Pose graphs", pose_graphs.measure, pose_graphs.render),
     "two-threads": Section("Two threads", two_threads.measure, two_threads.render),
+    "large-fronts": Section("Large fronts", large_fronts.measure, large_fronts.render),
     "growth": Section("Growth with size", growth.measure, growth.render),
     "chains": Section("Chains of control", chains.measure, chains.render),
     "marginals": Section("Marginal covariances", marginals.measure, marginals.render),
