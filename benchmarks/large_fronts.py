@@ -33,7 +33,7 @@ def matrix(size: int) -> Array:
 
 def measure(rounds: int, small: bool = False) -> Result:
     """All sizes."""
-    rows = [measure_size(size, min(rounds, 15)) for size in ((30, 60) if small else SIZES)]
+    rows = [measure_size(size, min(rounds, 15)) for size in ((60, 240) if small else SIZES)]
     goals = [
         goal(f"a full matrix of {row['size']} rows", "times faster than LAPACK", row["ratio"], 1.0)
         for row in rows
