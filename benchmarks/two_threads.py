@@ -39,7 +39,8 @@ def measure(rounds: int, small: bool = False) -> Result:
     rounds = min(rounds, ROUNDS)
     before, during = (0.0, 0.01) if small else (BEFORE, WHILE)
     with all_cores():
-        rows = [measure_case(case, rounds, before, during) for case in [*cases(small), *([] if small else [large()])]]
+        chosen = cases(small) if small else [*cases(), large()]
+        rows = [measure_case(case, rounds, before, during) for case in chosen]
     goals = [
         goal(f"{row['graph']}, one solve by two threads", "times faster than by one", row["ratio"]["solve"], WANTED)
         for row in rows
@@ -149,8 +150,8 @@ def render(result: Result) -> str:
     """A table, and what its columns are."""
     text = (
         "Wall time of one thread over that of two on two cores, `fg.use_threads(2)`, of the fastest repetition of each "
-        "turn. What more cores would gain is "
-        "counted, not measured: every part of the elimination tree by the core that is free first, then the fronts "
+        "turn. What more cores would gain is counted, not measured: every part "
+        "of the elimination tree by the core that is free first, then the fronts "
         "above them one by one, of which diagonal blocks are one core's work. An elimination of fewer than "
         f"{WORTH / 1e6:.0f} million multiplications is not shared out. The last column: two graphs stated apart, each "
         f"solved by a thread of its own, against one after the other. {result['rounds']} rounds."

@@ -112,10 +112,12 @@ class _Stage:
     @property
     def heard(self) -> bool:
         """Whether no factor pulls much less for being farther off than another one."""
+        if not len(self.squared):
+            return True
         pulls = self.now.weight(self.squared) * np.sqrt(self.squared)
-        strongest = int(pulls.argmax()) if len(pulls) else 0
-        farther = self.squared > self.squared[strongest : strongest + 1]
-        return bool((pulls[farther] >= HEARD * pulls[strongest : strongest + 1]).all())
+        strongest = pulls.argmax()
+        farther = self.squared > self.squared[strongest]
+        return bool((pulls[farther] >= HEARD * pulls[strongest]).all())
 
     @property
     def decided(self) -> bool:

@@ -30,7 +30,6 @@ class Crew:
         self.calling = threading.Lock()
         self.bell = threading.Condition()
         self.asleep = 0
-        self.rung = 0
         self.leaving = False
         for k in range(count):
             threading.Thread(target=self._stay, name=f"unifg {k + 1}", daemon=True).start()
@@ -38,7 +37,6 @@ class Crew:
     def wake(self) -> None:
         """Let all threads look out again."""
         with self.bell:
-            self.rung += 1
             self.bell.notify_all()
 
     def leave(self) -> None:
@@ -51,10 +49,10 @@ class Crew:
         while not self.leaving:
             seen = serve(self.mailbox, seen)
             with self.bell:
-                self.asleep += 1
-                rung = self.rung
-                self.bell.wait_for(lambda rung=rung: self.rung != rung or self.leaving)  # type: ignore[misc]
-                self.asleep -= 1
+                if not self.leaving:  # nobody rings for those who stay awake: who leaves has said so before
+                    self.asleep += 1
+                    self.bell.wait()
+                    self.asleep -= 1
 
 
 _crew: Crew | None = None
