@@ -22,6 +22,7 @@ from unifg.elimination.sharing import PLAN, row_of
 from unifg.elimination.subtrees import PARTS
 from unifg.elimination.symmetric import Symmetric
 from unifg.errors import UnifgError
+from unifg.machine import threads as crews
 from unifg.machine.jit import compiled
 from unifg.machine.mailbox import ENTERED, LEFT, POSTED, arguments_at, arrays, empty_mailbox, entrance, lead, serve
 from unifg.machine.threads import cores, share, threads
@@ -292,6 +293,22 @@ def test_a_pass_is_done_whoever_comes() -> None:
         for pause in (0.0, 0.01) * 10:  # threads that look out, and threads that sleep
             time.sleep(pause)
             assert (count() == 1000).all()
+
+
+def test_threads_that_nobody_calls_sleep_and_are_woken() -> None:
+    fg.use_threads(3)
+    crew = crews._crew
+    assert crew is not None
+    for _ in range(2):
+        waited = time.monotonic() + 30.0
+        while crew.asleep < crew.size and time.monotonic() < waited:
+            time.sleep(0.01)
+        begin, entered = time.process_time(), int(crew.mailbox[ENTERED])
+        time.sleep(0.3)
+        assert time.process_time() - begin < 0.1
+        while crew.mailbox[ENTERED] == entered and time.monotonic() < waited:
+            assert (count() == 1000).all()
+        assert crew.mailbox[ENTERED] > entered
 
 
 def test_passes_of_many_callers_do_not_mix() -> None:
