@@ -35,8 +35,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from unifg.errors import ModelError, UnifgError
-from unifg.kernels.derive.derived import DerivedKernel, Each, Given, derived
+from unifg.kernels.derive.derived import DerivedKernel, derived
 from unifg.kernels.derive.reach import reach_of
+from unifg.kernels.derive.rows import Each, Given
 from unifg.kernels.derive.symbols import TraceError
 from unifg.kernels.residuals import Residual, residual
 from unifg.lie import LieGroup, Rn

@@ -17,8 +17,9 @@ import pytest
 
 import unifg as fg
 from unifg.errors import GraphError
-from unifg.kernels.derive.derived import Each, Shared, derived
+from unifg.kernels.derive.derived import derived
 from unifg.kernels.derive.reach import reach_of
+from unifg.kernels.derive.rows import Each, Shared
 from unifg.kernels.derive.symbols import TraceError
 from unifg.program import term
 from unifg.program.curvature import lagrangian_hessian

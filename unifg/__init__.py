@@ -40,7 +40,7 @@ from unifg.kernels.residuals import Residual, residual
 from unifg.kernels.robust import DCS, Cauchy, GemanMcClure, Huber, Loss, Reweighted, TruncatedLeastSquares, Tukey
 from unifg.language.factors import ManifoldResidual, between, difference, prior
 from unifg.language.joint_prior import joint_prior
-from unifg.language.variables import Data, Family, Selection
+from unifg.language.variables import Data, Family, Selection, each, shared
 from unifg.lie import (
     SE2,
     SE3,
@@ -123,12 +123,14 @@ __all__ = [
     "check_manifold",
     "compiled",
     "difference",
+    "each",
     "elementwise",
     "from_casadi",
     "joint_prior",
     "optimality",
     "prior",
     "residual",
+    "shared",
     "solve",
     "use_threads",
     "warmup",

@@ -45,12 +45,18 @@ class Batched:
         self._memory = np.empty(0)  # for results of many calls: fresh memory of that size costs more than they do
         self._tiled: dict[tuple[int, int], Array] = {}
 
-    def bind(self, arguments: list[Any], places: list[int], each: list[int]) -> None:
-        """Take constants, where variables stand among them, and which of them have a row for each factor."""
-        self._arguments, self._places = arguments, places
+    def bind(self, arguments: list[Any], places: list[int], each: list[int], alone: bool = False) -> None:
+        """Take constants, and say which of them have a row for each factor.
+
+        Args:
+            arguments: of the function; anything in the places of variables.
+            places: of the variables.
+            each: places of constants with a row for each factor.
+            alone: whether it is not known of another constant, so that there must be a call for each move.
+        """
+        self._arguments, self._places, self._each = arguments, places, each
         self._tiled.clear()
-        if self._long is None:
-            self._each = each
+        self._long = False if alone else self._long
 
     def forget(self) -> None:
         """Constants have changed in place."""
@@ -184,8 +190,7 @@ class Batched:
     def _takes_long_batches(self, near: Near, steps: Steps) -> bool | None:
         """Call it both ways; None where there are no numbers to compare.
 
-        Arrays as long as the batch may or may not have a row for each factor: both is tried.
-        """
+            """
         with np.errstate(all="ignore"):
             anywhere = near.directions.anywhere
             points = near.moved(steps, anywhere, 0, anywhere.count)
@@ -196,23 +201,10 @@ class Batched:
             if not np.isfinite(alone).any():
                 return None
             size = _largest(alone) + _largest(near.joined)
-            each = self._each
-            for rows in (each + self._perhaps(len(near.joined)), each):
-                self._each = rows
-                self._tiled.clear()
-                found = self._batch(points)
-                if found is not None and found.shape == alone.shape:
-                    if np.allclose(found, alone, rtol=0.0, atol=ALIKE * size, equal_nan=True):
-                        return True
-        return False
-
-    def _perhaps(self, count: int) -> list[int]:
-        known = {*self._places, *self._each}
-        return [
-            k
-            for k, given in enumerate(self._arguments)
-            if k not in known and isinstance(given, np.ndarray) and given.ndim and len(given) == count > 1
-        ]
+            self._tiled.clear()
+            found = self._batch(points)
+            alike = found is not None and found.shape == alone.shape
+            return alike and np.allclose(found, alone, rtol=0.0, atol=ALIKE * size, equal_nan=True)
 
 
 def changes(name: str, place: int) -> str:

@@ -118,14 +118,14 @@ class Statement:
         self._changed()
         return family
 
-    def data(self, name: str, value: ArrayLike, *, each: bool = False) -> Data:
+    def data(self, name: str, value: ArrayLike, *, each: bool | None = None) -> Data:
         """Declare an array that may be replaced between solves.
 
         Args:
             name: shown in messages.
             value: default; its shape (and whether it is boolean) is kept.
-            each: whether the first axis runs over the factors of the terms that use it; otherwise all
-                factors share it.
+            each: True where the first axis runs over the factors of the terms that use it, False where all factors
+                share it; None leaves it to the structure of each term's function.
 
         Raises:
             GraphError: when the name is taken, or the value is not made of real numbers or booleans.
@@ -353,7 +353,7 @@ class Statement:
                 raise GraphError(f"term '{name or title(function)}': give sigma or information, not both", term=name)
             wrapped = complete(function, arguments, name)
             unique = self._unique(name, wrapped.name, replaced)
-            normal, active, count = self._arguments(unique, arguments, active)
+            normal, rows, active, count = self._arguments(unique, arguments, active)
             if robust is not None and (isinstance(robust, type) or not hasattr(robust, "weight")):
                 raise GraphError(
                     f"term '{unique}': robust= must be a loss such as fg.Huber(1.345), found {robust!r}", term=unique
@@ -361,7 +361,7 @@ class Statement:
             size = rows_of(unique, wrapped, normal, count)
             sigma, information = check_weights(unique, sigma, information, count, size)
             self._own_data(unique, sigma, information)
-            return Cost(unique, wrapped, normal, active, count, size, sigma, information, robust)
+            return Cost(unique, wrapped, normal, active, count, size, sigma, information, robust, rows=rows)
 
     def _scalar_cost(
         self,
@@ -374,9 +374,9 @@ class Statement:
         with placed(name, arguments):
             wrapped = complete(function, arguments, name)
             unique = self._unique(name, wrapped.name, replaced)
-            normal, active, count = self._arguments(unique, arguments, active)
+            normal, rows, active, count = self._arguments(unique, arguments, active)
             size = rows_of(unique, wrapped, normal, count, scalar=True)
-            return ScalarCost(unique, wrapped, normal, active, count, size)
+            return ScalarCost(unique, wrapped, normal, active, count, size, rows=rows)
 
     def _constraint(
         self,
@@ -391,12 +391,12 @@ class Statement:
         with placed(name, arguments):
             wrapped = complete(function, arguments, name)
             unique = self._unique(name, wrapped.name, replaced)
-            normal, active, count = self._arguments(unique, arguments, active)
+            normal, rows, active, count = self._arguments(unique, arguments, active)
             size = rows_of(unique, wrapped, normal, count)
             lower, upper = _given("a constraint", unique, lower, upper)
             lower, upper = check_limits(unique, lower, upper, count, size)
             self._own_data(unique, lower, upper)
-            return Constraint(unique, wrapped, normal, active, count, size, lower, upper)
+            return Constraint(unique, wrapped, normal, active, count, size, lower, upper, rows=rows)
 
     def _bound(
         self,
@@ -415,12 +415,12 @@ class Statement:
                     family=selection.family.name,
                 )
             unique = self._unique(name, f"{selection.family.name} bounds", replaced)
-            normal, active, count = self._arguments(unique, (selection,), None)
+            normal, rows, active, count = self._arguments(unique, (selection,), None)
             size = selection.manifold.dim
             lower, upper = _given("a bound", unique, lower, upper)
             lower, upper = check_limits(unique, lower, upper, count, size)
             self._own_data(unique, lower, upper)
-            return Constraint(unique, residual(itself), normal, active, count, size, lower, upper, is_bound=True)
+            return Constraint(unique, residual(itself), normal, active, count, size, lower, upper, is_bound=True, rows=rows)
 
     def _fix(self, name: str | None, stated: tuple[Any, ...], replaced: Fix | None = None) -> Fix:
         if len(stated) != 2:
@@ -478,13 +478,15 @@ class Statement:
         for handle in {handle for stated in gone for handle in stated.data} - used:
             self._data.pop(handle.name, None)
 
-    def _arguments(self, name: str, arguments: tuple[Any, ...], active: Any) -> tuple[tuple[Any, ...], Any, int]:
-        normal, active, count = prepare_arguments(name, arguments, active)
+    def _arguments(
+        self, name: str, arguments: tuple[Any, ...], active: Any
+    ) -> tuple[tuple[Any, ...], tuple[bool | None, ...], Any, int]:
+        normal, rows, active, count = prepare_arguments(name, arguments, active)
         for argument in normal:
             if isinstance(argument, Selection):
                 self._own(argument, name)
         self._own_data(name, *normal, active)
-        return normal, active, count
+        return normal, rows, active, count
 
     def _own(self, selection: Selection, term: str) -> None:
         if self.families.get(selection.family.name) is not selection.family:

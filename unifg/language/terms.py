@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -11,7 +11,7 @@ from unifg.errors import GraphError
 from unifg.kernels.residuals import Residual
 from unifg.kernels.robust import Loss
 from unifg.language.doubles import doubles
-from unifg.language.variables import Data, Family, Selection
+from unifg.language.variables import Data, Declared, Family, Selection
 from unifg.typing import Array, ArrayLike, BoolArray
 
 Parameter: TypeAlias = ArrayLike | Data
@@ -28,6 +28,7 @@ class Term:
         active: (n,) boolean, constant or data; None means all.
         count: number of factors n.
         size: rows m of each of them.
+        rows: for each argument, whether it is declared to have a row for each factor; None where nothing is declared.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Term:
     active: BoolArray | Data | None
     count: int
     size: int
+    rows: tuple[bool | None, ...] = field(kw_only=True)
 
     @property
     def kind(self) -> str:
@@ -148,17 +150,26 @@ class Fix:
         return f"<fix '{self.name}': {self.selection!r}>"
 
 
-def prepare_arguments(name: str, arguments: tuple[Any, ...], active: Any) -> tuple[tuple[Any, ...], Any, int]:
+def prepare_arguments(
+    name: str, arguments: tuple[Any, ...], active: Any
+) -> tuple[tuple[Any, ...], tuple[bool | None, ...], Any, int]:
     """Normalise a term's arguments and find its number of factors.
 
-    Selections of length 1 are shared; all longer ones, every ``each=True`` data and ``active`` must agree.
+    Selections of length 1 are shared; all longer ones, data and constants declared to have a row for each factor, and
+    ``active`` must agree.
+
+    Returns:
+        Arguments, whether each of them is declared to have a row for each factor, active, number of factors.
 
     Raises:
         GraphError: when there is no variable among the arguments, or the lengths disagree.
     """
-    normal = tuple(a[:] if isinstance(a, Family) else a for a in arguments)
+    rows = tuple(a.each if isinstance(a, Data | Declared) else None for a in arguments)
+    normal = tuple(
+        a[:] if isinstance(a, Family) else a.value if isinstance(a, Declared) else a for a in arguments
+    )
     lengths: list[tuple[str, int]] = []
-    for argument in normal:
+    for place, argument in enumerate(normal):
         if isinstance(argument, Selection):
             if argument.count == 0:
                 raise GraphError(
@@ -168,8 +179,9 @@ def prepare_arguments(name: str, arguments: tuple[Any, ...], active: Any) -> tup
                 )
             if argument.count > 1:
                 lengths.append((f"family '{argument.family.name}'", argument.count))
-        elif isinstance(argument, Data) and argument.each:
-            lengths.append((f"data '{argument.name}'", len(argument.value)))
+        elif rows[place]:
+            what = f"data '{argument.name}'" if isinstance(argument, Data) else f"argument {place}, by fg.each,"
+            lengths.append((what, len(argument.value if isinstance(argument, Data) else argument)))
     if not any(isinstance(argument, Selection) for argument in normal):
         raise GraphError(f"term '{name}' has no variable among its arguments: pass a family or a selection", term=name)
     if active is not None:
@@ -190,4 +202,4 @@ def prepare_arguments(name: str, arguments: tuple[Any, ...], active: Any) -> tup
             f"term '{name}': the number of factors is unclear: {found}. Only selections of length 1 are shared",
             term=name,
         )
-    return normal, active, lengths[0][1] if lengths else 1
+    return normal, rows, active, lengths[0][1] if lengths else 1

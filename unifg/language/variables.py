@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -104,10 +105,11 @@ class Data:
     Attributes:
         name: unique name within its graph.
         value: present default; a solve may override it.
-        each: whether the first axis runs over the factors of every term that uses it.
+        each: whether the first axis runs over the factors of every term that uses it; None where each term's function
+            says so.
     """
 
-    def __init__(self, name: str, value: ArrayLike, each: bool) -> None:
+    def __init__(self, name: str, value: ArrayLike, each: bool | None) -> None:
         """Hold a default value; made by :meth:`unifg.Graph.data`."""
         self.name = name
         self.each = each
@@ -146,6 +148,35 @@ class Data:
     def __repr__(self) -> str:
         """Name and shape."""
         return f"<Data {self.name} {self.value.shape}{' each' if self.each else ''}>"
+
+
+@dataclass(frozen=True, eq=False)
+class Declared:
+    """A constant of which it is declared whether it has a row for each factor; made by :func:`each`, :func:`shared`."""
+
+    value: Array
+    each: bool
+
+
+def each(value: ArrayLike) -> Declared:
+    """Declare that the first axis of a constant argument runs over the factors of its term.
+
+    Raises:
+        GraphError: it is a scalar, or not made of real numbers or booleans.
+    """
+    array = doubles("an argument of fg.each", value, flags=True)
+    if array.ndim == 0:
+        raise GraphError("fg.each needs one row per factor, found a scalar")
+    return Declared(array, True)
+
+
+def shared(value: ArrayLike) -> Declared:
+    """Declare that all factors of a term share a constant argument, however long it is.
+
+    Raises:
+        GraphError: it is not made of real numbers or booleans.
+    """
+    return Declared(doubles("an argument of fg.shared", value, flags=True), False)
 
 
 Variable: TypeAlias = Family | Selection

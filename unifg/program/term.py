@@ -36,7 +36,7 @@ from unifg.language.trial import blocks_of, size_of, told, tried
 from unifg.language.variables import Data, Selection
 from unifg.lie import Manifold
 from unifg.program.columns import Columns, Values
-from unifg.program.traced import Batch, Trace, find, reason
+from unifg.program.traced import Batch, Trace, find, has_rows, reason, unclear_places
 from unifg.typing import Array, BoolArray, IntArray
 
 Bound: TypeAlias = Mapping[Data, Array]
@@ -134,6 +134,7 @@ class CompiledTerm:
         self._blocks: dict[int, tuple[int, int]] = {}
         self._taken = tuple(range(len(term.arguments)))
         self.trace: Trace | None = None
+        self._each: tuple[int, ...] | None = None  # arguments that were found to have a row for each factor
         self._changes = 0
         self._weighed = False
         self.bind({})
@@ -184,8 +185,12 @@ class CompiledTerm:
         why = "it has a search Jacobian" if own.search else ""
         if own.derivatives == "differences":
             why = "as it was asked to be"
-        if not why:
-            self.trace, why = find(self._batch, own.function, asked)
+        if not why or unclear_places(self._arguments, self.term.rows, self.count):
+            found, reason = find(self._batch, own.function, asked)
+            self._each = None if found is None else found.each
+            self._bind_batched(self._batched)
+            if not why:
+                self.trace, why = found, reason
         if self.trace is None and own.jacobian is not None:
             return f"evaluated by Python, its derivatives attached: {why}"
         if self.trace is None:
@@ -217,8 +222,10 @@ class CompiledTerm:
         self._batched.function, self._jacobian = self.kernel, self.kernel.jacobian
 
     def _traced(self) -> str:
-        logger.info("term '%s' was traced: its derivatives are exact", self.name)
-        return "traced, its derivatives exact"
+        assert self.trace is not None
+        how = "traced on the whole batch" if self.trace.whole else "traced"
+        logger.info("term '%s' was %s: its derivatives are exact", self.name, how)
+        return f"{how}, its derivatives exact"
 
     def _by_python(self, why: str) -> str:
         return self._said("evaluated by Python", why)
@@ -241,6 +248,7 @@ class CompiledTerm:
             shared,
             self.count,
             self.size,
+            self.term.rows,
             isinstance(self.term, ScalarCost),
             self.term.residual.function if self.term.residual.rows else None,
         )
@@ -307,8 +315,9 @@ class CompiledTerm:
         self._changes += not same
         if self._changes > CHANGES and not asked:
             found, why = None, "what it reads beyond its arguments keeps changing: declare it by graph.data"
-        if found is None:
-            self._leave(why)
+        if found is None or found.each != self._each:
+            self._each = None
+            self._leave(why or "what it reads beyond its arguments has changed their meaning")
             return False
         self.trace, self.kernel = found, found.kernel
         self._bind_parameters(self._data)
@@ -590,13 +599,12 @@ class CompiledTerm:
         """Compile the user's function of one factor for the manifolds and shapes it is used with."""
         arguments: list[Manifold | int] = []
         shapes = []
-        for given, argument in zip(self._arguments, self.term.arguments, strict=True):
+        for given, argument, declared in zip(self._arguments, self.term.arguments, self.term.rows, strict=True):
             if isinstance(argument, Selection):
                 arguments.append(argument.manifold)
                 continue
             shape = np.shape(given)
-            each = argument.each if isinstance(argument, Data) else len(shape) > 1
-            shapes.append(shape[1:] if each else shape)
+            shapes.append(shape[1:] if has_rows(given, declared) else shape)
             arguments.append(len(shapes[-1]))
         own = self.term.residual
         return per_factor(own.function, own.jacobian, own.rows, arguments, shapes, self.name)
@@ -614,8 +622,9 @@ class CompiledTerm:
         return full
 
     def _bind_batched(self, batched: Batched) -> None:
-        each = [k for k, a in enumerate(self.term.arguments) if isinstance(a, Data) and a.each]
-        batched.bind(self._arguments, self._places, each)
+        each = [k for k, declared in enumerate(self.term.rows) if declared]
+        unclear = unclear_places(self._arguments, self.term.rows, self.count) if self._each is None else ()
+        batched.bind(self._arguments, self._places, each if self._each is None else list(self._each), bool(unclear))
 
     def _side_by_side(self, *arguments: Any) -> Array:
         """(n, m, D) attached Jacobian."""

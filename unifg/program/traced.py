@@ -1,9 +1,8 @@
-"""Plain functions of terms, traced: which reading of their arguments is right, and whether the trace is the function.
+"""Plain functions of terms, traced: the reading of their arguments, and a check of the trace against the function.
 
-A function is traced with one factor and serves a batch of many. A mean over the batch, its length, a row of another
-factor or an array that holds a row for each look like constants then. So what was traced is compared with the function
-on the whole batch, at points that differ from factor to factor. Rows that depend on other factors are an error, whoever
-differentiates them; a function that a trace cannot stand for otherwise stays as it is, and that is said.
+Whether an array as long as the batch has a row for each factor or is shared is decided by structure: the function is
+traced on batches of several rows whose numbers are all symbols (:mod:`unifg.kernels.derive.rows`). Rows that depend on
+the variables of other factors are an error. A function that no trace can stand for stays in Python, with a message.
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.kernels.batched import Batched, changes
-from unifg.kernels.derive.derived import DerivedKernel, Each, Fixed, Given, Shared, derived, in_python
+from unifg.kernels.derive.derived import DerivedKernel, derived, in_python
 from unifg.kernels.derive.reach import Reach, reach_of
+from unifg.kernels.derive.rows import Common, Each, Fixed, Given, RowsError, Shared, lengths_for
 from unifg.kernels.derive.symbols import TraceError
-from unifg.kernels.derive.trace import Rebound
 from unifg.kernels.steps import ANGLE, OTHER, TURN, parts_of
 from unifg.language.variables import Data, Selection
 from unifg.lie import Manifold
@@ -30,6 +29,7 @@ from unifg.typing import Array, BoolArray, IntArray
 
 logger = logging.getLogger("unifg")
 READINGS = 8  # of arrays that may or may not have a row for each factor
+WHOLE = 100  # factors of a batch that is traced as a whole where two short ones do not decide
 ALIKE = 1e-9  # relative to the numbers that go in and come out
 AMPLIFIED = 1e4  # roundings of the arguments, as the function itself enlarges them
 DOUBTED = 1e-5  # the most of it, relative as above
@@ -53,6 +53,7 @@ class Batch:
         manifolds: of the variables.
         shared: for each variable, whether all factors have the same.
         count, size: number of factors, rows of each.
+        rows: for each argument, whether it has a row for each factor, as declared; None where that is not said.
         scalar: whether it returns (n,).
         single: the function, where it takes one factor at a time and is compiled.
     """
@@ -65,15 +66,9 @@ class Batch:
     shared: Sequence[bool]
     count: int
     size: int
+    rows: Sequence[bool | None]
     scalar: bool = False
     single: Callable[..., Any] | None = None
-
-    def may_have_rows(self, place: int) -> bool:
-        """Whether an argument is an array as long as the batch, with a row for each factor or not."""
-        argument, value = self.arguments[place], self.present[place]
-        if not isinstance(value, np.ndarray) or (isinstance(argument, Data) and argument.each):
-            return False
-        return bool(value.ndim and len(value) == self.count > 1)
 
     @property
     def looked_at(self) -> IntArray:
@@ -105,12 +100,9 @@ class Batch:
     def rows_of(self, filled: Sequence[Any]) -> list[bool]:
         """Which arguments of a function of one factor have a row for each factor."""
         found = []
-        for argument, value in zip(self.arguments, filled, strict=True):
-            if isinstance(argument, Selection):
-                found.append(True)
-            else:
-                own = argument.each if isinstance(argument, Data) else np.ndim(value) > 1
-                found.append(own and len(value) == self.count)
+        for argument, value, declared in zip(self.arguments, filled, self.rows, strict=True):
+            variable = isinstance(argument, Selection)
+            found.append(variable or (has_rows(value, declared) and len(value) == self.count))
         return found
 
     def anywhere(self, rng: np.random.Generator) -> list[Array]:
@@ -126,6 +118,17 @@ class Batch:
         return result
 
 
+def unclear_places(present: Sequence[Any], rows: Sequence[bool | None], count: int) -> list[int]:
+    """Places of arrays as long as the batch of which it is not declared whether they have a row for each factor."""
+    arrays = [k for k, value in enumerate(present) if rows[k] is None and isinstance(value, np.ndarray)]
+    return [k for k in arrays if present[k].ndim and len(present[k]) == count > 1]
+
+
+def has_rows(value: Any, declared: bool | None) -> bool:
+    """Whether an argument of a compiled function of one factor has a row for each: matrices, unless declared."""
+    return np.ndim(value) > 1 if declared is None else declared
+
+
 @dataclass(frozen=True)
 class Trace:
     """A derived kernel that stands for a term's function.
@@ -136,6 +139,8 @@ class Trace:
         reached: named arrays of the function that the kernel takes after these.
         reach: what else the function reaches, which is compiled in.
         fixed, free: arrays of the user that are compiled in, or are parameters, and what stood in them.
+        each: places of the arguments with a row for each factor.
+        whole: whether it holds for batches of this length only.
         given: what other arguments that are compiled in reach.
         lists: lists, dictionaries and tuples of numbers among them, and what stood in them.
     """
@@ -146,6 +151,8 @@ class Trace:
     reach: Reach
     fixed: Contents
     free: Contents
+    each: tuple[int, ...] = ()
+    whole: bool = False
     given: tuple[Reach, ...] = ()
     lists: tuple[tuple[Any, bytes], ...] = ()
 
@@ -248,38 +255,87 @@ def find(
 
 
 def _found(batch: Batch, function: Callable[..., Any], everything: Reach, asked: bool) -> tuple[Trace | None, str]:
-    why, name = "", getattr(function, "__name__", "residual")
-    per_factor, at_all = WATCHED
-    most = max(at_all, per_factor * batch.count)
-    different = False
-    for given, reached in _readings(batch, everything.named):
-        reach = reach_of(function, [array for array, _ in reached]) if reached else everything
-        if reach.size > most and not asked:
-            why = why or f"it reaches {reach.size} numbers, which would be looked at again before each solve"
+    why, mistraced, tried = "", False, set[tuple[_Reading, bool]]()
+    failures: list[RowsError] = []
+    many = batch.single is None and batch.count > 1
+    waiting = [(reading, False) for reading in _readings(batch, everything.named)]
+    if many and batch.count <= WHOLE:
+        waiting += [(reading, True) for reading, _ in waiting]
+    while waiting:
+        reading, whole = waiting.pop(0)
+        if (reading, whole) in tried:
             continue
-        rows = batch.size if batch.single else 0
-        beyond, lists, refusal = _reached_by(given, reach)
-        if refusal and not asked:
-            why = why or refusal
-            continue
+        tried.add((reading, whole))
+        given, reached = reading.of(batch, everything.named)
         try:
-            kernel = derived(function, given, reach, rows, batch.scalar, name, not asked, reached)
+            trace = _traced(batch, function, everything, asked, given, reached, whole)
+        except RowsError as error:
+            failures.append(error)
+            why = why or str(error)
+            if shared := reading.sharing(error.mixed, given, reached):
+                waiting.insert(0, (shared, whole))
+            continue
         except TraceError as error:
             why = why or str(error)
             continue
-        if kernel.rows != batch.size:
-            why = why or f"it returns {kernel.rows} rows for one factor and {batch.size} for {batch.count}"
-            continue
-        taken = tuple(k for k, part in enumerate(given) if not isinstance(part, Fixed))
-        arrays = {k: a for k, a in enumerate(batch.arguments) if isinstance(a, np.ndarray) and not a.dtype.hasobject}
-        fixed = [array for k, array in arrays.items() if k not in taken]
-        free = [*(array for k, array in arrays.items() if k in taken), *(array for array, _ in reached)]
-        named = tuple(array for array, _ in reached)
-        trace = Trace(kernel, taken, named, reach, _contents(fixed), _contents(free), beyond, lists)
-        if not any(_differs_anywhere(*pair) for pair in ((trace, batch), _with_other_rows(trace, batch, function))):
+        if not _differs_anywhere(trace, batch):
             return trace, ""
-        different = True
-    return None, reason(batch, batch.anywhere(np.random.default_rng(0))) if different else why
+        mistraced = True
+    for error in failures:
+        variables = {k for k, argument in enumerate(batch.arguments) if isinstance(argument, Selection)}
+        if variables & error.mixed and all(variables & other.mixed for other in failures):
+            raise mixing(batch.name, error.row)
+    return None, reason(batch, batch.anywhere(np.random.default_rng(0))) if mistraced else why
+
+
+def mixing(name: str, index: int) -> GraphError:
+    """The error for rows that depend on the variables of other factors."""
+    return GraphError(
+        f"term '{name}': the rows of factor {index} change when the variables of other factors do; its derivatives "
+        "would be wrong. The rows of a factor may depend on its own arguments only: a mean over the batch, x[0] or a "
+        "difference of neighbours in the batch is no residual of one factor. Pass all variables that it depends on as "
+        "arguments, one selection each",
+        term=name,
+        index=index,
+    )
+
+
+def _traced(
+    batch: Batch,
+    function: Callable[..., Any],
+    everything: Reach,
+    asked: bool,
+    given: list[Given],
+    reached: list[tuple[Array, bool]],
+    whole: bool,
+) -> Trace:
+    """The trace of one reading.
+
+    Raises:
+        TraceError: there is none.
+    """
+    per_factor, at_all = WATCHED
+    reach = reach_of(function, [array for array, _ in reached]) if reached else everything
+    if reach.size > max(at_all, per_factor * batch.count) and not asked:
+        raise TraceError(f"it reaches {reach.size} numbers, which would be looked at again before each solve")
+    beyond, lists, refusal = _reached_by(given, reach)
+    if refusal and not asked:
+        raise TraceError(refusal)
+    name, rows = getattr(function, "__name__", "residual"), batch.size if batch.single else 0
+    if batch.count == 1 or batch.single is not None:
+        lengths: tuple[int, ...] = (1,)
+    else:
+        lengths = (batch.count,) if whole else lengths_for(given)
+    kernel = derived(function, given, reach, rows, batch.scalar, name, not asked, reached, lengths)
+    if kernel.rows != batch.size:
+        raise TraceError(f"it returns {kernel.rows} rows for one factor and {batch.size} for {batch.count}")
+    taken = tuple(k for k, part in enumerate(given) if not isinstance(part, Fixed))
+    arrays = {k: a for k, a in enumerate(batch.arguments) if isinstance(a, np.ndarray) and not a.dtype.hasobject}
+    fixed = [array for k, array in arrays.items() if k not in taken]
+    free = [*(array for k, array in arrays.items() if k in taken), *(array for array, _ in reached)]
+    named = tuple(array for array, _ in reached)
+    each = tuple(k for k, part in enumerate(given) if isinstance(part, Each))
+    return Trace(kernel, taken, named, reach, _contents(fixed), _contents(free), each, whole, beyond, lists)
 
 
 def _reached_by(
@@ -324,129 +380,79 @@ def _differs_anywhere(trace: Trace, batch: Batch) -> bool:
         return False
 
 
-def _with_other_rows(trace: Trace, batch: Batch, function: Callable[..., Any]) -> tuple[Trace, Batch]:
-    """The same with other numbers in arrays of as many equal rows as factors, and in those of zeros.
-
-    Goals of zeros and weights of ones do not say whether a row belongs to a factor, a gain of zero hides what it
-    multiplies, and their content may change later.
-    """
-    if batch.single is not None or batch.count == 1:
-        return trace, batch
-    rng = np.random.default_rng(3)
-    present = list(batch.present)
-    for place in trace.taken:
-        if not isinstance(batch.arguments[place], Selection):
-            present[place] = _with_distinct_rows(present[place], batch, rng)
-    reached = tuple(_with_distinct_rows(array, batch, rng) for array in trace.reached)
-    rebound = Rebound()
-    rebound.given = {id(old): new for old, new in zip(trace.reached, reached, strict=True) if old is not new}
-    batched = Batched(batch.name, rebound.callable(function) if rebound.given else batch.batched.function)
-    places = [k for k, argument in enumerate(batch.arguments) if isinstance(argument, Selection)]
-    batched.bind(present, places, [])
-    return replace(trace, reached=reached), replace(batch, batched=batched, present=present)
-
-
-def _with_distinct_rows(array: Any, batch: Batch, rng: np.random.Generator) -> Any:
-    """Another array, where two rows of as many as factors are equal or all is zero; elements stay elements."""
-    count = batch.count
-    if isinstance(array, np.ndarray) and array.dtype.kind in "bf" and not array.any():
-        return np.asarray(~array if array.dtype.kind == "b" else rng.uniform(0.1, 0.5, array.shape))
-    if not isinstance(array, np.ndarray) or not array.ndim or len(array) != count or not array.size:
-        return array
-    if len(np.unique(array.reshape(count, -1), axis=0)) == count:
-        return array
-    if array.dtype.kind == "b":
-        return rng.random(array.shape) < 0.5
-    for manifold in batch.manifolds:
-        turns = [slice(p.start, p.start + p.storage) for p, _ in parts_of(manifold) if p.kind == TURN]
-        if turns and array.shape == (count, manifold.storage):
-            if all(np.allclose((array[:, turn] ** 2).sum(axis=1), 1.0) for turn in turns):
-                return _moved(manifold, array, rng.uniform(-0.5, 0.5, (count, manifold.dim)))
-    return array + rng.uniform(0.0, 0.5, array.shape) if array.dtype.kind == "f" else array
-
-
 def reason(batch: Batch, points: Sequence[Array]) -> str:
-    """Why a trace of one factor is not the function of the batch.
-
-    Raises:
-        GraphError: rows of a factor depend on other factors.
-    """
-    if batch.single is not None:
-        return "what was traced is not what it computes"
+    """Reason for which a trace does not compute what its function does."""
     before = batch.original(points)
-    if _unequal(before, batch.original(points), 0.0).any():
+    if batch.single is None and _unequal(before, batch.original(points), 0.0).any():
         return "it returns other numbers each time it is called"
-    rng = np.random.default_rng(2)
-    for kept in (0, 1):
-        mine = np.arange(batch.count) % 2 == kept
-        others = [
-            p if shared else np.where(mine[:, None], p, q)
-            for p, q, shared in zip(points, batch.moved(points, 0.5, rng), batch.shared, strict=True)
-        ]
-        moved = batch.original(others)
-        changed = _unequal(before, moved, 1e-12 * (1.0 + np.abs(before))) & mine
-        if changed.any():
-            index = int(np.argmax(changed))
-            raise GraphError(
-                f"term '{batch.name}': the rows of factor {index} change when the variables of other factors do; "
-                "its derivatives would be wrong. The rows of a factor may depend on its own arguments only: a mean "
-                "over the batch, x[0] or a difference of neighbours in the batch is no residual of one factor. Pass "
-                "all variables that it depends on as arguments, one selection each",
-                term=batch.name,
-                index=index,
-            )
-    return (
-        "its rows depend on which factor they belong to, as by the length of the batch or by an array with a row for "
-        "each factor that is no argument: pass such arrays as arguments"
-    )
+    return "what was traced is not what it computes"
 
 
-def _readings(batch: Batch, named: Sequence[Array]) -> Iterator[tuple[list[Given], list[tuple[Array, bool]]]]:
-    """What may stand in the place of each argument, and of arrays that have a name; likeliest first."""
-    if batch.single is not None:
-        rows = batch.rows_of(batch.present)
-        yield (
-            [
+@dataclass(frozen=True)
+class _Reading:
+    """One way to read arrays as long as the batch.
+
+    Attributes:
+        places: of arguments with a row for each factor.
+        ids: of named arrays with a row for each factor.
+        fixed: whether shared numbers are compiled in.
+    """
+
+    places: frozenset[int]
+    ids: frozenset[int]
+    fixed: bool
+
+    def of(self, batch: Batch, named: Sequence[Array]) -> tuple[list[Given], list[tuple[Array, bool]]]:
+        """What stands in the place of each argument, and the named arrays that are parameters."""
+        if batch.single is not None:
+            rows = batch.rows_of(batch.present)
+            return [
                 a.manifold if isinstance(a, Selection) else (Each(np.shape(v)[1:]) if each else Shared(np.shape(v)))
                 for a, v, each in zip(batch.arguments, batch.present, rows, strict=True)
-            ],
-            [],
-        )
-        return
-    places = range(len(batch.arguments))
-    unclear = [k for k in places if batch.may_have_rows(k)]
-    open_rows = [array for array in named if len(array) == batch.count > 1 and array[0].size <= SHORT]
-    choices = list(itertools.product((True, False), repeat=len(unclear) + len(open_rows)))
+            ], []
+        given = [_given(batch, k, k in self.places, self.fixed) for k in range(len(batch.arguments))]
+        reached = [
+            (array, id(array) in self.ids)
+            for array in named
+            if id(array) in self.ids or (array.size <= SHORT and not self.fixed)
+        ]
+        return given, reached
+
+    def sharing(
+        self, mixed: frozenset[int], given: Sequence[Given], reached: Sequence[tuple[Array, bool]]
+    ) -> _Reading | None:
+        """The reading in which inputs are shared other rows of which a row depends on; None where none is unclear."""
+        places = self.places & mixed
+        ids = self.ids & {id(array) for k, (array, _) in enumerate(reached, len(given)) if k in mixed}
+        return replace(self, places=self.places - places, ids=self.ids - ids) if places or ids else None
+
+
+def _readings(batch: Batch, named: Sequence[Array]) -> Iterator[_Reading]:
+    """Readings of the arrays as long as the batch; a row for each factor first."""
+    unclear = [] if batch.single is not None else unclear_places(batch.present, batch.rows, batch.count)
+    open_rows = [id(array) for array in named if len(array) == batch.count > 1 and array[0].size <= SHORT]
+    keys = [*((True, k) for k in unclear), *((False, k) for k in open_rows)]
+    choices = list(itertools.product((True, False), repeat=len(keys)))
     if len(choices) > READINGS:
         choices = [choices[0], choices[-1]]
-    for fixed in (False, True):
+    for fixed in (False, True) if batch.single is None else (False,):
         for choice in choices:
-            each = {k for k, rows in zip(unclear, choice, strict=False) if rows}
-            rowed = {id(array): rows for array, rows in zip(open_rows, choice[len(unclear) :], strict=True)}
-            given = [_given(batch, k, k in each, fixed) for k in places]
-            reached = [
-                (array, rowed.get(id(array), False))
-                for array in named
-                if rowed.get(id(array)) or (array.size <= SHORT and not fixed)
-            ]
-            if not fixed or any(isinstance(part, Fixed) for part in given) or len(reached) < len(named):
-                yield given, reached
+            chosen = [key for key, rows in zip(keys, choice, strict=True) if rows]
+            places, ids = ({k for argument, k in chosen if argument is kind} for kind in (True, False))
+            yield _Reading(frozenset(places), frozenset(ids), fixed)
 
 
 def _given(batch: Batch, place: int, each: bool, fixed: bool) -> Given:
     argument, value = batch.arguments[place], batch.present[place]
     if isinstance(argument, Selection):
-        return argument.manifold
+        variable = [k for k, a in enumerate(batch.arguments) if isinstance(a, Selection)].index(place)
+        return Common(argument.manifold) if batch.shared[variable] else argument.manifold
     shape = np.shape(value)
-    if isinstance(argument, Data):
-        each = each or (argument.each and batch.count > 1)
-        return Each(shape[1:]) if each else Shared(shape)
-    if each:
+    if each or (batch.rows[place] and batch.count > 1):
         return Each(shape[1:])
     kind = getattr(value, "dtype", np.dtype(type(value)) if isinstance(value, float) else None)
-    if isinstance(value, float | np.floating | np.ndarray) and kind is not None and kind.kind == "f" and not fixed:
-        return Shared(shape)
-    return Fixed(value, reach_of_value(value))
+    numbers = isinstance(value, float | np.floating | np.ndarray) and kind is not None and kind.kind == "f"
+    return Shared(shape) if isinstance(argument, Data) or (numbers and not fixed) else Fixed(value, reach_of_value(value))
 
 
 def _moved(manifold: Manifold, point: Array, step: Array) -> Array:

@@ -163,7 +163,7 @@ class Types:
         name = given or wrapped.name
         if sigma is not None and information is not None:
             raise GraphError(f"term '{name}': give sigma or information, not both", term=name)
-        normal, active, count = prepare_arguments(name, arguments, active)
+        normal, rows, active, count = prepare_arguments(name, arguments, active)
         selections = [argument for argument in normal if isinstance(argument, Selection)]
         families: list[GrowingFamily] = []
         for selection in selections:
@@ -176,11 +176,12 @@ class Types:
             families.append(selection.family)
         members = [int(s.indices[0]) if len(s) == 1 else s.indices for s in selections]
         form = form_of(robust)
-        key = self._key(wrapped, normal, count)
+        key = self._key(wrapped, normal, rows, count)
         known = self._kernels.get(key) if form is not None else None
         if known is None or (known[2] is not None and known[2].outdated):
             size = rows_of(name, wrapped, normal, count)
-            term = _compiled(Cost(name, wrapped, _by_itself(normal), None, count, size, sigma, information, robust))
+            stated = _by_itself(normal)
+            term = _compiled(Cost(name, wrapped, stated, None, count, size, sigma, information, robust, rows=rows))
             if term.kernel is None or form is None or len(term.kernel.manifolds) > len(selections):
                 rest = np.zeros((count, 0))
                 kind = self._kind(None, (0, 0, 0, term.size), selections, (), *PLAIN)
@@ -257,12 +258,14 @@ class Types:
         self._numbers[key] = len(self.fields) - 1
         return len(self.fields) - 1
 
-    def _key(self, wrapped: Residual, arguments: Sequence[Any], count: int) -> tuple[Any, ...]:
+    def _key(
+        self, wrapped: Residual, arguments: Sequence[Any], rows: tuple[bool | None, ...], count: int
+    ) -> tuple[Any, ...]:
         """What makes statements share a kernel."""
         kernel = wrapped.kernel
         if kernel is None and not wrapped.rows:  # what a trace makes of constants depends on all of this
             stated = [a.manifold if isinstance(a, Selection) else _told(a) for a in arguments]
-            return id(wrapped.function), id(wrapped.jacobian), wrapped.derivatives, count, *stated
+            return id(wrapped.function), id(wrapped.jacobian), wrapped.derivatives, count, rows, *stated
         expected = kernel.arguments if kernel is not None else ()
         parts: list[Any] = [
             id(kernel) if kernel is not None else (id(wrapped.function), id(wrapped.jacobian), wrapped.rows)
@@ -275,8 +278,8 @@ class Types:
                 parts.append(axes if isinstance(axes, int | tuple) else "constant")
             elif wrapped.rows:
                 shape = argument.value.shape if isinstance(argument, Data) else np.shape(argument)
-                each = argument.each if isinstance(argument, Data) else len(shape) > 1
-                parts.append(shape[1:] if each else shape)
+                own = rows[place]
+                parts.append(shape[1:] if (len(shape) > 1 if own is None else own) else shape)
         return tuple(parts)
 
 
@@ -308,7 +311,7 @@ def _compiled_in(trace: Trace, arguments: Sequence[Any]) -> bool:
 def _told(argument: Any) -> Any:
     """What tells a constant from others that a trace treats differently."""
     if isinstance(argument, Data):
-        return argument.value.shape, argument.value.dtype, argument.each
+        return argument.value.shape, argument.value.dtype
     if isinstance(argument, float | np.floating | np.ndarray) and np.asarray(argument).dtype.kind == "f":
         return np.shape(argument), "float"
     return reach_of_value(argument) or id(argument)

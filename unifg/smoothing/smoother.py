@@ -129,13 +129,13 @@ class Smoother:
         return family
 
     @in_turn
-    def data(self, name: str, value: ArrayLike, *, each: bool = False) -> Data:
+    def data(self, name: str, value: ArrayLike, *, each: bool | None = None) -> Data:
         """Declare an array for the factors stated with it, which take the value it has then.
 
         Args:
             name: shown in messages.
             value: numbers or booleans.
-            each: whether the first axis runs over the factors; otherwise all share it.
+            each: as for :meth:`unifg.Graph.data`.
 
         Raises:
             GraphError: when the name is taken.

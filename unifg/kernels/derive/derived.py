@@ -12,18 +12,18 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import prod
-from typing import Any, NoReturn, TypeAlias
+from typing import Any, NoReturn
 
 import numpy as np
 
 from unifg.kernels.derive.expression import Expression, generating, traced
 from unifg.kernels.derive.operations import Op
 from unifg.kernels.derive.reach import Reach
+from unifg.kernels.derive.rows import Fixed, Given, argument_of, traced_rows
 from unifg.kernels.derive.symbols import TraceError
 from unifg.kernels.derive.tape import Tape
 from unifg.kernels.derive.trace import Rebound, run
 from unifg.kernels.kernel import Argument, Kernel
-from unifg.lie import Manifold
 from unifg.machine.jit import is_compiled
 from unifg.typing import Array
 
@@ -31,31 +31,6 @@ logger = logging.getLogger("unifg")
 KEPT = 256  # kernels
 LONGEST = 5000  # nodes of a residual; of more, machine code takes seconds
 WIDEST = 2000  # parameters of one factor
-
-
-@dataclass(frozen=True)
-class Each:
-    """An argument with a row for each factor; ``shape`` is that of a row."""
-
-    shape: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class Shared:
-    """An argument that all factors share, whose numbers may change."""
-
-    shape: tuple[int, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Fixed:
-    """An argument that all factors share and that a trace fixes; ``key`` tells it from others, None if nothing can."""
-
-    value: Any
-    key: Hashable | None
-
-
-Given: TypeAlias = Manifold | Each | Shared | Fixed
 
 
 def _nowhere(*_: Any) -> NoReturn:
@@ -108,6 +83,7 @@ def derived(
     name: str = "",
     limit: bool = True,
     reached: Sequence[tuple[Array, bool]] = (),
+    lengths: Sequence[int] = (1,),
 ) -> DerivedKernel:
     """The kernel of a plain function, traced once for all who use it alike.
 
@@ -120,20 +96,23 @@ def derived(
         name: for messages.
         limit: refuse functions whose code would take long to generate.
         reached: named arrays that the kernel is given after all arguments, and whether they have a row for each factor.
+        lengths: of the batches that a batched function is traced with; see :func:`~.rows.traced_rows`.
 
     Raises:
+        RowsError: rows of a batch depend on rows of other factors, or differ.
         TraceError: the function does what cannot be traced.
     """
     with generating:
         fixed = [part for part in given if isinstance(part, Fixed)]
         if reach.key is None or any(part.key is None for part in fixed):
-            return _traced(function, given, rows, scalar, name, limit, reached)
+            return _traced(function, given, rows, scalar, name, limit, reached, lengths)
         places = tuple(part.key if isinstance(part, Fixed) else part for part in given)
-        key = reach.key, places, rows, scalar, limit, tuple((array.shape, each) for array, each in reached)
+        parts = tuple((array.shape, each) for array, each in reached)
+        key = reach.key, places, rows, scalar, limit, parts, tuple(lengths)
         found = _kernels.get(key)
         if found is None:
             try:
-                found = _traced(function, given, rows, scalar, name, limit, reached)
+                found = _traced(function, given, rows, scalar, name, limit, reached, lengths)
             except TraceError as error:
                 found = error.with_traceback(None)
             _kernels[key] = found
@@ -141,7 +120,7 @@ def derived(
                 _kernels.popitem(last=False)
         _kernels.move_to_end(key)
         if isinstance(found, TraceError):
-            raise TraceError(str(found))
+            raise found.with_traceback(None)
         return found
 
 
@@ -153,27 +132,17 @@ def _traced(
     name: str,
     limit: bool,
     reached: Sequence[tuple[Array, bool]],
+    lengths: Sequence[int],
 ) -> DerivedKernel:
-    arguments: list[Argument] = []
-    for part in given:
-        if isinstance(part, Manifold):
-            arguments.append(part)
-        elif not isinstance(part, Fixed):
-            arguments.append(part.shape)
+    arguments = [argument for part in given if (argument := argument_of(part)) is not None]
     arguments += [array.shape[1:] if each else array.shape for array, each in reached]
     numbers = sum(prod(argument) for argument in arguments if isinstance(argument, tuple))
     if limit and numbers > WIDEST:
         raise TraceError(f"its constants are {numbers} numbers for each factor")
-    changed: list[int] = []
-    called = function if is_compiled(function) else _as_called(function, given, scalar, changed)
-    try:
-        expression = traced(called, arguments, rows, name, reached)
-    except TraceError:
-        raise
-    except Exception as error:  # of a manifold of the user's own
-        raise TraceError(f"{type(error).__name__}: {error}") from error
-    if changed:
-        raise TraceError(f"it changes its argument {changed[0]}")
+    if is_compiled(function):
+        expression = traced(function, arguments, rows, name)
+    else:
+        expression = traced_rows(function, given, reached, lengths, scalar, name)
     tape = expression.tape
     live = tape.live(expression.rows)
     if limit and len(live) > LONGEST:
@@ -194,33 +163,3 @@ def in_python(function: Callable[..., Any], arguments: Sequence[Any], rows: int)
     """(m,) what a compiled function of one factor writes, found without compiling it."""
     with generating:
         return np.array(run(function, arguments, Tape(), Rebound(), rows), dtype=np.float64)
-
-
-def _as_called(
-    function: Callable[..., Any], given: Sequence[Given], scalar: bool, changed: list[int]
-) -> Callable[..., Any]:
-    """The function as a term calls it: some arguments have a row for each factor, others stand as they are.
-
-    Arguments that it changes are noted in ``changed``.
-    """
-    places = list(given)
-
-    def call(*numbers: Any) -> Any:
-        rest = iter(numbers)
-        arguments, kept = [], []
-        for part in places:
-            if isinstance(part, Fixed):
-                arguments.append(part.value)
-                continue
-            array = next(rest)
-            argument = array[0] if isinstance(part, Shared) else array
-            arguments.append(argument)
-            if isinstance(argument, np.ndarray):
-                kept.append((len(arguments) - 1, argument, list(argument.flat)))
-        result = function(*arguments)
-        for place, argument, entries in kept:
-            if any(now is not before for now, before in zip(argument.flat, entries, strict=True)):
-                changed.append(place)
-        return np.asarray(result)[:, None] if scalar else result
-
-    return call

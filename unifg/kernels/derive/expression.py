@@ -148,7 +148,6 @@ def traced(
     arguments: Sequence[Argument],
     rows: int = 0,
     name: str = "",
-    reached: Sequence[tuple[Array, bool]] = (),
 ) -> Expression:
     """Run a function once and keep what it computes.
 
@@ -158,8 +157,6 @@ def traced(
         arguments: the manifold of each variable, the shape of each parameter for one factor.
         rows: m of a compiled function.
         name: for messages.
-        reached: arrays that the function has names for and that are parameters too, the last of ``arguments``; and
-            whether each has a row for every factor.
 
     Raises:
         TraceError: the function does what cannot be traced, or returns another shape.
@@ -188,10 +185,7 @@ def traced(
                 raise TraceError(f"a variable lies on {argument.name}: {type(error).__name__}: {error}") from error
             given.append(array if single else array[None])
             stored, width = stored + argument.storage, width + argument.dim
-    first = len(given) - len(reached)
-    for (array, each), numbers in zip(reached, given[first:], strict=True):
-        rebound.given[id(array)] = numbers if each else numbers[0]
-    result = np.asarray(run(function, given[:first], tape, rebound, rows), dtype=object)
+    result = np.asarray(run(function, given, tape, rebound, rows), dtype=object)
     if not single and (result.ndim != 2 or len(result) != 1):
         raise TraceError(f"returns an array of shape {result.shape} for one factor, expected (1, m)")
     return Expression(tape, tuple(node_of(tape, entry) for entry in result.ravel()), width, name or "residual")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 
@@ -140,6 +140,17 @@ class Symbol:
 class Symbols(np.ndarray[Any, np.dtype[Any]]):
     """An array of symbols and numbers."""
 
+    @property
+    def shape(self) -> Any:
+        """Shape; a first axis as long as the traced batch is a :class:`Length`."""
+        shape = np.ndarray.shape.__get__(self)  # type: ignore[attr-defined]
+        return (Length(shape[0]), *shape[1:]) if shape and shape[0] == Length.batch else shape
+
+    @shape.setter
+    def shape(self, shape: Any) -> None:
+        """Reshape in place."""
+        np.ndarray.shape.__set__(self, shape)  # type: ignore[attr-defined]
+
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
         """Do what the ufunc does, entry by entry."""
         out = options.pop("out", None)
@@ -182,6 +193,9 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
         for part in key if isinstance(key, tuple) else (key,):
             if isinstance(part, Symbol | Symbols):
                 raise TraceError("takes entries by a number that is not known yet; write np.where(condition, a, b)")
+        first = key[0] if isinstance(key, tuple) and key else key
+        if isinstance(first, slice) and first != slice(None) and self.shape and type(self.shape[0]) is Length:
+            Length.used = True
         return super().__getitem__(key)
 
     def __setitem__(self, key: Any, value: Any) -> None:
@@ -226,6 +240,57 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
         """Round to so many places."""
         rounded: Any = np.rint(self * 10.0**decimals) / 10.0**decimals if decimals else np.rint(self)
         return rounded
+
+
+class Length(int):
+    """Length of a batch whose trace is to hold for batches of any length.
+
+    It may be the length of other arrays. Any other use is noted, because it may tell one batch from another: a
+    comparison, a division, a position along the batch. No batch has fewer than two rows.
+
+    Attributes:
+        batch: length of the batch that is traced; 0 where a trace holds for that one length only.
+        used: another use was made of it.
+    """
+
+    batch: ClassVar[int] = 0
+    used: ClassVar[bool] = False
+
+    def __hash__(self) -> int:
+        """Hash of the number."""
+        return super().__hash__()
+
+
+def _carried(name: str) -> Callable[..., Any]:
+    """Arithmetic whose result is again a length."""
+    plain = getattr(int, name)
+    return lambda self, other: Length(found) if isinstance(found := plain(self, other), int) else found
+
+
+def _distinguishes(other: float) -> bool:
+    """Whether a comparison with a number may differ between batches of two rows and more."""
+    return type(other) is not Length and other > 1
+
+
+def _noted(name: str) -> Callable[..., Any]:
+    """An operation on a length whose result may differ between batches."""
+    plain, compared = getattr(int, name), name.strip("_") in ("lt", "le", "gt", "ge", "eq", "ne")
+
+    def operation(self: Length, *others: Any) -> Any:
+        if not compared or any(isinstance(other, int | float) and _distinguishes(other) for other in others):
+            Length.used = True
+        return plain(self, *others)
+
+    return operation
+
+
+for _name in ("add", "radd", "sub", "rsub", "mul", "rmul"):
+    setattr(Length, f"__{_name}__", _carried(f"__{_name}__"))
+for _name in (
+    "lt", "le", "gt", "ge", "eq", "ne", "floordiv", "rfloordiv", "mod", "rmod", "truediv", "rtruediv", "pow", "rpow",
+    "divmod", "rdivmod", "float", "and", "rand", "or", "ror", "xor", "rxor", "lshift", "rshift",
+):  # fmt: skip
+    setattr(Length, f"__{_name}__", _noted(f"__{_name}__"))
 
 
 def holds_symbols(array: Any) -> bool:

@@ -27,6 +27,7 @@ from unifg.kernels.derive.manifolds import Symbolic, stated_closed
 from unifg.kernels.derive.symbols import (
     FUNCTIONS,
     UFUNCS,
+    Length,
     Symbol,
     Symbols,
     TraceError,
@@ -250,10 +251,29 @@ class _Names(dict[str, Any]):
         self["__builtins__"] = {
             **vars(builtins),
             "abs": abs,
+            "enumerate": _along(enumerate),
+            "len": _length,
             "max": _greatest,
             "min": _least,
+            "range": _along(range),
             "sum": _sum,
         }
+
+
+def _length(thing: Any) -> int:
+    return thing.shape[0] if isinstance(thing, Symbols) and thing.ndim else len(thing)
+
+
+def _along(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function whose result depends on positions along the batch, where it is given the batch or its length."""
+
+    def positions(*arguments: Any, **options: Any) -> Any:
+        for part in (*arguments, *options.values()):
+            first = part.shape[0] if isinstance(part, Symbols) and part.ndim else part
+            Length.used = Length.used or type(first) is Length
+        return function(*arguments, **options)
+
+    return positions
 
 
 def _wrapped(angle: Any) -> Any:
@@ -323,7 +343,7 @@ def _full(shape: Any, value: Any, *arguments: Any, **options: Any) -> Any:
 
 
 def _eye(*arguments: Any, **options: Any) -> Any:
-    return wrapped(np.eye(*arguments, **options).astype(object))
+    return wrapped(_along(np.eye)(*arguments, **options).astype(object))
 
 
 class _Proxy(ModuleType):
@@ -353,6 +373,7 @@ _MAKERS = {
     "array": _array, "asarray": _as_array, "asanyarray": _as_array, "ascontiguousarray": _as_array,
     "zeros": _filled(0.0), "empty": _filled(0.0), "ones": _filled(1.0), "full": _full, "eye": _eye, "identity": _eye,
     "atleast_1d": lambda a: _as_array(a) if np.ndim(a) else _as_array(a).reshape(1),
+    **{name: _along(getattr(np, name)) for name in ("arange", "linspace", "indices", "tri", "ndindex", "ndenumerate")},
 }  # fmt: skip
 # The functions of groups, views, and arrays on the stack, as compiled functions of this library call them.
 BORROWED: dict[int, Callable[..., Any]] = {
