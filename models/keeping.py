@@ -128,7 +128,7 @@ def keep(
         raise ModelError(f"'{name}' has no obstacle")
     if not (price > 0.0 and np.isfinite(price)):
         raise ModelError(f"'{name}': the weight of a slack or a hinge must be positive, found {price!r}")
-    normal, _, count = prepare_arguments(name, arguments, active)
+    normal, _, _, count = prepare_arguments(name, arguments, active)
     rows = rows_of(name, complete(barrier, normal), normal, count)
     if rows != len(names):
         raise ModelError(f"'{name}': the barrier says something of {rows} obstacles, found {len(names)}: {names}")

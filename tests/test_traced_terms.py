@@ -293,7 +293,6 @@ SETTINGS = {"gain": 2.0}
         (lambda x: SETTINGS["gain"] * x - 1.0, "'SETTINGS' is a dict"),
         (lambda x: x - np.random.normal(size=(1, 3)), "other numbers each time"),  # noqa: NPY002
         (lambda x: np.linalg.qr(np.eye(3) + 0.0 * x[:, None])[1][:, 0] + x, "np.linalg.qr"),
-        (lambda x: x * len(x) - 1.0, "which factor they belong to"),
         (lambda x: x - np.arange(len(x))[:, None], "which factor they belong to"),
     ],
 )
@@ -313,7 +312,7 @@ def test_what_may_change_is_traced_when_asked(function: Function) -> None:
     np.testing.assert_allclose(found, 0.5, atol=1e-9)
 
 
-@pytest.mark.parametrize("function", [branching, lambda x: x * len(x) - 1.0])
+@pytest.mark.parametrize("function", [branching, lambda x: x - np.arange(len(x))[:, None]])
 def test_what_cannot_be_traced_is_an_error_when_asked(function: Function) -> None:
     with pytest.raises(GraphError, match="term 'term': cannot be traced: ") as raised:
         solved(fg.residual(function, derivatives="trace"))
@@ -370,21 +369,18 @@ def test_the_first_row_of_a_shared_variable_is_everybody_s() -> None:
     assert all(term.route.startswith("traced") for term in graph.compile().terms)
 
 
-def test_a_trace_that_is_wrong_at_the_guess_only_is_given_up() -> None:
+def test_a_table_of_rows_that_matters_far_away_only_is_seen() -> None:
     """About the origin nothing is amiss: a table of the function's own begins elsewhere."""
 
     def far(x: Array) -> Array:
         return np.asarray(x - 100.0 + np.maximum(x - 50.0, 0.0) * np.arange(len(x))[:, None] * 0.01)
 
     graph, x = stated(far)
-    assert graph.compile().terms[0].route.startswith("traced")
-    guess = {x: np.full((N, 3), 90.0)}
-    solution = InteriorPoint().solve(graph, guess)
     assert "which factor they belong to" in graph.compile().terms[0].route
+    solution = InteriorPoint().solve(graph, {x: np.full((N, 3), 90.0)})
     assert np.abs(far(solution[x])).max() < 1e-5
     with pytest.raises(GraphError, match="cannot be traced"):
-        graph, x = stated(fg.residual(far, derivatives="trace"))
-        InteriorPoint().solve(graph, {x: np.full((N, 3), 90.0)})
+        stated(fg.residual(far, derivatives="trace"))[0].compile()
 
 
 @pytest.mark.parametrize("derivatives", [None, "trace", "differences"])

@@ -188,9 +188,7 @@ class Batched:
         return found.reshape(k, count, *found.shape[1:]) if found.shape[:1] == (k * count,) else None
 
     def _takes_long_batches(self, near: Near, steps: Steps) -> bool | None:
-        """Call it both ways; None where there are no numbers to compare.
-
-            """
+        """Call it both ways; None where there are no numbers to compare."""
         with np.errstate(all="ignore"):
             anywhere = near.directions.anywhere
             points = near.moved(steps, anywhere, 0, anywhere.count)
@@ -203,8 +201,9 @@ class Batched:
             size = _largest(alone) + _largest(near.joined)
             self._tiled.clear()
             found = self._batch(points)
-            alike = found is not None and found.shape == alone.shape
-            return alike and np.allclose(found, alone, rtol=0.0, atol=ALIKE * size, equal_nan=True)
+            if found is None or found.shape != alone.shape:
+                return False
+            return bool(np.allclose(found, alone, rtol=0.0, atol=ALIKE * size, equal_nan=True))
 
 
 def changes(name: str, place: int) -> str:

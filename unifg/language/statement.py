@@ -420,7 +420,9 @@ class Statement:
             lower, upper = _given("a bound", unique, lower, upper)
             lower, upper = check_limits(unique, lower, upper, count, size)
             self._own_data(unique, lower, upper)
-            return Constraint(unique, residual(itself), normal, active, count, size, lower, upper, is_bound=True, rows=rows)
+            return Constraint(
+                unique, residual(itself), normal, active, count, size, lower, upper, is_bound=True, rows=rows
+            )
 
     def _fix(self, name: str | None, stated: tuple[Any, ...], replaced: Fix | None = None) -> Fix:
         if len(stated) != 2:

@@ -165,9 +165,7 @@ def prepare_arguments(
         GraphError: when there is no variable among the arguments, or the lengths disagree.
     """
     rows = tuple(a.each if isinstance(a, Data | Declared) else None for a in arguments)
-    normal = tuple(
-        a[:] if isinstance(a, Family) else a.value if isinstance(a, Declared) else a for a in arguments
-    )
+    normal = tuple(a[:] if isinstance(a, Family) else a.value if isinstance(a, Declared) else a for a in arguments)
     lengths: list[tuple[str, int]] = []
     for place, argument in enumerate(normal):
         if isinstance(argument, Selection):

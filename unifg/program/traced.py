@@ -281,10 +281,9 @@ def _found(batch: Batch, function: Callable[..., Any], everything: Reach, asked:
         if not _differs_anywhere(trace, batch):
             return trace, ""
         mistraced = True
-    for error in failures:
-        variables = {k for k, argument in enumerate(batch.arguments) if isinstance(argument, Selection)}
-        if variables & error.mixed and all(variables & other.mixed for other in failures):
-            raise mixing(batch.name, error.row)
+    variables = {k for k, argument in enumerate(batch.arguments) if isinstance(argument, Selection)}
+    if failures and all(variables & failure.mixed for failure in failures):
+        raise mixing(batch.name, failures[0].row)
     return None, reason(batch, batch.anywhere(np.random.default_rng(0))) if mistraced else why
 
 
@@ -452,7 +451,9 @@ def _given(batch: Batch, place: int, each: bool, fixed: bool) -> Given:
         return Each(shape[1:])
     kind = getattr(value, "dtype", np.dtype(type(value)) if isinstance(value, float) else None)
     numbers = isinstance(value, float | np.floating | np.ndarray) and kind is not None and kind.kind == "f"
-    return Shared(shape) if isinstance(argument, Data) or (numbers and not fixed) else Fixed(value, reach_of_value(value))
+    if isinstance(argument, Data) or (numbers and not fixed):
+        return Shared(shape)
+    return Fixed(value, reach_of_value(value))
 
 
 def _moved(manifold: Manifold, point: Array, step: Array) -> Array:

@@ -123,9 +123,7 @@ def traced_rows(
         results, used = batch.run(function, length, [array for array, _ in reached], scalar, len(lengths) > 1)
         rows = [batch.canonical(row, nodes) for row, nodes in enumerate(results)]
         if used:
-            raise RowsError(
-                "its rows may depend on which factor they belong to, by the length of the batch or positions along it", 0
-            )
+            raise RowsError("its rows may depend on which factor they belong to, by the length of the batch", 0)
         found = found or rows[0]
         if other := [row for row, nodes in enumerate(rows) if nodes != found]:
             raise RowsError("its rows depend on which factor they belong to", other[0])

@@ -143,7 +143,7 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
     @property
     def shape(self) -> Any:
         """Shape; a first axis as long as the traced batch is a :class:`Length`."""
-        shape = np.ndarray.shape.__get__(self)  # type: ignore[attr-defined]
+        shape = np.ndarray.shape.__get__(self)
         return (Length(shape[0]), *shape[1:]) if shape and shape[0] == Length.batch else shape
 
     @shape.setter

@@ -44,6 +44,7 @@ from unifg.machine import calls
 from unifg.machine.jit import is_compiled, source_of
 
 FUNCTIONS.update(TABLE)
+_AS_THEY_ARE = sys.stdlib_module_names | {"numpy", "numba"}  # modules of which no function is rebound
 NOWHERE = np.zeros((0, 0))  # where a kernel that is not asked for them would write derivatives
 
 
@@ -198,8 +199,8 @@ class Rebound:
             return _wrapped
         if is_compiled(thing):
             return self.function(thing)
-        if isinstance(thing, ModuleType) and thing.__name__.partition(".")[0] == "unifg":
-            return _House(thing, self)
+        if isinstance(thing, ModuleType) and thing.__name__.partition(".")[0] not in _AS_THEY_ARE:
+            return _Module(thing, self)
         if type(thing) in (tuple, list):
             return type(thing)(map(self.thing, thing))
         if isinstance(thing, FunctionType):
@@ -358,8 +359,8 @@ class _Proxy(ModuleType):
         return names[name] if name in names else getattr(self.__dict__["_module"], name)
 
 
-class _House(_Proxy):
-    """A module of this library, whose functions and groups take symbols."""
+class _Module(_Proxy):
+    """A module whose functions and groups take symbols, and whose arrays may be parameters."""
 
     def __init__(self, module: ModuleType, rebound: Rebound) -> None:
         super().__init__(module, {})
