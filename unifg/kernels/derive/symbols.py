@@ -8,7 +8,8 @@ needs the number itself (``if``, ``float``, an index) cannot be traced, and says
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
@@ -144,7 +145,7 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
     def shape(self) -> Any:
         """Shape; a first axis as long as the traced batch is a :class:`Length`."""
         shape = np.ndarray.shape.__get__(self)
-        return (Length(shape[0]), *shape[1:]) if shape and shape[0] == Length.batch else shape
+        return (Length(shape[0]), *shape[1:]) if shape and Length.batch == shape[0] > 0 else shape
 
     @shape.setter
     def shape(self, shape: Any) -> None:
@@ -259,6 +260,16 @@ class Length(int):
     def __hash__(self) -> int:
         """Hash of the number."""
         return super().__hash__()
+
+
+@contextmanager
+def one_factor() -> Iterator[None]:
+    """Run a function of one factor, whose arrays have no axis along the batch."""
+    batch, Length.batch = Length.batch, 0
+    try:
+        yield
+    finally:
+        Length.batch = batch
 
 
 def _carried(name: str) -> Callable[..., Any]:

@@ -32,6 +32,7 @@ from unifg.kernels.derive.symbols import (
     Symbols,
     TraceError,
     node_of,
+    one_factor,
     plain,
     symbols,
     wrapped,
@@ -230,7 +231,8 @@ def _written(kernel: Kernel, called: Callable[..., Any], v: Any, p: Any, size: i
 
     def once() -> Any:
         r = symbols((size,), math.nan)
-        called(v.copy(), p.copy(), kernel.table, r, NOWHERE)
+        with one_factor():
+            called(v.copy(), p.copy(), kernel.table, r, NOWHERE)
         return r
 
     if tape is None:
