@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -60,9 +61,13 @@ class Solution:
         in_python: seconds of them spent in residuals that Python evaluates, see ``graph.check``.
         verdict: which measurements it believes, from solves that decide that.
         picked: for what the backend was picked, where the caller named none.
+        checked: whether traced functions were evaluated as they were written at this answer, and agreed.
+        mistraced: terms left to Python by that check, and the reasons; the solve was repeated without their traces.
     """
 
     in_python = 0.0
+    checked = False
+    mistraced: Mapping[str, str] = MappingProxyType({})
     picked = ""
     verdict: Verdict[Solution] | None = None
 
@@ -353,6 +358,8 @@ class Solution:
             names = ", ".join(f"'{name}'" for name in self._program.left_to_python)
             share = 100.0 * self.in_python / self.seconds
             text += f" {share:.0f} % of the time went into functions in Python: {names}."
+        for name, why in self.mistraced.items():
+            text += f" Term '{name}' was left to Python and the solve repeated: {why}."
         if self.verdict is not None:
             text += f" {self.verdict.sentence(self.cost)}"
         return text

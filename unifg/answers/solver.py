@@ -37,6 +37,7 @@ logger = logging.getLogger("unifg")
 Callback: TypeAlias = Callable[[Iteration], bool | None]
 
 UNBOUNDED_COST = -1e20
+EVERY = 100  # solves of a loop after which answers are verified, besides the 1st, 2nd, 4th, ... and new comparisons
 
 
 class Backend(ABC):
@@ -141,6 +142,7 @@ class Solver(Backend):
         """
         prepared = self.bound(graph)
         prepared.allocate()
+        prepared.program.watch_conditions()
         if self.rehearses:
             rehearse(self)
         return prepared
@@ -427,6 +429,10 @@ class Prepared:
     It belongs to one thread at a time. Others prepare their own: those of one graph wait for each other, those of
     graphs that were stated twice do not.
 
+    Answers are verified by evaluating traced functions as they were written: values in solves 1, 2, 4, ..., every 100th
+    and after solves in which a comparison of a trace comes out otherwise, derivatives in solves 1, 2, 4, ... A term whose
+    trace differs is left to Python, and the solve repeated from there.
+
     Attributes:
         solver: the backend and its options.
         program: the compiled graph.
@@ -439,6 +445,7 @@ class Prepared:
         self._graph = graph or program.graph
         self._edition = self._graph.edition
         self._workspace: Any = None
+        self._solves = 0
         self._turn = Turn()
         self._constraints = {
             t.name: (t, rows) for t, rows in zip(program.constraint_terms, program.slices, strict=True)
@@ -490,6 +497,35 @@ class Prepared:
         run = SolveState(self.solver, program, values, multipliers, callback)
         if not isinstance(guess, Mapping) and guess.penalties:
             run.penalties = self._stacked("penalties", guess.penalties)
+        solution = self._verified(self._finished(run), run, callback)
+        if check and not solution.converged:
+            raise NotConverged(solution)
+        return solution
+
+    def _verified(self, solution: Solution, run: SolveState, callback: Callback | None) -> Solution:
+        """Evaluate traced functions as they were written at an answer, and solve again without the traces that differ."""
+        program = self.program
+        self._solves += 1
+        slopes = self._solves.bit_count() == 1
+        solution.checked = not program.verifications
+        if solution.checked or not solution.finite or solution.status is Status.INTERRUPTED:
+            return solution
+        values = solution._lin.values
+        if not (slopes or self._solves % EVERY == 0 or program.conditions_changed(values)):
+            return solution
+        mistraced: dict[str, str] = {}
+        while found := program.mistraced(values, slopes, self._solves):
+            mistraced |= found
+            again = SolveState(self.solver, program, program.columns.values(solution.values), run.multipliers, callback)
+            again._started, again.penalties = run._started, run.penalties
+            solution, values = self._finished(again), again.values
+            if not solution.finite:
+                break
+        solution.checked, solution.mistraced, solution.seconds = solution.finite, mistraced, run.seconds
+        return solution
+
+    def _finished(self, run: SolveState) -> Solution:
+        """The solution of a solve that has begun."""
         self._refuse_not_finite(run)
         reason = None
         if run.status is None:
@@ -506,10 +542,7 @@ class Prepared:
                 raise
             if run.alone and not run.iterations:
                 self._refuse_not_finite(run)
-        solution = run.finish(reason)
-        if check and not solution.converged:
-            raise NotConverged(solution)
-        return solution
+        return run.finish(reason)
 
     @property
     def stale(self) -> bool:

@@ -36,6 +36,7 @@ from unifg.program.shares import Shares
 from unifg.program.systems import Systems
 from unifg.program.table import ENTRY, PARAMETER, ROW, WIDTH, TermArrays, TermTable
 from unifg.program.term import CompiledTerm
+from unifg.program.verification import Verification
 from unifg.turns import Turn
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
@@ -81,6 +82,7 @@ class Program:
         scratch: memory for compiled loops.
         python_seconds: time spent so far in terms that Python evaluates.
         buffers: memory for linearisations.
+        verifications: of the traced terms, once a guess has been read.
         turn: held by who binds data, until nobody needs them any more, and while anything is evaluated.
     """
 
@@ -126,6 +128,8 @@ class Program:
         self._shares: Shares | None = None
         self.buffers = Buffers([*self.table.sizes, self.columns.width, self.normal.nnz])
         self._watched: list[CompiledTerm] = []
+        self.verifications: list[Verification] = []
+        self._watching, self._watchers = False, list[Verification]()
         self.python_seconds = 0.0
         read = {value for term in self.terms for value in term.data}
         read |= {fix.value for fix in graph.fixes if isinstance(fix.value, Data)}
@@ -242,6 +246,7 @@ class Program:
                 if not term.stands(values):
                     self._give_up(term)
             self._vetted = True
+            self.renew_verifications()
             self._watched = [term for term in self.terms if term.trace is not None and not term.trace.constant]
         for term in self._watched:
             if term.trace is None:
@@ -252,10 +257,63 @@ class Program:
                 else:
                     self.table.renew(term)
                     self.table.bind([term], self.lower, self.upper)
+                self.renew_verifications()
             elif term.trace.moved:
                 term.refresh()
                 self.table.bind([term], self.lower, self.upper)
         return values
+
+    def mistraced(self, values: Values, slopes: bool, seed: int) -> dict[str, str]:
+        """Leave to Python the terms whose traces are not their functions at an answer.
+
+        Args:
+            values: the answer.
+            slopes: whether derivatives are compared as well.
+            seed: of the direction along which they are.
+
+        Returns:
+            Reasons by the names of these terms.
+        """
+        found: dict[str, str] = {}
+        step = np.random.default_rng(seed).uniform(-1.0, 1.0, self.size)
+        direction = np.zeros(self.columns.width)
+        direction[self.columns.free] = step
+        moved: dict[float, Values] = {}
+
+        def move(length: float) -> Values:
+            if length not in moved:
+                moved[length] = self.retract(values, length * step)
+            return moved[length]
+
+        for verification in self.verifications:
+            term = verification.term
+            if why := verification.difference(values, direction, move, slopes):
+                term.leave(why)
+                self._give_up(term)
+                found[term.name] = why
+        if found:
+            self.renew_verifications()
+        return found
+
+    def watch_conditions(self) -> None:
+        """Compile the comparisons of traces, for :meth:`conditions_changed` in a loop."""
+        self._watching = True
+        self.renew_verifications()
+
+    def conditions_changed(self, values: Values) -> bool:
+        """Whether comparisons of watched traces come out otherwise than when this was last asked."""
+        changed = False
+        for watcher in self._watchers:
+            changed |= watcher.conditions_changed(values)
+        return changed
+
+    def renew_verifications(self) -> None:
+        """Keep what verifies the present traces."""
+        kept = {(known.term, known.kernel): known for known in self.verifications}
+        self.verifications = [
+            kept.get((term, term.trace.kernel)) or Verification(term) for term in self.terms if term.trace is not None
+        ]
+        self._watchers = [known for known in self.verifications if self._watching and known.watch()]
 
     def _give_up(self, term: CompiledTerm) -> None:
         """Leave a term that was traced to Python."""

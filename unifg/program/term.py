@@ -61,6 +61,11 @@ class Gather:
             self.rows = slice(int(indices[0]), int(indices[-1]) + 1)
         self.columns = None if selection.component is None else selection.storage
 
+    def places(self, starts: IntArray) -> IntArray:
+        """(n, storage) places of this argument among all stored numbers, given the start of each member."""
+        own = starts[:, None] + np.arange(self.selection.manifold.storage)
+        return np.broadcast_to(own, (self.count, own.shape[1]))
+
     def __call__(self, values: Values) -> Array:
         """(n, storage) values of this argument."""
         part = values[self.family][self.rows]
@@ -186,7 +191,7 @@ class CompiledTerm:
         if own.derivatives == "differences":
             why = "as it was asked to be"
         if not why or unclear_places(self._arguments, self.term.rows, self.count):
-            found, reason = find(self._batch, own.function, asked)
+            found, reason = find(self.batch, own.function, asked)
             self._each = None if found is None else found.each
             self._bind_batched(self._batched)
             if not why:
@@ -205,7 +210,7 @@ class CompiledTerm:
         asked = own.derivatives == "trace"
         if asked or (own.jacobian is None and own.derivatives != "differences"):
             self.size = own.rows
-            self.trace, why = find(self._batch, own.function, asked)
+            self.trace, why = find(self.batch, own.function, asked)
             del self.size
         if self.trace is None:
             self._call_single()
@@ -237,7 +242,8 @@ class CompiledTerm:
         return f"{how}, its derivatives by differences: {why}"
 
     @property
-    def _batch(self) -> Batch:
+    def batch(self) -> Batch:
+        """The term's function and what it is called with at present."""
         shared = [gather.shared for gather in self.gathers]
         return Batch(
             self.name,
@@ -258,6 +264,16 @@ class CompiledTerm:
         assert self.trace is not None
         return self.trace.kernel.jacobian(*self.trace.arguments(arguments))
 
+    def exact_slopes(self, points: list[Array]) -> list[Array]:
+        """One (n, m, d_k) array per variable argument, by the trace."""
+        assert self.trace is not None
+        return self.trace.kernel.jacobian(*self._for_kernel(points))
+
+    @property
+    def packed(self) -> Array:
+        """(n or 1, P) present parameters of the kernel."""
+        return self._packed
+
     def _for_kernel(self, points: list[Array]) -> list[Any]:
         """The arguments that the kernel takes, variables at these points."""
         filled = self._batched.fill(points)
@@ -272,21 +288,21 @@ class CompiledTerm:
         if self.trace is None:
             return True
         points = self.points(values)
-        if not self.trace.agrees(self._batch, points):
+        if not self.trace.agrees(self.batch, points):
             if self.trace.outdated:  # since it was traced, which it will be again
                 return True
-            self._leave(reason(self._batch, points))
+            self.leave(reason(self.batch, points))
             return False
         if (index := self._undefined(points)) is None:
             return True
-        self._leave(f"its derivatives are not finite at the guess (factor {index})")
+        self.leave(f"its derivatives are not finite at the guess (factor {index})")
         return False
 
     def _undefined(self, points: list[Array]) -> int | None:
         """The first active factor whose exact derivatives are not finite though differences are; None for none."""
         assert self.trace is not None
         with np.errstate(all="ignore"):
-            exact = np.concatenate(self.trace.kernel.jacobian(*self._for_kernel(points)), axis=2)
+            exact = np.concatenate(self.exact_slopes(points), axis=2)
             wrong = ~np.isfinite(self._masked(exact)).all(axis=(1, 2))
             if not wrong.any():
                 return None
@@ -308,7 +324,7 @@ class CompiledTerm:
         assert self.trace is not None
         old = self.trace
         asked = self.term.residual.derivatives == "trace"
-        found, why = find(self._batch, self.term.residual.function, asked)
+        found, why = find(self.batch, self.term.residual.function, asked)
         if found is not None and found.layout != old.layout:
             found, why = None, "what it reads beyond its arguments has changed its shape"
         same = found is not None and found.kernel is old.kernel
@@ -317,7 +333,7 @@ class CompiledTerm:
             found, why = None, "what it reads beyond its arguments keeps changing: declare it by graph.data"
         if found is None or found.each != self._each:
             self._each = None
-            self._leave(why or "what it reads beyond its arguments has changed their meaning")
+            self.leave(why or "what it reads beyond its arguments has changed their meaning")
             return False
         self.trace, self.kernel = found, found.kernel
         self._bind_parameters(self._data)
@@ -334,7 +350,7 @@ class CompiledTerm:
         self.trace = self.trace.refreshed()
         self._bind_parameters(self._data)
 
-    def _leave(self, why: str) -> None:
+    def leave(self, why: str) -> None:
         """Leave to Python what was traced."""
         if self.term.residual.derivatives == "trace":
             raise GraphError(f"term '{self.name}': cannot be traced: {why}", term=self.name)

@@ -186,10 +186,10 @@ class Trace:
         """What the kernel takes, of all arguments of the term."""
         return [*(filled[place] for place in self.taken), *self.reached]
 
-    def differs(self, batch: Batch, points: Sequence[Array]) -> BoolArray:
-        """(n,) for which factors it computes something else than the function."""
+    def differs(self, batch: Batch, points: Sequence[Array], theirs: Array | None = None) -> BoolArray:
+        """(n,) for which factors it computes something else than the function, which returns ``theirs``."""
         given = self.arguments(batch.batched.fill(points))
-        theirs, looked_at = batch.original(points), batch.looked_at
+        theirs, looked_at = batch.original(points) if theirs is None else theirs, batch.looked_at
         variables, parameters, _ = self.kernel.split(given, batch.count)
         with np.errstate(all="ignore"):
             ours = self.kernel(*given)

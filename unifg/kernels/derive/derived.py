@@ -31,6 +31,7 @@ logger = logging.getLogger("unifg")
 KEPT = 256  # kernels
 LONGEST = 5000  # nodes of a residual; of more, machine code takes seconds
 WIDEST = 2000  # parameters of one factor
+NO_SLOPES = np.empty((0, 0, 0))  # for kernels of which values alone are wanted
 
 
 def _nowhere(*_: Any) -> NoReturn:

@@ -77,6 +77,17 @@ class Expression:
         return tuple(not row for row in bent(self.tape, self.rows))
 
     @cached_property
+    def conditions(self) -> Expression | None:
+        """Comparisons that the rows make, smallest and largest numbers among them; None where they make none."""
+        tape, found = self.tape, list[int]()
+        for i in tape.live(self.rows):
+            if tape.op[i] in (Op.LESS, Op.LESS_EQUAL, Op.EQUAL):
+                found.append(i)
+            elif tape.op[i] in (Op.MINIMUM, Op.MAXIMUM):
+                found.append(tape.apply(Op.LESS, tape.a[i], tape.b[i]))
+        return Expression(tape, tuple(found), self.width, f"conditions of {self.name}") if found else None
+
+    @cached_property
     def table(self) -> Array:
         """Numbers that look-ups read, flat: what the kernel is given as its table."""
         return np.concatenate([np.zeros(0), *self.tape.tables])

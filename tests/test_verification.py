@@ -1,0 +1,198 @@
+"""Answers are verified by the user's functions: a trace that is another function is found out, and nothing else is."""
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.answers import solver as frame
+from unifg.kernels.derive import symbols
+from unifg.kernels.derive.calculus import jacobian
+from unifg.kernels.derive.operations import Op
+from unifg.program import term
+from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, InteriorPoint, LevenbergMarquardt
+from unifg.typing import Array
+
+Function = Callable[..., Any]
+N = 4
+
+
+@pytest.fixture
+def wrong_above() -> Iterator[Function]:
+    """A ufunc whose trace is wrong above a limit, as a fault of the tracer would be."""
+    honest = symbols.UFUNCS["tanh"]
+
+    def faulty(limit: float) -> None:
+        wrong = symbols.UFUNCS["tanh"] = lambda a: symbols.choose(
+            symbols.UFUNCS["less"](a, limit), honest(a), honest(a) + (a - limit)
+        )
+        symbols.Symbol.tanh = lambda self: wrong(self)  # type: ignore[attr-defined]
+
+    yield faulty
+    symbols.UFUNCS["tanh"] = honest
+    symbols.Symbol.tanh = lambda self: honest(self)  # type: ignore[attr-defined]
+
+
+def stated(function: Function, *, constrained: bool) -> tuple[fg.Graph, fg.Family, fg.Data]:
+    """Members pulled to a target; a function of one's own is a cost or a constraint."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), N)
+    target = graph.data("target", np.zeros((N, 1)))
+    graph.minimize(fg.prior, x, target, name="pull")
+    if constrained:
+        graph.constrain(function, x, upper=0.9, name="own")
+    else:
+        graph.minimize(function, x, name="own")
+    return graph, x, target
+
+
+SOLVERS = [GaussNewton(), LevenbergMarquardt(), InteriorPoint(), SQP(), AugmentedLagrangian()]
+
+
+@pytest.mark.parametrize("constrained", [False, True])
+@pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: s.name)
+def test_a_wrong_value_at_the_answer_is_found(
+    solver: fg.Solver, constrained: bool, wrong_above: Function, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The trace is right at the guess and wrong at the answer: the solve goes on without it."""
+    if constrained and solver.constraints != "all":
+        pytest.skip(f"{solver.name} takes no constraints")
+    wrong_above(1.2)
+
+    def own(x: Array) -> Array:
+        return np.asarray(np.tanh(x))
+
+    graph, x, target = stated(own, constrained=constrained)
+    term._told.clear()
+    with caplog.at_level(logging.WARNING, "unifg"):
+        solution = solver.solve(graph, {x: np.full((N, 1), 0.1)}, data={target: np.full((N, 1), 2.5)})
+    assert solution.converged and solution.checked and list(solution.mistraced) == ["own"]
+    assert "term 'own' is evaluated by Python" in caplog.text
+    assert "Term 'own' was left to Python and the solve repeated: at factor 0 of an answer" in solution.report()
+    y = solution[x]
+    if constrained:
+        np.testing.assert_allclose(np.tanh(y), 0.9, atol=1e-5)
+    else:
+        np.testing.assert_allclose(y - 2.5 + np.tanh(y) * (1.0 - np.tanh(y) ** 2), 0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("solver", [GaussNewton(), SQP()], ids=lambda s: s.name)
+def test_a_wrong_derivative_at_the_answer_is_found(solver: fg.Solver, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The values are right everywhere."""
+
+    def doubled(tape: Any, rows: Any, width: int) -> Any:
+        slopes = jacobian(tape, rows, width)
+        own = any(tape.op[i] == Op.TANH for i in tape.live(rows))
+        return {place: tape.apply(Op.ADD, node, node) if own else node for place, node in slopes.items()}
+
+    monkeypatch.setattr("unifg.kernels.derive.expression.jacobian", doubled)
+    monkeypatch.setattr("unifg.kernels.derive.expression._WRITERS", "")
+    graph, x, target = stated(lambda x: np.tanh(x), constrained=False)
+    solution = solver.solve(graph, {x: np.full((N, 1), 0.1)}, data={target: np.full((N, 1), 2.5)})
+    assert "derivatives differ" in solution.mistraced["own"] and solution.converged
+    y = solution[x]
+    np.testing.assert_allclose(y - 2.5 + np.tanh(y) * (1.0 - np.tanh(y) ** 2), 0.0, atol=1e-5)
+
+
+def test_insisting_on_the_trace_is_an_error_then(wrong_above: Function) -> None:
+    wrong_above(1.2)
+    graph, x, target = stated(fg.residual(lambda x: np.tanh(x), derivatives="trace"), constrained=False)
+    with pytest.raises(fg.GraphError, match="term 'own': cannot be traced: at factor 0 of an answer"):
+        GaussNewton().solve(graph, {x: np.full((N, 1), 0.1)}, data={target: np.full((N, 1), 2.5)})
+
+
+def test_a_loop_is_verified_on_a_schedule(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, x, target = stated(lambda x: np.tanh(x), constrained=False)
+    prepared = GaussNewton().prepare(graph)
+    asked = list[tuple[int, bool]]()
+    honest = prepared.program.mistraced
+    monkeypatch.setattr(
+        prepared.program, "mistraced", lambda v, slopes, n: asked.append((n, slopes)) or honest(v, slopes, n)
+    )
+    checked = [prepared.solve({x: np.zeros((N, 1))}).checked for _ in range(frame.EVERY + 1)]
+    assert asked == [(n, True) for n in (1, 2, 4, 8, 16, 32, 64)] + [(frame.EVERY, False)]
+    assert [n for n, yes in enumerate(checked, 1) if yes] == [n for n, _ in asked]
+
+
+def test_where_nothing_is_traced_nothing_is_left_unchecked() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [1.0])
+    prepared = GaussNewton().prepare(graph)
+    assert all(prepared.solve({x: np.zeros((1, 1))}).checked for _ in range(4))
+
+
+@pytest.mark.parametrize("prepared_by", ["prepare", "bound"])
+def test_a_fault_that_begins_to_matter_late_is_found(wrong_above: Function, prepared_by: str) -> None:
+    """Where a comparison comes out otherwise, the answer is verified at once; else within a hundred solves."""
+    wrong_above(1.2)
+    graph, x, target = stated(lambda x: np.tanh(x), constrained=False)
+    solver = GaussNewton()
+    prepared = solver.prepare(graph) if prepared_by == "prepare" else solver.bound(graph)
+    late = 137
+    for tick in range(late):
+        assert not prepared.solve({x: np.zeros((N, 1))}, data={target: np.full((N, 1), 0.1 + 1e-4 * tick)}).mistraced
+    for tick in range(frame.EVERY):
+        solution = prepared.solve({x: np.zeros((N, 1))}, data={target: np.full((N, 1), 2.5)})
+        if solution.mistraced:
+            break
+    assert tick == (0 if prepared_by == "prepare" else 2 * frame.EVERY - late - 1)
+    y = solution[x]
+    np.testing.assert_allclose(y - 2.5 + np.tanh(y) * (1.0 - np.tanh(y) ** 2), 0.0, atol=1e-5)
+
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(
+    ("function", "at"),
+    [
+        (lambda x: np.abs(x), 0.0),
+        (lambda x: np.maximum(x, 0.0) + np.maximum(0.0, x[:, ::-1]), 0.0),
+        (lambda x: np.linalg.norm(x, axis=1, keepdims=True), 0.0),
+        (lambda x: np.sign(x) + np.floor(x), 0.0),
+        (lambda x: np.where(x < 1.0, x, 2.0 * x - 1.0), 1.0),
+        (lambda x: np.where(x < 1.0, x, x + 5.0), 1.0),
+        (lambda x: np.rint(3.0 * x), 0.5),
+        (lambda x: np.sin(1e4 * x) / 1e4, 0.3),
+        (lambda x: (1.0 - np.cos(x)) / x**2, 1e-5),
+        (lambda x: (x - 1e8) ** 2, 1e8),
+        (lambda x: np.exp(50.0 * x), 1.0),
+        (lambda x: 1e-9 * x, 1.0),
+        (lambda x: 1e9 * x, 1e6),
+        (lambda x: np.arctan2(x, x[:, ::-1] - 1.0), 0.5),
+        (lambda x: fg.wrap_angle(x), np.pi),
+    ],
+)
+def test_kinks_jumps_and_noise_are_no_differences(function: Function, at: float) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 40)
+    graph.minimize(function, x, name="own")
+    program = graph.compile()
+    values = program.values_from({x: np.full((40, 2), at)})
+    assert len(program.verifications) == 1
+    for seed in range(20):
+        assert not program.mistraced(values, True, seed)
+
+
+def test_verification_costs_little() -> None:
+    """Within a loop it is a small share of the time; the figure is on docs/own-functions.md."""
+    graph, x, target = stated(lambda x: np.where(x < 0.5, np.tanh(x), np.sin(x)), constrained=True)
+    prepared = InteriorPoint().prepare(graph)
+    spent, honest = 0.0, prepared._verified
+
+    def timed(*arguments: Any) -> Any:
+        nonlocal spent
+        began = time.perf_counter()
+        found = honest(*arguments)
+        spent += time.perf_counter() - began
+        return found
+
+    prepared._verified = timed  # type: ignore[method-assign]
+    for tick in range(300):
+        assert prepared.solve({x: np.zeros((N, 1))}, data={target: np.full((N, 1), 0.001 * tick)}).converged
+    assert spent < 10.0
