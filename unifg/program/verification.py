@@ -87,7 +87,9 @@ class Verification:
                         beside = term.points(move(BESIDE))
                         wrong &= trace.differs(batch, beside, batch.original(beside))
                     if wrong.any():
-                        return f"at factor {int(np.argmax(wrong))} of an answer, what was traced is not what it computes"
+                        return (
+                            f"at factor {int(np.argmax(wrong))} of an answer, what was traced is not what it computes"
+                        )
                 if not slopes or batch.single is not None:  # of one factor, the slopes are those of the source
                     return ""
                 wrong = self._wrong_slopes(batch, values, theirs, direction, move)
@@ -95,7 +97,9 @@ class Verification:
             raise
         except Exception as error:
             return f"at an answer it raises {type(error).__name__}: {error}"
-        return f"its derivatives differ from those of its trace at factor {int(np.argmax(wrong))}" if wrong.any() else ""
+        return (
+            f"its derivatives differ from those of its trace at factor {int(np.argmax(wrong))}" if wrong.any() else ""
+        )
 
     def _wrong_slopes(self, batch: Batch, values: Values, middle: Array, direction: Array, move: Move) -> BoolArray:
         """(n,) active factors whose slope along the direction differs for every length of the step."""
@@ -115,7 +119,9 @@ class Verification:
             doubt = RELATIVE * np.abs(slope) + ROUNDINGS * np.finfo(float).eps * reach / length
             for sure in (True, False):
                 if not sure:
-                    doubt += MARGIN * (np.abs(ahead - quotient(2.0 * length)) + np.abs(behind - quotient(-2.0 * length)))
+                    doubt += MARGIN * (
+                        np.abs(ahead - quotient(2.0 * length)) + np.abs(behind - quotient(-2.0 * length))
+                    )
                 least, most = np.minimum(ahead, behind) - doubt, np.maximum(ahead, behind) + doubt
                 wrong &= self._active(((slope < least) | (slope > most)).any(axis=1))
                 if not wrong.any():

@@ -10,7 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from unifg.kernels.derive.symbols import INSTEAD, UFUNCS, TraceError, choose, plain, symbols, wrapped
+from unifg.kernels.derive.symbols import (
+    INSTEAD,
+    UFUNCS,
+    TraceError,
+    alike,
+    as_truth,
+    choose,
+    is_truth,
+    plain,
+    require_float,
+    symbols,
+    wrapped,
+)
 
 _Pick = np.frompyfunc(choose, 3, 1)
 
@@ -23,10 +35,16 @@ def matmul(a: Any, b: Any) -> Any:
     """``a @ b`` with NumPy's rules for stacks and vectors."""
     a, b = _objects(a), _objects(b)
     left, right = a[None, :] if a.ndim == 1 else a, b[:, None] if b.ndim == 1 else b
-    product = np.sum(left[..., :, :, None] * right[..., None, :, :], axis=-2)
+    add = np.logical_or if _truths(a) and _truths(b) else np.add
+    product = add.reduce(wrapped(left[..., :, :, None] * right[..., None, :, :]), axis=-2)
     if a.ndim == 1:
         product = product[..., 0, :]
     return product[..., 0] if b.ndim == 1 else product
+
+
+def _truths(array: Any) -> bool:
+    """Whether the entries of an array are truth values."""
+    return array.size > 0 and is_truth(next(array.flat))
 
 
 def _each(name: str, *arguments: Any) -> Any:
@@ -37,12 +55,15 @@ def _each(name: str, *arguments: Any) -> Any:
 def _where(condition: Any, *parts: Any) -> Any:
     if len(parts) != 2:
         raise TraceError("asks np.where for places that are not known yet; give it what to choose from")
-    return _Pick(_objects(condition), _objects(parts[0]), _objects(parts[1]))
+    return alike(_Pick(_objects(condition), _objects(parts[0]), _objects(parts[1])))
 
 
-def _clip(array: Any, lower: Any = None, upper: Any = None, **options: Any) -> Any:
-    lower = options.get("min", options.get("a_min", lower))
-    upper = options.get("max", options.get("a_max", upper))
+def _clip(
+    array: Any, a_min: Any = None, a_max: Any = None, out: Any = None, *, min: Any = None, max: Any = None
+) -> Any:
+    if out is not None:
+        raise TraceError("clips into another array; assign the result")
+    lower, upper = (a_min if min is None else min), (a_max if max is None else max)
     limited = wrapped(_objects(array))
     if lower is not None:
         limited = np.maximum(limited, lower)
@@ -72,9 +93,11 @@ def _cross(a: Any, b: Any, *arguments: Any, **options: Any) -> Any:
     )
 
 
-def _einsum(subscripts: str, *operands: Any, **options: Any) -> Any:
+def _einsum(subscripts: str, *operands: Any, optimize: Any = False) -> Any:
     if not isinstance(subscripts, str):
         raise TraceError("calls np.einsum without a string of subscripts")
+    if all(_truths(_objects(item)) for item in operands):
+        raise TraceError(f"calls np.einsum on truth values; {INSTEAD}")
     if "->" not in subscripts:
         count = Counter(c for c in subscripts if c in string.ascii_letters)
         left = "".join(sorted(c for c, times in count.items() if times == 1))
@@ -83,12 +106,18 @@ def _einsum(subscripts: str, *operands: Any, **options: Any) -> Any:
 
 
 def _like(value: float | None) -> Callable[..., Any]:
-    def fill(array: Any, *arguments: Any, **options: Any) -> Any:
-        shape = options.get("shape")
-        number = arguments[0] if value is None else value
-        return symbols(np.shape(array) if shape is None else shape, number)
+    def fill(
+        array: Any, fill_value: Any = value, dtype: Any = None, order: Any = None, subok: Any = None, shape: Any = None
+    ) -> Any:
+        size, number = np.shape(array) if shape is None else shape, fill_value if value is None else value
+        if dtype is None:
+            return symbols(size, as_truth(number) if _truths(_objects(array)) else number)
+        return np.full(size, number, dtype=dtype) if np.dtype(dtype).kind in "iub" else symbols(size, number)
 
-    return fill
+    def fill_like(array: Any, dtype: Any = None, order: Any = None, subok: Any = None, shape: Any = None) -> Any:
+        return fill(array, value, dtype, order, subok, shape)
+
+    return fill if value is None else fill_like
 
 
 def _determinant(array: Any) -> Any:
@@ -127,21 +156,22 @@ def _solve(a: Any, b: Any) -> Any:
     return matmul(inverse, b) if b.ndim != 1 else matmul(inverse, b[:, None])[..., 0]
 
 
-def _every(array: Any, *arguments: Any, **options: Any) -> Any:
-    return np.logical_and.reduce(wrapped(_objects(array)), *arguments, **options)
+def _every(array: Any, axis: Any = None, *, keepdims: bool = False) -> Any:
+    return np.logical_and.reduce(wrapped(_objects(array)), axis, keepdims=keepdims)
 
 
-def _some(array: Any, *arguments: Any, **options: Any) -> Any:
-    return np.logical_or.reduce(wrapped(_objects(array)), *arguments, **options)
+def _some(array: Any, axis: Any = None, *, keepdims: bool = False) -> Any:
+    return np.logical_or.reduce(wrapped(_objects(array)), axis, keepdims=keepdims)
 
 
-def _mean(array: Any, axis: Any = None, keepdims: bool = False, **options: Any) -> Any:
+def _mean(array: Any, axis: Any = None, dtype: Any = None, *, keepdims: bool = False) -> Any:
+    require_float("np.mean", dtype)
     array = wrapped(_objects(array))
     total = np.sum(array, axis=axis, keepdims=keepdims)
     return total / (array.size / np.size(total))
 
 
-def _cholesky(array: Any, **options: Any) -> Any:
+def _cholesky(array: Any) -> Any:
     array = _objects(array)
     n = array.shape[-1]
     root = symbols(array.shape)
@@ -217,13 +247,13 @@ TABLE: dict[Any, Callable[..., Any]] = {
     np.linalg.cholesky: _cholesky,
     np.linalg.multi_dot: lambda arrays: reduce(matmul, arrays),
     np.linalg.matrix_power: lambda array, n: reduce(matmul, [array] * n if n > 0 else [_inverse(array)] * -n),
-    np.matmul: lambda a, b, **options: matmul(a, b),
-    np.divmod: lambda a, b, **options: (_each("floor_divide", a, b), _each("remainder", a, b)),
-    np.modf: lambda a, **options: (_each("fmod", a, 1.0), _each("trunc", a)),
+    np.matmul: matmul,
+    np.divmod: lambda a, b: (_each("floor_divide", a, b), _each("remainder", a, b)),
+    np.modf: lambda a: (_each("fmod", a, 1.0), _each("trunc", a)),
     np.select: _select,
     np.piecewise: _piecewise,
     np.nan_to_num: _finite,
-    np.round: lambda array, decimals=0, out=None: wrapped(_objects(array)).round(decimals),
+    np.round: lambda array, decimals=0: wrapped(_objects(array)).round(decimals),
     np.all: _every,
     np.any: _some,
     np.mean: _mean,
@@ -244,7 +274,7 @@ TABLE |= {
 TABLE |= {  # not in every NumPy: of 2, and what 2.5 calls deprecated
     getattr(module, name): made
     for module, name, made in (
-        (np, "fix", lambda x, out=None: np.trunc(wrapped(_objects(x)), out=out)),
+        (np, "fix", lambda x: np.trunc(wrapped(_objects(x)))),
         (np, "vecdot", _product_of_sums),
         (np.linalg, "vecdot", lambda a, b, *, axis=-1: _product_of_sums(a, b, axis)),
         (np.linalg, "vector_norm", lambda x, *, axis=None, keepdims=False, ord=2: _norm(x, ord, axis, keepdims)),

@@ -7,7 +7,9 @@ needs the number itself (``if``, ``float``, an index) cannot be traced, and says
 
 from __future__ import annotations
 
+import inspect
 import math
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar, NoReturn
@@ -21,8 +23,44 @@ from unifg.kernels.derive.tape import NUMPY, Tape
 INSTEAD = 'leave it to differences: fg.residual(f, derivatives="differences")'
 
 
+_OF_TRUTHS = frozenset({Op.AND, Op.OR, Op.NOT})
+_TRUTHS = _OF_TRUTHS | {Op.LESS, Op.LESS_EQUAL, Op.EQUAL}
+
+
 class TraceError(UnifgError):
     """A function does something that cannot be written on a tape."""
+
+
+def is_truth(item: Any) -> bool:
+    """Whether an entry is a truth value, whose sum is `or` and whose product is `and`."""
+    if isinstance(item, Symbol):
+        return item.tape.op[item.node] in _TRUTHS or item.node in item.tape.truths
+    return isinstance(item, bool | np.bool_)
+
+
+def as_number(item: Any) -> Any:
+    """An entry as a floating-point number: 1.0 and 0.0 for truth values."""
+    if not is_truth(item):
+        return item
+    if not isinstance(item, Symbol):
+        return float(item)
+    tape = item.tape
+    return Symbol.of(tape, tape.select(item.node, tape.one, tape.zero))
+
+
+def as_truth(item: Any) -> Any:
+    """An entry as a truth value: whether it differs from zero."""
+    return item if is_truth(item) else UFUNCS["not_equal"](item, 0.0)
+
+
+def alike(array: Any) -> Any:
+    """An array whose entries are of one kind: truth values beside numbers become numbers, as in an array of NumPy."""
+    entries = plain(array)
+    if isinstance(entries, np.ndarray) and entries.dtype.hasobject:
+        truths = [is_truth(item) for item in entries.flat]
+        if any(truths) and not all(truths):
+            return np.frompyfunc(as_number, 1, 1)(entries)
+    return array
 
 
 def _both(ufunc: str) -> tuple[Any, Any]:
@@ -91,13 +129,13 @@ class Symbol:
     __floordiv__, __rfloordiv__ = _both("floor_divide")
     __mod__, __rmod__ = _both("remainder")
     __pow__, __rpow__ = _both("power")
-    __neg__, __abs__, __invert__ = _alone("negative"), _alone("absolute"), _alone("logical_not")
+    __neg__, __abs__, __invert__ = _alone("negative"), _alone("absolute"), _alone("invert")
     # Comparisons stay open.
     __lt__, __gt__ = _both("less")
     __le__, __ge__ = _both("less_equal")
     __eq__, __ne__ = _both("equal")[0], _both("not_equal")[0]
-    __and__, __rand__ = _both("logical_and")
-    __or__, __ror__ = _both("logical_or")
+    __and__, __rand__ = _both("bitwise_and")
+    __or__, __ror__ = _both("bitwise_or")
 
     # ---------------------------------------------------------------- what cannot be traced
 
@@ -149,30 +187,44 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
 
     @shape.setter
     def shape(self, shape: Any) -> None:
-        """Reshape in place."""
-        np.ndarray.shape.__set__(self, shape)  # type: ignore[attr-defined]
+        """Refuse a change in place."""
+        raise TraceError("changes the shape of an array in place; write reshape")
+
+    @property
+    def dtype(self) -> Any:
+        """Type of the numbers that the symbols stand for: float64 or bool; to NumPy, objects."""
+        if sys._getframe(1).f_globals.get("__name__", "").startswith("numpy"):
+            return np.ndarray.dtype.__get__(self)  # type: ignore[attr-defined]
+        return np.dtype(bool if self.size and is_truth(next(self.flat)) else float)
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
         """Do what the ufunc does, entry by entry."""
         out = options.pop("out", None)
+        if method == "__call__":
+            only(f"np.{ufunc.__name__}", options, "where", "dtype", "casting", "order", "subok")
+            if options.pop("where", True) is not True:
+                raise TraceError(f"calls np.{ufunc.__name__} with where=; write np.where(condition, a, b)")
+            dtype = options.pop("dtype", None)
+            require_float(f"np.{ufunc.__name__}", dtype)
+            if dtype is not None and ufunc.__name__.startswith("logical"):
+                raise TraceError(f"calls np.{ufunc.__name__} with dtype=, which is not traced; {INSTEAD}")
+            if dtype is not None:
+                inputs = tuple(np.frompyfunc(as_number, 1, 1)(plain(item)) for item in inputs)
         if ufunc in FUNCTIONS and method == "__call__":
-            result = FUNCTIONS[ufunc](*(plain(item) for item in inputs), **options)
+            result = FUNCTIONS[ufunc](*(plain(item) for item in inputs))
         elif (scalar := UFUNCS.get(ufunc.__name__)) is None:
             raise TraceError(f"calls {ufunc.__name__}, which has no derivative here; {INSTEAD}")
         elif method == "__call__":
-            if options.pop("where", True) is not True:
-                raise TraceError(f"calls np.{ufunc.__name__} with where=; write np.where(condition, a, b)")
-            options.pop("dtype", None), options.pop("casting", None)
             result = np.frompyfunc(scalar, ufunc.nin, 1)(*(plain(item) for item in inputs))
         elif method in ("reduce", "accumulate") and ufunc.nin == 2:
-            result = _reduced(scalar, method, plain(inputs[0]), *inputs[1:], **options)
+            result = _reduced(ufunc, scalar, method, plain(inputs[0]), *inputs[1:], **options)
         elif method == "outer":
             first, second = (np.asarray(plain(item), dtype=object) for item in inputs)
             result = np.frompyfunc(scalar, 2, 1)(first.reshape(first.shape + (1,) * second.ndim), second)
         else:
             raise TraceError(f"calls np.{ufunc.__name__}.{method}, which is not traced; {INSTEAD}")
         if out is not None:
-            plain(out[0])[...] = result
+            out[0][...] = wrapped(result)
             return out[0]
         return wrapped(result)
 
@@ -180,6 +232,12 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
         """Do what NumPy's function does."""
         special = FUNCTIONS.get(function)
         if special is not None:
+            try:
+                inspect.signature(special).bind(*arguments, **options)
+            except TypeError as error:
+                raise TraceError(
+                    f"calls np.{function.__name__} in a way that is not traced ({error}); {INSTEAD}"
+                ) from None
             return wrapped(special(*arguments, **options))
         if function.__module__.startswith(("numpy.linalg", "numpy.fft")):
             module = function.__module__.removeprefix("numpy")
@@ -187,7 +245,8 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
                 f"calls np{module}.{function.__name__}; of np.linalg, norm, det, inv, solve and cholesky of "
                 f"small matrices are traced; {INSTEAD}"
             )
-        return wrapped(super().__array_function__(function, kinds, arguments, options))
+        result = super().__array_function__(function, kinds, arguments, options)
+        return wrapped([alike(item) for item in result] if isinstance(result, list) else alike(result))
 
     def __getitem__(self, key: Any) -> Any:
         """Take entries; an index must be known."""
@@ -204,6 +263,10 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
         for part in key if isinstance(key, tuple) else (key,):
             if isinstance(part, Symbol | Symbols):
                 raise TraceError("puts entries by a number that is not known yet; write np.where(condition, a, b)")
+        if self.size:  # what is put takes the kind of the array
+            cast = as_truth if is_truth(next(self.flat)) else as_number
+            many = isinstance(value, np.ndarray | list | tuple)
+            value = np.frompyfunc(cast, 1, 1)(plain(np.asarray(value, dtype=object))) if many else cast(value)
         super().__setitem__(key, value)
 
     @property  # type: ignore[misc]
@@ -222,10 +285,14 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
             return bool(self.item())
         return super().__bool__()
 
-    def astype(self, *arguments: Any, **options: Any) -> Any:
-        """Symbols stay symbols; whole numbers are what is left without the fraction."""
-        kind = np.dtype(arguments[0] if arguments else options["dtype"]).kind
-        return np.trunc(self) if kind in "iu" else self.copy()
+    def astype(self, dtype: Any, **options: Any) -> Any:
+        """Floats, truth values, or 64-bit integers: what is left without the fraction."""
+        only("astype", options, "order", "casting", "subok", "copy")
+        kind = np.dtype(dtype)
+        if kind not in (np.float64, np.int64, np.bool_):
+            raise TraceError(f"turns numbers into {kind.name}, which is not traced; {INSTEAD}")
+        cast = wrapped(np.frompyfunc(as_truth if kind == np.bool_ else as_number, 1, 1)(plain(self)))
+        return np.trunc(cast) if kind == np.int64 else cast
 
     def sort(self, *arguments: Any, **options: Any) -> Any:
         """Nobody knows the order."""
@@ -235,10 +302,13 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
 
     def clip(self, lower: Any = None, upper: Any = None, **options: Any) -> Any:  # type: ignore[override]
         """Limit every entry."""
+        only("clip", options, "min", "max")
         return np.clip(self, options.get("min", lower), options.get("max", upper))
 
     def round(self, decimals: int = 0, out: Any = None) -> Any:  # type: ignore[override]
         """Round to so many places."""
+        if out is not None:
+            raise TraceError("rounds into another array; assign the result")
         rounded: Any = np.rint(self * 10.0**decimals) / 10.0**decimals if decimals else np.rint(self)
         return rounded
 
@@ -306,6 +376,7 @@ for _name in (
 
 def holds_symbols(array: Any) -> bool:
     """Whether an array holds numbers that are not known."""
+    array = plain(array)
     return isinstance(array, np.ndarray) and array.dtype == object and any(isinstance(x, Symbol) for x in array.flat)
 
 
@@ -323,6 +394,18 @@ def symbols(shape: tuple[int, ...], fill: Any = 0.0) -> Any:
     array = np.empty(shape, dtype=object)
     array[...] = fill
     return array.view(Symbols)
+
+
+def only(name: str, options: dict[str, Any], *known: str) -> None:
+    """Refuse keywords that have no rule here."""
+    if unknown := sorted(set(options) - set(known)):
+        raise TraceError(f"calls {name} with {unknown[0]}=, which is not traced; {INSTEAD}")
+
+
+def require_float(name: str, dtype: Any) -> None:
+    """Refuse another type than that of floats."""
+    if dtype is not None and np.dtype(dtype) not in (np.float64, np.object_):
+        raise TraceError(f"calls {name} with dtype={np.dtype(dtype).name}, which is not traced; {INSTEAD}")
 
 
 def node_of(tape: Tape, value: Any) -> int:
@@ -346,8 +429,11 @@ def _apply(op: Op, *arguments: Any) -> Any:
     if tape is None:
         with np.errstate(all="ignore"):
             return NUMPY[op](*arguments)
+    if op not in _OF_TRUTHS:
+        arguments = tuple(map(as_number, arguments))  # simplified to one of them, a number stays one
     node = tape.apply(op, *(node_of(tape, item) for item in arguments))
-    return Symbol.of(tape, node)
+    known = Symbol.of(tape, node)
+    return bool(known) if op in _TRUTHS and not isinstance(known, Symbol) else known
 
 
 def _operation(op: Op) -> Callable[..., Any]:
@@ -358,8 +444,49 @@ def choose(condition: Any, a: Any, b: Any) -> Any:
     """Choose between single entries: the first where the condition holds."""
     if not isinstance(condition, Symbol):
         return a if condition else b
-    tape = condition.tape
+    if is_truth(a) and is_truth(b):
+        return _apply(Op.OR, _apply(Op.AND, condition, a), _apply(Op.AND, _apply(Op.NOT, condition), b))
+    tape, a, b = condition.tape, as_number(a), as_number(b)
     return Symbol.of(tape, tape.select(condition.node, node_of(tape, a), node_of(tape, b)))
+
+
+def _by_kind(number: Op, truth: Op) -> Callable[..., Any]:
+    """An operation on numbers that is another one on truth values."""
+    return lambda a, b: _apply(truth if is_truth(a) and is_truth(b) else number, a, b)
+
+
+def _of_truths(name: str, op: Op) -> Callable[..., Any]:
+    """An operation on the bits of integers, which is traced for truth values only."""
+
+    def operation(*arguments: Any) -> Any:
+        if not all(map(is_truth, arguments)):
+            raise TraceError(f"calls np.{name} on numbers, which takes their bits; {INSTEAD}")
+        return _apply(op, *arguments)
+
+    return operation
+
+
+def _of_numbers(name: str, op: Op) -> Callable[..., Any]:
+    """An operation that NumPy refuses for truth values."""
+
+    def operation(*arguments: Any) -> Any:
+        if all(map(is_truth, arguments)):
+            raise TraceError(f"calls np.{name} on truth values, which NumPy refuses")
+        return _apply(op, *arguments)
+
+    return operation
+
+
+def _beside_nan(op: Op, truth: Op) -> Callable[..., Any]:
+    """The smaller or the larger number; where one is NaN, the other."""
+
+    def operation(a: Any, b: Any) -> Any:
+        if is_truth(a) and is_truth(b):
+            return _apply(truth, a, b)
+        known = choose(_apply(Op.EQUAL, b, b), _apply(op, a, b), a)
+        return choose(_apply(Op.EQUAL, a, a), known, b)
+
+    return operation
 
 
 def _remainder(a: Any, b: Any) -> Any:
@@ -367,6 +494,12 @@ def _remainder(a: Any, b: Any) -> Any:
     rest = _apply(Op.FMOD, a, b)
     other = _apply(Op.LESS, rest * b, 0.0)
     return choose(other, rest + b, rest)
+
+
+def _signed(a: Any) -> Any:
+    """Whether a number has a minus sign, as -0.0 has."""
+    zero = _apply(Op.AND, _apply(Op.EQUAL, a, 0.0), _apply(Op.LESS, _apply(Op.DIVIDE, 1.0, a), 0.0))
+    return _apply(Op.OR, _apply(Op.LESS, a, 0.0), zero)
 
 
 def _floor_divide(a: Any, b: Any) -> Any:
@@ -382,22 +515,22 @@ def _not_equal(a: Any, b: Any) -> Any:
 
 
 UFUNCS: dict[str, Callable[..., Any]] = {
-    "add": _operation(Op.ADD),
-    "subtract": _operation(Op.SUBTRACT),
-    "multiply": _operation(Op.MULTIPLY),
+    "add": _by_kind(Op.ADD, Op.OR),
+    "subtract": _of_numbers("subtract", Op.SUBTRACT),
+    "multiply": _by_kind(Op.MULTIPLY, Op.AND),
     "divide": _operation(Op.DIVIDE),
     "true_divide": _operation(Op.DIVIDE),
     "power": _operation(Op.POWER),
     "float_power": _operation(Op.POWER),
-    "negative": _operation(Op.NEGATE),
+    "negative": _of_numbers("negative", Op.NEGATE),
     "positive": lambda a: a,
     "conjugate": lambda a: a,
-    "absolute": _operation(Op.ABSOLUTE),
+    "absolute": lambda a: a if is_truth(a) else _apply(Op.ABSOLUTE, a),
     "fabs": _operation(Op.ABSOLUTE),
     "sign": _operation(Op.SIGN),
     "sqrt": _operation(Op.SQRT),
     "cbrt": lambda a: _apply(Op.SIGN, a) * _apply(Op.POWER, _apply(Op.ABSOLUTE, a), 1.0 / 3.0),
-    "square": lambda a: a * a,
+    "square": lambda a: _apply(Op.MULTIPLY, a, a),
     "reciprocal": lambda a: _apply(Op.DIVIDE, 1.0, a),
     "sin": _operation(Op.SIN),
     "cos": _operation(Op.COS),
@@ -442,11 +575,11 @@ UFUNCS: dict[str, Callable[..., Any]] = {
     "floor_divide": _floor_divide,
     "remainder": _remainder,
     "fmod": _operation(Op.FMOD),
-    "minimum": _operation(Op.MINIMUM),
-    "maximum": _operation(Op.MAXIMUM),
-    "fmin": _operation(Op.MINIMUM),
-    "fmax": _operation(Op.MAXIMUM),
-    "copysign": lambda a, b: choose(_apply(Op.LESS, b, 0.0), -abs(a), abs(a)),
+    "minimum": _by_kind(Op.MINIMUM, Op.AND),
+    "maximum": _by_kind(Op.MAXIMUM, Op.OR),
+    "fmin": _beside_nan(Op.MINIMUM, Op.AND),
+    "fmax": _beside_nan(Op.MAXIMUM, Op.OR),
+    "copysign": lambda a, b: choose(_signed(b), -abs(a), abs(a)),
     "heaviside": lambda a, b: choose(_apply(Op.EQUAL, a, 0.0), b, choose(_apply(Op.LESS, a, 0.0), 0.0, 1.0)),
     "less": _operation(Op.LESS),
     "less_equal": _operation(Op.LESS_EQUAL),
@@ -457,18 +590,48 @@ UFUNCS: dict[str, Callable[..., Any]] = {
     "logical_and": _operation(Op.AND),
     "logical_or": _operation(Op.OR),
     "logical_not": _operation(Op.NOT),
-    "bitwise_and": _operation(Op.AND),
-    "bitwise_or": _operation(Op.OR),
-    "invert": _operation(Op.NOT),
+    "bitwise_and": _of_truths("bitwise_and", Op.AND),
+    "bitwise_or": _of_truths("bitwise_or", Op.OR),
+    "invert": _of_truths("invert", Op.NOT),
 }
 """What the ufuncs of NumPy do with single entries, by name."""
+
+
+def _not_in_half_precision(name: str, scalar: Callable[..., Any]) -> Callable[..., Any]:
+    """Refuse truth values where NumPy computes functions of them with half precision."""
+    types = getattr(getattr(np, name, None), "types", ())
+    if not types or any(kinds[0] in "?b" for kinds in types) or not any(kinds[0] == "e" for kinds in types):
+        return scalar
+
+    def operation(*arguments: Any) -> Any:
+        if all(map(is_truth, arguments)):
+            raise TraceError(f"calls np.{name} on truth values, which NumPy does with half precision; convert them")
+        return scalar(*arguments)
+
+    return operation
+
+
+UFUNCS |= {name: _not_in_half_precision(name, scalar) for name, scalar in UFUNCS.items()}
 for _name, _scalar in UFUNCS.items():  # NumPy asks the entries of plain arrays of objects for methods of these names
     setattr(Symbol, _name, (lambda scalar: lambda *arguments: scalar(*arguments))(_scalar))
 
 
-def _reduced(scalar: Callable[..., Any], method: str, array: Any, axis: Any = 0, **options: Any) -> Any:
+def _reduced(
+    ufunc: np.ufunc, scalar: Callable[..., Any], method: str, array: Any, axis: Any = 0, **options: Any
+) -> Any:
     """``ufunc.reduce`` and ``ufunc.accumulate``."""
+    only(f"np.{ufunc.__name__}.{method}", options, "keepdims", "initial", "where", "dtype")
+    if options.pop("where", True) is not True:
+        raise TraceError(f"calls np.{ufunc.__name__}.{method} with where=; write np.where(condition, a, b)")
+    dtype = options.pop("dtype", None)
+    if ufunc in (np.logical_and, np.logical_or) and dtype in (bool, np.bool_):
+        dtype = None
+    require_float(f"np.{ufunc.__name__}.{method}", dtype)
     keep, initial = options.pop("keepdims", False), options.pop("initial", None)
+    if ufunc in (np.add, np.multiply) or dtype is not None:  # which count truth values
+        array = np.frompyfunc(as_number, 1, 1)(array)
+    elif initial is not None and initial is not np._NoValue and any(map(is_truth, array.flat)):
+        raise TraceError(f"calls np.{ufunc.__name__}.{method} on truth values with initial=; {INSTEAD}")
     array = np.asarray(array, dtype=object)
     if axis is None:
         axes = tuple(range(array.ndim))
@@ -483,11 +646,12 @@ def _reduced(scalar: Callable[..., Any], method: str, array: Any, axis: Any = 0,
     rest = [k for k in range(array.ndim) if k not in axes]
     moved = array.transpose([*axes, *rest]).reshape(-1, *(array.shape[k] for k in rest))
     combine = np.frompyfunc(scalar, 2, 1)
-    starts = [] if initial is None or not isinstance(initial, int | float | Symbol) else [initial]
+    starts = [] if initial is None or initial is np._NoValue else [initial]
     rows = [np.broadcast_to(np.array(item, dtype=object), moved.shape[1:]) for item in starts] + list(moved)
     if not rows:
-        neutral = {"add": 0.0, "multiply": 1.0}
-        total: Any = np.full(moved.shape[1:], neutral["multiply" if scalar is UFUNCS["multiply"] else "add"], object)
+        if ufunc.identity is None:
+            raise TraceError(f"calls np.{ufunc.__name__}.{method} on nothing")
+        total: Any = np.full(moved.shape[1:], ufunc.identity, object)
     else:
         total = np.array(rows[0], dtype=object)  # the caller may write into it
         for row in rows[1:]:

@@ -49,6 +49,7 @@ class Tape:
         a, b, c: nodes it takes; of a variable, a parameter, a weight or a tangent coordinate, a is its place.
         value: of constants.
         tables: flat arrays that look-ups read, side by side.
+        truths: leaves that are truth values.
         decide: settles conditions while code that decides is run, see :mod:`unifg.kernels.derive.branches`.
     """
 
@@ -60,6 +61,7 @@ class Tape:
         self.c: list[int] = []
         self.value: list[float] = []
         self.tables: list[Array] = []
+        self.truths: set[int] = set()
         self.decide: Callable[[int], bool] | None = None
         self._found: dict[tuple[int, int, int, int], int] = {}
         self._constants: dict[tuple[float, float], int] = {}
@@ -180,6 +182,8 @@ class Tape:
             return self._fold(Op.MULTIPLY, a, b)
         for root, other in ((a, b), (b, a)):
             if op[root] == Op.SQRT:  # whose square has derivatives at zero, as the root has not
+                if not self._never_negative(self.a[root]):
+                    continue
                 if other == root:
                     return self.a[root]
                 if op[other] == Op.MULTIPLY and root in (self.a[other], self.b[other]):
@@ -190,6 +194,17 @@ class Tape:
         if op[b] == Op.NEGATE:
             return self.negate(self.multiply(a, self.a[b]))
         return self._node(Op.MULTIPLY, a, b) if a < b else self._node(Op.MULTIPLY, b, a)
+
+    def _never_negative(self, i: int) -> bool:
+        """Whether the form of an expression says that it is no negative number: a square, a sum of such, a length."""
+        op, a, b = self.op[i], self.a[i], self.b[i]
+        if op == Op.CONSTANT:
+            return self.value[i] >= 0.0
+        if op in (Op.ABSOLUTE, Op.EXP, Op.SQRT) or (op == Op.MULTIPLY and a == b):
+            return True
+        if op == Op.SELECT:
+            return self._never_negative(b) and self._never_negative(self.c[i])
+        return op in (Op.ADD, Op.MULTIPLY, Op.DIVIDE) and self._never_negative(a) and self._never_negative(b)
 
     def divide(self, a: int, b: int) -> int:
         """The quotient."""

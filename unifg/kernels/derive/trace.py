@@ -31,9 +31,14 @@ from unifg.kernels.derive.symbols import (
     Symbol,
     Symbols,
     TraceError,
+    alike,
+    as_number,
+    is_truth,
     node_of,
     one_factor,
+    only,
     plain,
+    require_float,
     symbols,
     wrapped,
 )
@@ -255,16 +260,33 @@ class _Names(dict[str, Any]):
             **vars(builtins),
             "abs": abs,
             "enumerate": _along(enumerate),
+            "isinstance": _is_instance,
             "len": _length,
             "max": _greatest,
             "min": _least,
             "range": _along(range),
             "sum": _sum,
+            "type": _type,
         }
 
 
 def _length(thing: Any) -> int:
     return thing.shape[0] if isinstance(thing, Symbols) and thing.ndim else len(thing)
+
+
+def _stand_in(thing: Any) -> Any:
+    """A number or an array of the type that a symbol stands for."""
+    if isinstance(thing, Symbols):
+        return np.empty(0, dtype=thing.dtype)
+    return (np.bool_ if is_truth(thing) else np.float64)(0) if isinstance(thing, Symbol) else thing
+
+
+def _is_instance(thing: Any, kind: Any) -> bool:
+    return isinstance(_stand_in(thing), builtins.type if kind is _type else kind)
+
+
+def _type(*arguments: Any) -> Any:
+    return builtins.type(_stand_in(arguments[0])) if len(arguments) == 1 else builtins.type(*arguments)
 
 
 def _along(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -311,37 +333,37 @@ def _sum(values: Any, start: Any = 0) -> Any:
 # ---------------------------------------------------------------- NumPy and math, as far as they look at entries
 
 
-def _array(values: Any, *arguments: Any, **options: Any) -> Any:
-    if isinstance(values, Symbols):
-        return values.copy()
-    if isinstance(values, Symbol):
-        return symbols((), values)
-    plain = np.array(values, dtype=object)
-    if any(isinstance(item, Symbol) for item in plain.flat):
-        return wrapped(plain)
-    return np.array(values, *arguments, **options)
+def _array(values: Any, dtype: Any = None, **options: Any) -> Any:
+    if isinstance(values, Symbols | Symbol):
+        array = values.copy() if isinstance(values, Symbols) else symbols((), values)
+    else:
+        plain = np.array(values, dtype=object)
+        if not any(isinstance(item, Symbol) for item in plain.flat):
+            return np.array(values, dtype, **options)
+        array = wrapped(alike(plain))
+    only("np.array", options, "copy", "order", "subok")
+    return array if dtype is None else array.astype(dtype)
 
 
-def _as_array(values: Any, *arguments: Any, **options: Any) -> Any:
-    return values if isinstance(values, Symbols) else _array(values, *arguments, **options)
+def _as_array(values: Any, dtype: Any = None, **options: Any) -> Any:
+    if isinstance(values, Symbols) and (dtype is None or np.dtype(dtype) == values.dtype):
+        return values
+    return _array(values, dtype, **options)
 
 
 def _filled(value: float) -> Callable[..., Any]:
-    def make(shape: Any, *arguments: Any, **options: Any) -> Any:
-        if _whole(arguments, options):
-            return np.full(shape, value, dtype=arguments[0] if arguments else options["dtype"])
-        return symbols(tuple(shape) if isinstance(shape, list | tuple) else (int(shape),), value)
+    def make(shape: Any, dtype: Any = None, order: Any = None) -> Any:
+        return _full(shape, value, dtype)
 
     return make
 
 
-def _whole(arguments: tuple[Any, ...], options: dict[str, Any]) -> bool:
-    """Whether an array is to hold integers or truth values, such as indices: nothing that is not known goes there."""
-    kind = arguments[0] if arguments else options.get("dtype")
-    return kind is not None and np.dtype(kind).kind in "iub"
-
-
-def _full(shape: Any, value: Any, *arguments: Any, **options: Any) -> Any:
+def _full(shape: Any, fill_value: Any, dtype: Any = None, order: Any = None) -> Any:
+    kind = np.dtype(float if dtype is None else dtype)
+    if kind.kind in "iub":  # for indices and masks that are known
+        return np.full(shape, fill_value, dtype=kind)
+    require_float("np.full", kind)
+    value = as_number(fill_value) if np.ndim(fill_value) == 0 else fill_value
     return symbols(tuple(shape) if isinstance(shape, list | tuple) else (int(shape),), value)
 
 
@@ -361,6 +383,16 @@ class _Proxy(ModuleType):
         return names[name] if name in names else getattr(self.__dict__["_module"], name)
 
 
+class _Refused:
+    """A part of a module that no trace may use."""
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+
+    def __getattr__(self, name: str) -> Any:
+        raise TraceError(f"calls {self._what}.{name}, which returns other numbers each time")
+
+
 class _Module(_Proxy):
     """A module whose functions and groups take symbols, and whose arrays may be parameters."""
 
@@ -376,6 +408,7 @@ _MAKERS = {
     "array": _array, "asarray": _as_array, "asanyarray": _as_array, "ascontiguousarray": _as_array,
     "zeros": _filled(0.0), "empty": _filled(0.0), "ones": _filled(1.0), "full": _full, "eye": _eye, "identity": _eye,
     "atleast_1d": lambda a: _as_array(a) if np.ndim(a) else _as_array(a).reshape(1),
+    "random": _Refused("np.random"),
     **{name: _along(getattr(np, name)) for name in ("arange", "linspace", "indices", "tri", "ndindex", "ndenumerate")},
 }  # fmt: skip
 # The functions of groups, views, and arrays on the stack, as compiled functions of this library call them.
