@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from datetime import datetime
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -206,7 +207,7 @@ def drawn(count: int, seed: int) -> Iterator[tuple[str, Function]]:
         else:
             name, other = pick(ELEMENTWISE), pick([lambda x: x, lambda x: x > 0.0, lambda x: 1.5, lambda x: True])
             kept = {k: v for k, v in chosen.items() if k in ("where", "dtype")}
-            called = lambda x, n=name, k=kept, b=before, o=other: getattr(np, n)(b(x), o(x), **k)
+            called = partial(lambda n, k, b, o, x: getattr(np, n)(b(x), o(x), **k), name, kept, before, other)
         after: Function = pick(
             [lambda r: r * 1.0, lambda r: r + r, lambda r: np.where(r, 1.0, 2.0), lambda r: r + True]
         )
@@ -228,6 +229,9 @@ def test_drawn_calls_with_keywords_are_traced_rightly_or_refused(seed: int) -> N
     assert not wrong and kept > 15, wrong
 
 
+DRAW = np.random.default_rng(0)
+
+
 @pytest.mark.parametrize(
     ("function", "why"),
     [
@@ -235,7 +239,7 @@ def test_drawn_calls_with_keywords_are_traced_rightly_or_refused(seed: int) -> N
         (lambda x: x * time.perf_counter(), "time.perf_counter()"),
         (lambda x: x * datetime.now().microsecond, "datetime"),
         (lambda x: x * np.random.rand(), "np.random"),  # noqa: NPY002
-        (lambda x, draw=np.random.default_rng(0): x * draw.normal(), "Generator"),
+        (lambda x: x * DRAW.normal(), "Generator"),
     ],
 )
 def test_clocks_and_random_numbers_are_refused_by_name(function: Function, why: str) -> None:

@@ -267,18 +267,84 @@ def importing(x: Array) -> Array:
 
 
 class Model:
-    """Something that may change."""
+    """The usual way to write a robot: parameters in attributes, functions in methods."""
 
     gain = 2.0
 
+    def __init__(self) -> None:
+        self.mass, self.offset, self.options = 1.0, np.ones(3), {"scale": [1.0]}
+        self.count, self.log, self.draw = 0, list[Any](), np.random.default_rng(0)
+
+    @property
+    def scale(self) -> float:
+        return self.options["scale"][0]
+
+    @staticmethod
+    def scaled(x: Array, by: float) -> Array:
+        r = np.zeros((len(x), 3))
+        r[:, :] = by * x
+        return r
+
     def residual(self, x: Array) -> Array:
-        return self.gain * x - 1.0
+        return self.scaled(x, self.gain * self.mass * self.scale) - self.offset
 
     def __call__(self, x: Array) -> Array:
         return self.residual(x)
 
+    def counted(self, x: Array) -> Array:
+        self.count += 1
+        return x
+
+    def logged(self, x: Array) -> Array:
+        self.log.append(len(x))
+        return x
+
+    def overridden(self, x: Array) -> Array:
+        return x - self.draw.normal()
+
 
 SETTINGS = {"gain": 2.0}
+
+
+def halved(self: Model, x: Array) -> Array:
+    return 4.0 * x - self.offset
+
+
+@pytest.mark.parametrize("of", ["method", "call", "function"])
+@pytest.mark.parametrize("derivatives", [None, "trace"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda m, patch: setattr(m, "mass", 2.0),
+        lambda m, patch: m.offset.fill(0.5),
+        lambda m, patch: setattr(m, "offset", np.full(3, 0.5)),
+        lambda m, patch: m.options["scale"].__setitem__(0, 2.0),
+        lambda m, patch: m.options.update(scale=[2.0]),
+        lambda m, patch: patch.setattr(Model, "gain", 4.0),
+        lambda m, patch: setattr(m, "gain", 4.0),
+        lambda m, patch: patch.setattr(Model, "residual", halved),
+        lambda m, patch: patch.setattr(Model, "scale", property(lambda self: 2.0)),
+    ],
+)
+def test_attributes_are_watched(change: Function, derivatives: Any, of: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a trace is asked for: nothing is frozen that the function reads."""
+    model = Model()
+    function: Function = {"method": model.residual, "call": model, "function": lambda x: model.residual(x)}[of]
+    graph, x = stated(fg.residual(function, derivatives=derivatives))
+    prepared = GaussNewton().prepare(graph)
+    np.testing.assert_allclose(prepared.solve({x: np.zeros((N, 3))})[x], 0.5, atol=1e-9)
+    change(model, monkeypatch)
+    found = prepared.solve({x: np.zeros((N, 3))})[x]
+    if not (of == "method" and getattr(function, "__func__", None) is not Model.residual):  # a bound method is kept
+        np.testing.assert_allclose(found, 0.25, atol=1e-9)
+    assert prepared.program.terms[0].route == "traced, its derivatives exact"
+    np.testing.assert_allclose(np.asarray(function(found)), 0.0, atol=1e-9)
+
+
+def test_what_a_function_reaches_is_not_touched_by_its_trace() -> None:
+    model = Model()
+    assert "changes a list" in solved(model.logged)[0]
+    assert all(isinstance(entry, int) for entry in model.log)
 
 
 @pytest.mark.parametrize(
@@ -288,9 +354,9 @@ SETTINGS = {"gain": 2.0}
         (printing, "calls print()"),
         (trying, "handles exceptions"),
         (importing, "imports random"),
-        (Model().residual, "a method of an instance of Model"),
-        (Model(), "an instance of Model"),
-        (lambda x: SETTINGS["gain"] * x - 1.0, "'SETTINGS' is a dict"),
+        (Model().counted, "it changes the attribute 'count'"),
+        (Model().logged, "changes a list that it reaches"),
+        (Model().overridden, "which may change"),
         (lambda x: x - np.random.normal(size=(1, 3)), "other numbers each time"),  # noqa: NPY002
         (lambda x: np.linalg.qr(np.eye(3) + 0.0 * x[:, None])[1][:, 0] + x, "np.linalg.qr"),
         (lambda x: x - np.arange(len(x))[:, None], "which factor they belong to"),
@@ -305,11 +371,13 @@ def test_what_is_not_traced_is_said(function: Function, why: str, caplog: pytest
     assert sum("term 'term' is evaluated by Python" in message for message in caplog.messages) == 1
 
 
-@pytest.mark.parametrize("function", [Model().residual, Model(), lambda x: SETTINGS["gain"] * x - 1.0])
-def test_what_may_change_is_traced_when_asked(function: Function) -> None:
-    route, found = solved(fg.residual(function, derivatives="trace"))
-    assert route.startswith("traced")
-    np.testing.assert_allclose(found, 0.5, atol=1e-9)
+def test_dictionaries_are_watched(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, x = stated(lambda x: SETTINGS["gain"] * x - 1.0)
+    prepared = GaussNewton().prepare(graph)
+    for gain in (2.0, 4.0):
+        monkeypatch.setitem(SETTINGS, "gain", gain)
+        np.testing.assert_allclose(prepared.solve({x: np.zeros((N, 3))})[x], 1.0 / gain, atol=1e-9)
+    assert prepared.program.terms[0].route.startswith("traced")
 
 
 @pytest.mark.parametrize("function", [branching, lambda x: x - np.arange(len(x))[:, None]])
@@ -495,8 +563,11 @@ def test_functions_that_compute_the_same_share_a_kernel() -> None:
 
 
 def test_what_cannot_be_told_apart_is_not_shared() -> None:
-    function = Model().residual
+    function = lambda x: x * (0.0 if DRAW is None else 2.0)  # noqa: E731
     assert derived(function, (fg.Rn(2),), reach_of(function)) is not derived(function, (fg.Rn(2),), reach_of(function))
+
+
+DRAW = np.random.default_rng(1)
 
 
 def test_a_kernel_is_pickled_with_its_tape() -> None:

@@ -429,8 +429,8 @@ class Prepared:
     It belongs to one thread at a time. Others prepare their own: those of one graph wait for each other, those of
     graphs that were stated twice do not.
 
-    Answers are verified by evaluating traced functions as they were written: values in solves 1, 2, 4, ..., every 100th
-    and after solves in which a comparison of a trace comes out otherwise, derivatives in solves 1, 2, 4, ... A term whose
+    Answers are verified by evaluating traced functions as written: values in solves 1, 2, 4, ..., every 100th, and after
+    solves in which a comparison of a trace comes out otherwise; derivatives in solves 1, 2, 4, ... A term whose
     trace differs is left to Python, and the solve repeated from there.
 
     Attributes:
@@ -503,7 +503,7 @@ class Prepared:
         return solution
 
     def _verified(self, solution: Solution, run: SolveState, callback: Callback | None) -> Solution:
-        """Evaluate traced functions as they were written at an answer, and solve again without the traces that differ."""
+        """Evaluate traced functions as written at an answer, and solve again without the traces that differ."""
         program = self.program
         self._solves += 1
         slopes = self._solves.bit_count() == 1

@@ -85,7 +85,7 @@ class Batch:
         """
         with np.errstate(all="ignore"):
             if self.single is None:
-                return self.batched.on_copies(points).reshape(self.count, self.size)
+                return np.array(self.batched.on_copies(points)).reshape(self.count, self.size)  # it may keep its memory
             filled = self.batched.fill(points)
             found = np.full((self.count, self.size), np.nan)
             for factor in self.looked_at:

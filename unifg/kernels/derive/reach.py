@@ -1,8 +1,7 @@
-"""What a function reaches beyond its arguments: a trace fixes it, so it must be known, and looked at again.
+"""Everything a function reaches beyond its arguments: a trace fixes it, so it is watched from solve to solve.
 
-Numbers, text, tuples, frozen records and arrays are values; functions are followed. Lists, dictionaries, instances and
-what a function writes outside itself may change with nobody noticing: such a function is traced only when its user asks
-for that.
+Numbers, text, tuples, arrays, lists, dictionaries and attributes of instances are values; functions and methods are
+followed. A function that changes what it reaches, or reaches what cannot be watched, is traced only on request.
 """
 
 from __future__ import annotations
@@ -10,10 +9,11 @@ from __future__ import annotations
 import dis
 import functools
 import hashlib
-from collections.abc import Callable, Hashable, Iterator, Sequence
+import sys
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
-from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
+from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -53,14 +53,15 @@ class Reach:
     named: tuple[Array, ...]
     attributes: frozenset[str]
     _cells: tuple[tuple[CellType, Any], ...]
-    _names: tuple[tuple[dict[str, Any], str, Any], ...]
+    _names: tuple[tuple[Mapping[str, Any], str, Any], ...]
     _arrays: tuple[tuple[Array, bytes], ...]
     _functions: tuple[tuple[FunctionType, tuple[Any, ...]], ...]
+    _containers: tuple[tuple[Any, tuple[Any, ...]], ...]
     _elsewhere: bool = False
 
     def __reduce__(self) -> tuple[Any, ...]:
         """In another process names mean what they mean there: look at everything anew."""
-        return Reach, (None, self.refusal, self.size, (), self.attributes, (), (), (), (), True)
+        return Reach, (None, self.refusal, self.size, (), self.attributes, (), (), (), (), (), True)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Reach:
         """A copy watches the same names."""
@@ -80,12 +81,17 @@ class Reach:
         for function, written in self._functions:
             if any(now is not before for now, before in zip(_written(function), written, strict=True)):
                 return True
+        for container, entries in self._containers:
+            present = entries_of(container)
+            if len(present) != len(entries) or any(now is not kept for now, kept in zip(present, entries, strict=True)):
+                return True
         return any(array.tobytes() != content for array, content in self._arrays)
 
     @property
     def fixed(self) -> bool:
         """Whether there is nothing that could change."""
-        return not (self._cells or self._names or self._arrays or self._functions or self._elsewhere)
+        watched = self._cells or self._names or self._arrays or self._functions or self._containers
+        return not (watched or self._elsewhere)
 
 
 def reach_of(
@@ -98,12 +104,8 @@ def reach_of(
         given: named arrays whose content does not matter, because a kernel is given it each time.
         attributes: what others ask for that take what it returns.
     """
-    whole = function
-    while True:  # what a module or a record is asked for, functions say that are met after it
+    while True:  # what a module or an instance is asked for, functions say that are met after it
         walk = _Walk(given, attributes)
-        if isinstance(whole, MethodType):
-            walk.refuse(f"it is a method of {_kind(whole.__self__)}, which may change")
-            function = whole.__func__
         key = walk.value(function, "it")
         if walk.complete:
             break
@@ -118,6 +120,7 @@ def reach_of(
         tuple(walk.names),
         tuple(walk.arrays),
         tuple(walk.functions),
+        tuple(walk.containers),
     )
 
 
@@ -130,9 +133,10 @@ class _Walk:
         self.refusal = ""
         self.size = 0
         self.cells: list[tuple[CellType, Any]] = []
-        self.names: list[tuple[dict[str, Any], str, Any]] = []
+        self.names: list[tuple[Mapping[str, Any], str, Any]] = []
         self.arrays: list[tuple[Array, bytes]] = []
         self.functions: list[tuple[FunctionType, tuple[Any, ...]]] = []
+        self.containers: list[tuple[Any, tuple[Any, ...]]] = []
         self._seen: dict[int, int] = {}
         self._attributes = set(attributes)
         self._asked = len(attributes)
@@ -170,8 +174,12 @@ class _Walk:
             if type(value) not in (tuple, frozenset) and not hasattr(value, "_fields"):
                 self.refuse(f"{where} is {_kind(value)}, which may change")
             if hasattr(value, "_fields"):
-                self._refuse_methods(value, where)
+                self._named_tuple(value, where)
             return type(value), tuple(self.value(item, f"an entry of {where}") for item in value)
+        if type(value) in (list, dict):
+            return self._container(value, where)
+        if isinstance(value, MethodType):
+            return "method", self.value(value.__func__, where), self.value(value.__self__, where)
         if isinstance(value, slice):
             return "slice", tuple(self.value(part, where) for part in (value.start, value.stop, value.step))
         if isinstance(value, ModuleType):
@@ -204,19 +212,59 @@ class _Walk:
             return "numpy", value.__name__, id(value)  # functions of NumPy that are not written in Python
         if is_dataclass(value) and getattr(vars(type(value)).get("__dataclass_params__"), "frozen", False):
             if not isinstance(value, Kernel):  # whose methods nobody changes
-                self._refuse_methods(value, where)
+                return self._instance(value, where)
             parts = tuple(self.value(getattr(value, f.name), f"{where}.{f.name}") for f in fields(value))
             return type(value), parts
-        self.refuse(f"{where} is {_kind(value)}, which may change")
-        return id(value)
+        return self._instance(value, where)
 
-    def _refuse_methods(self, value: Any, where: str) -> None:
-        """Refuse a record that is more than numbers."""
+    def _named_tuple(self, value: Any, where: str) -> None:
+        """Refuse a named tuple whose methods are used: no stand-in can be made of it."""
         for owner in type(value).__mro__:
-            used = [name for name in vars(owner) if name in self._attributes and not name.startswith("__")]
-            for name in used:
-                if isinstance(vars(owner)[name], FunctionType | property):
+            for name in self._attributes & set(vars(owner)):
+                if isinstance(vars(owner)[name], FunctionType | property) and not name.startswith("__"):
                     self.refuse(f"{where} is {_kind(value)}, whose method {name} it uses")
+
+    def _container(self, value: Any, where: str) -> Hashable:
+        """A list or dictionary: its entries, and what tells them from others."""
+        if id(value) in self._seen:
+            return "seen", self._seen[id(value)]
+        self._seen[id(value)] = len(self._seen)
+        entries = entries_of(value)
+        self.containers.append((value, entries))
+        return type(value).__name__, tuple(self.named_value(entry, f"an entry of {where}") for entry in entries)
+
+    def _instance(self, value: Any, where: str) -> Hashable:
+        """An instance of a class written in Python: the attributes that functions ask for, and its operators."""
+        if id(value) in self._seen:
+            return "seen", self._seen[id(value)]
+        self._seen[id(value)] = len(self._seen)
+        owners = classes_of(value)
+        if not owners:
+            self.refuse(f"{where} is {_kind(value)}, which may change")
+            return id(value)
+        own: dict[str, Any] = vars(value)
+        parts: list[Hashable] = [type(value)]
+        asked = {name for name in self._attributes if not name.startswith("__")}
+        for name in sorted(asked | {name for owner in owners for name in vars(owner) if is_operator(owner, name)}):
+            if name in own:
+                parts.append(self._named(own, name, f"{_kind(value)}."))
+                continue
+            for owner in owners:  # also those further up, which super() calls
+                if name in vars(owner):
+                    self.names += [(own, name, _MISSING), (vars(owner), name, vars(owner)[name])]
+                    parts.append((owner, name, self._of_class(vars(owner)[name], f"{where}.{name}")))
+        return tuple(parts)
+
+    def _of_class(self, value: Any, where: str) -> Hashable:
+        """An attribute of a class as its instances see it."""
+        if isinstance(value, staticmethod | classmethod):
+            return self.value(value.__func__, where)
+        if isinstance(value, property):
+            return "property", self.value(value.fget, where)
+        if hasattr(type(value), "__get__") and not isinstance(value, FunctionType) and not is_compiled(value):
+            self.refuse(f"{where} is a {type(value).__name__}, which may return anything")
+            return id(value)
+        return self.named_value(value, where)
 
     def _array(self, array: Array, where: str) -> Hashable:
         if array.dtype.hasobject or type(array) is not np.ndarray:
@@ -260,6 +308,9 @@ class _Walk:
         for name, cell in zip(code.co_freevars, python.__closure__ or (), strict=True):
             value = _inside(cell)
             self.cells.append((cell, value))
+            if name == "__class__":  # for super()
+                parts.append(value)
+                continue
             parts.append((name, "unassigned" if value is _MISSING else self.named_value(value, f"'{name}'")))
         for default in (*(python.__defaults__ or ()), *(v for _, v in sorted((python.__kwdefaults__ or {}).items()))):
             parts.append(self.named_value(default, "a default"))
@@ -295,6 +346,8 @@ def _scanned(code: CodeType) -> _Scan:
                 attributes.add(str(step.argval))
             elif operation in ("STORE_GLOBAL", "DELETE_GLOBAL"):
                 trouble = trouble or f"it changes the global name '{step.argval}'"
+            elif operation in ("STORE_ATTR", "DELETE_ATTR"):
+                trouble = trouble or f"it changes the attribute '{step.argval}'"
             elif operation == "STORE_DEREF" and step.argval in code.co_freevars:
                 trouble = trouble or f"it changes '{step.argval}' outside itself"
             elif operation == "IMPORT_NAME" and not _trusted(str(step.argval)):
@@ -302,6 +355,37 @@ def _scanned(code: CodeType) -> _Scan:
             elif operation == "PUSH_EXC_INFO" and after.opname != "WITH_EXCEPT_START":
                 trouble = trouble or "it handles exceptions, so what it computes may depend on the numbers"
     return _Scan(frozenset(names), frozenset(attributes), trouble)
+
+
+def entries_of(container: Any) -> tuple[Any, ...]:
+    """Entries of a list; keys and values of a dictionary."""
+    return tuple(container) if isinstance(container, list) else (*container, *container.values())
+
+
+def classes_of(value: Any) -> list[type]:
+    """Classes of an instance that is nothing but attributes, written in Python; none of any other."""
+    owners = [owner for owner in type(value).__mro__ if owner is not object]
+    if type(value) is SimpleNamespace:
+        return [SimpleNamespace]
+    strange = any(
+        owner.__module__.partition(".")[0] in sys.stdlib_module_names - {"__main__", "types", "abc", "typing"}
+        or "__getattribute__" in vars(owner)
+        or "__getattr__" in vars(owner)
+        or "__slots__" in vars(owner)
+        for owner in owners
+    )
+    python = type(value).__basicsize__ == _Plain.__basicsize__
+    return owners if python and hasattr(value, "__dict__") and not strange and not isinstance(value, type) else []
+
+
+def is_operator(owner: type, name: str) -> bool:
+    """Whether an attribute of a class is a method that an operator calls, or a call."""
+    hidden = ("__init__", "__new__", "__repr__", "__init_subclass__", "__post_init__", "__setattr__", "__delattr__")
+    return name.startswith("__") and name not in hidden and isinstance(vars(owner)[name], FunctionType)
+
+
+class _Plain:
+    """An instance with a dictionary and nothing else."""
 
 
 def _codes(code: CodeType) -> Iterator[CodeType]:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import fields, is_dataclass
 from functools import partial
-from types import CellType, CodeType, FunctionType, MethodType, ModuleType
+from types import CellType, CodeType, FunctionType, MethodType, ModuleType, SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -24,6 +24,7 @@ from unifg.kernels.derive.array_functions import TABLE
 from unifg.kernels.derive.branches import every_way
 from unifg.kernels.derive.groups import wrap
 from unifg.kernels.derive.manifolds import Symbolic, stated_closed
+from unifg.kernels.derive.reach import classes_of, entries_of, is_operator
 from unifg.kernels.derive.symbols import (
     FUNCTIONS,
     UFUNCS,
@@ -73,7 +74,9 @@ def run(function: Callable[..., Any], arguments: Sequence[Any], tape: Tape, rebo
     try:
         made = rebound.callable(function)
         if not is_compiled(function):
-            return made(*arguments)
+            result = made(*arguments)
+            rebound.require_untouched()
+            return result
 
         def once() -> list[int]:
             written = symbols((rows,), math.nan)  # what is not written stays so
@@ -115,6 +118,8 @@ class Rebound:
         self.given: dict[int, Any] = {}  # what stands in for arrays, by their ids
         self._seen: dict[int, Any] = {}
         self._kept: list[Any] = []  # ids stay theirs
+        self._instances: dict[int, Any] = {}
+        self._containers: list[tuple[Any, tuple[Any, ...]]] = []
 
     def callable(self, thing: Any) -> Any:
         """A callable, rebound as far as it is written in Python."""
@@ -125,8 +130,8 @@ class Rebound:
             named = {name: self.thing(part) for name, part in thing.keywords.items()}
             return partial(self.callable(thing.func), *given, **named)
         if isinstance(thing, MethodType) and isinstance(thing.__func__, FunctionType):
-            return MethodType(self.function(thing.__func__), thing.__self__)
-        return thing
+            return MethodType(self.function(thing.__func__), self.thing(thing.__self__))
+        return self.thing(thing)
 
     def function(self, function: Any) -> Any:
         """A copy of a function with other names in reach."""
@@ -187,6 +192,59 @@ class Rebound:
             object.__setattr__(copied, name, value)
         return copied
 
+    def require_untouched(self) -> None:
+        """Refuse a function that changed a list or a dictionary it reaches; it changed a copy."""
+        for copied, entries in self._containers:
+            present = entries_of(copied)
+            if len(present) != len(entries) or any(a is not b for a, b in zip(present, entries, strict=True)):
+                raise TraceError(f"changes a {type(copied).__name__} that it reaches")
+
+    def _copied(self, container: Any) -> Any:
+        """A copy of a list or a dictionary, once for each."""
+        if id(container) not in self._instances:
+            copied: Any = type(container)()
+            self._instances[id(container)] = copied
+            if isinstance(container, list):
+                copied.extend(map(self.thing, container))
+            else:
+                copied.update({key: self.thing(value) for key, value in container.items()})
+            self._kept.append(container)
+            self._containers.append((copied, entries_of(copied)))
+        return self._instances[id(container)]
+
+    def _instance(self, instance: Any) -> Any:
+        """A stand-in for an instance, of a subclass of its class, whose attributes and methods take symbols."""
+        found = self._instances.get(id(instance))
+        if found is not None:
+            return found
+        owners, parts, rebound = classes_of(instance), dict[str, Any](), self
+
+        def attribute(this: Any, name: str) -> Any:
+            if name.startswith("__"):
+                return object.__getattribute__(this, name)
+            if name not in parts:
+                plain = next((vars(owner)[name] for owner in owners if name in vars(owner)), None)
+                if isinstance(plain, property) and name not in vars(instance):
+                    return rebound.callable(plain.fget)(this)
+                if isinstance(plain, FunctionType) and name not in vars(instance):
+                    parts[name] = MethodType(rebound.function(plain), this)
+                else:
+                    parts[name] = rebound.thing(getattr(instance, name))
+            return parts[name]
+
+        def refused(this: Any, name: str, value: Any = None) -> None:
+            raise TraceError(f"changes the attribute '{name}' of something that it reaches")
+
+        names: dict[str, Any] = {"__getattribute__": attribute, "__setattr__": refused, "__delattr__": refused}
+        for owner in reversed(owners):
+            for name in filter(partial(is_operator, owner), vars(owner)):
+                names[name] = self.function(vars(owner)[name])
+        made = SimpleNamespace.__new__ if isinstance(instance, SimpleNamespace) else object.__new__
+        stand_in = made(type(type(instance).__name__, (type(instance),), names))
+        self._instances[id(instance)] = stand_in
+        self._kept.append(instance)
+        return stand_in
+
     def thing(self, thing: Any) -> Any:
         """What a name means while a function is traced."""
         if id(thing) in self.given:
@@ -207,15 +265,19 @@ class Rebound:
             return self.function(thing)
         if isinstance(thing, ModuleType) and thing.__name__.partition(".")[0] not in _AS_THEY_ARE:
             return _Module(thing, self)
-        if type(thing) in (tuple, list):
-            return type(thing)(map(self.thing, thing))
+        if type(thing) is tuple:
+            return tuple(map(self.thing, thing))
+        if type(thing) in (list, dict):
+            return self._copied(thing)
         if isinstance(thing, FunctionType):
             module = str(thing.__module__ or "")
             return thing if module.partition(".")[0] == "numpy" else self.function(thing)
         if isinstance(thing, partial | MethodType):
             return self.callable(thing)
-        if is_dataclass(thing) and not isinstance(thing, type):
+        if is_dataclass(thing) and not isinstance(thing, type) and not classes_of(thing):
             return self.record(thing)
+        if classes_of(thing):
+            return self._instance(thing)
         return CONSTRUCTORS.get(id(thing), thing) if callable(thing) else thing
 
 
