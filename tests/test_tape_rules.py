@@ -1,0 +1,122 @@
+"""Every rule of the tape, in value, first and second derivative, by mpmath with ninety digits."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from test_derive import curved, evaluated
+from unifg.kernels.derive.expression import Expression
+from unifg.kernels.derive.operations import STEADY, UNARY, Op
+from unifg.kernels.derive.tape import Tape
+from unifg.lie import Rn
+
+mp = pytest.importorskip("mpmath")
+Rule = Callable[..., Any]
+
+
+def fmod(a: Any, b: Any) -> Any:
+    quotient = a / b
+    return a - b * (mp.floor(quotient) if quotient >= 0 else mp.ceil(quotient))
+
+
+GENERIC, POSITIVE, INNER, BEYOND = (
+    (-1.3, -0.2, 0.4, 1.9, 30.0),
+    (0.3, 1.0, 7.0, 1e-8),
+    (-0.9, 0.0, 0.3),
+    (1.1, 2.0, 40.0),
+)
+ONE: dict[Op, tuple[Rule, tuple[float, ...]]] = {
+    Op.NEGATE: (lambda a: -a, (*GENERIC, 0.0)), Op.SQRT: (mp.sqrt, POSITIVE), Op.SIN: (mp.sin, (*GENERIC, 0.0, math.pi)),
+    Op.COS: (mp.cos, (*GENERIC, 0.0, math.pi)), Op.TAN: (mp.tan, (*GENERIC[:4], 0.0)), Op.ARCSIN: (mp.asin, INNER),
+    Op.ARCCOS: (mp.acos, INNER), Op.ARCTAN: (mp.atan, (*GENERIC, 0.0)), Op.SINH: (mp.sinh, (*GENERIC, 0.0)),
+    Op.COSH: (mp.cosh, (*GENERIC, 0.0)), Op.TANH: (mp.tanh, (*GENERIC[:4], 0.0)), Op.ARCSINH: (mp.asinh, (*GENERIC, 0.0)),
+    Op.ARCCOSH: (mp.acosh, BEYOND), Op.ARCTANH: (mp.atanh, INNER), Op.ERF: (mp.erf, (*GENERIC[:4], 0.0)),
+    Op.EXP: (mp.exp, (*GENERIC, 0.0)), Op.EXPM1: (mp.expm1, (*GENERIC, 0.0, 1e-9)), Op.LOG: (mp.log, POSITIVE),
+    Op.LOG1P: (mp.log1p, (0.0, 1e-9, -0.5, 3.0)), Op.ABSOLUTE: (abs, GENERIC),
+}  # fmt: skip
+PAIRS = ((0.7, 1.9), (-1.3, 0.4), (2.5, -0.6), (-3.1, -1.2), (30.0, 7.0))
+TWO: dict[Op, tuple[Rule, tuple[tuple[float, float], ...]]] = {
+    Op.ADD: (lambda a, b: a + b, PAIRS), Op.SUBTRACT: (lambda a, b: a - b, PAIRS), Op.MULTIPLY: (lambda a, b: a * b, PAIRS),
+    Op.DIVIDE: (lambda a, b: a / b, PAIRS), Op.ARCTAN2: (mp.atan2, (*PAIRS, (0.0, 1.0), (1.0, 0.0), (0.5, -1e-3))),
+    Op.POWER: (lambda a, b: a**b, ((0.7, 1.9), (2.5, -0.6), (1.0, 0.0), (3.0, 2.0), (1e-3, 0.5))),
+    Op.FMOD: (fmod, (*PAIRS, (7.3, 2.0), (-7.3, 2.0), (7.3, -2.0))),
+    Op.MINIMUM: (min, PAIRS), Op.MAXIMUM: (max, PAIRS),
+}  # fmt: skip
+
+
+def stated(op: Op, count: int) -> Expression:
+    """One operation on the coordinates of a vector."""
+    tape = Tape()
+    moved = [tape.add(tape.leaf(Op.VARIABLE, k), tape.leaf(Op.TANGENT, k)) for k in range(count)]
+    return Expression(tape, (tape.apply(op, *moved),), Rn(count).dim, op.name)
+
+
+def test_every_operation_with_derivatives_has_a_rule_here() -> None:
+    leaves = {Op.CONSTANT, Op.VARIABLE, Op.PARAMETER, Op.WEIGHT, Op.TANGENT}
+    assert set(ONE) == (UNARY - STEADY) and set(ONE) | set(TWO) | {Op.SELECT} | STEADY | leaves == set(Op)
+
+
+@pytest.mark.parametrize("op", [*ONE, *TWO], ids=lambda op: op.name)
+def test_values_and_derivatives(op: Op) -> None:
+    rule, points = ONE.get(op) or TWO[op]
+    count = 1 if op in ONE else 2
+    expression = stated(op, count)
+    for point in points:
+        v = np.atleast_2d(np.array(point, dtype=float))
+        nothing = np.zeros((1, 0))
+        r, J = evaluated(expression, v, nothing)
+        S = curved(expression, v, nothing, np.ones((1, 1)))[0]
+        with mp.workdps(90):
+            at = tuple(mp.mpf(float(x)) for x in v[0])
+            h = mp.mpf(10) ** -20
+            value = rule(*at)
+
+            def along(k: int, order: int = 1, other: int = -1, at: Any = at, h: Any = h) -> Any:
+                """Central differences with many digits; across two coordinates where ``other`` is given."""
+
+                def moved(*steps: tuple[int, int]) -> Any:
+                    x = list(at)
+                    for place, times in steps:
+                        x[place] += times * h
+                    return rule(*x)
+
+                if other >= 0:
+                    around = [(i, j) for i in (1, -1) for j in (1, -1)]
+                    return sum(i * j * moved((k, i), (other, j)) for i, j in around) / (4 * h * h)
+                if order == 1:
+                    return (moved((k, 1)) - moved((k, -1))) / (2 * h)
+                return (moved((k, 1)) - 2 * rule(*at) + moved((k, -1))) / (h * h)
+
+            slope = [float(along(k)) for k in range(count)]
+            bend = [[float(along(i, 2) if i == j else along(i, 1, j)) for j in range(count)] for i in range(count)]
+        np.testing.assert_allclose(r[0, 0], float(value), rtol=4e-15, atol=1e-300)
+        np.testing.assert_allclose(J[0, 0], slope, rtol=1e-13, atol=1e-14)
+        np.testing.assert_allclose(S, bend, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("op", sorted(STEADY - {Op.GATHER}), ids=lambda op: Op(op).name)
+def test_what_jumps_has_no_slope(op: Op) -> None:
+    expression = stated(op, 1 if op in UNARY else 2)
+    v = np.array([[0.7, 1.9][: expression.width]])
+    nothing = np.zeros((1, 0))
+    r, J = evaluated(expression, v, nothing)
+    expected = {Op.SIGN: 1.0, Op.FLOOR: 0.0, Op.RINT: 1.0, Op.NOT: 0.0, Op.EQUAL: 0.0}
+    assert r[0, 0] == expected.get(Op(op), 1.0) and not J.any() and not expression.slopes
+
+
+def test_a_choice_has_the_slope_of_what_is_chosen() -> None:
+    tape = Tape()
+    x, y = (tape.add(tape.leaf(Op.VARIABLE, k), tape.leaf(Op.TANGENT, k)) for k in range(2))
+    chosen = tape.select(tape.apply(Op.LESS, x, y), tape.multiply(x, x), tape.multiply(x, y))
+    expression, nothing = Expression(tape, (chosen,), 2, "choice"), np.zeros((1, 0))
+    for point, value, slope, bend in (
+        ((2.0, 3.0), 4.0, [4.0, 0.0], [[2.0, 0.0], [0.0, 0.0]]),
+        ((3.0, 2.0), 6.0, [2.0, 3.0], [[0.0, 1.0], [1.0, 0.0]]),
+        ((2.0, 2.0), 4.0, [2.0, 2.0], [[0.0, 1.0], [1.0, 0.0]]),
+    ):
+        r, J = evaluated(expression, np.array([point]), nothing)
+        S = curved(expression, np.array([point]), nothing, np.ones((1, 1)))[0]
+        assert r[0, 0] == value and J[0, 0].tolist() == slope and S.tolist() == bend
