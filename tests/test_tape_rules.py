@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from test_derive import curved, evaluated
-from unifg.kernels.derive.expression import Expression
-from unifg.kernels.derive.operations import STEADY, UNARY, Op
+from unifg.kernels.derive.expression import Expression, traced
+from unifg.kernels.derive.operations import GROUPED, STEADY, UNARY, Op
 from unifg.kernels.derive.tape import Tape
 from unifg.lie import Rn
 
@@ -32,15 +32,16 @@ ONE: dict[Op, tuple[Rule, tuple[float, ...]]] = {
     Op.NEGATE: (lambda a: -a, (*GENERIC, 0.0)), Op.SQRT: (mp.sqrt, POSITIVE), Op.SIN: (mp.sin, (*GENERIC, 0.0, math.pi)),
     Op.COS: (mp.cos, (*GENERIC, 0.0, math.pi)), Op.TAN: (mp.tan, (*GENERIC[:4], 0.0)), Op.ARCSIN: (mp.asin, INNER),
     Op.ARCCOS: (mp.acos, INNER), Op.ARCTAN: (mp.atan, (*GENERIC, 0.0)), Op.SINH: (mp.sinh, (*GENERIC, 0.0)),
-    Op.COSH: (mp.cosh, (*GENERIC, 0.0)), Op.TANH: (mp.tanh, (*GENERIC[:4], 0.0)), Op.ARCSINH: (mp.asinh, (*GENERIC, 0.0)),
+    Op.COSH: (mp.cosh, (*GENERIC, 0.0)), Op.TANH: (mp.tanh, (*GENERIC[:4], 0.0)),
+    Op.ARCSINH: (mp.asinh, (*GENERIC, 0.0)),
     Op.ARCCOSH: (mp.acosh, BEYOND), Op.ARCTANH: (mp.atanh, INNER), Op.ERF: (mp.erf, (*GENERIC[:4], 0.0)),
     Op.EXP: (mp.exp, (*GENERIC, 0.0)), Op.EXPM1: (mp.expm1, (*GENERIC, 0.0, 1e-9)), Op.LOG: (mp.log, POSITIVE),
     Op.LOG1P: (mp.log1p, (0.0, 1e-9, -0.5, 3.0)), Op.ABSOLUTE: (abs, GENERIC),
 }  # fmt: skip
 PAIRS = ((0.7, 1.9), (-1.3, 0.4), (2.5, -0.6), (-3.1, -1.2), (30.0, 7.0))
 TWO: dict[Op, tuple[Rule, tuple[tuple[float, float], ...]]] = {
-    Op.ADD: (lambda a, b: a + b, PAIRS), Op.SUBTRACT: (lambda a, b: a - b, PAIRS), Op.MULTIPLY: (lambda a, b: a * b, PAIRS),
-    Op.DIVIDE: (lambda a, b: a / b, PAIRS), Op.ARCTAN2: (mp.atan2, (*PAIRS, (0.0, 1.0), (1.0, 0.0), (0.5, -1e-3))),
+    Op.ADD: (lambda a, b: a + b, PAIRS), Op.SUBTRACT: (lambda a, b: a - b, PAIRS),
+    Op.MULTIPLY: (lambda a, b: a * b, PAIRS), Op.DIVIDE: (lambda a, b: a / b, PAIRS), Op.ARCTAN2: (mp.atan2, (*PAIRS, (0.0, 1.0), (1.0, 0.0), (0.5, -1e-3))),
     Op.POWER: (lambda a, b: a**b, ((0.7, 1.9), (2.5, -0.6), (1.0, 0.0), (3.0, 2.0), (1e-3, 0.5))),
     Op.FMOD: (fmod, (*PAIRS, (7.3, 2.0), (-7.3, 2.0), (7.3, -2.0))),
     Op.MINIMUM: (min, PAIRS), Op.MAXIMUM: (max, PAIRS),
@@ -56,7 +57,8 @@ def stated(op: Op, count: int) -> Expression:
 
 def test_every_operation_with_derivatives_has_a_rule_here() -> None:
     leaves = {Op.CONSTANT, Op.VARIABLE, Op.PARAMETER, Op.WEIGHT, Op.TANGENT}
-    assert set(ONE) == (UNARY - STEADY) and set(ONE) | set(TWO) | {Op.SELECT} | STEADY | leaves == set(Op)
+    others = {Op.SELECT, Op.ENTRY} | GROUPED | STEADY | leaves
+    assert set(ONE) == (UNARY - STEADY) and set(ONE) | set(TWO) | others == set(Op)
 
 
 @pytest.mark.parametrize("op", [*ONE, *TWO], ids=lambda op: op.name)
@@ -120,3 +122,49 @@ def test_a_choice_has_the_slope_of_what_is_chosen() -> None:
         r, J = evaluated(expression, np.array([point]), nothing)
         S = curved(expression, np.array([point]), nothing, np.ones((1, 1)))[0]
         assert r[0, 0] == value and J[0, 0].tolist() == slope and S.tolist() == bend
+
+
+@pytest.mark.parametrize("condition", [1.0, 1e5, 1e10])
+@pytest.mark.parametrize("size", [1, 2, 3, 4, 6])
+def test_linear_systems_are_solved_as_well_as_their_condition_allows(size: int, condition: float) -> None:
+    """Value and both derivatives by A and b, within 100 roundings times the condition number."""
+    rng = np.random.default_rng(size)
+    left, right = (np.linalg.qr(rng.normal(size=(size, size)))[0] for _ in range(2))
+    matrix = left @ np.diag(np.geomspace(1.0, 1.0 / condition if size > 1 else 1.0, size)) @ right
+    v = np.concatenate([matrix.ravel(), rng.normal(size=size)])[None]
+    n = v.shape[1]
+
+    def function(x: Any) -> Any:
+        a, b = x[:, : size * size].reshape(-1, size, size), x[:, size * size :]
+        return np.linalg.solve(a, b[..., None])[..., 0]
+
+    expression, nothing, w = traced(function, (Rn(n),)), np.zeros((1, 0)), rng.normal(size=(1, size))
+    r, J = evaluated(expression, v, nothing)
+    S = curved(expression, v, nothing, w)[0]
+    with mp.workdps(60):
+        inverse = mp.matrix(matrix.tolist()) ** -1
+        Y = np.array(inverse.tolist(), dtype=object)
+        x = Y @ np.array([mp.mpf(float(b)) for b in v[0, size * size :]], dtype=object)
+        slope = np.zeros((size, n), dtype=object)
+        bend = np.zeros((n, n), dtype=object)
+        z = np.array([mp.mpf(float(weight)) for weight in w[0]], dtype=object) @ Y
+        for i in range(size):
+            slope[:, size * size + i] = Y[:, i]
+            for j in range(size):
+                slope[:, i * size + j] = -Y[:, i] * x[j]
+                for k in range(size):  # by an entry of A and one of b, and by two entries of A
+                    bend[i * size + j, size * size + k] = bend[size * size + k, i * size + j] = -z[i] * Y[j, k]
+                    for m in range(size):
+                        bend[i * size + j, k * size + m] = z[i] * Y[j, k] * x[m] + z[k] * Y[m, i] * x[j]
+        expected = [np.array(part, dtype=float) for part in (x, slope, bend)]
+    for found, true in zip((r[0], J[0], S), expected, strict=True):
+        error = np.abs(found - true).max() / np.abs(true).max()
+        assert error <= 100.0 * np.finfo(float).eps * condition
+
+
+def test_a_system_that_needs_pivots_is_solved() -> None:
+    function = lambda x: np.linalg.inv(np.stack([x[:, :2] - 1.0, x[:, 2:]], axis=1))[:, 0]  # noqa: E731
+    expression = traced(function, (Rn(4),))
+    v = np.array([[1.0, 3.0, 2.0, 5.0]])  # the first pivot is zero
+    np.testing.assert_allclose(evaluated(expression, v, np.zeros((1, 0)))[0], function(v), rtol=1e-15)
+    assert np.isfinite(curved(expression, v, np.zeros((1, 0)), np.ones((1, 2)))).all()

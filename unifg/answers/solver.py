@@ -430,8 +430,8 @@ class Prepared:
     graphs that were stated twice do not.
 
     Answers are verified by evaluating traced functions as written: values in solves 1, 2, 4, ..., every 100th, and after
-    solves in which a comparison of a trace comes out otherwise; derivatives in solves 1, 2, 4, ... A term whose
-    trace differs is left to Python, and the solve repeated from there.
+    solves in which a comparison of a trace comes out otherwise; derivatives in solves 1, 2, 4, ... A term whose trace
+    differs is left to Python, and the solve repeated from there.
 
     Attributes:
         solver: the backend and its options.

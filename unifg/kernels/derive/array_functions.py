@@ -13,17 +13,21 @@ import numpy as np
 from unifg.kernels.derive.symbols import (
     INSTEAD,
     UFUNCS,
+    Symbol,
     TraceError,
     alike,
+    as_number,
     as_truth,
     choose,
     is_truth,
+    node_of,
     plain,
     require_float,
     symbols,
     wrapped,
 )
 
+LARGEST = 12  # rows of a linear system, whose elimination is written out
 _Pick = np.frompyfunc(choose, 3, 1)
 
 
@@ -134,26 +138,40 @@ def _determinant(array: Any) -> Any:
 
 def _inverse(array: Any) -> Any:
     array = _objects(array)
-    n = array.shape[-1]
-    if n > 4:
-        raise TraceError(f"inverts a matrix of more than four rows; {INSTEAD}")
-    if n == 1:
-        return np.frompyfunc(UFUNCS["reciprocal"], 1, 1)(array)
-    determinant = np.asarray(_determinant(array), dtype=object)
-    rows = [
-        [
-            (1.0 if (i + j) % 2 == 0 else -1.0) * _determinant(np.delete(np.delete(array, j, -2), i, -1)) / determinant
-            for j in range(n)
-        ]
-        for i in range(n)
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return _systems(array, np.broadcast_to(np.eye(array.shape[-1]).astype(object), array.shape))
 
 
 def _solve(a: Any, b: Any) -> Any:
-    inverse = _inverse(a)
-    b = _objects(b)
-    return matmul(inverse, b) if b.ndim != 1 else matmul(inverse, b[:, None])[..., 0]
+    a, b = _objects(a), _objects(b)
+    return _systems(a, b) if b.ndim != 1 else _systems(a, b[:, None])[..., 0]
+
+
+def _systems(a: Any, b: Any) -> Any:
+    """(..., n, k) solutions of linear systems, by nodes of the tape that pivot."""
+    n = a.shape[-1]
+    if a.ndim < 2 or a.shape[-2] != n:
+        raise TraceError("solves a linear system whose matrix is not square")
+    if n > LARGEST:
+        raise TraceError(f"solves a linear system of more than {LARGEST} rows; {INSTEAD}")
+    stack = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    a, b = np.broadcast_to(a, (*stack, n, n)), np.broadcast_to(b, (*stack, *b.shape[-2:]))
+    found = symbols(b.shape)
+    for place in np.ndindex(stack):
+        for column in range(b.shape[-1]):
+            found[(*place, slice(None), column)] = _solution(a[place], b[place][:, column])
+    return found
+
+
+def _solution(matrix: Any, right: Any) -> list[Any]:
+    """Solution of one linear system."""
+    numbers = [as_number(entry) for entry in (*matrix.flat, *right)]
+    tape = next((entry.tape for entry in numbers if isinstance(entry, Symbol)), None)
+    n = len(right)
+    if tape is None:
+        return list(np.linalg.solve(np.array(numbers[: n * n], dtype=float).reshape(n, n), np.array(numbers[n * n :])))
+    nodes = [node_of(tape, entry) for entry in numbers]
+    rows = [nodes[k * n : (k + 1) * n] for k in range(n)]
+    return [Symbol.of(tape, node) for node in tape.solve(rows, nodes[n * n :])]
 
 
 def _every(array: Any, axis: Any = None, *, keepdims: bool = False) -> Any:

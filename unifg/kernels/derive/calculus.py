@@ -13,12 +13,13 @@ read from a table) zero. Remainders move with what is divided.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 
-from unifg.kernels.derive.operations import STEADY, Op
+from unifg.kernels.derive.operations import GROUPED, STEADY, Op
 from unifg.kernels.derive.tape import Tape
 
+_FLAT = STEADY | GROUPED  # no derivatives of their own
 Partials = list[tuple[int, int]]
 WAIST = 1  # waists that a node may depend on without being one
 
@@ -98,6 +99,11 @@ def bent(tape: Tape, outputs: Sequence[int]) -> list[bool]:
         op, a, b = tape.op[i], tape.a[i], tape.b[i]
         if op <= Op.TANGENT or op in STEADY:
             degree[i] = 1 if op == Op.TANGENT else 0
+        elif op in GROUPED:
+            continue
+        elif op == Op.ENTRY:
+            matrix, right = tape.system(a)
+            degree[i] = 2 if any(degree[j] for row in (*matrix, right) for j in row) else 0
         elif op == Op.SELECT:
             degree[i] = max(degree[b], degree[tape.c[i]])
         elif op in (Op.ADD, Op.SUBTRACT, Op.MINIMUM, Op.MAXIMUM):
@@ -138,7 +144,7 @@ def _waists(tape: Tape, outputs: Sequence[int]) -> _Waists:
         if op == Op.TANGENT:
             order.append(i)
             by[i] = {i: tape.one}
-        elif op > Op.TANGENT and op not in STEADY:
+        elif op > Op.TANGENT and op not in _FLAT:
             found = _chosen(tape, i, by) if op == Op.SELECT else _chained(tape, i, by)
             if len(found) > WAIST:
                 order.append(i)
@@ -157,7 +163,7 @@ def _between(tape: Tape, i: int, slopes: dict[int, int]) -> dict[int, dict[int, 
     for j in tape.live(slopes.values(), slopes):
         if j in slopes:
             by[j] = {j: tape.one}
-        elif tape.op[j] > Op.TANGENT and tape.op[j] not in STEADY and j != i:
+        elif tape.op[j] > Op.TANGENT and tape.op[j] not in _FLAT and j != i:
             found = _chosen(tape, j, by) if tape.op[j] == Op.SELECT else _chained(tape, j, by)
             if found:
                 by[j] = found
@@ -173,10 +179,10 @@ def _chosen(tape: Tape, i: int, by: dict[int, dict[int, int]]) -> dict[int, int]
 
 
 def _chained(tape: Tape, i: int, by: dict[int, dict[int, int]]) -> dict[int, int]:
-    if not any(j in by for j in (tape.a[i], tape.b[i])):
+    if tape.op[i] != Op.ENTRY and not any(j in by for j in (tape.a[i], tape.b[i])):
         return {}
     found = dict[int, int]()
-    for argument, partial in _partials(tape, i):
+    for argument, partial in _solution_partials(tape, i, by) if tape.op[i] == Op.ENTRY else _partials(tape, i):
         for waist, slope in by.get(argument, {}).items():
             found[waist] = tape.add(found.get(waist, tape.zero), tape.scaled(slope, partial))
     return found
@@ -188,7 +194,7 @@ def derivatives_by(tape: Tape, outputs: Sequence[int], leaf: int) -> list[int]:
     for i in tape.live(outputs):
         if i == leaf:
             by[i] = {i: tape.one}
-        elif tape.op[i] > Op.TANGENT and tape.op[i] not in STEADY:
+        elif tape.op[i] > Op.TANGENT and tape.op[i] not in _FLAT:
             found = _chosen(tape, i, by) if tape.op[i] == Op.SELECT else _chained(tape, i, by)
             if found:
                 by[i] = found
@@ -287,6 +293,19 @@ def _partials(tape: Tape, i: int) -> Partials:
         return [(a, t.select(first, one, t.zero)), (b, t.select(first, t.zero, one))]
     slope = _slope(tape, op, i, a)
     return [] if slope == t.zero else [(a, slope)]
+
+
+def _solution_partials(tape: Tape, i: int, by: Container[int]) -> Partials:
+    """Derivatives of an entry of x, A x = b, by what ``by`` holds: of dx = A^-1 (db - dA x), where A' y = e gives y."""
+    t, solved, place = tape, tape.a[i], int(tape.value[tape.b[i]])
+    matrix, right = t.system(solved)
+    size = range(len(right))
+    if not any(j in by for row in (*matrix, right) for j in row):
+        return []
+    turned = t.solve([[matrix[k][j] for k in size] for j in size], [t.one if k == place else t.zero for k in size])
+    x = t.solve(matrix, right)
+    found = [(right[k], turned[k]) for k in size]
+    return found + [(matrix[j][k], t.negate(t.multiply(turned[j], x[k]))) for j in size for k in size]
 
 
 def _vanishing_length(tape: Tape, i: int) -> tuple[float, int] | None:

@@ -55,6 +55,7 @@ class _Line:
         self._lines: list[str] = []
         self._values: dict[int, str] = {}  # what stands for a node
         self._truths: dict[int, str] = {}  # of comparisons: one bit
+        self._solutions: dict[int, list[str]] = {}
         self._called = dict[str, int]()  # number of arguments
         self._liberty = ""
 
@@ -77,7 +78,7 @@ class _Line:
     def compute(self, outputs: Iterable[int]) -> None:
         """Write what the outputs need and is not there yet."""
         for i in self._tape.live(outputs):
-            if i not in self._values and i not in self._truths:
+            if i not in self._values and i not in self._truths and i not in self._solutions:
                 self._instruction(i)
 
     def store(self, array: str, place: int, node: int) -> None:
@@ -92,6 +93,16 @@ class _Line:
         name = f"%n{i}"
         if op == Op.CONSTANT:
             self._values[i] = number(tape.value[i])
+            return
+        if op == Op.LIST:
+            return
+        if op == Op.SOLVE:
+            matrix, right = tape.system(i)
+            rows = [[self._number(j) for j in (*row, b)] for row, b in zip(matrix, right, strict=True)]
+            self._solutions[i] = self._solved(i, rows)
+            return
+        if op == Op.ENTRY:
+            self._values[i] = self._solutions[a][int(tape.value[b])]
             return
         if op <= Op.TANGENT:
             self.write(
@@ -143,6 +154,37 @@ class _Line:
                 self._called[called] = len(given)
                 self.write(f"{name} = call double @{called}({', '.join(given)})")
         (self._truths if op in _COMPARISONS or op in (Op.AND, Op.OR, Op.NOT) else self._values)[i] = name
+
+    def _solved(self, i: int, rows: list[list[str]]) -> list[str]:
+        """Solution of a linear system by elimination with partial pivoting, written out; rows end with b."""
+        size, count = len(rows), 0
+
+        def put(instruction: str) -> str:
+            nonlocal count
+            count += 1
+            self.write(f"%n{i}_{count} = {instruction}")
+            return f"%n{i}_{count}"
+
+        self._called[_LIBRARY[Op.ABSOLUTE]] = 1
+        for k in range(size):
+            for below in range(k + 1, size):  # the largest entry of the column comes up
+                lengths = [put(f"call double @llvm.fabs.f64(double {rows[r][k]})") for r in (below, k)]
+                larger = put(f"fcmp ogt double {lengths[0]}, {lengths[1]}")
+                for j in range(k, size + 1):
+                    low, high = rows[below][j], rows[k][j]
+                    rows[k][j] = put(f"select i1 {larger}, double {low}, double {high}")
+                    rows[below][j] = put(f"select i1 {larger}, double {high}, double {low}")
+            for below in range(k + 1, size):
+                factor = put(f"fdiv double {rows[below][k]}, {rows[k][k]}")
+                for j in range(k + 1, size + 1):
+                    rows[below][j] = put(f"fsub double {rows[below][j]}, {put(f'fmul double {factor}, {rows[k][j]}')}")
+        x: list[str] = [""] * size
+        for k in reversed(range(size)):
+            rest = rows[k][size]
+            for j in range(k + 1, size):
+                rest = put(f"fsub double {rest}, {put(f'fmul double {rows[k][j]}, {x[j]}')}")
+            x[k] = put(f"fdiv double {rest}, {rows[k][k]}")
+        return x
 
     def _number(self, i: int) -> str:
         value = self._values.get(i)

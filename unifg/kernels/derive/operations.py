@@ -53,6 +53,9 @@ class Op(IntEnum):
     NOT = auto()
     SELECT = auto()  # b where a, else c
     GATHER = auto()  # the a-th number of the tables
+    LIST = auto()  # the list a, and b; a list begins where a is none
+    SOLVE = auto()  # all of x in A x = b, for a list of the rows of A and b
+    ENTRY = auto()  # the b-th of the solution a
 
 
 UNARY = frozenset(
@@ -64,3 +67,5 @@ UNARY = frozenset(
 )  # fmt: skip
 STEADY = frozenset({Op.SIGN, Op.FLOOR, Op.RINT, Op.LESS, Op.LESS_EQUAL, Op.EQUAL, Op.AND, Op.OR, Op.NOT, Op.GATHER})
 """Constant but where they jump: they have no derivatives."""
+GROUPED = frozenset({Op.LIST, Op.SOLVE})
+"""Several numbers: their derivatives are those of their entries."""

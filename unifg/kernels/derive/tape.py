@@ -114,7 +114,7 @@ class Tape:
         if simple is not None:
             return simple(self, a, b, c)
         kind = self.op
-        if kind[a] == Op.CONSTANT and (b < 0 or kind[b] == Op.CONSTANT) and op != Op.GATHER:
+        if kind[a] == Op.CONSTANT and (b < 0 or kind[b] == Op.CONSTANT) and op < Op.GATHER:
             return self._fold(op, a, b)
         if op in _COMMUTES and b < a:
             a, b = b, a
@@ -241,6 +241,24 @@ class Tape:
             return self.select(self.a[condition], b, a)
         return self._node(Op.SELECT, condition, a, b)
 
+    def solve(self, matrix: Sequence[Sequence[int]], right: Sequence[int]) -> list[int]:
+        """Solution of a linear system."""
+        listed = self.one
+        for node in (*(node for row in matrix for node in row), *right):
+            listed = self._node(Op.LIST, listed, node)
+        solved = self._node(Op.SOLVE, listed)
+        return [self._node(Op.ENTRY, solved, self.constant(float(k))) for k in range(len(right))]
+
+    def system(self, solved: int) -> tuple[list[list[int]], list[int]]:
+        """Matrix and right-hand side of a SOLVE node."""
+        listed, nodes = self.a[solved], list[int]()
+        while self.op[listed] == Op.LIST:
+            nodes.append(self.b[listed])
+            listed = self.a[listed]
+        size = math.isqrt(len(nodes))
+        nodes.reverse()
+        return [nodes[k * size : (k + 1) * size] for k in range(size)], nodes[size * size :]
+
     def scaled(self, a: int, partial: int) -> int:
         """A derivative times a partial derivative; not of what is not chosen: its partial may be infinite."""
         if self.op[a] == Op.SELECT:
@@ -308,6 +326,7 @@ class Tape:
         given = {Op.VARIABLE: variables, Op.PARAMETER: parameters}
         tables = np.concatenate([np.zeros(0), *self.tables])
         found: dict[int, float] = {}
+        solved: dict[int, Array] = {}
         with np.errstate(all="ignore"):
             for i in self.live(outputs):
                 op, a, b = self.op[i], self.a[i], self.b[i]
@@ -315,8 +334,16 @@ class Tape:
                     found[i] = self.value[i]
                 elif op <= Op.TANGENT:
                     found[i] = float(given[Op(op)][a]) if op in given else float(op == Op.WEIGHT)
+                elif op == Op.LIST:
+                    continue
                 elif op == Op.GATHER:
                     found[i] = float(tables[int(found[a])]) if 0 <= found[a] < len(tables) else np.nan
+                elif op == Op.SOLVE:
+                    matrix, right = self.system(i)
+                    numbers = [[found[j] for j in row] for row in matrix], [found[j] for j in right]
+                    solved[i] = np.linalg.solve(*map(np.array, numbers))
+                elif op == Op.ENTRY:
+                    found[i] = float(solved[a][int(self.value[b])])
                 elif op == Op.SELECT:
                     found[i] = found[b] if found[a] != 0.0 else found[self.c[i]]
                 else:
