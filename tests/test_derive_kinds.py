@@ -60,31 +60,31 @@ def column(a: Any) -> Any:
     return np.asarray(a).reshape(len(a), -1) if np.ndim(a) else a
 
 
-def reshaped(x: Array) -> Array:
+def reshaped(x: Array) -> Any:
     y = x * 1.0
     y.shape = (2, 2)
     return y.reshape(1, 4) if y.shape[0] == 2 else 2.0 * y.reshape(1, 4)
 
 
-def assigned(x: Array) -> Array:
+def assigned(x: Array) -> Any:
     r = np.zeros_like(x)
     r[:, :2] = x[:, :2] > 0.5
     return r[:, :2] + r[:, :2]
 
 
-def masked(x: Array) -> Array:
+def masked(x: Array) -> Any:
     m = x > 0.0
     m[:, 0] = x[:, 1]
     return (m + m) * 1.0
 
 
-def outed(x: Array) -> Array:
+def outed(x: Array) -> Any:
     r = np.zeros((1, 4))
     np.greater(x, 0.5, out=r)
     return r + r
 
 
-def summed_builtin(x: Array) -> Array:
+def summed_builtin(x: Array) -> Any:
     return sum([x[:, :1] > 0.0, x[:, 1:2] > 0.0]) * 1.0
 
 

@@ -29,7 +29,8 @@ GENERIC, POSITIVE, INNER, BEYOND = (
     (1.1, 2.0, 40.0),
 )
 ONE: dict[Op, tuple[Rule, tuple[float, ...]]] = {
-    Op.NEGATE: (lambda a: -a, (*GENERIC, 0.0)), Op.SQRT: (mp.sqrt, POSITIVE), Op.SIN: (mp.sin, (*GENERIC, 0.0, math.pi)),
+    Op.NEGATE: (lambda a: -a, (*GENERIC, 0.0)), Op.SQRT: (mp.sqrt, POSITIVE),
+    Op.SIN: (mp.sin, (*GENERIC, 0.0, math.pi)),
     Op.COS: (mp.cos, (*GENERIC, 0.0, math.pi)), Op.TAN: (mp.tan, (*GENERIC[:4], 0.0)), Op.ARCSIN: (mp.asin, INNER),
     Op.ARCCOS: (mp.acos, INNER), Op.ARCTAN: (mp.atan, (*GENERIC, 0.0)), Op.SINH: (mp.sinh, (*GENERIC, 0.0)),
     Op.COSH: (mp.cosh, (*GENERIC, 0.0)), Op.TANH: (mp.tanh, (*GENERIC[:4], 0.0)),
@@ -41,7 +42,8 @@ ONE: dict[Op, tuple[Rule, tuple[float, ...]]] = {
 PAIRS = ((0.7, 1.9), (-1.3, 0.4), (2.5, -0.6), (-3.1, -1.2), (30.0, 7.0))
 TWO: dict[Op, tuple[Rule, tuple[tuple[float, float], ...]]] = {
     Op.ADD: (lambda a, b: a + b, PAIRS), Op.SUBTRACT: (lambda a, b: a - b, PAIRS),
-    Op.MULTIPLY: (lambda a, b: a * b, PAIRS), Op.DIVIDE: (lambda a, b: a / b, PAIRS), Op.ARCTAN2: (mp.atan2, (*PAIRS, (0.0, 1.0), (1.0, 0.0), (0.5, -1e-3))),
+    Op.MULTIPLY: (lambda a, b: a * b, PAIRS), Op.DIVIDE: (lambda a, b: a / b, PAIRS),
+    Op.ARCTAN2: (mp.atan2, (*PAIRS, (0.0, 1.0), (1.0, 0.0), (0.5, -1e-3))),
     Op.POWER: (lambda a, b: a**b, ((0.7, 1.9), (2.5, -0.6), (1.0, 0.0), (3.0, 2.0), (1e-3, 0.5))),
     Op.FMOD: (fmod, (*PAIRS, (7.3, 2.0), (-7.3, 2.0), (7.3, -2.0))),
     Op.MINIMUM: (min, PAIRS), Op.MAXIMUM: (max, PAIRS),
@@ -163,7 +165,7 @@ def test_linear_systems_are_solved_as_well_as_their_condition_allows(size: int, 
 
 
 def test_a_system_that_needs_pivots_is_solved() -> None:
-    function = lambda x: np.linalg.inv(np.stack([x[:, :2] - 1.0, x[:, 2:]], axis=1))[:, 0]  # noqa: E731
+    function: Rule = lambda x: np.linalg.inv(np.stack([x[:, :2] - 1.0, x[:, 2:]], axis=1))[:, 0]  # noqa: E731
     expression = traced(function, (Rn(4),))
     v = np.array([[1.0, 3.0, 2.0, 5.0]])  # the first pivot is zero
     np.testing.assert_allclose(evaluated(expression, v, np.zeros((1, 0)))[0], function(v), rtol=1e-15)

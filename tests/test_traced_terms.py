@@ -329,7 +329,8 @@ def halved(self: Model, x: Array) -> Array:
 def test_attributes_are_watched(change: Function, derivatives: Any, of: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where a trace is asked for: nothing is frozen that the function reads."""
     model = Model()
-    function: Function = {"method": model.residual, "call": model, "function": lambda x: model.residual(x)}[of]
+    functions: dict[str, Function] = {"method": model.residual, "call": model, "function": lambda x: model.residual(x)}
+    function = functions[of]
     graph, x = stated(fg.residual(function, derivatives=derivatives))
     prepared = GaussNewton().prepare(graph)
     np.testing.assert_allclose(prepared.solve({x: np.zeros((N, 3))})[x], 0.5, atol=1e-9)

@@ -110,9 +110,12 @@ def test_a_loop_is_verified_on_a_schedule(monkeypatch: pytest.MonkeyPatch) -> No
     prepared = GaussNewton().prepare(graph)
     asked = list[tuple[int, bool]]()
     honest = prepared.program.mistraced
-    monkeypatch.setattr(
-        prepared.program, "mistraced", lambda v, slopes, n: asked.append((n, slopes)) or honest(v, slopes, n)
-    )
+
+    def noted(values: Any, slopes: bool, seed: int) -> dict[str, str]:
+        asked.append((seed, slopes))
+        return honest(values, slopes, seed)
+
+    monkeypatch.setattr(prepared.program, "mistraced", noted)
     checked = [prepared.solve({x: np.zeros((N, 1))}).checked for _ in range(frame.EVERY + 1)]
     assert asked == [(n, True) for n in (1, 2, 4, 8, 16, 32, 64)] + [(frame.EVERY, False)]
     assert [n for n, yes in enumerate(checked, 1) if yes] == [n for n, _ in asked]
@@ -178,7 +181,7 @@ def test_kinks_jumps_and_noise_are_no_differences(function: Function, at: float)
         assert not program.mistraced(values, True, seed)
 
 
-def test_verification_costs_little() -> None:
+def test_verification_costs_little(monkeypatch: pytest.MonkeyPatch) -> None:
     """Within a loop it is a small share of the time; the figure is on docs/own-functions.md."""
     graph, x, target = stated(lambda x: np.where(x < 0.5, np.tanh(x), np.sin(x)), constrained=True)
     prepared = InteriorPoint().prepare(graph)
@@ -191,7 +194,7 @@ def test_verification_costs_little() -> None:
         spent += time.perf_counter() - began
         return found
 
-    prepared._verified = timed  # type: ignore[method-assign]
+    monkeypatch.setattr(prepared, "_verified", timed)
     for tick in range(300):
         assert prepared.solve({x: np.zeros((N, 1))}, data={target: np.full((N, 1), 0.001 * tick)}).converged
     assert spent < 10.0

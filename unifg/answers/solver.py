@@ -429,9 +429,9 @@ class Prepared:
     It belongs to one thread at a time. Others prepare their own: those of one graph wait for each other, those of
     graphs that were stated twice do not.
 
-    Answers are verified by evaluating traced functions as written: values in solves 1, 2, 4, ..., every 100th, and after
-    solves in which a comparison of a trace comes out otherwise; derivatives in solves 1, 2, 4, ... A term whose trace
-    differs is left to Python, and the solve repeated from there.
+    Answers are verified by evaluating traced functions as written. Values: in solves 1, 2, 4, ..., in every 100th, and
+    after solves in which a comparison of a trace comes out otherwise. Derivatives: in solves 1, 2, 4, ... A term whose
+    trace differs is left to Python, and the solve is repeated from there.
 
     Attributes:
         solver: the backend and its options.

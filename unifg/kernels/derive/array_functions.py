@@ -174,11 +174,11 @@ def _solution(matrix: Any, right: Any) -> list[Any]:
     return [Symbol.of(tape, node) for node in tape.solve(rows, nodes[n * n :])]
 
 
-def _every(array: Any, axis: Any = None, *, keepdims: bool = False) -> Any:
+def _every(array: Any, axis: Any = None, *, keepdims: Any = False) -> Any:
     return np.logical_and.reduce(wrapped(_objects(array)), axis, keepdims=keepdims)
 
 
-def _some(array: Any, axis: Any = None, *, keepdims: bool = False) -> Any:
+def _some(array: Any, axis: Any = None, *, keepdims: Any = False) -> Any:
     return np.logical_or.reduce(wrapped(_objects(array)), axis, keepdims=keepdims)
 
 

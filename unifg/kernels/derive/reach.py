@@ -243,7 +243,7 @@ class _Walk:
             self.refuse(f"{where} is {_kind(value)}, which may change")
             return id(value)
         own: dict[str, Any] = vars(value)
-        parts: list[Hashable] = [type(value)]
+        parts: list[Any] = [type(value)]
         asked = {name for name in self._attributes if not name.startswith("__")}
         for name in sorted(asked | {name for owner in owners for name in vars(owner) if is_operator(owner, name)}):
             if name in own:

@@ -194,7 +194,7 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
     def dtype(self) -> Any:
         """Type of the numbers that the symbols stand for: float64 or bool; to NumPy, objects."""
         if sys._getframe(1).f_globals.get("__name__", "").startswith("numpy"):
-            return np.ndarray.dtype.__get__(self)  # type: ignore[attr-defined]
+            return np.ndarray.dtype.__get__(self)
         return np.dtype(bool if self.size and is_truth(next(self.flat)) else float)
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
@@ -285,7 +285,7 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
             return bool(self.item())
         return super().__bool__()
 
-    def astype(self, dtype: Any, **options: Any) -> Any:
+    def astype(self, dtype: Any, **options: Any) -> Any:  # type: ignore[override]
         """Floats, truth values, or 64-bit integers: what is left without the fraction."""
         only("astype", options, "order", "casting", "subok", "copy")
         kind = np.dtype(dtype)

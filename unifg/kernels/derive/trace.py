@@ -240,7 +240,7 @@ class Rebound:
             for name in filter(partial(is_operator, owner), vars(owner)):
                 names[name] = self.function(vars(owner)[name])
         made = SimpleNamespace.__new__ if isinstance(instance, SimpleNamespace) else object.__new__
-        stand_in = made(type(type(instance).__name__, (type(instance),), names))
+        stand_in: Any = made(type(type(instance).__name__, (type(instance),), names))
         self._instances[id(instance)] = stand_in
         self._kept.append(instance)
         return stand_in
