@@ -198,3 +198,32 @@ def test_verification_costs_little(monkeypatch: pytest.MonkeyPatch) -> None:
     for tick in range(300):
         assert prepared.solve({x: np.zeros((N, 1))}, data={target: np.full((N, 1), 0.001 * tick)}).converged
     assert spent < 10.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_fields_of_discs_and_costs_with_kinks_raise_no_alarm(seed: int) -> None:
+    """Two hundred such fields were run once; none was wrong."""
+    rng = np.random.default_rng(seed)
+    centre, radius, steps = rng.uniform([0.8, -1.0], [4.2, 1.0], (6, 2)), rng.uniform(0.1, 0.35, 6), 15
+
+    def moved(x: Array, u: Array, after: Array) -> Array:
+        heading = 0.5 * (x + after)[:, 2]
+        rate = np.stack([u[:, 0] * np.cos(heading), u[:, 0] * np.sin(heading), u[:, 1]], axis=1)
+        return np.asarray(after - x - 0.3 * rate)
+
+    graph = fg.Graph()
+    x, u = graph.variables("x", fg.Rn(3), steps + 1), graph.variables("u", fg.Rn(2), steps)
+    graph.fix(x[0], np.zeros(3))
+    graph.constrain(moved, x[:-1], u, x[1:], lower=0.0, upper=0.0)
+    gap: Function = lambda x: np.linalg.norm(x[:, None, :2] - centre, axis=2) - radius  # noqa: E731
+    graph.constrain((lambda x: gap(x).min(axis=1, keepdims=True)) if seed % 2 else gap, x[1:], lower=0.1)
+    graph.minimize(lambda x: x - np.array([4.5, 0.0, 0.0]), x[-1], sigma=0.05)
+    graph.bound(u, lower=-2.0, upper=2.0)
+    graph.minimize(lambda u: 0.1 * u, u)
+    if seed % 3:
+        graph.minimize_scalar(lambda u: np.abs(u).sum(axis=1), u)
+    else:
+        graph.minimize(lambda u: np.maximum(np.abs(u) - 0.5, 0.0), u)
+    line = np.linspace(np.zeros(3), [4.5, 0.0, 0.0], steps + 1)
+    solution = InteriorPoint(max_iterations=80).solve(graph, {x: line, u: np.full((steps, 2), 0.5)})
+    assert solution.checked and not solution.mistraced

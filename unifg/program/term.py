@@ -184,20 +184,19 @@ class CompiledTerm:
             return "the variable itself"
         if own.kernel is not None:
             return "a kernel that ships, its derivatives exact" if self.kernel is not None else _SEARCHED
-        asked = own.derivatives == "trace"
-        if own.jacobian is not None and not asked and own.derivatives != "trace first":
-            return "evaluated by Python, its derivatives attached"
+        asked, attached = own.derivatives == "trace", own.jacobian is not None
         why = "it has a search Jacobian" if own.search else ""
         if own.derivatives == "differences":
             why = "as it was asked to be"
-        if not why or unclear_places(self._arguments, self.term.rows, self.count):
-            found, reason = find(self.batch, own.function, asked)
+        taken = not why and (not attached or asked or own.derivatives == "trace first")
+        if taken or unclear_places(self._arguments, self.term.rows, self.count):
+            found, reason = find(self.batch, own.function, asked)  # also for how arrays as long as the batch are read
             self._each = None if found is None else found.each
             self._bind_batched(self._batched)
-            if not why:
+            if taken:
                 self.trace, why = found, reason
-        if self.trace is None and own.jacobian is not None:
-            return f"evaluated by Python, its derivatives attached: {why}"
+        if self.trace is None and attached:
+            return "evaluated by Python, its derivatives attached" + (f": {why}" if taken else "")
         if self.trace is None:
             return self._by_python(why)
         self.kernel, self._taken = self.trace.kernel, self.trace.taken

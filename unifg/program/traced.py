@@ -324,7 +324,8 @@ def _traced(
     if batch.count == 1 or batch.single is not None:
         lengths: tuple[int, ...] = (1,)
     else:
-        lengths = (batch.count,) if whole else lengths_for(given)
+        named_shapes = [Shared(array.shape) for array, _ in reached]
+        lengths = (batch.count,) if whole else lengths_for([*given, *named_shapes])
     kernel = derived(function, given, reach, rows, batch.scalar, name, not asked, reached, lengths)
     if kernel.rows != batch.size:
         raise TraceError(f"it returns {kernel.rows} rows for one factor and {batch.size} for {batch.count}")
