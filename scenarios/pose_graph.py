@@ -50,6 +50,7 @@ LOSSES: dict[str, Callable[[float], Loss]] = {
     "dcs": DCS,
     "gnc": TruncatedLeastSquares,
 }
+_JUDGED = {"optimum": 1e-6, "map": 1e-4}  # share of the cost by which maps are told apart: a map ends within 1e-5
 _DEFAULTS = {"huber": 1.345, "cauchy": 2.385, "tukey": 4.685, "dcs": 1.0}
 _INLIERS = 0.99  # of right measurements lie within the default threshold of gnc
 OUTLIER_WEIGHT = 0.5
@@ -74,8 +75,10 @@ class SolveSettings:
         max_iterations: before giving up.
         threads: that share the work of a large graph; no more than there are free cores.
         no_scene: leave out the scene and the picture, which take longer than the solve.
-        certify: see whether another map could be better, by the dual of the chordal relaxation.
-        staircase: where that finds a way down, follow it and solve again from there.
+        certify: bound what another map could gain, by the dual of the chordal relaxation, and take a better map where
+            one is found on the way.
+        staircase: where that finds a way down, follow it.
+        keep_map: keep the map of the first solve although a better one was found; that is a failure.
     """
 
     file: Path = option(text=existing("a pose graph (g2o or TORO)"), metavar="GRAPH")
@@ -90,6 +93,7 @@ class SolveSettings:
     no_scene: bool = option(False)
     certify: bool = option(False)
     staircase: bool = option(False)
+    keep_map: bool = option(False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +115,7 @@ class SolvedGraph:
         begun: name of the first guess that was taken.
         judgement: what the graph says about itself at the solution, outliers left out.
         certificate: of the solution, if it was asked for.
+        better: cost, as stated, of a better map that was found and not taken; None without one.
         seconds: wall-clock time by what it was spent on: read, initialise, compile, solve, certify.
     """
 
@@ -127,6 +132,7 @@ class SolvedGraph:
     begun: str
     judgement: Judgement
     certificate: Certificate | None
+    better: float | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     interrupted: bool = False
 
@@ -193,15 +199,30 @@ def _solve_file(settings: SolveSettings, progress: Progress) -> SolvedGraph:
     clock.split("initialise")
     solve = _Solve(settings, loss, clock, progress)
     solution, after, squared, outliers = solve(before)
-    certificate, stopped = None, solution.status is Status.INTERRUPTED
+    certificate, worse, stopped = None, None, solution.status is Status.INTERRUPTED
     if (settings.certify or settings.staircase) and not stopped:
         try:
-            progress(0.95, "is another map better?")
-            clock.start()
-            certificate = certify(after, used=~outliers, staircase=settings.staircase)
-            clock.split("certify")
-            if certificate.rank > read.group.point_dim:
-                solution, after, squared, outliers = solve(before.with_poses(certificate.poses))
+            while True:
+                progress(0.95, "is another map better?")
+                clock.start()
+                certificate = certify(
+                    after,
+                    used=None if loss is None else ~outliers,
+                    staircase=settings.staircase,
+                    tolerance=_JUDGED[settings.tolerance],
+                    residual=settings.residual,
+                )
+                clock.split("certify")
+                if certificate.better is None:
+                    break
+                again = solve(before.with_poses(certificate.better))
+                # Compared as stated, losses included.
+                if not again[0].cost < (1.0 - _JUDGED[settings.tolerance]) * solution.cost:
+                    break
+                if settings.keep_map:
+                    worse = again[0].cost
+                    break
+                solution, after, squared, outliers = again
         except KeyboardInterrupt:  # there is something to write
             stopped = True
     stopped = stopped or solution.status is Status.INTERRUPTED
@@ -212,7 +233,7 @@ def _solve_file(settings: SolveSettings, progress: Progress) -> SolvedGraph:
     judgement = judge(replace(after, edges=after.edges[~outliers]), settings.residual)
     return SolvedGraph(
         settings, before, after, chi2, solution, loss, squared, outliers, steps, numbers, begun, judgement, certificate,
-        clock.seconds, stopped,
+        worse, clock.seconds, stopped,
     )  # fmt: skip
 
 

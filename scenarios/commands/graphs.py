@@ -29,10 +29,13 @@ logger = logging.getLogger("unifg")
 def run(settings: pose_graph.SolveSettings, progress: Progress) -> Outcome:
     """Solve the graph of a file."""
     solved = pose_graph.solve_file(settings, progress)
-    converged = solved.solution.converged
     numbers = metrics(solved)
     return Outcome(
-        converged, solved.interrupted, summary(solved), numbers, lambda folder: write_results(folder, solved)
+        solved.solution.converged and solved.better is None,
+        solved.interrupted,
+        summary(solved),
+        numbers,
+        lambda folder: write_results(folder, solved),
     )
 
 
@@ -97,6 +100,7 @@ def metrics(solved: SolvedGraph) -> dict[str, Any]:
         "parts": solved.judgement.parts,
         "anchors_added": list(solved.judgement.anchors),
         "remarks": [*graph.remarks, *solved.judgement.sentences()],
+        "better_cost": solved.better,
         "certificate": None if solved.certificate is None else _certificate(solved.certificate),
         "cost": solution.cost,
         "stationarity": solution.stationarity,
@@ -132,6 +136,7 @@ def summary(solved: SolvedGraph) -> str:
         *(("remark", sentence) for sentence in numbers["remarks"]),
         ("held where it was", ", ".join(f"pose {name}" for name in numbers["anchors_added"][:5])),
         ("another map", "" if solved.certificate is None else solved.certificate.sentence()),
+        ("kept all the same", "" if solved.better is None else f"cost {solved.better:.6g} was found"),
         ("believed", "" if verdict is None else verdict.sentence(numbers["cost"])),
         ("iterations", f"{numbers['iterations']}"),
         ("status", solved.solution.status.value),
@@ -144,9 +149,13 @@ def _certificate(certificate: Certificate) -> dict[str, Any]:
     return {
         "certified": certificate.certified,
         "chi2_chordal": certificate.chi2,
+        "dual": certificate.dual,
         "gap": certificate.gap,
         "least_eigenvalue": certificate.least_eigenvalue,
         "rank": certificate.rank,
+        "moved": list(certificate.moved),
+        "interval": None if certificate.interval is None else list(certificate.interval),
+        "better_chi2": None if certificate.better_chi2 is None else certificate.better_chi2[1],
         "caveats": list(certificate.caveats),
     }
 
