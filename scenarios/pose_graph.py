@@ -25,7 +25,7 @@ from unifg.pose_graphs.certificate import Certificate, certify
 from unifg.pose_graphs.information import REPAIRS, Repair, indefinite
 from unifg.pose_graphs.initialise import chordal, lago, odometric, starts
 from unifg.pose_graphs.judgement import Judgement, judge
-from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
+from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName, RobustOn
 from unifg.pose_graphs.relaxation import admit
 from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.options import existing, option
@@ -66,6 +66,8 @@ class SolveSettings:
         solver: one of `unifg.solvers.names.LEAST_SQUARES`.
         robust: loss on loop closures, if any: huber, cauchy, tukey, dcs, or gnc (truncated least squares, graduated),
             with its parameter after a colon if it is not the usual one.
+        robust_on: the measurements with this loss: loop closures, or odometry and sightings of landmarks as well. All
+            can be wrong then, and gnc begins at several first guesses.
         init: first guess: poses of the file, a spanning tree, LAGO (2D) or chordal relaxation; or the one of them
             that costs least, but for the tree.
         residual: full logarithm, as GTSAM, or the chart of g2o; their optima differ in 3D.
@@ -84,6 +86,7 @@ class SolveSettings:
     file: Path = option(text=existing("a pose graph (g2o or TORO)"), metavar="GRAPH")
     solver: str = "gn"
     robust: str | None = option(None, metavar="LOSS[:PARAM]")
+    robust_on: RobustOn = option("closures")
     init: str = option(AUTO, choices=(AUTO, *GUESSES))
     residual: ResidualName = option("log")
     tolerance: Literal["optimum", "map"] = option("optimum")
@@ -250,7 +253,7 @@ class _Solve:
         clock.start()
         if not self.before:
             self.progress(0.06, "compiling")
-        graph, x, guess = begin.graph(robust=loss, residual=settings.residual)
+        graph, x, guess = begin.graph(robust=loss, residual=settings.residual, robust_on=settings.robust_on)
         graph.compile()
         clock.split("compile")
 
