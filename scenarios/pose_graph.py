@@ -54,7 +54,7 @@ _JUDGED = {"optimum": 1e-6, "map": 1e-4}  # share of the cost by which maps are 
 _DEFAULTS = {"huber": 1.345, "cauchy": 2.385, "tukey": 4.685, "dcs": 1.0}
 _INLIERS = 0.99  # of right measurements lie within the default threshold of gnc
 OUTLIER_WEIGHT = 0.5
-"""A loop closure that the robust loss gives less weight than this is called an outlier."""
+"""A measurement that the robust loss gives less weight than this is called an outlier."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class SolvedGraph:
         chi2: sum of r' Omega r, without losses: in the file, NaN where it has no poses, at the first guess, and at the
             solution.
         solution: what the backend returned.
-        loss: on the loop closures; None for none.
+        loss: on the loop closures, or on all measurements; None for none.
         squared: (m,) r' Omega r of every edge at the solution.
         outliers: (m,) edges that the loss gives less than half of their weight.
         steps: (k, n, storage) poses of up to a dozen iterates, the first guess and the solution among them.
@@ -276,7 +276,8 @@ class _Solve:
         weights = np.ones(len(errors)) if loss is None else np.asarray(loss.weight(errors))
         self.before += solution.iterations
         self.snapshots.add(self.before, after.poses)
-        return solution, after, errors, (weights < OUTLIER_WEIGHT) & ~begin.edges.odometry
+        trusted = begin.edges.odometry & (settings.robust_on == "closures")
+        return solution, after, errors, (weights < OUTLIER_WEIGHT) & ~trusted
 
 
 def robust_loss(text: str | None, dim: int) -> Loss | None:

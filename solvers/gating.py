@@ -41,7 +41,7 @@ class Scatter:
 
     Attributes:
         squared: sum of their weighted squared residuals.
-        freedom: number of their residuals less the number of unknowns.
+        freedom: number of their residuals less the number of unknowns; infinite where their noise is known.
     """
 
     squared: float
@@ -67,6 +67,11 @@ class Scatter:
             size: numbers in a measurement.
             count: how many are looked at.
         """
+        if np.isinf(self.freedom):
+            from scipy.special import chdtri
+
+            known: BoolArray = innovation > float(chdtri(size, CHANCE / max(count, 1)))
+            return known
         rest = self.freedom - size
         if rest < 1.0:
             return np.zeros(len(innovation), dtype=np.bool_)

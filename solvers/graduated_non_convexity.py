@@ -39,7 +39,7 @@ from unifg.answers.history import Iteration
 from unifg.answers.solution import AnyGuess, NotConverged, Solution, values_of
 from unifg.answers.solver import Backend, Callback, Prepared, Solver
 from unifg.answers.status import Status
-from unifg.answers.verdict import Verdict
+from unifg.answers.verdict import Group, Verdict
 from unifg.errors import BackendError, GraphError
 from unifg.kernels.robust import DCS, Graduated, Huber, Loss
 from unifg.language.statement import Statement
@@ -48,7 +48,7 @@ from unifg.language.variables import Data
 from unifg.machine.inner import inner
 from unifg.program.linearization import Linearization
 from unifg.program.term import CompiledTerm
-from unifg.solvers.gating import Innovations, Scatter, groups_of
+from unifg.solvers.gating import CHANCE, Innovations, Scatter, groups_of
 from unifg.solvers.least_squares import GaussNewton, LevenbergMarquardt
 from unifg.typing import Array, BoolArray, IntArray, Numbers
 
@@ -67,6 +67,9 @@ GROUPS = 3  # that are tried, of those that count and of those left out
 SPARE = 4.0  # noise is rarely of one size: twice the standard deviation of the others is no contradiction
 ROUNDS = 20  # of taking back or out
 DECIDED = 1e-3  # a truncated loss is done when every weight is this close to zero or one
+
+
+STATED = Scatter(0.0, np.inf)  # noise as large as stated
 
 
 class _Held:
@@ -223,8 +226,8 @@ class _Search:
         self._damped: Prepared | None = None
         self.found: list[_Answer] = []
         self._shares: dict[str, _Sum] = {}
-        self._calm = False
-        self.groups: list[tuple[str, IntArray, bool, _Answer]] = []
+        self._calm: _Answer | None = None
+        self._groups: list[tuple[str, IntArray, bool, Solution]] = []
         robust = self._run.program.table.robust
         self._terms = [t for t, _ in robust if isinstance(t.term, Cost) and isinstance(t.term.robust, _Stage)]
         staged_names = {term.name for term in self._terms}
@@ -233,25 +236,31 @@ class _Search:
 
     def best(self, guess: AnyGuess) -> Solution:
         """The best answer found, judged with the losses themselves."""
+        told: list[str] = []
+
+        def heard(origin: str, solution: Solution) -> None:
+            told.append(f"{origin} {self._answer(solution).solution.cost:.6g}")
+
         for start in self._starts(guess):
             graduated = self._graduated(start)
             if graduated.status is Status.INTERRUPTED:
                 break
-            self._answer(self._stated(graduated))
+            heard("surrogates", self._stated(graduated))
             # The optimum without losses believes everything: on a clean graph it is the answer.
-            self._answer(self._stated(self._plain))
-            self._calm |= self._believed(self._plain)
+            heard("squares", self._stated(self._plain))
+            if self._plain_terms and self._calm is None and self._within(self._plain) and self.found[-1].consistent:
+                self._calm = self.found[-1]
             for make in (_rival,) if self._plain_terms else (_rival, _huber):
                 for stage in self._stages:
                     stage.now = make(stage.goal)
-                self._answer(self._stated(self._from(start)))
+                heard(str(self._stages[0].now), self._stated(self._from(start)))
             if not self._plain_terms:
-                self._answer(self.history.add(self._last, start, self._data, restart=True))
+                heard("guess", self.history.add(self._last, start, self._data, restart=True))
         if not self.found:
             return self._interrupted(graduated)
-        answer = min(self.found, key=lambda one: one.solution.cost)
-        costs = ", ".join(f"{one.solution.cost:.6g}" for one in self.found)
-        logger.info("%s: answers of cost %s", self._options.name, costs)
+        # Nothing contradicts what was stated: a right measurement is not given up because that is cheaper.
+        answer = self._calm or min(self.found, key=lambda one: one.solution.cost)
+        logger.info("%s: answers of cost %s", self._options.name, ", ".join(told))
         if any(one.status is Status.INTERRUPTED for one in [graduated, *(one.solution for one in self.found)]):
             answer.solution.status = Status.INTERRUPTED
             return answer.solution
@@ -264,8 +273,8 @@ class _Search:
             with suppress(GraphError):  # what the measurements do not determine is no start
                 yield {**values_of(guess), **make()}
 
-    def _believed(self, found: Solution) -> bool:
-        """Whether an answer leaves every measurement within its threshold: nothing contradicts what is stated."""
+    def _within(self, found: Solution) -> bool:
+        """Whether an answer leaves every measurement within its threshold."""
         squares = self._run.program.linearize(found.values).squares
         parts = {term.name: part for term, part in self._run.program.table.robust}
         return all(
@@ -354,6 +363,8 @@ class _Search:
                 fall, far = innovations.without(term, plain, kept, stage.goal.weight(squared)[kept])
                 wrong = answer.scatter.contradicts(fall, term.size, everything)
                 answer.doubted[term.name] = np.flatnonzero(kept)[wrong]
+                if self._calm is not None:
+                    wrong = STATED.contradicts(fall, term.size, everything)
                 # What would stay within its threshold counts, by the loss as stated, however the others scatter.
                 score = np.full(len(kept), np.inf)
                 score[kept] = np.where(wrong & (far > bound), -fall, np.inf)
@@ -366,15 +377,26 @@ class _Search:
         return answer
 
     def _without_group(self, answer: _Answer) -> _Answer | None:
-        """An answer found before that leaves out several measurements and is better for it, or None."""
-        for other in self.found:
-            if other.solution.converged and other.count < answer.count and self._prefers(other, answer, SPARE):
-                return other
+        """A better answer found before that leaves out several measurements, or None.
+
+        Where all is consistent as stated, these have to be groups, and the answer cheaper.
+        """
+        for other in sorted(self.found, key=lambda one: one.solution.cost):
+            if not other.solution.converged or other.count >= answer.count:
+                continue
+            if self._calm is None:
+                if self._prefers(other, answer, SPARE):
+                    return other
+            elif other.solution.cost < (1.0 - LESS) * answer.solution.cost:
+                dropped = [ours & ~theirs for ours, theirs in zip(answer.kept, other.kept, strict=True)]
+                grouped = sum(len(g) for t, gone in zip(self._terms, dropped, strict=True) for g in groups_of(t, gone))
+                if grouped > HALF * sum(int(gone.sum()) for gone in dropped):
+                    return other
         return None
 
     def _by_groups(self, answer: _Answer, plain: Linearization, innovations: Innovations) -> _Answer | None:
         """A better answer without a group of measurements that counts, or with one that was left out, or None."""
-        self.groups = []
+        self._groups = []
         doubted: list[tuple[float, int, IntArray]] = []
         left: list[tuple[int, IntArray]] = []
         for k, (term, kept, weight) in enumerate(zip(self._terms, answer.kept, answer.weights, strict=True)):
@@ -397,7 +419,7 @@ class _Search:
                 continue  # the others decide about its members, one by one
             if self._prefers(found, answer, 1.0):
                 return found
-            self.groups.append((self._terms[k].name, group, not weight, found))
+            self._groups.append((self._terms[k].name, group, not weight, found.solution))
         return None
 
     def _prefers(self, one: _Answer, other: _Answer, spare: float) -> bool:
@@ -407,7 +429,7 @@ class _Search:
         each other is wrong: the cost as stated decides.
         """
         units: Mapping[str, float] = {}
-        if self._plain_terms and not (self._calm and spare > 1.0):
+        if self._plain_terms and (self._calm is None or spare == 1.0):
             units = {name: min(1.0, spare * unit) for name, unit in one.units_with(other, self._shares).items()}
         return one.judged(units) < (1.0 - LESS) * other.judged(units)
 
@@ -473,8 +495,21 @@ class _Search:
         for other in rivals[:RIVALS]:
             theirs = {term.name: kept for term, kept in zip(self._terms, other.kept, strict=True)}
             other.solution.verdict = Verdict(theirs, other.doubted, other.scatter.unit)
-        final.solution.verdict = Verdict(kept, doubted, final.scatter.unit, others)
+        groups = [
+            Group(name, factors, held, other, self._moved(final.solution, other))
+            for name, factors, held, other in self._groups
+        ]
+        final.solution.verdict = Verdict(kept, doubted, final.scatter.unit, others, tuple(groups))
         return final.solution
+
+    def _moved(self, one: Solution, other: Solution) -> tuple[str, int, float]:
+        """Family and member whose values differ most, and by how much."""
+        found = ("", 0, 0.0)
+        for name, family in self._last.program.graph.families.items():
+            apart = np.linalg.norm(family.manifold.local(one[family], other[family]), axis=1)
+            member = int(apart.argmax())
+            found = max(found, (name, member, float(apart[member])), key=lambda one: one[2])
+        return found
 
 
 class _Sum(NamedTuple):
@@ -517,6 +552,13 @@ class _Answer:
         for term, weight, own in zip(terms, self.weights, squared, strict=True):
             sums.append(_Sum(inner(weight, own), term.size * float(weight.sum())))
         self.scatter = Scatter(sum(one.total for one in sums), sum(one.rows for one in sums) - unknowns)
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the sum of all squares is no larger than what is stated makes likely."""
+        from scipy.special import chdtri  # slow to load
+
+        return self.scatter.freedom < 1.0 or self.scatter.squared <= float(chdtri(self.scatter.freedom, CHANCE))
 
     def units_with(self, other: _Answer, shares: Mapping[str, _Sum]) -> dict[str, float]:
         """Variance of unit weight of each term, over all measurements that this answer or another one keeps.

@@ -84,6 +84,7 @@ def metrics(solved: SolvedGraph) -> dict[str, Any]:
         "skipped_lines": dict(graph.skipped),
         "solver": solution.solver,
         "robust": settings.robust,
+        "robust_on": settings.robust_on,
         "init": solved.begun,
         "residual": settings.residual,
         "status": solution.status.name,
@@ -115,6 +116,7 @@ def summary(solved: SolvedGraph) -> str:
     """The outcome as a table of two columns."""
     numbers, verdict, graph = metrics(solved), solved.solution.verdict, solved.after
     more = f", {numbers['landmarks']} landmarks" if numbers["landmarks"] else ""
+    doubted = "loop closures" if solved.settings.robust_on == "closures" else "measurements"
     skipped = ", ".join(f"{tag} ({count})" for tag, count in numbers["skipped_lines"].items())
     milliseconds = {name: 1e3 * value for name, value in solved.seconds.items()}
     rows = [
@@ -126,12 +128,12 @@ def summary(solved: SolvedGraph) -> str:
         ),
         ("skipped lines", skipped),
         ("solver, residual", f"{numbers['solver']}, {numbers['residual']}"),
-        ("robust loss", "" if solved.loss is None else f"{solved.loss}, on loop closures"),
+        ("robust loss", "" if solved.loss is None else f"{solved.loss}, on {doubted}"),
         ("chi2 in the file", f"{numbers['chi2_file']:.9g}" if graph.placed else "it has no poses"),
         ("chi2 at the start", f"{numbers['chi2_start']:.9g} ({numbers['init']})"),
         ("chi2 at the end", f"{numbers['chi2']:.9g}, {numbers['degrees_of_freedom']} degrees of freedom"),
         ("without outliers", f"{numbers['chi2_inliers']:.9g}" if numbers["outliers"] else ""),
-        ("outliers", "" if solved.loss is None else f"{numbers['outliers']} of the loop closures"),
+        ("outliers", "" if solved.loss is None else f"{numbers['outliers']} of the {doubted}"),
         ("worst edges", _worst(solved)),
         *(("remark", sentence) for sentence in numbers["remarks"]),
         ("held where it was", ", ".join(f"pose {name}" for name in numbers["anchors_added"][:5])),
