@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -92,7 +91,7 @@ def test_uneven_closures_are_kept_beside_wrong_ones(share: float) -> None:
 
 @pytest.mark.parametrize(("seed", "count"), [(6, 8), (19, 15)])
 def test_a_group_that_contradicts_the_others_is_left_out(seed: int, count: int) -> None:
-    """All of it within its thresholds at the optimum of squares; it costs less as stated in the first, not in the other."""
+    """All of it lies within its thresholds at the optimum of squares; the first group even costs less as stated."""
     sim, rng = manhattan(200, seed), np.random.default_rng(seed)
     edges, group, truth = sim.pose_graph.edges, sim.pose_graph.group, sim.truth
     first = rng.integers(0, 60) + np.arange(count)
@@ -117,16 +116,23 @@ def test_a_group_that_contradicts_the_others_is_left_out(seed: int, count: int) 
 
 @pytest.mark.parametrize("seed", [0, 6, 9])
 def test_wrong_odometry_is_found_and_no_start_leads_lower(seed: int) -> None:
-    """Each start alone, and its Huber optimum: local descent of the stated objective ends no lower."""
+    """Each start alone, and its Huber optimum: local descent of the stated objective ends no lower.
+
+    Which edge of a loop slipped is not determined, if it is the only loop.
+    """
     clean, _ = drive(seed, CALM)
     graph, which = slipped(clean, 100 + seed)
+    keep = np.ones(len(graph.edges), dtype=bool)
+    keep[which] = False
+    without = replace(graph, edges=graph.edges[keep])
+    right = squares(without.with_poses(chordal(without)))
     stated, x, guess = graph.graph(robust=LOSS, robust_on="all")
     solution = GraduatedNonConvexity().solve(stated, guess, check=True)
     assert solution.verdict is not None
     assert solution.verdict.kept["closures"].all()
-    assert set(solution.verdict.left_out["odometry"]) <= set(which)
+    assert len(solution.verdict.left_out["odometry"]) <= 3
     milder, y, _ = graph.graph(robust=fg.Huber(1.345), robust_on="all")
-    begun: list[Array] = [graph.poses, *(method(graph) for method in (odometric, chordal, lago))]
+    begun: list[Array] = [right.poses, graph.poses, *(method(graph) for method in (odometric, chordal, lago))]
     begun += [GaussNewton().solve(milder, {y: start})[y] for start in begun]
     for start in begun:
         assert solution.cost <= GaussNewton().solve(stated, {x: start}).cost * (1.0 + 1e-9)
@@ -146,12 +152,13 @@ def test_a_graph_names_further_starts_where_nothing_is_trusted() -> None:
 
 def test_the_command_doubts_odometry_when_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     clean, _ = drive(0, CALM)
-    graph, which = slipped(clean, 100)
+    graph, _ = slipped(clean, 100)
     file, out = write_g2o(tmp_path / "drive.g2o", graph), tmp_path / "out"
     options = ["--robust", "gnc", "--robust-on", "all", "--no-scene", "--out", str(out)]
     assert command.main(["solve", str(file), *options]) == 0
     found = json.loads((out / "metrics.json").read_text())
-    assert found["robust_on"] == "all" and sorted(a for a, _ in found["outlier_edges"]) == sorted(which.tolist())
+    assert found["robust_on"] == "all" and found["outliers"] == 3
+    assert all(b - a == 1 for a, b in found["outlier_edges"])
     said = capsys.readouterr().out
     assert "on measurements" in said and "3 of the measurements" in said
 
@@ -175,14 +182,6 @@ def test_a_group_that_agrees_with_itself_alone_is_named(seed: int, miss: tuple[f
     said = solution.verdict.sentence(solution.cost)
     assert f"15 in 'closures' ({', '.join(map(str, closures[:5]))}, ...); {'without' if kept else 'with'} them" in said
     assert f"'poses' {member} by {far:.3g}" in said and group.sentence() in solution.report()
-
-
-def linearised(graph: PoseGraph) -> tuple[Callable[..., Innovations], fg.Graph, Array]:
-    stated, _, guess = graph.graph(robust=fg.TruncatedLeastSquares(50.0))
-    program = stated.compile()
-    program.bind({})
-    lin = program.linearize(guess)
-    return (lambda: Innovations(program, program.systems.normal(), lin.hessian)), stated, lin
 
 
 def test_a_group_is_taken_out_as_dense_algebra_does() -> None:
@@ -227,13 +226,12 @@ def test_groups_join_the_same_stretches() -> None:
 
 def test_the_size_of_noise_is_that_of_each_term_over_what_either_keeps() -> None:
     """Odometry and closures apart; a closure that one answer leaves out counts as the other one has it."""
-    graph, wrong = with_wrong_closures(drive(2, replace(CALM, count=600))[0], 0.2, 1, "same place")
-    stated, x, guess = graph.graph(robust=LOSS)
+    graph, _ = with_wrong_closures(drive(2, replace(CALM, count=600))[0], 0.2, 1, "same place")
+    stated, _, guess = graph.graph(robust=LOSS)
     staged, stages = graduated_non_convexity._staged(stated)
     search = graduated_non_convexity._Search(GraduatedNonConvexity(), stated, staged, stages, None, None)
     search.best(guess)
-    sparse, dense = (min, max)(search.found, key=lambda one: one.count), max(search.found, key=lambda one: one.count)
-    sparse = min(search.found, key=lambda one: one.count)
+    sparse, dense = (pick(search.found, key=lambda one: one.count) for pick in (min, max))
     assert sparse.count < dense.count
     units = sparse.units_with(dense, search._shares)
     assert units == dense.units_with(sparse, search._shares) and units.keys() == {"odometry", "closures"}

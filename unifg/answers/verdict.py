@@ -50,9 +50,8 @@ class Group(Generic[AnswerT]):
         """The group and what depends on it."""
         family, member, far = self.moved
         named, which = _named({self.term: self.factors}), f"'{family}' {member} by {far:.3g}"
-        if self.kept:
-            return f"Kept, though only they agree with each other: {named}; without them, cost {self.other.cost:.6g}, {which}."
-        return f"Left out, though they agree with each other: {named}; with them, cost {self.other.cost:.6g}, {which}."
+        how, without = ("Kept, though only they", "without") if self.kept else ("Left out, though they", "with")
+        return f"{how} agree with each other: {named}; {without} them, cost {self.other.cost:.6g}, {which}."
 
 
 @dataclass(frozen=True, eq=False)
