@@ -158,7 +158,8 @@ class Innovations:
             right = np.zeros(self._program.size)
             np.add.at(right, columns[free], np.einsum("nia,ni->na", jacobian, errors)[free])
             moved = self._solver.solve(right)
-            return np.einsum("nia,na->ni", jacobian, np.where(free, moved[columns], 0.0))
+            seen: Array = np.einsum("nia,na->ni", jacobian, np.where(free, moved[columns], 0.0))
+            return seen
 
         found, left = np.zeros_like(residual), residual
         along, size = left, float(np.sum(left * left))

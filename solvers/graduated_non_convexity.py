@@ -12,12 +12,19 @@ there is nothing to escape from: the guess led to nothing cheaper then on any gr
 each other in longer strides and from each other alone. Dynamic covariance scaling, a loss with the same bound,
 takes a few iterations from the guess and sometimes finds what graduation did not.
 
-Answers are compared by the cost of the graph as stated, once its noise has the size that is found
-(:class:`unifg.solvers.gating.Scatter`): sum of rho(r^2 / s^2), s^2 being the variance of unit weight, at most one. By
-the stated numbers alone a wrong measurement often pays: to fit it what only odometry holds is bent within its standard
-deviations, which costs less than c^2. If all others agree ten times better than they had to, that is a contradiction.
-Measurements that were left out are taken back where they agree with the rest, and those that counted are taken out
-where the rest contradicts them (:mod:`unifg.solvers.gating`), as long as the answer is better for it.
+The optimum without losses is a start of its own: on a clean graph it is the answer. Where it leaves every measurement
+within its threshold, and the sum of all squares is as stated, nothing contradicts what was stated: it is given up
+only for single measurements that are improbable as stated, and for groups. Answers are compared by the cost as
+stated, in which each measurement left out counts the bound of its loss. Where all terms have losses no measurement can
+be trusted, the guess least: all is done from the further starts of the graph, too, and from the optimum of Huber's
+loss.
+
+Measurements that were left out are then taken back where they agree with the rest, and those that counted are taken out
+where the rest contradicts them (:mod:`unifg.solvers.gating`). Here the size of the noise counts, found for each term
+over what both answers keep: by the stated numbers a wrong measurement often pays, since to fit it what only odometry
+holds is bent within its standard deviations. If all others agree ten times better than they had to, that is a
+contradiction. Measurements that join the same stretches are tested as a group as well, since each would be borne out by
+the others; groups that agree with themselves alone are named with the answer that reads them the other way.
 
 H. Yang, P. Antonante, V. Tzoumas, L. Carlone, "Graduated non-convexity for robust spatial perception: from non-minimal
 solvers to global outlier rejection", IEEE RA-L 5(2), 2020.
@@ -247,7 +254,7 @@ class _Search:
                 break
             heard("surrogates", self._stated(graduated))
             # The optimum without losses believes everything: on a clean graph it is the answer.
-            heard("squares", self._stated(self._plain))
+            heard("squares", self.history.add(self._last, self._plain.values, self._data, restart=True))
             if self._plain_terms and self._calm is None and self._within(self._plain) and self.found[-1].consistent:
                 self._calm = self.found[-1]
             for make in (_rival,) if self._plain_terms else (_rival, _huber):
@@ -408,18 +415,19 @@ class _Search:
             left += [(k, group) for group in groups_of(term, ~kept & (_active(term) > 0.0))]
         doubted.sort(key=lambda one: -one[0])
         left.sort(key=lambda one: -len(one[1]))
-        for k, group, weight in [(k, g, 0.0) for _, k, g in doubted[:GROUPS]] + [(k, g, 1.0) for k, g in left[:GROUPS]]:
+        tried = [(k, group, 0.0) for _, k, group in doubted[:GROUPS]] + [(k, group, 1.0) for k, group in left[:GROUPS]]
+        for k, group, share in tried:
             for j, (stage, squared) in enumerate(zip(self._stages, answer.squared, strict=True)):
                 held = stage.goal.weight(squared)
                 if j == k:
-                    held[group] = weight
+                    held[group] = share
                 stage.now = _Held(held)
             found = self._answer(self._stated(self.history.add(self._run, answer.solution.values, self._data)))
-            if bool(weight) != bool(found.kept[k][group].mean() >= HALF):
+            if bool(share) != bool(found.kept[k][group].mean() >= HALF):
                 continue  # the others decide about its members, one by one
             if self._prefers(found, answer, 1.0):
                 return found
-            self._groups.append((self._terms[k].name, group, not weight, found.solution))
+            self._groups.append((self._terms[k].name, group, not share, found.solution))
         return None
 
     def _prefers(self, one: _Answer, other: _Answer, spare: float) -> bool:

@@ -268,3 +268,18 @@ def test_a_group_says_what_depends_on_it() -> None:
         "without them, cost 12.5, 'poses' 7 by 49.8."
     )
     assert replace(kept, kept=False).sentence().startswith("Left out, though they agree with each other: 3 in")
+
+
+@pytest.mark.parametrize("seed", [6, 13])
+def test_scale_does_not_decide_where_nothing_is_trusted(seed: int) -> None:
+    """With odometry trusted, the answer gives up a wrong closure that pays; otherwise, the cost as stated decides."""
+    sim = manhattan(150, seed, outliers=0.3)
+    edges = replace(sim.pose_graph.edges, information=0.02 * sim.pose_graph.edges.information)
+    graph = replace(sim.pose_graph, edges=edges)
+    for everywhere in ("closures", "all"):
+        stated, _, guess = graph.graph(robust=LOSS, robust_on=everywhere)  # type: ignore[arg-type]
+        staged, stages = graduated_non_convexity._staged(stated)
+        search = graduated_non_convexity._Search(GraduatedNonConvexity(), stated, staged, stages, None, None)
+        found = search.best(guess)
+        cheapest = min(one.solution.cost for one in search.found)
+        assert (found.cost > 1.001 * cheapest) == (everywhere == "closures")
