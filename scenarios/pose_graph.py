@@ -25,7 +25,7 @@ from unifg.pose_graphs.certificate import Certificate, certify
 from unifg.pose_graphs.information import REPAIRS, Repair, indefinite
 from unifg.pose_graphs.initialise import chordal, lago, odometric, starts
 from unifg.pose_graphs.judgement import Judgement, judge
-from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
+from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName, RobustOn
 from unifg.pose_graphs.relaxation import admit
 from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.options import existing, option
@@ -50,10 +50,11 @@ LOSSES: dict[str, Callable[[float], Loss]] = {
     "dcs": DCS,
     "gnc": TruncatedLeastSquares,
 }
+_JUDGED = {"optimum": 1e-6, "map": 1e-4}  # share of the cost by which maps are told apart: a map ends within 1e-5
 _DEFAULTS = {"huber": 1.345, "cauchy": 2.385, "tukey": 4.685, "dcs": 1.0}
 _INLIERS = 0.99  # of right measurements lie within the default threshold of gnc
 OUTLIER_WEIGHT = 0.5
-"""A loop closure that the robust loss gives less weight than this is called an outlier."""
+"""A measurement that the robust loss gives less weight than this is called an outlier."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,8 @@ class SolveSettings:
         solver: one of `unifg.solvers.names.LEAST_SQUARES`.
         robust: loss on loop closures, if any: huber, cauchy, tukey, dcs, or gnc (truncated least squares, graduated),
             with its parameter after a colon if it is not the usual one.
+        robust_on: the measurements with this loss: loop closures, or odometry and sightings of landmarks as well. All
+            can be wrong then, and gnc begins at several first guesses.
         init: first guess: poses of the file, a spanning tree, LAGO (2D) or chordal relaxation; or the one of them
             that costs least, but for the tree.
         residual: full logarithm, as GTSAM, or the chart of g2o; their optima differ in 3D.
@@ -74,13 +77,16 @@ class SolveSettings:
         max_iterations: before giving up.
         threads: that share the work of a large graph; no more than there are free cores.
         no_scene: leave out the scene and the picture, which take longer than the solve.
-        certify: see whether another map could be better, by the dual of the chordal relaxation.
-        staircase: where that finds a way down, follow it and solve again from there.
+        certify: bound what another map could gain, by the dual of the chordal relaxation, and take a better map where
+            one is found on the way.
+        staircase: where that finds a way down, follow it.
+        keep_map: keep the map of the first solve although a better one was found; that is a failure.
     """
 
     file: Path = option(text=existing("a pose graph (g2o or TORO)"), metavar="GRAPH")
     solver: str = "gn"
     robust: str | None = option(None, metavar="LOSS[:PARAM]")
+    robust_on: RobustOn = option("closures")
     init: str = option(AUTO, choices=(AUTO, *GUESSES))
     residual: ResidualName = option("log")
     tolerance: Literal["optimum", "map"] = option("optimum")
@@ -90,6 +96,7 @@ class SolveSettings:
     no_scene: bool = option(False)
     certify: bool = option(False)
     staircase: bool = option(False)
+    keep_map: bool = option(False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +110,7 @@ class SolvedGraph:
         chi2: sum of r' Omega r, without losses: in the file, NaN where it has no poses, at the first guess, and at the
             solution.
         solution: what the backend returned.
-        loss: on the loop closures; None for none.
+        loss: on the loop closures, or on all measurements; None for none.
         squared: (m,) r' Omega r of every edge at the solution.
         outliers: (m,) edges that the loss gives less than half of their weight.
         steps: (k, n, storage) poses of up to a dozen iterates, the first guess and the solution among them.
@@ -111,6 +118,7 @@ class SolvedGraph:
         begun: name of the first guess that was taken.
         judgement: what the graph says about itself at the solution, outliers left out.
         certificate: of the solution, if it was asked for.
+        better: cost, as stated, of a better map that was found and not taken; None without one.
         seconds: wall-clock time by what it was spent on: read, initialise, compile, solve, certify.
     """
 
@@ -127,6 +135,7 @@ class SolvedGraph:
     begun: str
     judgement: Judgement
     certificate: Certificate | None
+    better: float | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     interrupted: bool = False
 
@@ -193,15 +202,30 @@ def _solve_file(settings: SolveSettings, progress: Progress) -> SolvedGraph:
     clock.split("initialise")
     solve = _Solve(settings, loss, clock, progress)
     solution, after, squared, outliers = solve(before)
-    certificate, stopped = None, solution.status is Status.INTERRUPTED
+    certificate, worse, stopped = None, None, solution.status is Status.INTERRUPTED
     if (settings.certify or settings.staircase) and not stopped:
         try:
-            progress(0.95, "is another map better?")
-            clock.start()
-            certificate = certify(after, used=~outliers, staircase=settings.staircase)
-            clock.split("certify")
-            if certificate.rank > read.group.point_dim:
-                solution, after, squared, outliers = solve(before.with_poses(certificate.poses))
+            while True:
+                progress(0.95, "is another map better?")
+                clock.start()
+                certificate = certify(
+                    after,
+                    used=None if loss is None else ~outliers,
+                    staircase=settings.staircase,
+                    tolerance=_JUDGED[settings.tolerance],
+                    residual=settings.residual,
+                )
+                clock.split("certify")
+                if certificate.better is None:
+                    break
+                again = solve(before.with_poses(certificate.better))
+                # Compared as stated, losses included.
+                if not again[0].cost < (1.0 - _JUDGED[settings.tolerance]) * solution.cost:
+                    break
+                if settings.keep_map:
+                    worse = again[0].cost
+                    break
+                solution, after, squared, outliers = again
         except KeyboardInterrupt:  # there is something to write
             stopped = True
     stopped = stopped or solution.status is Status.INTERRUPTED
@@ -212,7 +236,7 @@ def _solve_file(settings: SolveSettings, progress: Progress) -> SolvedGraph:
     judgement = judge(replace(after, edges=after.edges[~outliers]), settings.residual)
     return SolvedGraph(
         settings, before, after, chi2, solution, loss, squared, outliers, steps, numbers, begun, judgement, certificate,
-        clock.seconds, stopped,
+        worse, clock.seconds, stopped,
     )  # fmt: skip
 
 
@@ -229,7 +253,7 @@ class _Solve:
         clock.start()
         if not self.before:
             self.progress(0.06, "compiling")
-        graph, x, guess = begin.graph(robust=loss, residual=settings.residual)
+        graph, x, guess = begin.graph(robust=loss, residual=settings.residual, robust_on=settings.robust_on)
         graph.compile()
         clock.split("compile")
 
@@ -252,7 +276,8 @@ class _Solve:
         weights = np.ones(len(errors)) if loss is None else np.asarray(loss.weight(errors))
         self.before += solution.iterations
         self.snapshots.add(self.before, after.poses)
-        return solution, after, errors, (weights < OUTLIER_WEIGHT) & ~begin.edges.odometry
+        trusted = begin.edges.odometry & (settings.robust_on == "closures")
+        return solution, after, errors, (weights < OUTLIER_WEIGHT) & ~trusted
 
 
 def robust_loss(text: str | None, dim: int) -> Loss | None:

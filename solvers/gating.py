@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unifg.elimination.components import components
 from unifg.elimination.factorization import Factorization
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
@@ -26,7 +27,11 @@ from unifg.program.table import ENTRY, ROW, WIDTH
 from unifg.program.term import CompiledTerm
 from unifg.typing import Array, BoolArray, IntArray
 
+NEAR = 10  # members of a family between two measurements of one group, at most
+FEWEST = 3  # measurements that are a group
 CHANCE = 0.01  # that a right measurement among all is called wrong
+STEPS = 30  # of conjugate gradients
+EXACT = 1e-4  # residual they end at
 UNCHECKED = 1e-9  # share of a residual that the others can see: below, it is rounding
 
 
@@ -36,7 +41,7 @@ class Scatter:
 
     Attributes:
         squared: sum of their weighted squared residuals.
-        freedom: number of their residuals less the number of unknowns.
+        freedom: number of their residuals less the number of unknowns; infinite where their noise is known.
     """
 
     squared: float
@@ -62,6 +67,11 @@ class Scatter:
             size: numbers in a measurement.
             count: how many are looked at.
         """
+        if np.isinf(self.freedom):
+            from scipy.special import chdtri
+
+            known: BoolArray = innovation > float(chdtri(size, CHANCE / max(count, 1)))
+            return known
         rest = self.freedom - size
         if rest < 1.0:
             return np.zeros(len(innovation), dtype=np.bool_)
@@ -95,7 +105,7 @@ class Innovations:
             solver: for matrices in the pattern ``program.normal``.
             information: entries of the Hessian of the measurements that count.
         """
-        self._program = program
+        self._program, self._solver = program, solver
         self.determined = solver.factor(information) and solver.definite
         self._inverse = solver.selected_inverse() if self.determined else np.zeros(0)
 
@@ -129,15 +139,71 @@ class Innovations:
         seen = np.where(share > UNCHECKED, 1.0 / np.maximum(share, UNCHECKED), 0.0)
         return weight * np.einsum("na,na->n", along**2, seen), ((along * seen) ** 2).sum(axis=1)
 
+    def joint(self, term: CompiledTerm, lin: Linearization, chosen: IntArray, weight: Array) -> float:
+        """Fall r' (I / W - J S J')^-1 r of the sum of squares without all of several measurements.
+
+        By conjugate gradients, which take few steps: what measurements of a group have in common is all that the others
+        leave open. A direction that nothing else holds is left out.
+
+        Args:
+            term: a cost of the graph.
+            lin: linearisation without losses, where S was taken.
+            chosen: (k,) factors that count.
+            weight: (k,) with which they do.
+        """
+        residual, jacobian, columns = self._rows(term, lin, chosen)
+        free = columns >= 0
+
+        def spread(errors: Array) -> Array:
+            right = np.zeros(self._program.size)
+            np.add.at(right, columns[free], np.einsum("nia,ni->na", jacobian, errors)[free])
+            moved = self._solver.solve(right)
+            seen: Array = np.einsum("nia,na->ni", jacobian, np.where(free, moved[columns], 0.0))
+            return seen
+
+        found, left = np.zeros_like(residual), residual
+        along, size = left, float(np.sum(left * left))
+        first = size
+        for _ in range(STEPS):
+            if not size > EXACT**2 * first:
+                break
+            bent = along / weight[:, None] - spread(along)
+            curvature = float(np.sum(along * bent))
+            if not curvature > UNCHECKED * float(np.sum(along * along)):
+                break
+            found = found + size / curvature * along
+            left = left - size / curvature * bent
+            before, size = size, float(np.sum(left * left))
+            along = left + size / before * along
+        return float(np.sum(residual * found))
+
+    def redundancy(self, term: CompiledTerm, lin: Linearization, weight: Array) -> float:
+        """Residuals of a term that count, less those that the unknowns take up: sum w (m - w tr J S J').
+
+        Args:
+            term: a cost of the graph.
+            lin: linearisation without losses, where S was taken.
+            weight: (n,) with which factors count.
+        """
+        counts = weight > 0.0
+        spread = np.einsum("nii->n", self._spread(term, lin, counts)[1])
+        return float(np.sum(weight[counts] * (term.size - weight[counts] * spread)))
+
     def _spread(self, term: CompiledTerm, lin: Linearization, chosen: BoolArray) -> tuple[Array, Array]:
         """(k, m) residuals and (k, m, m) J S J' of some factors."""
-        program, size, width = self._program, term.size, int(term.place[WIDTH])
-        row, entry, count = int(term.place[ROW]), int(term.place[ENTRY]), term.count
-        residual = lin.residual[row : row + count * size].reshape(count, size)[chosen]
-        jacobian = lin.jacobian[entry : entry + count * size * width].reshape(count, size, width)[chosen]
-        columns = program.columns.unknown[np.concatenate(term.columns, axis=1)[chosen]]
+        residual, jacobian, columns = self._rows(term, lin, chosen)
         spread = np.einsum("nia,nab,njb->nij", jacobian, self._covariance(columns), jacobian, optimize=True)
         return residual, 0.5 * (spread + spread.transpose(0, 2, 1))
+
+    def _rows(
+        self, term: CompiledTerm, lin: Linearization, chosen: BoolArray | IntArray
+    ) -> tuple[Array, Array, IntArray]:
+        """(k, m) residuals, (k, m, w) Jacobians and (k, w) their unknowns of some factors."""
+        size, width, count = term.size, int(term.place[WIDTH]), term.count
+        row, entry = int(term.place[ROW]), int(term.place[ENTRY])
+        residual = lin.residual[row : row + count * size].reshape(count, size)[chosen]
+        jacobian = lin.jacobian[entry : entry + count * size * width].reshape(count, size, width)[chosen]
+        return residual, jacobian, self._program.columns.unknown[np.concatenate(term.columns, axis=1)[chosen]]
 
     def _covariance(self, columns: IntArray) -> Array:
         """(k, w, w) joint covariances of the unknowns of a factor, zero for fixed ones."""
@@ -148,3 +214,33 @@ class Innovations:
         places = normal.positions(np.minimum(first, second)[free], np.maximum(first, second)[free])
         covariance[free] = self._inverse[places]
         return covariance
+
+
+def groups_of(term: CompiledTerm, chosen: BoolArray) -> list[IntArray]:
+    """Groups of at least three factors that join the same stretches of a family, such as two drives along one street.
+
+    Args:
+        term: a term whose factors are told apart by the positions of their variables.
+        chosen: (n,) factors to be grouped.
+    """
+    selections = [one for one in term.term.selections if one.count == term.count]
+    which = np.flatnonzero(chosen)
+    if len(selections) < 2 or len(which) < FEWEST:
+        return []
+    places = np.stack([one.indices[which] for one in selections], axis=1)
+    order = np.argsort(places[:, 0], kind="stable")
+    which, places = which[order], places[order]
+    pairs: list[tuple[IntArray, IntArray]] = []
+    for apart in range(1, len(which)):
+        first, second = np.arange(len(which) - apart), np.arange(apart, len(which))
+        if (close := places[second, 0] - places[first, 0] <= NEAR).any():
+            close &= (np.abs(places[second] - places[first]) <= NEAR).all(axis=1)
+            pairs.append((first[close], second[close]))
+        else:
+            break
+    if not pairs:
+        return []
+    part = components(len(which), *(np.concatenate(ends) for ends in zip(*pairs, strict=True)))
+    order = np.argsort(part, kind="stable")
+    groups = np.split(which[order], np.flatnonzero(np.diff(part[order])) + 1)
+    return [np.sort(group) for group in groups if len(group) >= FEWEST]

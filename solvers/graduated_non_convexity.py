@@ -12,12 +12,19 @@ there is nothing to escape from: the guess led to nothing cheaper then on any gr
 each other in longer strides and from each other alone. Dynamic covariance scaling, a loss with the same bound,
 takes a few iterations from the guess and sometimes finds what graduation did not.
 
-Answers are compared by the cost of the graph as stated, once its noise has the size that is found
-(:class:`unifg.solvers.gating.Scatter`): sum of rho(r^2 / s^2), s^2 being the variance of unit weight, at most one. By
-the stated numbers alone a wrong measurement often pays: to fit it what only odometry holds is bent within its standard
-deviations, which costs less than c^2. If all others agree ten times better than they had to, that is a contradiction.
-Measurements that were left out are taken back where they agree with the rest, and those that counted are taken out
-where the rest contradicts them (:mod:`unifg.solvers.gating`), as long as the answer is better for it.
+The optimum without losses is a start of its own: on a clean graph it is the answer. Where it leaves every measurement
+within its threshold, and the sum of all squares is as stated, nothing contradicts what was stated: it is given up
+only for single measurements that are improbable as stated, and for groups. Answers are compared by the cost as
+stated, in which each measurement left out counts the bound of its loss. Where all terms have losses no measurement can
+be trusted, the guess least: all is done from the further starts of the graph, too, and from the optimum of Huber's
+loss.
+
+Measurements that were left out are then taken back where they agree with the rest, and those that counted are taken out
+where the rest contradicts them (:mod:`unifg.solvers.gating`). Here the size of the noise counts, found for each term
+over what both answers keep: by the stated numbers a wrong measurement often pays, since to fit it what only odometry
+holds is bent within its standard deviations. If all others agree ten times better than they had to, that is a
+contradiction. Measurements that join the same stretches are tested as a group as well, since each would be borne out by
+the others; groups that agree with themselves alone are named with the answer that reads them the other way.
 
 H. Yang, P. Antonante, V. Tzoumas, L. Carlone, "Graduated non-convexity for robust spatial perception: from non-minimal
 solvers to global outlier rejection", IEEE RA-L 5(2), 2020.
@@ -27,25 +34,28 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 
 from unifg.answers.history import Iteration
-from unifg.answers.solution import AnyGuess, NotConverged, Solution
+from unifg.answers.solution import AnyGuess, NotConverged, Solution, values_of
 from unifg.answers.solver import Backend, Callback, Prepared, Solver
 from unifg.answers.status import Status
-from unifg.answers.verdict import Verdict
-from unifg.errors import BackendError
-from unifg.kernels.robust import DCS, Graduated, Loss
+from unifg.answers.verdict import Group, Verdict
+from unifg.errors import BackendError, GraphError
+from unifg.kernels.robust import DCS, Graduated, Huber, Loss
 from unifg.language.statement import Statement
 from unifg.language.terms import Cost
 from unifg.language.variables import Data
 from unifg.machine.inner import inner
+from unifg.program.linearization import Linearization
 from unifg.program.term import CompiledTerm
-from unifg.solvers.gating import Innovations, Scatter
+from unifg.solvers.gating import CHANCE, Innovations, Scatter, groups_of
 from unifg.solvers.least_squares import GaussNewton, LevenbergMarquardt
 from unifg.typing import Array, BoolArray, IntArray, Numbers
 
@@ -59,8 +69,14 @@ ROUGH = 1e-2  # tolerance of the stages: a share of 1e-4 of the cost
 HEARD = 1e-2  # share of the strongest pull, below which a measurement that is farther off is not heard
 STRIDE = 2  # surrogates at a time while all are
 RIVALS = 3  # other answers that are named, at most
+HUBER = 1.345  # [sigma]
+GROUPS = 3  # that are tried, of those that count and of those left out
+SPARE = 4.0  # noise is rarely of one size: twice the standard deviation of the others is no contradiction
 ROUNDS = 20  # of taking back or out
 DECIDED = 1e-3  # a truncated loss is done when every weight is this close to zero or one
+
+
+STATED = Scatter(0.0, np.inf)  # noise as large as stated
 
 
 class _Held:
@@ -216,30 +232,69 @@ class _Search:
         self._last = solver.bound(graph)
         self._damped: Prepared | None = None
         self.found: list[_Answer] = []
+        self._shares: dict[str, _Sum] = {}
+        self._calm: _Answer | None = None
+        self._groups: list[tuple[str, IntArray, bool, Solution]] = []
         robust = self._run.program.table.robust
         self._terms = [t for t, _ in robust if isinstance(t.term, Cost) and isinstance(t.term.robust, _Stage)]
+        staged_names = {term.name for term in self._terms}
+        self._plain_terms = [term for term in self._last.program.cost_terms if term.name not in staged_names]
         self._parts = {term.name: part for term, part in self._last.program.table.robust}
 
     def best(self, guess: AnyGuess) -> Solution:
         """The best answer found, judged with the losses themselves."""
-        graduated = self._graduated(guess)
-        if graduated.status is Status.INTERRUPTED:
+        told: list[str] = []
+
+        def heard(origin: str, solution: Solution) -> None:
+            told.append(f"{origin} {self._answer(solution).solution.cost:.6g}")
+
+        for start in self._starts(guess):
+            graduated = self._graduated(start)
+            if graduated.status is Status.INTERRUPTED:
+                break
+            heard("surrogates", self._stated(graduated))
+            # The optimum without losses believes everything: on a clean graph it is the answer.
+            heard("squares", self.history.add(self._last, self._plain.values, self._data, restart=True))
+            if self._plain_terms and self._calm is None and self._within(self._plain) and self.found[-1].consistent:
+                self._calm = self.found[-1]
+            for make in (_rival,) if self._plain_terms else (_rival, _huber):
+                for stage in self._stages:
+                    stage.now = make(stage.goal)
+                heard(str(self._stages[0].now), self._stated(self._from(start)))
+            if not self._plain_terms:
+                heard("guess", self.history.add(self._last, start, self._data, restart=True))
+        if not self.found:
             return self._interrupted(graduated)
-        answer = self._answer(self._stated(graduated))
-        for stage in self._stages:
-            stage.now = _rival(stage.goal)
-        rival = self._answer(self._stated(self._from(guess)))
-        if rival.solution.status is not Status.INTERRUPTED and rival.better(answer):
-            losses = ", ".join(str(stage.now) for stage in self._stages)
-            found, missed = rival.solution.cost, answer.solution.cost
-            logger.info("%s: %s led to cost %g, the surrogates to %g", self._options.name, losses, found, missed)
-            answer = rival
+        # Nothing contradicts what was stated: a right measurement is not given up because that is cheaper.
+        answer = self._calm or min(self.found, key=lambda one: one.solution.cost)
+        logger.info("%s: answers of cost %s", self._options.name, ", ".join(told))
+        if any(one.status is Status.INTERRUPTED for one in [graduated, *(one.solution for one in self.found)]):
+            answer.solution.status = Status.INTERRUPTED
+            return answer.solution
         return self._concluded(self._revised(answer))
+
+    def _starts(self, guess: AnyGuess) -> Iterator[AnyGuess]:
+        """The guess, and the further ones of the graph."""
+        yield guess
+        for make in self._last.program.graph.starts:
+            with suppress(GraphError):  # what the measurements do not determine is no start
+                yield {**values_of(guess), **make()}
+
+    def _within(self, found: Solution) -> bool:
+        """Whether an answer leaves every measurement within its threshold."""
+        squares = self._run.program.linearize(found.values).squares
+        parts = {term.name: part for term, part in self._run.program.table.robust}
+        return all(
+            bool((squares[parts[term.name]] <= _bound(stage.goal)).all())
+            for term, stage in zip(self._terms, self._stages, strict=True)
+        )
 
     def _graduated(self, guess: AnyGuess) -> Solution:
         """Without the losses, then through their surrogates."""
         stages = self._stages
-        solution = self._from(guess)
+        for stage in stages:
+            stage.now, stage.largest = _Square(), 0.0
+        self._plain = solution = self._from(guess)
         # The largest residual on the way from the guess: the solution without losses may hide an outlier by spreading
         # it over many weak measurements.
         paths = [stage.goal.surrogates(stage.largest, self._options.growth) for stage in stages]
@@ -302,6 +357,7 @@ class _Search:
             innovations = Innovations(program, factorization, program.linearize(values).hessian)
             if answer.solution.status is Status.INTERRUPTED or not innovations.determined:
                 return answer
+            self._shares = self._redundancies(answer, plain, innovations)
             back, out = [], []
             everything = sum(len(kept) for kept in answer.kept)
             for term, stage, kept, squared in zip(self._terms, self._stages, answer.kept, answer.squared, strict=True):
@@ -314,15 +370,85 @@ class _Search:
                 fall, far = innovations.without(term, plain, kept, stage.goal.weight(squared)[kept])
                 wrong = answer.scatter.contradicts(fall, term.size, everything)
                 answer.doubted[term.name] = np.flatnonzero(kept)[wrong]
+                if self._calm is not None:
+                    wrong = STATED.contradicts(fall, term.size, everything)
                 # What would stay within its threshold counts, by the loss as stated, however the others scatter.
                 score = np.full(len(kept), np.inf)
                 score[kept] = np.where(wrong & (far > bound), -fall, np.inf)
                 out.append(score / bound)
-            better = self._with(answer, back, 1.0) or self._with(answer, out, 0.0)
+            better = self._with(answer, back, 1.0) or self._with(answer, out, 0.0) or self._without_group(answer)
+            better = better or self._by_groups(answer, plain, innovations)
             if better is None:
                 return answer
             answer = better
         return answer
+
+    def _without_group(self, answer: _Answer) -> _Answer | None:
+        """A better answer found before that leaves out several measurements, or None.
+
+        Where all is consistent as stated, these have to be groups, and the answer cheaper.
+        """
+        for other in sorted(self.found, key=lambda one: one.solution.cost):
+            if not other.solution.converged or other.count >= answer.count:
+                continue
+            if self._calm is None:
+                if self._prefers(other, answer, SPARE):
+                    return other
+            elif other.solution.cost < (1.0 - LESS) * answer.solution.cost:
+                dropped = [ours & ~theirs for ours, theirs in zip(answer.kept, other.kept, strict=True)]
+                grouped = sum(len(g) for t, gone in zip(self._terms, dropped, strict=True) for g in groups_of(t, gone))
+                if grouped > HALF * sum(int(gone.sum()) for gone in dropped):
+                    return other
+        return None
+
+    def _by_groups(self, answer: _Answer, plain: Linearization, innovations: Innovations) -> _Answer | None:
+        """A better answer without a group of measurements that counts, or with one that was left out, or None."""
+        self._groups = []
+        doubted: list[tuple[float, int, IntArray]] = []
+        left: list[tuple[int, IntArray]] = []
+        for k, (term, kept, weight) in enumerate(zip(self._terms, answer.kept, answer.weights, strict=True)):
+            groups = groups_of(term, kept)
+            for group in groups:
+                fall = innovations.joint(term, plain, group, weight[group])
+                if answer.scatter.contradicts(np.array([fall]), term.size, len(groups))[0]:
+                    doubted.append((fall / len(group), k, group))
+            left += [(k, group) for group in groups_of(term, ~kept & (_active(term) > 0.0))]
+        doubted.sort(key=lambda one: -one[0])
+        left.sort(key=lambda one: -len(one[1]))
+        tried = [(k, group, 0.0) for _, k, group in doubted[:GROUPS]] + [(k, group, 1.0) for k, group in left[:GROUPS]]
+        for k, group, share in tried:
+            for j, (stage, squared) in enumerate(zip(self._stages, answer.squared, strict=True)):
+                held = stage.goal.weight(squared)
+                if j == k:
+                    held[group] = share
+                stage.now = _Held(held)
+            found = self._answer(self._stated(self.history.add(self._run, answer.solution.values, self._data)))
+            if bool(share) != bool(found.kept[k][group].mean() >= HALF):
+                continue  # the others decide about its members, one by one
+            if self._prefers(found, answer, 1.0):
+                return found
+            self._groups.append((self._terms[k].name, group, not share, found.solution))
+        return None
+
+    def _prefers(self, one: _Answer, other: _Answer, spare: float) -> bool:
+        """Whether an answer costs less than another once the noise of each term has the size found for both.
+
+        Where every term has a loss, no measurement is trusted, and scale does not tell which of two that contradict
+        each other is wrong: the cost as stated decides.
+        """
+        units: Mapping[str, float] = {}
+        if self._plain_terms and (self._calm is None or spare == 1.0):
+            units = {name: min(1.0, spare * unit) for name, unit in one.units_with(other, self._shares).items()}
+        return one.judged(units) < (1.0 - LESS) * other.judged(units)
+
+    def _competes(self, one: _Answer, final: _Answer) -> bool:
+        """Whether an answer costs less than the final one as stated, or keeps something else for nearly as little."""
+        if one.solution.cost < (1.0 - LESS) * final.solution.cost:
+            return True
+        if not any((ours & ~theirs).any() for ours, theirs in zip(one.kept, final.kept, strict=True)):
+            return False  # it only gave up more
+        units = one.units_with(final, self._shares) if self._shares else {}
+        return one.judged(units) < final.judged(units) + max(_bound(stage.goal) for stage in self._stages)
 
     def _with(self, answer: _Answer, scores: list[Array], weight: float) -> _Answer | None:
         """A better answer in which the measurements with the lowest finite scores have that weight, or None."""
@@ -333,7 +459,7 @@ class _Search:
             for stage, present, score in zip(self._stages, weights, scores, strict=True):
                 stage.now = _Held(np.where(score <= every[-1], weight, present))
             found = self._answer(self._stated(self.history.add(self._run, answer.solution.values, self._data)))
-            if found.better(answer):
+            if self._prefers(found, answer, SPARE):
                 return found
             every = every[: int(FEWER * len(every))]
         return None
@@ -343,17 +469,24 @@ class _Search:
         program = self._last.program
         lin = program.linearize(solution.values)
         squared = [lin.squares[self._parts[term.name]] for term in self._terms]
-        rest, count = 2.0 * lin.cost, 0.0
-        for term, stage, s in zip(self._terms, self._stages, squared, strict=True):
-            weight = stage.goal.weight(s) if term.active is None else stage.goal.weight(s) * term.active
-            rest -= float(stage.goal.value(s).sum())
-            count += term.size * float(weight.sum())
-        staged = {term.name for term in self._terms}
-        for other in program.cost_terms:
-            if other.name not in staged:
-                count += other.size * (other.count if other.active is None else int(other.active.sum()))
-        found = _Answer(solution, self._stages, self._terms, squared, rest, count - program.size)
+        plain = {}
+        for term in self._plain_terms:
+            active, loss = _active(term), term.term.robust if isinstance(term.term, Cost) else None
+            own = lin.norms[term.name] ** 2
+            if loss is not None:
+                own = inner(loss.value(lin.squares[self._parts[term.name]]), active)
+            plain[term.name] = _Sum(own, term.size * float(active.sum()))
+        found = _Answer(solution, self._stages, self._terms, squared, plain, program.size)
         self.found.append(found)
+        return found
+
+    def _redundancies(self, answer: _Answer, plain: Linearization, innovations: Innovations) -> dict[str, _Sum]:
+        """Of each term, the residuals that the unknowns do not take up, and those that count, at an answer."""
+        weights = dict(zip([t.name for t in self._terms], answer.weights, strict=True))
+        found = {}
+        for term in self._last.program.cost_terms:
+            weight = weights.get(term.name, _active(term))
+            found[term.name] = _Sum(innovations.redundancy(term, plain, weight), term.size * float(weight.sum()))
         return found
 
     def _concluded(self, answer: _Answer) -> Solution:
@@ -363,15 +496,35 @@ class _Search:
         rivals: list[_Answer] = []
         for other in sorted(self.found, key=lambda a: a.solution.cost):
             known = any(other.believes_as(one) for one in [final, *rivals])
-            if other.solution.converged and not known and other.competes_with(final):
+            if other.solution.converged and not known and self._competes(other, final):
                 rivals.append(other)
         kept = {term.name: kept for term, kept in zip(self._terms, final.kept, strict=True)}
         others = tuple(other.solution for other in rivals[:RIVALS])
         for other in rivals[:RIVALS]:
             theirs = {term.name: kept for term, kept in zip(self._terms, other.kept, strict=True)}
             other.solution.verdict = Verdict(theirs, other.doubted, other.scatter.unit)
-        final.solution.verdict = Verdict(kept, doubted, final.scatter.unit, others)
+        groups = [
+            Group(name, factors, held, other, self._moved(final.solution, other))
+            for name, factors, held, other in self._groups
+        ]
+        final.solution.verdict = Verdict(kept, doubted, final.scatter.unit, others, tuple(groups))
         return final.solution
+
+    def _moved(self, one: Solution, other: Solution) -> tuple[str, int, float]:
+        """Family and member whose values differ most, and by how much."""
+        found = ("", 0, 0.0)
+        for name, family in self._last.program.graph.families.items():
+            apart = np.linalg.norm(family.manifold.local(one[family], other[family]), axis=1)
+            member = int(apart.argmax())
+            found = max(found, (name, member, float(apart[member])), key=lambda one: one[2])
+        return found
+
+
+class _Sum(NamedTuple):
+    """A sum over residuals that count, and their number."""
+
+    total: float
+    rows: float
 
 
 class _Answer:
@@ -383,8 +536,8 @@ class _Answer:
         stages: list[_Stage],
         terms: list[CompiledTerm],
         squared: list[Array],
-        rest: float,
-        freedom: float,
+        plain: dict[str, _Sum],
+        unknowns: int,
     ) -> None:
         """Sum up.
 
@@ -393,42 +546,59 @@ class _Answer:
             stages: of every term with a loss.
             terms: those terms.
             squared: (n,) squared residuals of their factors.
-            rest: twice the cost of all other terms.
-            freedom: residuals that count less unknowns.
+            plain: of every other term, twice its cost.
+            unknowns: number of them.
         """
-        self.solution, self.squared, self._rest = solution, squared, rest
+        self.solution, self.squared, self._plain, self._terms = solution, squared, plain, terms
         self._goals = [stage.goal for stage in stages]
-        self._active = [np.ones(len(s)) if t.active is None else t.active for t, s in zip(terms, squared, strict=True)]
-        weights = [goal.weight(s) * a for goal, s, a in zip(self._goals, squared, self._active, strict=True)]
-        self.kept: list[BoolArray] = [weight >= HALF for weight in weights]
+        self._active = [_active(term) for term in terms]
+        self.weights = [goal.weight(s) * a for goal, s, a in zip(self._goals, squared, self._active, strict=True)]
+        self.kept: list[BoolArray] = [weight >= HALF for weight in self.weights]
+        self.count = sum(int(kept.sum()) for kept in self.kept)
         self.doubted: dict[str, IntArray] = {}
-        self.scatter = Scatter(rest + sum(inner(w, s) for w, s in zip(weights, squared, strict=True)), freedom)
+        sums = [*plain.values()]
+        for term, weight, own in zip(terms, self.weights, squared, strict=True):
+            sums.append(_Sum(inner(weight, own), term.size * float(weight.sum())))
+        self.scatter = Scatter(sum(one.total for one in sums), sum(one.rows for one in sums) - unknowns)
 
-    def judged(self, unit: float) -> float:
-        """Twice the cost with the noise of all measurements smaller, by the root of ``unit``, than they state."""
+    @property
+    def consistent(self) -> bool:
+        """Whether the sum of all squares is no larger than what is stated makes likely."""
+        from scipy.special import chdtri  # slow to load
+
+        return self.scatter.freedom < 1.0 or self.scatter.squared <= float(chdtri(self.scatter.freedom, CHANCE))
+
+    def units_with(self, other: _Answer, shares: Mapping[str, _Sum]) -> dict[str, float]:
+        """Variance of unit weight of each term, over all measurements that this answer or another one keeps.
+
+        A measurement that one of them leaves out counts where it is kept, so it is at least about that of the answer
+        which keeps more.
+
+        Args:
+            other: answer.
+            shares: of each term, the redundancy and the number of its residuals at one of both.
+        """
+        found = {}
+        for name, one in self._plain.items():
+            found[name] = Scatter(max(one.total, other._plain[name].total), shares[name].total).unit
+        for k, term in enumerate(self._terms):
+            ours, theirs = self.weights[k] * self.squared[k], other.weights[k] * other.squared[k]
+            rows = term.size * float(np.maximum(self.weights[k], other.weights[k]).sum())
+            freedom = shares[term.name].total + rows - shares[term.name].rows
+            found[term.name] = Scatter(float(np.maximum(ours, theirs).sum()), freedom).unit
+        return found
+
+    def judged(self, units: Mapping[str, float]) -> float:
+        """Twice the cost with the noise of each term smaller, by the root of its unit (or one), than it states."""
         losses = sum(
-            float((goal.value(squared / unit) * active).sum())
-            for goal, squared, active in zip(self._goals, self.squared, self._active, strict=True)
+            float((goal.value(squared / units.get(term.name, 1.0)) * active).sum())
+            for term, goal, squared, active in zip(self._terms, self._goals, self.squared, self._active, strict=True)
         )
-        return self._rest / unit + losses
-
-    def better(self, other: _Answer) -> bool:
-        """Whether this answer costs less once noise has the size found in either."""
-        unit = min(self.scatter.unit, other.scatter.unit)
-        return self.judged(unit) < (1.0 - LESS) * other.judged(unit)
+        return sum(one.total / units.get(name, 1.0) for name, one in self._plain.items()) + losses
 
     def believes_as(self, other: _Answer) -> bool:
         """Whether both keep the same measurements."""
         return all(np.array_equal(a, b) for a, b in zip(self.kept, other.kept, strict=True))
-
-    def competes_with(self, other: _Answer) -> bool:
-        """Whether this answer costs less than the other as stated, or believes something else for nearly as little."""
-        if self.solution.cost < (1.0 - LESS) * other.solution.cost:
-            return True
-        if not any((ours & ~theirs).any() for ours, theirs in zip(self.kept, other.kept, strict=True)):
-            return False  # it only gave up more
-        unit = min(self.scatter.unit, other.scatter.unit)
-        return self.judged(unit) < other.judged(unit) + max(_bound(goal) for goal in self._goals)
 
 
 class _History:
@@ -463,6 +633,11 @@ class _History:
         return None if self._callback is None else self._callback(row)
 
 
+def _active(term: CompiledTerm) -> Array:
+    """(n,) one for each factor that is switched on."""
+    return np.ones(term.count) if term.active is None else np.asarray(term.active, dtype=np.float64)
+
+
 def _bound(loss: Loss) -> float:
     """What the loss of a measurement tends to when it is left out altogether."""
     return float(loss.value(np.array([FAR]))[0])
@@ -471,6 +646,11 @@ def _bound(loss: Loss) -> float:
 def _rival(loss: Loss) -> Loss:
     """Dynamic covariance scaling with the same bound."""
     return DCS(_bound(loss) / 3.0)
+
+
+def _huber(loss: Loss) -> Loss:
+    """The convex loss nearest to squares: 95 % as efficient where all is right."""
+    return Huber(HUBER)
 
 
 def _staged(graph: Statement) -> tuple[Statement, list[_Stage]]:

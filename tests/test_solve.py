@@ -216,6 +216,27 @@ def test_a_folded_map_is_said_and_not_the_default(tmp_path: Path, capsys: pytest
     assert "largest" not in solve_file(SolveSettings(file)).solution.report()
 
 
+@pytest.mark.parametrize(("more", "code"), [([], 0), (["--keep-map"], 1), (["--robust", "huber:50"], 0)])
+def test_a_better_map_is_taken(tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str], code: int) -> None:
+    """The map that was solved is certified or replaced; told to keep the worse one, the command fails."""
+    file, out = folded_loop(tmp_path / "loop.g2o"), tmp_path / "out"
+    right = solve_file(SolveSettings(file)).chi2[2]
+    options = ["--init", "file", "--staircase", "--no-scene", "--out", str(out), *more]
+    assert command.main(["solve", str(file), *options]) == code
+    said, found = capsys.readouterr().out, numbers(out)
+    certificate = found["certificate"]
+    assert len(certificate["moved"]) == 2 and certificate["chi2_chordal"] - certificate["dual"] >= 0.0
+    if code:
+        assert found["chi2"] > 100.0 * right and found["better_cost"] == pytest.approx(0.5 * right, rel=1e-6)
+        assert not certificate["certified"] and certificate["better_chi2"] == pytest.approx(right, rel=1e-6)
+        assert "a better map was found" in said and "kept all the same" in said and found["converged"]
+    else:
+        assert found["chi2"] == pytest.approx(right, rel=1e-6) and found["better_cost"] is None
+        assert certificate["better_chi2"] is None and "kept all the same" not in said
+        assert certificate["gap"] < 1e-4 * certificate["chi2_chordal"]
+        assert (certificate["interval"] is None) == (more != [])
+
+
 def test_measurements_alone_are_solved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = write_g2o(tmp_path / "city.g2o", manhattan(120, 1).pose_graph)
     reference = solve_file(SolveSettings(file)).chi2[2]

@@ -29,10 +29,13 @@ logger = logging.getLogger("unifg")
 def run(settings: pose_graph.SolveSettings, progress: Progress) -> Outcome:
     """Solve the graph of a file."""
     solved = pose_graph.solve_file(settings, progress)
-    converged = solved.solution.converged
     numbers = metrics(solved)
     return Outcome(
-        converged, solved.interrupted, summary(solved), numbers, lambda folder: write_results(folder, solved)
+        solved.solution.converged and solved.better is None,
+        solved.interrupted,
+        summary(solved),
+        numbers,
+        lambda folder: write_results(folder, solved),
     )
 
 
@@ -81,6 +84,7 @@ def metrics(solved: SolvedGraph) -> dict[str, Any]:
         "skipped_lines": dict(graph.skipped),
         "solver": solution.solver,
         "robust": settings.robust,
+        "robust_on": settings.robust_on,
         "init": solved.begun,
         "residual": settings.residual,
         "status": solution.status.name,
@@ -97,6 +101,7 @@ def metrics(solved: SolvedGraph) -> dict[str, Any]:
         "parts": solved.judgement.parts,
         "anchors_added": list(solved.judgement.anchors),
         "remarks": [*graph.remarks, *solved.judgement.sentences()],
+        "better_cost": solved.better,
         "certificate": None if solved.certificate is None else _certificate(solved.certificate),
         "cost": solution.cost,
         "stationarity": solution.stationarity,
@@ -111,6 +116,7 @@ def summary(solved: SolvedGraph) -> str:
     """The outcome as a table of two columns."""
     numbers, verdict, graph = metrics(solved), solved.solution.verdict, solved.after
     more = f", {numbers['landmarks']} landmarks" if numbers["landmarks"] else ""
+    doubted = "loop closures" if solved.settings.robust_on == "closures" else "measurements"
     skipped = ", ".join(f"{tag} ({count})" for tag, count in numbers["skipped_lines"].items())
     milliseconds = {name: 1e3 * value for name, value in solved.seconds.items()}
     rows = [
@@ -122,16 +128,17 @@ def summary(solved: SolvedGraph) -> str:
         ),
         ("skipped lines", skipped),
         ("solver, residual", f"{numbers['solver']}, {numbers['residual']}"),
-        ("robust loss", "" if solved.loss is None else f"{solved.loss}, on loop closures"),
+        ("robust loss", "" if solved.loss is None else f"{solved.loss}, on {doubted}"),
         ("chi2 in the file", f"{numbers['chi2_file']:.9g}" if graph.placed else "it has no poses"),
         ("chi2 at the start", f"{numbers['chi2_start']:.9g} ({numbers['init']})"),
         ("chi2 at the end", f"{numbers['chi2']:.9g}, {numbers['degrees_of_freedom']} degrees of freedom"),
         ("without outliers", f"{numbers['chi2_inliers']:.9g}" if numbers["outliers"] else ""),
-        ("outliers", "" if solved.loss is None else f"{numbers['outliers']} of the loop closures"),
+        ("outliers", "" if solved.loss is None else f"{numbers['outliers']} of the {doubted}"),
         ("worst edges", _worst(solved)),
         *(("remark", sentence) for sentence in numbers["remarks"]),
         ("held where it was", ", ".join(f"pose {name}" for name in numbers["anchors_added"][:5])),
         ("another map", "" if solved.certificate is None else solved.certificate.sentence()),
+        ("kept all the same", "" if solved.better is None else f"cost {solved.better:.6g} was found"),
         ("believed", "" if verdict is None else verdict.sentence(numbers["cost"])),
         ("iterations", f"{numbers['iterations']}"),
         ("status", solved.solution.status.value),
@@ -144,9 +151,13 @@ def _certificate(certificate: Certificate) -> dict[str, Any]:
     return {
         "certified": certificate.certified,
         "chi2_chordal": certificate.chi2,
+        "dual": certificate.dual,
         "gap": certificate.gap,
         "least_eigenvalue": certificate.least_eigenvalue,
         "rank": certificate.rank,
+        "moved": list(certificate.moved),
+        "interval": None if certificate.interval is None else list(certificate.interval),
+        "better_chi2": None if certificate.better_chi2 is None else certificate.better_chi2[1],
         "caveats": list(certificate.caveats),
     }
 

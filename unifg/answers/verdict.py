@@ -29,6 +29,32 @@ AnswerT = TypeVar("AnswerT", bound=Answer)
 
 
 @dataclass(frozen=True, eq=False)
+class Group(Generic[AnswerT]):
+    """Measurements between the same stretches that agree with each other, and with little else.
+
+    Attributes:
+        term: their term.
+        factors: (k,) their positions in it.
+        kept: they count in the answer. The others contradict them, though none of them alone.
+        other: the answer without them where they count, with them where they do not.
+        moved: family, member and distance by which that answer differs most; the longest tangent vector between both.
+    """
+
+    term: str
+    factors: IntArray
+    kept: bool
+    other: AnswerT = field(repr=False)
+    moved: tuple[str, int, float]
+
+    def sentence(self) -> str:
+        """The group and what depends on it."""
+        family, member, far = self.moved
+        named, which = _named({self.term: self.factors}), f"'{family}' {member} by {far:.3g}"
+        how, without = ("Kept, though only they", "without") if self.kept else ("Left out, though they", "with")
+        return f"{how} agree with each other: {named}; {without} them, cost {self.other.cost:.6g}, {which}."
+
+
+@dataclass(frozen=True, eq=False)
 class Verdict(Generic[AnswerT]):
     """What a solve that tells right measurements from wrong ones found.
 
@@ -40,12 +66,15 @@ class Verdict(Generic[AnswerT]):
             most one.
         rivals: other answers that were found and believe other measurements: those with a lower cost, as stated, and
             those that keep something else and can hardly be told from this one. Each has a verdict of its own.
+        groups: measurements that agree with themselves alone, with what depends on them; up to three that count and
+            three that do not. Neither reading is ruled out.
     """
 
     kept: dict[str, BoolArray]
     doubted: dict[str, IntArray] = field(default_factory=dict)
     unit: float = 1.0
     rivals: tuple[AnswerT, ...] = field(default=(), repr=False)
+    groups: tuple[Group[AnswerT], ...] = ()
 
     @property
     def left_out(self) -> dict[str, IntArray]:
@@ -75,7 +104,7 @@ class Verdict(Generic[AnswerT]):
                 text for text in (f"keeps {more}" if more else "", f"leaves out {fewer}" if fewer else "") if text
             )
             text += f" Another answer costs {rival.cost:.6g} (this one {cost:.6g}): it {differs}."
-        return text
+        return " ".join([text, *(group.sentence() for group in self.groups)])
 
 
 def _named(factors: dict[str, IntArray]) -> str:

@@ -6,7 +6,7 @@ returns. One that is refused leaves the graph as it was.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from difflib import get_close_matches
 from html import escape
@@ -73,6 +73,7 @@ class Statement:
         families: variable families by name.
         terms: costs and constraints in the order they were stated.
         fixes: fixed variables.
+        starts: further first guesses, for solvers that begin at several: functions that return values by family.
         compiled: what rooms above have made of this statement, dropped with every change; None before.
         edition: how often it has been changed.
     """
@@ -82,6 +83,7 @@ class Statement:
         self.families: dict[str, Family] = {}
         self.terms: list[Term] = []
         self.fixes: list[Fix] = []
+        self.starts: list[Callable[[], Mapping[Family, Array]]] = []
         self._data: dict[str, Data] = {}
         self._names: set[str] = set()
         self.compiled: object | None = None
@@ -311,7 +313,7 @@ class Statement:
         """A statement of its own of the same terms, which changes of this one do not reach."""
         kept = copy(self)
         kept.families, kept.terms, kept.fixes = dict(self.families), list(self.terms), list(self.fixes)
-        kept._data, kept._names = dict(self._data), set(self._names)
+        kept._data, kept._names, kept.starts = dict(self._data), set(self._names), list(self.starts)
         kept.compiled = None
         return kept
 

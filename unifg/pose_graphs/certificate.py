@@ -1,10 +1,12 @@
-"""Whether the best map has been found: the dual of the chordal relaxation, and the way down where it has not.
+"""Global optimality of a pose graph's map: the dual of the chordal relaxation, and the way down to a better map.
 
 At a stationary point of the chordal cost (:mod:`unifg.pose_graphs.relaxation`), its multipliers Lambda give the
 matrix S = Q - diag(0, Lambda_i) over positions and columns of frames. If S + e I >= 0 on the frames, no poses whatever
 cost less than the dual value sum tr(Lambda_i) - e d n. A negative eigenvalue is a way out through frames of one
-dimension more (the Riemannian staircase); from there the cost falls, and what is found is moved back to rotations.
+dimension more (the Riemannian staircase); from there the cost falls, and the result is moved back to rotations.
 D. Rosen, L. Carlone, A. Bandeira, J. Leonard, "SE-Sync", IJRR 38(2-3), 2019, theorem 7 and section 4.3.
+
+The dual is held against the cost of the poses that are given. The stationary point only serves to find it.
 """
 
 from __future__ import annotations
@@ -15,8 +17,9 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.pose_graphs.linear import BlockQuadratic
-from unifg.pose_graphs.pose_graph import PoseGraph
+from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
 from unifg.pose_graphs.relaxation import Relaxation
+from unifg.solvers.least_squares import LevenbergMarquardt
 from unifg.typing import Array, BoolArray
 
 __all__ = ["Certificate", "certify"]
@@ -28,22 +31,30 @@ STEPS = 40  # halvings on the way out of a saddle
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """What is known about the lowest chordal cost of a pose graph.
+    """Bounds on the cost of the best map of a pose graph.
 
     Attributes:
-        certified: whether the cost at `poses` is proven to be the lowest, but for `gap`.
-        chi2: chordal cost at `poses`, with the weights of the graph.
-        gap: by how much another map could be better at most; below `tolerance` it is certified.
-        tolerance: what the gap is compared with.
+        certified: the chordal cost of the given poses is at most `tolerance` above the least possible one.
+        chi2: chordal cost of the given poses, with the weights of the graph.
+        dual: chordal cost that no poses whatever fall below.
+        gap: chi2 less dual; certified where it is at most `tolerance`.
+        tolerance: absolute.
         least_eigenvalue: of the dual matrix on the frames; negative where the relaxation shows a way down.
-        poses: (n, storage) stationary point of the chordal cost that was judged, anchors where they were.
-        moved: greatest distance [m] and turn [rad] from the poses given to those.
+        poses: (n, storage) stationary point of the chordal cost near the given poses, anchors where they were.
+        moved: greatest distance [m] and turn [rad] from the given poses to those; no criterion.
         rank: dimension of the frames in which the staircase ended; that of the world where it was not climbed.
-        caveats: what of the graph's weights the chordal cost does not hold.
+        caveats: sentences, what of the graph's weights the chordal cost does not hold.
+        interval: bounds on the least sum of r' Omega r over all maps, r the logarithm: a lower bound, and its value at
+            the given poses. None where there is none.
+        no_interval: the reason for that; empty otherwise.
+        better: (n, storage) solution, by the residual asked for, that a solve from `poses` ended at, where its chi2 is
+            lower than that of the given poses by more than the relative tolerance; otherwise None.
+        better_chi2: chi2 of the given poses by that residual and of `better`; None without it.
     """
 
     certified: bool
     chi2: float
+    dual: float
     gap: float
     tolerance: float
     least_eigenvalue: float
@@ -51,32 +62,54 @@ class Certificate:
     moved: tuple[float, float]
     rank: int
     caveats: tuple[str, ...]
+    interval: tuple[float, float] | None
+    no_interval: str
+    better: Array | None = None
+    better_chi2: tuple[float, float] | None = None
 
     def sentence(self) -> str:
-        """What may be said, and what not."""
-        near = f"{self.moved[0]:.2g} m and {self.moved[1]:.2g} rad from the poses given"
+        """Claims that hold, and those that are not made."""
         if self.certified:
-            text = f"no map has a lower chordal chi2 than {self.chi2:.6g} (but for {self.gap:.1g}), reached {near}"
+            text = f"no map has a lower chordal chi2 than {self.chi2:.6g}, that of this one (but for {self.gap:.1g})"
         else:
             text = (
-                f"not certified: a map with a chordal chi2 as low as {max(self.chi2 - self.gap, 0.0):.6g} is not "
-                f"excluded where {self.chi2:.6g} was reached, {near}"
+                f"not certified: the chordal chi2 of this map is {self.chi2:.6g}, "
+                f"and a map as low as {self.dual:.6g} is not excluded"
             )
-        return "; ".join([text, *self.caveats, "nothing is claimed of other residuals or of robust losses"])
+        said = [text, f"a stationary point of that cost lies {self.moved[0]:.2g} m and {self.moved[1]:.2g} rad away"]
+        if self.better_chi2 is not None:
+            said.append(
+                f"a better map was found: chi2 {self.better_chi2[1]:.6g}, of this one {self.better_chi2[0]:.6g}"
+            )
+        if self.interval is None:
+            said.append(f"no interval is claimed for chi2: {self.no_interval}")
+        else:
+            least, here = self.interval
+            wide = f", {here / least:.3g} times as much" if least > 0.0 else ""
+            said.append(f"chi2 of the best map lies between {least:.6g} and {here:.6g}{wide}, that of this one")
+        return "; ".join([*said, *self.caveats, "nothing is claimed of robust losses"])
 
 
 def certify(
-    pose_graph: PoseGraph, *, used: BoolArray | None = None, staircase: bool = False, tolerance: float = 1e-6
+    pose_graph: PoseGraph,
+    *,
+    used: BoolArray | None = None,
+    staircase: bool = False,
+    tolerance: float = 1e-6,
+    residual: ResidualName = "log",
 ) -> Certificate:
-    """Judge the map near a graph's present poses.
+    """Bound what a map can gain over a graph's present poses.
 
-    The nearest minimum of the chordal cost is found first; it is that cost's global optimality that is judged.
+    The chordal cost of these poses is compared with the dual of its relaxation. The dual is taken at the stationary
+    point of that cost near them. Where the comparison fails, a solve of plain squares begins there.
 
     Args:
         pose_graph: with poses that solve it, in whatever residual; relative poses only.
-        used: (m,) edges that count, say the inliers of a robust solve; all by default.
+        used: (m,) edges that count, say the inliers of a robust solve. The interval is left out where it is given:
+            it is one of plain squares over all edges.
         staircase: where there is a way down, follow it.
         tolerance: of the gap, relative to chi2.
+        residual: by which a better map is looked for; the interval is that of the logarithm.
 
     Raises:
         GraphError: the graph has landmarks, several poses of one part are known, or `used` is something else than one
@@ -90,19 +123,17 @@ def certify(
         )
     # Weights of positions and of frames are added up below: the unit of length is the graph's own, not the file's.
     unit = _length(pose_graph, chosen)
-    problem = Relaxation.of(_measured_in(pose_graph, unit), chosen)
-    judge = _Judge(problem, tolerance)
+    scaled = _measured_in(pose_graph, unit)
+    problem = Relaxation.of(scaled, chosen)
     # Seen from the anchor of its part, a pose keeps its digits wherever the map lies.
     shift = pose_graph.poses[problem.anchors][problem.parts, : problem.dim]
     near = pose_graph.poses.copy()
     near[:, : problem.dim] = (near[:, : problem.dim] - shift) / unit
-    point = problem.minimize(problem.lift(pose_graph.with_poses(near)))
-    verdict = judge(point)
-    rank = problem.dim
-    if staircase and not verdict.proven:
-        point, rank, bound = _climb(problem, judge, point, verdict)
-        verdict = judge(point)
-        verdict = replace(verdict, gap=min(verdict.gap, max(verdict.cost - bound, 0.0)))
+    start = problem.lift(pose_graph.with_poses(near))
+    judge = _Judge(problem, tolerance)
+    point, verdict, rank, dual = _bound(judge, start, staircase)
+    chi2 = problem.cost(start)
+    allowed = judge.allowed(chi2)
     poses = problem.lower(point, pose_graph)
     poses[:, : problem.dim] = poses[:, : problem.dim] * unit + shift
     poses[problem.anchors] = pose_graph.poses[problem.anchors]
@@ -110,9 +141,52 @@ def certify(
     turned = np.linalg.norm(apart[:, problem.dim :], axis=1)
     shifted = np.linalg.norm(poses[:, : problem.dim] - pose_graph.poses[:, : problem.dim], axis=1)
     moved = float(shifted.max(initial=0.0)), float(turned.max(initial=0.0))
-    return Certificate(
-        verdict.proven, verdict.cost, verdict.gap, verdict.tolerance, verdict.least, poses, moved, rank, problem.caveats
-    )
+    interval, missing = None, ""
+    if residual != "log" or chosen is not None:
+        missing = f"the residual is {residual!r}" if residual != "log" else "edges were chosen, or have a robust loss"
+    else:
+        least = Relaxation.of(scaled, below=True)
+        whole = float(pose_graph.squared_errors().sum()) if len(pose_graph.edges) else 0.0
+        # Where nothing was lost, both are one problem.
+        lower = dual if _same(least, problem) else _bound(_Judge(least, tolerance), start, staircase)[3]
+        interval = min(lower, whole), whole
+    found = Certificate(
+        chi2 - dual <= allowed, chi2, dual, max(chi2 - dual, 0.0), allowed, verdict.least, poses, moved, rank,
+        problem.caveats, interval, missing,
+    )  # fmt: skip
+    return found if found.certified else _improved(found, pose_graph, chosen, tolerance, residual)
+
+
+def _bound(judge: _Judge, start: Array, staircase: bool) -> tuple[Array, _Verdict, int, float]:
+    """Stationary point near a start, what is known there, the rank reached, and what no poses cost less than."""
+    problem = judge.problem
+    point = problem.minimize(start)
+    verdict = judge(point)
+    rank, dual = problem.dim, verdict.dual
+    if staircase and not verdict.proven:
+        point, rank, bound = _climb(judge, point, verdict)
+        verdict = judge(point)
+        dual = max(verdict.dual, bound)
+    return point, verdict, rank, max(dual, 0.0)
+
+
+def _same(one: Relaxation, other: Relaxation) -> bool:
+    """Equality of the weights of two relaxations but for rounding."""
+    return np.allclose(one.by_first, other.by_first, rtol=1e-12, atol=0.0)
+
+
+def _improved(
+    found: Certificate, pose_graph: PoseGraph, used: BoolArray | None, tolerance: float, residual: ResidualName
+) -> Certificate:
+    """Solve plain squares from the stationary point, and hand over the result where it is better."""
+    judged = pose_graph if used is None else replace(pose_graph, edges=pose_graph.edges[used])
+    here = float(judged.squared_errors(residual).sum())
+    graph, x, guess = judged.with_poses(found.poses).graph(residual=residual)
+    solution = LevenbergMarquardt().solve(graph, guess)
+    there = float(judged.with_poses(solution[x]).squared_errors(residual).sum())
+    if not there < (1.0 - tolerance) * here:
+        return found
+    return replace(found, better=solution[x], better_chi2=(here, there))
 
 
 def _length(pose_graph: PoseGraph, used: BoolArray | None) -> float:
@@ -137,17 +211,20 @@ def _measured_in(pose_graph: PoseGraph, unit: float) -> PoseGraph:
 
 @dataclass(frozen=True, eq=False)
 class _Verdict:
-    """cost, gap and what it must be below; least eigenvalue, and its direction (n, d + 1)."""
+    """cost of a point, what no point costs less than, how far they may be apart; least eigenvalue, and its direction.
+
+    The direction is (n, d + 1).
+    """
 
     cost: float
-    gap: float
+    dual: float
     tolerance: float
     least: float
     direction: Array
 
     @property
     def proven(self) -> bool:
-        return self.gap <= self.tolerance
+        return self.cost - self.dual <= self.tolerance
 
 
 class _Judge:
@@ -161,10 +238,14 @@ class _Judge:
         self.weight = float(np.sum(problem.by_first**2) + np.sum(problem.by_second**2))
         self.anchor = float(np.max(problem.by_second**2, initial=0.0)) or 1.0
 
+    def allowed(self, cost: float) -> float:
+        """Gap that a cost may have."""
+        return self.relative * cost + ROUNDING * self.weight
+
     def __call__(self, point: Array) -> _Verdict:
         problem, dim = self.problem, self.problem.dim
         cost, multipliers = problem.cost(point), problem.multipliers(point)
-        tolerance = self.relative * cost + ROUNDING * self.weight
+        tolerance = self.allowed(cost)
         frames = dim * problem.count
         own = np.zeros((problem.count, dim + 1, dim + 1))
         own[:, 1:, 1:] = -multipliers
@@ -172,19 +253,19 @@ class _Judge:
         entries = self.quadratic.entries(problem.by_first, problem.by_second, own)
         system = self.quadratic.factorization
         lifted = np.tile(np.arange(dim + 1) > 0, problem.count).astype(np.float64)
-        beyond = max(cost - float(np.trace(multipliers, axis1=1, axis2=2).sum()), 0.0)
+        value = min(float(np.trace(multipliers, axis1=1, axis2=2).sum()), cost)  # of the dual; more is rounding
         shift = 0.5 * tolerance / frames
         greatest = 1e3 * self.weight
         if not self.weight > 0.0:  # every map costs nothing
-            return _Verdict(cost, 0.0, tolerance, 0.0, np.zeros((problem.count, dim + 1)))
-        largest = (tolerance - beyond) / frames * (1.0 - 1e-9)  # that still proves what is asked
+            return _Verdict(cost, cost, tolerance, 0.0, np.zeros((problem.count, dim + 1)))
+        largest = (tolerance - (cost - value)) / frames * (1.0 - 1e-9)  # that still proves what is asked
         while not (system.factor(entries, shift * lifted) and system.definite):
             shift = largest if shift < largest else 10.0 * shift
             if not shift < greatest:
-                return _Verdict(cost, np.inf, tolerance, -np.inf, np.zeros((problem.count, dim + 1)))
-        proven = beyond + shift * frames
-        if proven <= tolerance:
-            return _Verdict(cost, proven, tolerance, -shift, np.zeros((problem.count, dim + 1)))
+                return _Verdict(cost, -np.inf, tolerance, -np.inf, np.zeros((problem.count, dim + 1)))
+        dual = value - shift * frames
+        if cost - dual <= tolerance:
+            return _Verdict(cost, dual, tolerance, -shift, np.zeros((problem.count, dim + 1)))
         places = np.flatnonzero(lifted)
         whole = np.zeros(len(lifted))
 
@@ -206,18 +287,18 @@ class _Judge:
         for share in (1.001, 1.01, 1.1):
             nearer = max(-least * share, 0.5 * tolerance / frames)
             if nearer < shift and system.factor(entries, nearer * lifted) and system.definite:
-                proven = beyond + nearer * frames
+                dual = value - nearer * frames
                 break
-        return _Verdict(cost, proven, tolerance, least, direction)
+        return _Verdict(cost, dual, tolerance, least, direction)
 
 
-def _climb(problem: Relaxation, judge: _Judge, point: Array, verdict: _Verdict) -> tuple[Array, int, float]:
+def _climb(judge: _Judge, point: Array, verdict: _Verdict) -> tuple[Array, int, float]:
     """Follow the way down through more dimensions until there is none, and come back to rotations.
 
     Returns:
         The point of rank d, the rank reached, and what no map costs less than, as proven there.
     """
-    lifted = point
+    problem, lifted = judge.problem, point
     while not verdict.proven and lifted.shape[2] < problem.dim + RANKS:
         lifted = problem.minimize(_leave(problem, lifted, verdict.direction))
         verdict = judge(lifted)
@@ -225,7 +306,7 @@ def _climb(problem: Relaxation, judge: _Judge, point: Array, verdict: _Verdict) 
     return (
         (returned if problem.cost(returned) < problem.cost(point) else point),
         lifted.shape[2],
-        verdict.cost - verdict.gap,
+        verdict.dual,
     )
 
 

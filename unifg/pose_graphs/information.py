@@ -1,4 +1,4 @@
-"""Information matrices with negative eigenvalues, which are none: which they are, and what can be made of them."""
+"""Information matrices: those that are none, repairs of them, and bounds from below that a relaxation can hold."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ from unifg.errors import GraphError
 from unifg.kernels.whitening import quick_roots
 from unifg.typing import Array, BoolArray
 
-__all__ = ["REPAIRS", "Repair", "indefinite", "repaired", "require_repair"]
+__all__ = ["REPAIRS", "Repair", "bounded_below", "indefinite", "repaired", "require_repair"]
 
 Repair: TypeAlias = Literal["zero", "project"]
 REPAIRS: tuple[Repair, ...] = ("zero", "project")
 NEGATIVE = 1e-9  # of the largest eigenvalue; what a graph refuses
+SHARES = np.concatenate([np.linspace(0.0, 0.95, 20), 1.0 - np.geomspace(0.03, 1e-9, 12), [1.0]])  # of an eigenvalue
+ROUNDING = 1e-14  # of the greatest entry of an information matrix
+FLOOR = 1e-6  # of an eigenvalue: where it counts as lost
 
 
 def indefinite(information: Array) -> BoolArray:
@@ -59,3 +62,46 @@ def repaired(information: Array, how: Repair) -> Array:
         halves = axes * np.sqrt(np.maximum(lengths, 0.0))[:, None, :]
         result[wrong] = halves @ np.swapaxes(halves, 1, 2)
     return result
+
+
+def bounded_below(information: Array, dim: int) -> tuple[Array, Array]:
+    """Block diagonal matrices diag(tau I, Omega) that lie below information matrices [[A, B], [B', C]].
+
+    With tau below the least eigenvalue of A, the difference is positive semi-definite where Omega is the Schur
+    complement C - B' (A - tau I)^-1 B. A coupling costs rotation what tau gains: of a grid of tau, the one is taken
+    whose ellipsoid is the least. In space, Omega's greatest eigenvalue is then lowered to the sum of the others, beyond
+    which no chordal cost has it.
+
+    Args:
+        information: (m, d, d) positive semi-definite, translation before rotation.
+        dim: of the translation.
+
+    Returns:
+        (m,) tau, and (m, k, k) Omega.
+    """
+    lengths, axes = np.linalg.eigh(information[:, :dim, :dim])
+    cross = np.swapaxes(axes, 1, 2) @ information[:, :dim, dim:]
+    turning = information[:, dim:, dim:]
+    greatest = np.maximum(np.abs(turning).max(axis=(1, 2), initial=0.0), np.finfo(np.float64).tiny)
+    least = np.maximum(lengths[:, 0], 0.0)
+    tau, omega, best = np.zeros(len(information)), np.zeros_like(turning), np.full(len(information), -np.inf)
+    for share in SHARES:
+        left = lengths - share * least[:, None]
+        open_ = left > 0.0
+        coupled = (cross != 0.0).any(axis=2)
+        inverse = np.where(open_, 1.0 / np.where(open_, left, 1.0), 0.0)
+        schur = turning - np.swapaxes(cross, 1, 2) @ (inverse[:, :, None] * cross)
+        bends = np.linalg.eigvalsh(schur) / greatest[:, None]
+        size = dim * np.log(share + FLOOR) + np.sum(np.log(np.maximum(bends, 0.0) + FLOOR), axis=1)
+        valid = (
+            (bends[:, 0] >= -ROUNDING) & (open_ | ~coupled).all(axis=1)
+            if share
+            else np.ones(len(information), dtype=bool)
+        )
+        better = valid & (size > best)
+        tau[better], omega[better], best[better] = share * least[better], schur[better], size[better]
+    own, frames = np.linalg.eigh(omega)
+    own = np.maximum(own, 0.0)
+    if own.shape[1] == 3:
+        own[:, 2] = np.minimum(own[:, 2], own[:, 0] + own[:, 1])
+    return tau, frames @ (own[:, :, None] * np.swapaxes(frames, 1, 2))

@@ -16,7 +16,7 @@ from unifg.errors import GraphError
 from unifg.kernels.robust import Loss
 from unifg.lie import SE2, SE3, SO3, LieGroup
 from unifg.pose_graphs.linear import block_least_squares
-from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
+from unifg.pose_graphs.pose_graph import GUESSES, PoseGraph, ResidualName
 from unifg.pose_graphs.spanning import spanning_tree
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -258,3 +258,6 @@ def _tree(pose_graph: PoseGraph, fixed: IntArray, cost: Array, shortest: bool) -
             index=lost,
         )
     return parent, edge, forward
+
+
+GUESSES += [odometric, chordal, lago]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -33,6 +34,9 @@ _SEEN: dict[str, ManifoldResidual | Residual] = {
     "range": distance,
     "bearing-range": bearing_range,
 }
+
+GUESSES: list[Callable[[PoseGraph], Array]] = []
+"""First guesses from measurements alone, entered by :mod:`unifg.pose_graphs.initialise`, which stands on this file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +146,8 @@ class PoseGraph:
             robust: loss on the whitened residuals of the loop closures.
             residual: ``"log"`` is Log(Z^-1 Xi^-1 Xj), as in GTSAM; ``"g2o"`` is g2o's chart (see
                 `unifg.pose_graphs.chart_between`). Both take the information matrices as the file has them.
-            robust_on: ``"all"`` puts the loss on odometry and sightings too.
+            robust_on: ``"all"`` puts the loss on odometry and sightings too. Where odometry may be wrong, so is a guess
+                made of it: the graph then names chordal poses and, in the plane, LAGO's as further starts.
 
         Returns:
             The graph, the family of the poses, called ``poses``, and a guess made of the present values. Landmarks are
@@ -183,6 +188,8 @@ class PoseGraph:
             graph.fix(x[fixed], self.poses[fixed], name="anchor")
         if len(known):
             graph.fix(graph.families["landmarks"][known], self.landmarks[known], name="known landmarks")
+        if everywhere is not None:
+            graph.starts += [partial(_guessed, method, self, x) for method in GUESSES]
         return graph, x, guess
 
     def chi2(self, residual: ResidualName = "log") -> float:
@@ -245,6 +252,10 @@ class PoseGraph:
         seen = sum(map(len, self.sightings.values()))
         more = f", {len(self.landmarks)} landmarks, {seen} sightings" if len(self.landmarks) else ""
         return f"<PoseGraph: {len(self.poses)} poses in {self.group.name}, {len(self.edges)} edges{more}>"
+
+
+def _guessed(method: Callable[[PoseGraph], Array], pose_graph: PoseGraph, poses: Family) -> dict[Family, Array]:
+    return {poses: method(pose_graph)}
 
 
 def _require(who: str, what: str, places: tuple[IntArray, ...], count: int) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.lie import SO3
-from unifg.pose_graphs.information import indefinite
+from unifg.pose_graphs.information import bounded_below, indefinite
 from unifg.pose_graphs.linear import BlockQuadratic, block_gradient
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.typing import Array, BoolArray, IntArray
@@ -80,12 +80,14 @@ class Relaxation:
     caveats: tuple[str, ...]
 
     @classmethod
-    def of(cls, pose_graph: PoseGraph, used: BoolArray | None = None) -> Relaxation:
+    def of(cls, pose_graph: PoseGraph, used: BoolArray | None = None, *, below: bool = False) -> Relaxation:
         """State it.
 
         Args:
             pose_graph: poses and edges.
             used: (m,) edges that count, say the inliers; all by default.
+            below: take weights that no information matrix lies below (`bounded_below`), which makes this cost at most
+                that of the logarithm: |t| <= |v| and 2 sin(w / 2) <= w. Otherwise means stand for what it cannot hold.
 
         Raises:
             GraphError: the graph has landmarks, or several poses of one part are known.
@@ -95,21 +97,17 @@ class Relaxation:
         edges, anchors, parts = kept.edges, kept.anchors()[0], kept.parts()
         admit(kept)
         dim, angles = pose_graph.group.point_dim, pose_graph.group.dim - pose_graph.group.point_dim
-        moving, turning = edges.information[:, :dim, :dim], edges.information[:, dim:, dim:]
         caveats = []
         if not real.all():
             caveats.append(f"{(~real).sum()} edges from a pose to itself, which cost the same in any map, are left out")
-        tau = np.trace(moving, axis1=1, axis2=2) / dim
-        crooked = ~_close(moving, tau[:, None, None] * np.eye(dim))
-        if crooked.any():
-            caveats.append(
-                f"translation information of {crooked.sum()} edges is not the same in all directions: "
-                "its mean stands for it"
+        if below:
+            tau, turning = bounded_below(edges.information, dim)
+        else:
+            tau, turning = (
+                np.trace(edges.information[:, :dim, :dim], axis1=1, axis2=2) / dim,
+                edges.information[:, dim:, dim:],
             )
-        # A coupling is small beside what it couples, in whatever units these are.
-        coupled = ~_close(edges.information[:, :dim, dim:], 0.0, np.sqrt(_greatest(moving) * _greatest(turning)))
-        if coupled.any():
-            caveats.append(f"{coupled.sum()} edges couple rotation and translation: the coupling is left out")
+            caveats += _lost(edges.information, dim, tau)
         mean = np.trace(turning, axis1=1, axis2=2)[:, None, None]
         squared = 0.5 * turning if angles == 1 else 0.5 * mean * np.eye(3) - turning
         if angles == 1:
@@ -210,6 +208,23 @@ class Relaxation:
             else:
                 damping = max(10.0 * damping, FRAME * scale)
         return point
+
+
+def _lost(information: Array, dim: int, tau: Array) -> list[str]:
+    """Sentences: directions of translation information, and couplings, that the form does not hold."""
+    moving, turning = information[:, :dim, :dim], information[:, dim:, dim:]
+    caveats = []
+    crooked = ~_close(moving, tau[:, None, None] * np.eye(dim))
+    if crooked.any():
+        caveats.append(
+            f"translation information of {crooked.sum()} edges is not the same in all directions: "
+            "its mean stands for it"
+        )
+    # A coupling is small beside what it couples, in whatever units these are.
+    coupled = ~_close(information[:, :dim, dim:], 0.0, np.sqrt(_greatest(moving) * _greatest(turning)))
+    if coupled.any():
+        caveats.append(f"{coupled.sum()} edges couple rotation and translation: the coupling is left out")
+    return caveats
 
 
 def _greatest(blocks: Array) -> Array:
