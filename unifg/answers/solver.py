@@ -397,6 +397,8 @@ class SolveState:
             return Status.NOT_FINITE
         if self.lin.cost < UNBOUNDED_COST:  # out there, derivatives may be lost to rounding and look like zero
             return Status.UNBOUNDED
+        if self.optimality.stationarity == np.inf:  # a saddle or maximum, where no model shows a way
+            return Status.STALLED
         if self.optimality.holds(self.tolerance):
             if not self.optimality.determined:
                 return Status.UNDETERMINED
