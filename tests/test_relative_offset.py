@@ -331,7 +331,7 @@ def test_published_optima_in_other_units(shared_data: Path, name: str, chi2: flo
 
 
 def beside(size: float, linked: bool) -> tuple[fg.Graph, dict[fg.Family, Array], fg.Family]:
-    """A nonlinear block of one unknown, and priors that contradict each other by ``size`` sigma, linked to it or not."""
+    """One nonlinear unknown, and priors that contradict each other by ``size`` sigma, linked to it or not."""
     graph = fg.Graph()
     x, y = graph.variables("x", fg.Rn(1), 1), graph.variables("y", fg.Rn(1), 1)
     graph.minimize(fg.prior, x, [0.0], sigma=1.0, name="here")

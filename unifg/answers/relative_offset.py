@@ -16,8 +16,8 @@ promises to remove is measured. Where it is singular too, the point is left a li
 undetermined only if H stays singular there, which excludes a mere kink, and no minimum at all if the cost falls.
 
 The offset is a share of the whole cost: beside a gross error, a part of the graph could be anywhere. A point that
-passes is therefore tested once more, variable by variable. With d the Gauss-Newton step (Newton's where H is singular), and
-over the factors f of one variable,
+passes is therefore tested once more, variable by variable. With d the Gauss-Newton step (Newton's where H is singular),
+and over the factors f of one variable,
 
     sqrt(sum |J_f d|^2 / sum |r_f|^2)
 
@@ -414,9 +414,9 @@ def _bounds(
     guess: Array,
     sizes: Array,
 ) -> tuple[float, float, float]:
-    """Write the size of every coordinate. |r|; the largest |g_k| / sqrt(H_kk) and the norm of sqrt(H_kk) times the size of coordinate k, both over |r|.
+    """|r|; the largest |g_k| / sqrt(H_kk) and the norm of sqrt(H_kk) times the size of coordinate k, both over |r|.
 
-    The second is not a number when some derivative is not finite.
+    The second is not a number when some derivative is not finite. Sizes are written to ``sizes``.
     """
     squares = cosine = rounding = 0.0
     if len(counted):
