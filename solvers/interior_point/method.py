@@ -146,14 +146,19 @@ class InteriorPoint(Solver):
     def _attempt(self, run: SolveState, workspace: Workspace) -> Status | None:
         """From where the workspace is to one of the endings."""
         program, work, now = run.program, workspace.work, workspace.now
-        now["assisted"], now["watched"], now["stage"] = not program.fully_compiled, not run.alone, state.MOVED
-        if not run.alone:
+        now["assisted"], now["watched"], now["stage"] = not program.fully_compiled, not run.alone, state.LINEARIZED
+        if run.alone:
+            if program.fully_compiled:
+                workspace.call("renew")
+            else:
+                workspace.take(program.linearize(program.columns.view(work.values.copy())))
+            run.slopes.see(work.constraint_jacobian, work.gradient)
+        else:
             if not np.array_equal(run.lin.values.flat, work.values):
                 run.begin_at(program.linearize(program.columns.view(work.values.copy())))
                 if run.status is not None:
                     return None
             workspace.take(run.lin)
-            now["stage"] = state.LINEARIZED
         interrupted, seen, now["answer"] = False, now["iteration"], NO_ANSWER
         try:
             while workspace.asks():

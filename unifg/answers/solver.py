@@ -15,6 +15,7 @@ import numpy as np
 
 from unifg.answers.conditioning import HARDLY
 from unifg.answers.history import HEADER, Deferred, Iteration, factor_norms, line
+from unifg.answers.multipliers import Slopes
 from unifg.answers.optimality import infeasible_stationary, optimality, within_bounds
 from unifg.answers.rehearsal import rehearse
 from unifg.answers.relative_offset import Factored
@@ -196,6 +197,7 @@ class SolveState:
         tolerance: of the KKT test.
         lent: the backend's factorisation of a matrix near the Hessian of the objective, which the KKT test of least
             squares may use and overwrite; None where the backend has no such thing.
+        slopes: the largest so far.
     """
 
     def __init__(self, solver: Solver, program: Program, values: Values, multipliers: Array, callback: Callback | None):
@@ -212,6 +214,7 @@ class SolveState:
         self._recall: Callable[[], list[Iteration]] | None = None
         self._least, self._least_values, self._start = np.inf, values, values
         self.lent: Factored | None = None
+        self.slopes = Slopes(program)
         self.iterations = 0
         if solver.verbose:
             logger.info(HEADER)
@@ -296,6 +299,8 @@ class SolveState:
 
     def _move(self, lin: Linearization, multipliers: Array) -> None:
         self.lin, self.values, self.multipliers = lin, lin.values, multipliers
+        if len(multipliers):
+            self.slopes.see(lin.constraint_jacobian, lin.gradient)
         self.optimality = optimality(self.program, lin, multipliers, self.tolerance, self.lent, self._start.flat)
         if self.optimality.violation < self._least:
             self._least, self._least_values = self.optimality.violation, lin.values
@@ -369,6 +374,8 @@ class SolveState:
         measured = self.optimality
         if measured.passes(self.tolerance) and status is not Status.UNBOUNDED:
             status = Status.CONVERGED if measured.weakest > HARDLY else Status.HARDLY_DETERMINED
+            if len(self.multipliers) and self.slopes.degenerate(self.multipliers, self.tolerance):
+                status = Status.DEGENERATE
         elif measured.holds(self.tolerance) and not measured.determined:
             status = Status.UNDETERMINED
         elif measured.holds(self.tolerance) and status is not Status.UNBOUNDED:

@@ -15,6 +15,10 @@ class Status(Enum):
         "The KKT conditions of the problem hold to the tolerance, but some direction is so weakly determined that few "
         "digits of it are known; look at solution.conditioning, add a prior or another measurement."
     )
+    DEGENERATE = (
+        "The KKT conditions hold to the tolerance, but only with huge multipliers: constraints have lost their slope "
+        "there, and the point need not be an optimum; state them with a slope where they are met."
+    )
     STOP_RULE = "The chosen stop rule ended the loop, but the KKT conditions do not hold to the tolerance."
     ITERATION_LIMIT = "The iteration limit was reached before the KKT conditions held; raise max_iterations."
     TIME_LIMIT = "The time limit was reached before the KKT conditions held; raise time_limit."
