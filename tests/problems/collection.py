@@ -44,8 +44,8 @@ class Outcome:
 
     Attributes:
         verdict: "optimum" (the known one), "other" (a KKT point listed with the problem), "degenerate" (said so at an
-            optimum that has no multipliers), "infeasible" (said so, and there is no answer), else the status, or "unknown point" for a KKT point nobody has listed and "disproved"
-            for a claim that the judge rejects.
+            optimum that has no multipliers), "infeasible" (said so, and there is no answer), else the status, or
+            "unknown point" for a KKT point nobody has listed and "disproved" for a claim that the judge rejects.
         iterations: spent.
         cost: at the end.
     """

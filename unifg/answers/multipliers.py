@@ -1,11 +1,12 @@
 """The size of multipliers in units of the problem's own: what tells that constraints have lost their slope.
 
-Where the gradients of active constraints vanish or become dependent, as of exp(x) = 0 or x^3 = 0, no multipliers balance
-the cost, and a solve ends where large ones seem to: the KKT numbers hold, divided by the mean multiplier, at a point that
-need not be an optimum. How large is a question of units. With the largest gradients of all rows and of the cost that were
-seen on the way, unknowns, rows and cost are brought to one scale by taking square roots of the largest entries out of
-both, again and again (Ruiz, RAL-TR-2001-034). The sum of the multipliers of that problem is the same for any units, of
-the order of the number of active rows where all is well, and beyond `LARGEST` what no chain of rows explains.
+Where the gradients of active constraints vanish or become dependent, as of exp(x) = 0 or x^3 = 0, no multipliers
+balance the cost, and a solve ends where large ones seem to: the KKT numbers hold, divided by the mean multiplier, at a
+point that need not be an optimum. How large is a question of units. With the largest gradients of all rows and of the
+cost that were seen on the way, unknowns, rows and cost are brought to one scale by taking square roots of the largest
+entries out of both, again and again (Ruiz, RAL-TR-2001-034). The sum of the multipliers of that problem is the same for
+any units, of the order of the number of active rows where all is well, and beyond `LARGEST` what no chain of rows
+explains.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ import numpy as np
 
 from unifg.answers.conditioning import HARDLY
 from unifg.answers.history import HEADER, Deferred, Iteration, factor_norms, line
+from unifg.answers.incumbent import Incumbent, Incumbents
 from unifg.answers.multipliers import Slopes
 from unifg.answers.optimality import infeasible_stationary, optimality, within_bounds
 from unifg.answers.rehearsal import rehearse
@@ -38,6 +39,16 @@ logger = logging.getLogger("unifg")
 Callback: TypeAlias = Callable[[Iteration], bool | None]
 
 UNBOUNDED_COST = -1e20
+FEW = 3  # iterations that are asked for as such, one after the other in a control loop
+WITHOUT_SUCCESS = (
+    Status.ITERATION_LIMIT,
+    Status.TIME_LIMIT,
+    Status.STALLED,
+    Status.SINGULAR,
+    Status.NOT_FINITE,
+    Status.INTERRUPTED,
+)
+"""Endings that return the best iterate."""
 
 
 class Backend(ABC):
@@ -198,6 +209,7 @@ class SolveState:
         lent: the backend's factorisation of a matrix near the Hessian of the objective, which the KKT test of least
             squares may use and overwrite; None where the backend has no such thing.
         slopes: the largest so far.
+        incumbents: iterates one of which is returned without success.
     """
 
     def __init__(self, solver: Solver, program: Program, values: Values, multipliers: Array, callback: Callback | None):
@@ -210,7 +222,7 @@ class SolveState:
         self.tolerance = solver.tolerance
         self.history: list[Iteration] = []
         self.status: Status | None = None
-        self._best: tuple[float, float] | None = None
+        self.incumbents = Incumbents()
         self._recall: Callable[[], list[Iteration]] | None = None
         self._least, self._least_values, self._start = np.inf, values, values
         self.lent: Factored | None = None
@@ -242,8 +254,8 @@ class SolveState:
         **details: float | int | str,
     ) -> None:
         """Make ``lin`` the present iterate: measure it, record a row, decide whether to go on."""
-        self._move(lin, multipliers)
         self.iterations = len(self.history)
+        self._move(lin, multipliers)
         deferred = Deferred(lambda: factor_norms(self.program, lin, self.program.violation(lin.constraints)))
         row = Iteration(
             self.iterations,
@@ -264,7 +276,6 @@ class SolveState:
         self.history.append(row)
         if self._solver.verbose:
             logger.info(line(row))
-        self._keep_best()
         self.status = self._decide_in_time()
         if self._callback is not None and self._callback(row) and self.status is None:
             self.status = Status.INTERRUPTED
@@ -287,14 +298,8 @@ class SolveState:
             iterations: how many there were.
             history: makes their rows when somebody asks for them.
         """
-        start, carried = self.values, self.multipliers
-        self._move(lin, multipliers)
-        if not self.optimality.finite:
-            self._move(self.program.linearize(start), carried)
-            self._keep_best()
-            self._move(lin, multipliers)
-        self._keep_best()
         self.iterations, self._recall = iterations, history
+        self._move(lin, multipliers)
         self.status = self._decide()
 
     def _move(self, lin: Linearization, multipliers: Array) -> None:
@@ -304,11 +309,24 @@ class SolveState:
         self.optimality = optimality(self.program, lin, multipliers, self.tolerance, self.lent, self._start.flat)
         if self.optimality.violation < self._least:
             self._least, self._least_values = self.optimality.violation, lin.values
+        if self.optimality.finite:
+            self.consider(lin.cost, lin.constraints, lin.values, multipliers)
+
+    def consider(self, cost: float, constraints: Array, values: Values, multipliers: Array) -> None:
+        """Take note of an iterate that may be returned if the solve ends without success.
+
+        Args:
+            cost: objective.
+            constraints: (M,) there.
+            values: the iterate, which is not written to any more.
+            multipliers: (M,) there, the same.
+        """
+        violation = float(np.abs(self.program.violation(constraints)).sum()) if len(constraints) else 0.0
+        self.incumbents.see(Incumbent(self.iterations, cost, violation, values, multipliers))
 
     def begin_at(self, lin: Linearization) -> None:
         """Move the start, as onto the bounds, without spending an iteration."""
         self._move(lin, self.multipliers)
-        self._keep_best()
         self.status = self._decide_in_time()
 
     def search(self, workspace: Any) -> None:
@@ -328,7 +346,7 @@ class SolveState:
 
     def keep_with(self, error: Exception) -> None:
         """Hand what has been reached along with an error, as its attribute ``reached``, and say so in a note."""
-        if self._best is None:
+        if not self.incumbents:
             return
         with suppress(Exception):  # the functions may raise again
             self.status = Status.INTERRUPTED
@@ -356,11 +374,11 @@ class SolveState:
         return infeasible_stationary(self.program, self.lin, self.tolerance)
 
     def finish(self, reason: Status | None) -> Solution:
-        """Return the last iterate, judged by the KKT test of the original problem.
+        """Return the last iterate, or after a solve without success the best one, judged by the KKT test.
 
-        No ranking of iterates comes before the backend's own choice: a step of a real-time iteration may raise every
-        merit, and would never be taken from a feasible start. Only where the last iterate is not finite does the best
-        of the others stand in for it.
+        No ranking of iterates comes before the backend's own choice where it succeeded, where a stop rule fired, and
+        where a step or a few of them are all that was asked for: a step of a real-time iteration may raise every merit,
+        and would never be taken from a feasible start.
         """
         status = self.status or reason or Status.STALLED
         if status is Status.STALLED and self.infeasible_stationary():
@@ -369,8 +387,7 @@ class SolveState:
             status = Status.STALLED
         if status is Status.LOCALLY_INFEASIBLE and (within := within_bounds(self.program, self.lin)) is not self.lin:
             self._move(within, self.multipliers)
-        if not self.optimality.finite:
-            self._move(self._best_lin, self._best_multipliers)
+        returned = self._return_best(status)
         measured = self.optimality
         if measured.passes(self.tolerance) and status is not Status.UNBOUNDED:
             status = Status.CONVERGED if measured.weakest > HARDLY else Status.HARDLY_DETERMINED
@@ -395,9 +412,21 @@ class SolveState:
             self.iterations,
             self.seconds,
             self._solver.name,
+            returned,
         )
         solution.in_python = self.program.python_seconds - self._in_python
         return solution
+
+    def _return_best(self, status: Status) -> int:
+        """Go back to the best iterate where the ending asks for it; returns the number of what is returned."""
+        asked = self._solver.max_iterations <= FEW or getattr(self._solver, "step_tolerance", 0.0) == np.inf
+        sound = asked or status not in WITHOUT_SUCCESS or self.optimality.holds(self.tolerance)
+        if self.optimality.finite and sound:
+            return self.iterations
+        best = self.incumbents.best
+        if best.values is not self.values or best.multipliers is not self.multipliers:
+            self._move(self.program.linearize(best.values), best.multipliers)
+        return best.number
 
     def _decide(self) -> Status | None:
         if not self.optimality.finite:
@@ -416,15 +445,6 @@ class SolveState:
 
     def _decide_in_time(self) -> Status | None:
         return self._decide() or (Status.TIME_LIMIT if self.out_of_time else None)
-
-    def _keep_best(self) -> None:
-        """What to return if the last iterate is not finite: feasible ones rank by stationarity, others by violation."""
-        measured = self.optimality
-        feasible = measured.violation <= self.tolerance
-        error = max(measured.stationarity, measured.complementarity)
-        rank = (0.0, error) if feasible else (measured.violation, error)
-        if self._best is None or (measured.finite and rank <= self._best):
-            self._best, self._best_lin, self._best_multipliers = rank, self.lin, self.multipliers
 
 
 class Prepared:
@@ -507,7 +527,7 @@ class Prepared:
                 run.search(self._workspace)
                 reason = self.solver.iterate(run, self._workspace)
             except KeyboardInterrupt:
-                if run._best is None:
+                if not run.incumbents:
                     raise  # there is nothing to return
                 run.status = Status.INTERRUPTED
             except Exception as error:
