@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.answers.multipliers import Slopes
+from unifg.answers.multipliers import Slopes, estimated
 from unifg.answers.solver import Solver, SolveState
 from unifg.solvers import (
     KKT,
@@ -50,7 +50,9 @@ class Liar(Solver):
 
     def iterate(self, run: SolveState, workspace: Any) -> fg.Status:
         moved = run.program.retract(run.values, np.array([self.point]) - run.values.flat)
-        run.accept(run.program.linearize(moved), np.array([self.multiplier]), 1.0, 1.0)
+        multipliers = np.zeros(len(run.multipliers))
+        multipliers[:1] = self.multiplier
+        run.accept(run.program.linearize(moved), multipliers, 1.0, 1.0)
         run.status = fg.Status.CONVERGED
         return fg.Status.CONVERGED
 
@@ -345,3 +347,49 @@ def test_long_chains_of_constraints_are_not_degenerate(solver: Solver) -> None:
     graph.minimize(fg.prior, x, [0.4, 0.0], sigma=0.3)
     solution = solver.solve(graph, {x: np.zeros((count, 2)), u: np.zeros((count - 1, 1))})
     assert solution.status is fg.Status.CONVERGED, solution.report()
+
+
+def test_an_exact_optimum_is_found_out_where_the_linear_system_was_singular() -> None:
+    """From the centre of a circle its row has no slope: the first step reaches the optimum with a multiplier of 1e9."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(fg.prior, x, [1.0, 0.0])
+    graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0, name="circle")
+    solution = InteriorPoint().solve(graph, {x: np.zeros((1, 2))}, check=True)
+    assert solution.dual("circle").item() == pytest.approx(0.0, abs=1e-9)
+    assert solution.stationarity <= 1e-9
+
+
+@pytest.mark.parametrize(
+    ("point", "multiplier", "found"), [(1.0, 50.0, 2.0), (1.0, 0.0, 2.0), (0.5, 1.0, None), (1.5, 1.0, None)]
+)
+def test_multipliers_of_a_stalled_solve_are_estimated_from_the_gradients(
+    point: float, multiplier: float, found: float | None
+) -> None:
+    """Only of rows at their limits, where they are met."""
+
+    class Stalls(Liar):
+        def iterate(self, run: SolveState, workspace: Any) -> fg.Status:
+            super().iterate(run, workspace)
+            run.status = fg.Status.STALLED
+            return fg.Status.STALLED
+
+    graph, x = limited()
+    graph.bound(x, lower=-9.0, name="far")
+    backend = Stalls(point, multiplier)
+    backend.max_iterations = 3
+    solution = backend.solve(graph, {x: np.zeros((1, 1))})
+    assert solution.converged is (found is not None)
+    assert solution.dual("limit").item() == pytest.approx(multiplier if found is None else found)
+
+
+def test_estimated_multipliers_have_the_sign_of_their_limits() -> None:
+    """Pulled away from its limit, a row has none; between limits that meet it may have either."""
+    for goal, lower, expected in ((3.0, -np.inf, 2.0), (0.0, -np.inf, 0.0), (3.0, 1.0, 2.0), (0.0, 1.0, -1.0)):
+        graph = fg.Graph()
+        x = graph.variables("x", fg.Rn(1), 1)
+        graph.minimize(fg.prior, x, [goal])
+        graph.constrain(lambda p: p, x, lower=lower, upper=1.0)
+        program = graph.compile()
+        multipliers = estimated(program, program.linearize({x: np.ones((1, 1))}), 1e-6)
+        assert multipliers is not None and multipliers.item() == pytest.approx(expected)

@@ -7,6 +7,9 @@ cost that were seen on the way, unknowns, rows and cost are brought to one scale
 entries out of both, again and again (Ruiz, RAL-TR-2001-034). The sum of the multipliers of that problem is the same for
 any units, of the order of the number of active rows where all is well, and beyond `LARGEST` what no chain of rows
 explains.
+
+A solve that stalls may do so at an optimum, with multipliers that its last linear system made of nothing. There they
+are estimated again, from the gradients alone.
 """
 
 from __future__ import annotations
@@ -14,12 +17,14 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.machine.jit import compiled
+from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.typing import Array
 
 LARGEST = 1e6
 SUSPICIOUS = 1e3  # in the graph's own units; below it nobody looks
 PASSES = 12
+DENSE = 1_000_000  # entries of A up to which multipliers are estimated, by dense algebra
 
 
 class Slopes:
@@ -66,6 +71,30 @@ class Slopes:
             unknowns /= np.sqrt(np.where(of_unknowns > 0.0, of_unknowns, 1.0))
             cost /= np.sqrt(of_cost or 1.0)
         return bool(cost * float((np.abs(multipliers) / scale).sum()) > LARGEST)
+
+
+def estimated(program: Program, lin: Linearization, tolerance: float) -> Array | None:
+    """(M,) multipliers of active rows that balance the gradient best, with their signs; None for a large graph.
+
+    The least squares problem min |grad f + A' lambda| with bounds (Stark and Parker, Computational Statistics 10, 1995).
+
+    Args:
+        program: the compiled graph.
+        lin: where.
+        tolerance: distance from its limit at which an inequality is active.
+    """
+    from scipy.optimize import lsq_linear  # slow to load
+
+    at_lower, at_upper = (np.abs(lin.constraints - limit) <= tolerance for limit in (program.lower, program.upper))
+    active = np.flatnonzero(program.equality | at_lower | at_upper)
+    if not len(active) or len(active) * program.size > DENSE:
+        return None
+    slopes = program.constraints.matrix(lin.constraint_jacobian)[active].toarray()
+    free, either = lin.gradient[program.columns.free], program.equality | (at_lower & at_upper)
+    least, most = np.where(either | at_lower, -np.inf, 0.0)[active], np.where(either | at_upper, np.inf, 0.0)[active]
+    multipliers = np.zeros(program.constraints.count)
+    multipliers[active] = lsq_linear(slopes.T, -free, (least, most), method="bvls").x
+    return multipliers
 
 
 @compiled

@@ -16,7 +16,7 @@ import numpy as np
 from unifg.answers.conditioning import HARDLY
 from unifg.answers.history import HEADER, Deferred, Iteration, factor_norms, line
 from unifg.answers.incumbent import Incumbent, Incumbents
-from unifg.answers.multipliers import Slopes
+from unifg.answers.multipliers import Slopes, estimated
 from unifg.answers.optimality import infeasible_stationary, optimality, within_bounds
 from unifg.answers.rehearsal import rehearse
 from unifg.answers.relative_offset import Factored
@@ -388,6 +388,8 @@ class SolveState:
         if status is Status.LOCALLY_INFEASIBLE and (within := within_bounds(self.program, self.lin)) is not self.lin:
             self._move(within, self.multipliers)
         returned = self._return_best(status)
+        if status in (Status.STALLED, Status.SINGULAR) and self.optimality.violation <= self.tolerance:
+            self._estimate()
         measured = self.optimality
         if measured.passes(self.tolerance) and status is not Status.UNBOUNDED:
             status = Status.CONVERGED if measured.weakest > HARDLY else Status.HARDLY_DETERMINED
@@ -416,6 +418,16 @@ class SolveState:
         )
         solution.in_python = self.program.python_seconds - self._in_python
         return solution
+
+    def _estimate(self) -> None:
+        """Take multipliers that are made of the gradients here, if all KKT numbers are better with them."""
+        before, found = self.optimality, estimated(self.program, self.lin, self.tolerance)
+        if found is None or before.holds(self.tolerance):
+            return
+        after = optimality(self.program, self.lin, found, self.tolerance)
+        pairs = zip(after[:3], before[:3], strict=True)
+        if all(better <= worse for better, worse in pairs) and after[:3] != before[:3]:
+            self.multipliers, self.optimality = found, after
 
     def _return_best(self, status: Status) -> int:
         """Go back to the best iterate where the ending asks for it; returns the number of what is returned."""
