@@ -632,7 +632,7 @@ def test_the_solver_is_given_what_is_left_of_the_deadline() -> None:
     assert loop.sources == {"solved": 3}
 
 
-class Timed:
+class Delayed:
     """A prepared backend that takes a given time, notes what it may take, and finds a plan or none."""
 
     def __init__(self, inner: fg.Prepared, clock: list[float], takes: float, status: fg.Status | None = None) -> None:
@@ -656,7 +656,7 @@ def test_time_limits_of_the_backends_own_are_kept() -> None:
     now = [0.0]
     own = InteriorPoint(time_limit=0.03)
     loop = line_loop(solver=own, cold=InteriorPoint(time_limit=0.04), deadline=0.1, clock=lambda: now[0])
-    loop.warm, loop.cold = (Timed(run, now, 0.0) for run in (loop.warm, loop.cold))  # type: ignore[assignment]
+    loop.warm, loop.cold = (Delayed(run, now, 0.0) for run in (loop.warm, loop.cold))  # type: ignore[assignment]
     drive(loop, 4)
     assert loop.cold.limits == pytest.approx([0.04])  # type: ignore[attr-defined]
     assert loop.warm.limits == pytest.approx([0.03] * 3)  # type: ignore[attr-defined]
@@ -673,9 +673,9 @@ def test_the_second_backend_has_what_is_left_of_the_deadline(takes: float, own: 
     now, second = [0.0], InteriorPoint(time_limit=own)
     loop = line_loop(second=second, deadline=0.1, clock=lambda: now[0])
     assert loop.second is not None
-    runs = [Timed(run, now, takes, fg.Status.STALLED) for run in (loop.warm, loop.cold)]
+    runs = [Delayed(run, now, takes, fg.Status.STALLED) for run in (loop.warm, loop.cold)]
     loop.warm, loop.cold = runs  # type: ignore[assignment]
-    other = Timed(loop.second, now, 0.0)
+    other = Delayed(loop.second, now, 0.0)
     loop.second = other  # type: ignore[assignment]
     plans, _ = drive(loop, 1)
     assert other.limits == pytest.approx(limits, abs=1e-9)

@@ -393,3 +393,40 @@ def test_estimated_multipliers_have_the_sign_of_their_limits() -> None:
         program = graph.compile()
         multipliers = estimated(program, program.linearize({x: np.ones((1, 1))}), 1e-6)
         assert multipliers is not None and multipliers.item() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("watched", [False, True])
+@pytest.mark.parametrize("solver", [s for s in EVERY if s.constraints == "all"], ids=lambda s: s.name)
+def test_rows_between_fixed_variables_are_judged_first_and_named(solver: Solver, watched: bool) -> None:
+    """No step changes them: nothing is gained by an iteration."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 3)
+    where = graph.data("where", [[0.0, 0.0], [1.0, 0.5]])
+    graph.fix(x[:2], where)
+    graph.minimize(fg.prior, x, [3.0, 1.0])
+    graph.constrain(lambda a, b: b - a, x[:-1], x[1:], lower=-1.0, upper=1.0, name="step")
+    graph.bound(x, upper=2.0, name="fence")
+    run = replace(solver, keep_values=watched).prepare(graph)
+    guess = {x: np.zeros((3, 2))}
+    assert run.solve(guess).converged
+    solution = run.solve(guess, data={where: np.array([[0.0, 0.0], [1.0, 1.5]])})
+    assert solution.status is fg.Status.INFEASIBLE and solution.iterations == 0 and not solution.converged
+    assert solution.worst == ("step", 0) and solution.violation == pytest.approx(0.5)
+    assert "all fixed" in solution.report() and "'step', factor 0" in solution.report()
+    # The largest violation that can be mended is not the one that is named.
+    solution = run.solve({x: np.full((3, 2), 90.0)}, data={where: np.array([[1.5, 0.0], [2.5, 0.0]])})
+    assert solution.status is fg.Status.INFEASIBLE and solution.worst == ("fence", 1)
+    within = run.solve(guess, data={where: np.array([[0.0, 0.0], [1.0, 1.0 + 1e-7]])})
+    assert within.status is not fg.Status.INFEASIBLE and within.iterations > 0
+
+
+def test_check_names_violated_rows_between_fixed_variables() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 3)
+    graph.fix(x[:2], [[0.0, 0.0], [1.0, 1.5]])
+    graph.minimize(fg.prior, x, [3.0, 1.0])
+    graph.constrain(lambda a, b: b - a, x[:-1], x[1:], lower=-1.0, upper=1.0, name="step")
+    report = graph.check({x: np.zeros((3, 2))})
+    (finding,) = report.findings
+    assert (finding.kind, finding.term, finding.index) == ("violated and fixed", "step", 0)
+    assert "violated by 0.5, and all its variables are fixed" in finding.message

@@ -76,7 +76,7 @@ class Slopes:
 def estimated(program: Program, lin: Linearization, tolerance: float) -> Array | None:
     """(M,) multipliers of active rows that balance the gradient best, with their signs; None for a large graph.
 
-    The least squares problem min |grad f + A' lambda| with bounds (Stark and Parker, Computational Statistics 10, 1995).
+    The least squares problem min |grad f + A' lambda| with bounds (Stark and Parker, Comput. Stat. 10, 1995).
 
     Args:
         program: the compiled graph.

@@ -329,6 +329,19 @@ class SolveState:
         self._move(lin, self.multipliers)
         self.status = self._decide_in_time()
 
+    def look_at_fixed(self) -> None:
+        """End before the first iteration where a violated row touches nothing but fixed variables."""
+        rows = self.program.fixed_rows()
+        if self.status is not None or not len(rows):
+            return
+        point = self.program.evaluate(self.values) if self.alone else self.lin
+        outside = np.abs(self.program.violation(point.constraints)[rows])
+        if outside.max() > self.tolerance:
+            if self.alone:
+                self.accept(self.program.linearize(self.values), self.multipliers, 0.0, 0.0)
+            self.optimality = self.optimality._replace(worst_row=int(rows[outside.argmax()]))
+            self.status = Status.INFEASIBLE
+
     def search(self, workspace: Any) -> None:
         """Take the first steps along the search Jacobians; the multipliers wait, and the true numbers are recorded.
 
@@ -532,6 +545,7 @@ class Prepared:
         if not isinstance(guess, Mapping) and guess.penalties:
             run.penalties = self._stacked("penalties", guess.penalties)
         self._refuse_not_finite(run)
+        run.look_at_fixed()
         reason = None
         if run.status is None:
             self.allocate()

@@ -26,6 +26,10 @@ class Status(Enum):
     LOCALLY_INFEASIBLE = (
         "The point is stationary for the violation of the constraints: no nearby point violates them less."
     )
+    INFEASIBLE = (
+        "A constraint whose variables are all fixed is violated, and no step can change that: change what is fixed, or "
+        "the limits."
+    )
     UNBOUNDED = "The objective fell below every reasonable value: it is probably unbounded below."
     UNDETERMINED = (
         "The costs are stationary but do not determine every unknown: others would fit as well; run "
