@@ -16,6 +16,7 @@ from benchmarks.report import command, machine, publish, table
 from problems.collection import (
     BACKENDS,
     CASES,
+    DEGENERATE_POINT,
     GROUPS,
     INFEASIBLE_POINT,
     OPTIMUM,
@@ -60,8 +61,8 @@ def _summary(results: dict[str, dict[str, Outcome]]) -> str:
         lines.append(
             (name, str(len(outcomes)), *(str(count[word]) for word in RIGHT), str(len(outcomes) - right), share)
         )
-    head = ("backend", "takes", "known optimum", "other KKT point", "infeasible, says so", "not solved", "right")
-    return table(head, lines)
+    words = "known optimum", "other KKT point", "degenerate, says so", "infeasible, says so"
+    return table(("backend", "takes", *words, "not solved", "right"), lines)
 
 
 def _failures(results: dict[str, dict[str, Outcome]]) -> str:
@@ -84,7 +85,7 @@ def _iterations(results: dict[str, dict[str, Outcome]], cases: list[Problem]) ->
 def _cell(outcome: Outcome | None) -> str:
     if outcome is None:
         return "-"
-    mark = {OPTIMUM: "", OTHER: "*", INFEASIBLE_POINT: ""}.get(outcome.verdict, " (no)")
+    mark = {OPTIMUM: "", OTHER: "*", DEGENERATE_POINT: "", INFEASIBLE_POINT: ""}.get(outcome.verdict, " (no)")
     return f"{outcome.iterations}{mark}"
 
 

@@ -32,7 +32,7 @@ from unifg.solvers.augmented_objective import Primal
 from unifg.solvers.augmented_step import STRAIGHT, damped_step, model_step
 from unifg.solvers.augmented_usual import UsualPrimal
 from unifg.solvers.globalize.damping import Damping
-from unifg.solvers.globalize.least_violation import leave, settle
+from unifg.solvers.globalize.least_violation import leave, resume, settle
 from unifg.solvers.globalize.sizes import largest, norm
 from unifg.typing import Array, IntArray
 
@@ -220,24 +220,24 @@ class AugmentedLagrangian(Solver):
             change = largest(scale * (after - multipliers) / penalty)
             if len(run.history) == before:  # nothing moved: the dual step alone is this iteration
                 run.accept(run.lin, after, 0.0, 0.0, outer=outer, penalty=rho)
-            if stalled and (change == 0.0 or rho >= heaviest):
-                return settle(run, Status.STALLED)
-            violation = run.optimality.violation
+            here, violation = run.lin, run.optimality.violation
+            if stalled and (change == 0.0 or rho >= heaviest) and (ending := resume(run, Status.STALLED)) is not None:
+                return ending
             falling = violation <= FALLING * last
             lost = run.has_been_feasible and len(recent) == PATIENCE
             lost = lost and violation > max(self.tolerance, FALLING * max(recent))
             last, recent = violation, [*recent, violation][-PATIENCE:]
-            stuck, here = 0 if falling else stuck + 1, run.lin
+            stuck = 0 if falling else stuck + 1
             if stuck == PATIENCE and settle(run, Status.STALLED) is Status.LOCALLY_INFEASIBLE:
                 return Status.LOCALLY_INFEASIBLE
-            if change <= violation_goal:
+            if change <= violation_goal and run.lin is here:
                 multipliers = after
                 if len(run.history) - before <= 1 and not stalled:  # so easy that the next one may be harder
                     rho = max(rho, min(rho * self.penalty_growth, LARGEST_EASY))
                 violation_goal = max(min(violation_goal / rho**0.9, FALL * change), least)
                 gradient_goal = max(0.1 * gradient_goal, 0.0 if run.program.least_squares else 0.1 * self.tolerance)
             else:
-                if not falling and (lost or run.infeasible_stationary()):
+                if run.lin is here and not falling and (lost or run.infeasible_stationary()):
                     ending = leave(run)
                     if ending is not None and not lost:
                         return ending
@@ -246,6 +246,9 @@ class AugmentedLagrangian(Solver):
                 least_yet = min(least_yet, violation)
                 if creeping == PATIENCE and not run.has_been_feasible and run.lin is here:  # rho began too small
                     run.begin_at(run.program.linearize(beginning))
+                if run.lin is here and not falling and rho >= heaviest:
+                    if (ending := resume(run, Status.STALLED)) is not None:
+                        return ending
                 if run.lin is not here:  # led astray: from the new point more slowly, and without what was learned
                     creeping, stuck, last, least_yet, recent = 0, 0, np.inf, np.inf, []
                     first *= self.penalty_growth**2
@@ -255,11 +258,9 @@ class AugmentedLagrangian(Solver):
                 elif rho < heaviest:
                     rho = min(rho * self.penalty_growth, heaviest)
                     gradient_goal, violation_goal = self._goals(run, primal, rho, multipliers, rho * weights)
-                elif falling:  # as where constraints have no multipliers
+                else:  # falling, as where constraints have no multipliers
                     multipliers = after
                     gradient_goal = max(0.1 * gradient_goal, 0.1 * self.tolerance)
-                else:
-                    return settle(run, Status.STALLED)
             if stalled:
                 damping = Damping(self.damping)
         return None

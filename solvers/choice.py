@@ -31,6 +31,7 @@ ELSEWHERE = {
     Status.ITERATION_LIMIT,
     Status.STALLED,
     Status.LOCALLY_INFEASIBLE,
+    Status.DEGENERATE,
     Status.SINGULAR,
     Status.NOT_FINITE,
 }

@@ -8,7 +8,9 @@ its contribution to the linear system is the block A and nothing else:
 
 The weight is indefinite, so the system is assembled as blocks, never through a square root. It is factorised with
 a shift of every row in its own units, so that no order of elimination meets a vanishing pivot, and refined until the
-shift is gone (:mod:`unifg.elimination.saddle`). H is that of Gauss-Newton.
+shift is gone (:mod:`unifg.elimination.saddle`). H is that of Gauss-Newton, or of the Lagrangian where steps with the
+first converge slowly (:mod:`unifg.solvers.globalize.pace`): what residuals and constraints bend may be as much as H. A
+step of the second that does not lower the merit is left for one of the first.
 
 The paper takes every step in full. By default a step has to lower the l1 merit f + price |h| (Nocedal and Wright,
 chapter 18): the cost alone would reject steps that restore feasibility. A full step that is rejected is corrected once
@@ -30,6 +32,7 @@ from unifg.answers.requirements import require
 from unifg.answers.solver import Solver, SolveState
 from unifg.answers.status import Status
 from unifg.errors import BackendError
+from unifg.program.curvature import lagrangian_hessian
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
 from unifg.program.systems import aim, fill
@@ -38,6 +41,7 @@ from unifg.solvers.globalize.damping import LARGEST, Damping, gain
 from unifg.solvers.globalize.least_violation import leave, settle
 from unifg.solvers.globalize.line_search import search
 from unifg.solvers.globalize.merit import OnePrice
+from unifg.solvers.globalize.pace import creeps
 from unifg.solvers.globalize.sizes import largest, norm
 from unifg.typing import Array
 
@@ -98,13 +102,18 @@ class KKT(Solver):
             return self._damped(run, workspace)
         merit = OnePrice(run.program)
         damping = slackness = 0.0
-        failures = 0
+        failures, slow = 0, False
         while run.status is None:
-            found = workspace.step(run.lin, run.multipliers, damping, slackness)
+            taken, slow = None, slow or (creeps(run.history) and not self.full_steps)
+            if slow and (found := workspace.step(run.lin, run.multipliers, 0.0, slackness, curved=True)) is not None:
+                taken = self._search(run, workspace, merit, *found, hopeful=True)
+            if taken is None:
+                found = workspace.step(run.lin, run.multipliers, damping, slackness)
             if found is None and self.full_steps:
                 return settle(run, Status.SINGULAR)
             # Damping tells of steps that were shortened: without it the full one will probably be taken.
-            taken = None if found is None else self._search(run, workspace, merit, *found, hopeful=damping == 0.0)
+            if taken is None and found is not None:
+                taken = self._search(run, workspace, merit, *found, hopeful=damping == 0.0)
             if (taken is None or slackness) and run.infeasible_stationary():
                 if (ending := leave(run)) is not None:
                     return ending
@@ -139,11 +148,12 @@ class KKT(Solver):
     def _damped(self, run: SolveState, workspace: Newton) -> Status | None:
         """Levenberg and Marquardt's iteration."""
         merit, damping = OnePrice(run.program), Damping(FIRST_LEVENBERG)
-        rejected, slackness = 0, 0.0
+        rejected, slackness, slow = 0, 0.0, False
         while run.status is None:
-            lin = run.lin
+            lin, slow = run.lin, slow or creeps(run.history)
             less = damping.value / (1.0 + damping.value)
-            found = workspace.step(lin, run.multipliers, damping.value, slackness, less)
+            curved = slow and rejected == 0
+            found = workspace.step(lin, run.multipliers, damping.value, slackness, less, curved)
             reached = None
             if found is not None:
                 linear = run.program.constraints.times(lin.constraint_jacobian, found[0])
@@ -225,7 +235,13 @@ class Newton:
         self._begun = False  # equal solves take equal steps
 
     def step(
-        self, lin: Linearization, multipliers: Array, damping: float, slackness: float, less: float = 0.0
+        self,
+        lin: Linearization,
+        multipliers: Array,
+        damping: float,
+        slackness: float,
+        less: float = 0.0,
+        curved: bool = False,
     ) -> tuple[Array, Array] | None:
         """Solve for the step.
 
@@ -236,12 +252,14 @@ class Newton:
             slackness: subtracted from the diagonal of the multipliers' block, relative to the largest A A' / H; lets
                 linearised constraints that contradict each other be met by halves.
             less: part of the violation that the linearised constraints may keep.
+            curved: whether H is the Hessian of the Lagrangian.
 
         Returns:
             (n,) tangent step and (M,) change of the multipliers; None when the system is singular.
         """
         n = self.program.size
-        fill(self.system.arrays, lin.hessian, lin.constraint_jacobian, self._data)
+        hessian = lagrangian_hessian(self.program, lin, multipliers) if curved else lin.hessian
+        fill(self.system.arrays, hessian, lin.constraint_jacobian, self._data)
         if damping or slackness:
             diagonal = self.system.pattern.diagonal
             curvatures = self._data[diagonal[:n]]

@@ -107,8 +107,9 @@ class Penalty(Solver):
             run.accept(lin, estimate, norm(step), 1.0, penalty=rho, damping=damping.value, rejected=rejected)
             if run.status is not None:
                 return False
-            unit = 0.0 if run.program.least_squares else 1.0
-            if before - primal.merit(lin, none, penalty) <= ROUNDING * max(unit, abs(before)):
+            gained = before - primal.merit(lin, none, penalty)
+            # Beside a gross cost of least squares, the progress of all others is rounding.
+            if not run.program.least_squares and gained <= ROUNDING * max(1.0, abs(before)):
                 return True
         return False
 

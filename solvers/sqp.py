@@ -23,7 +23,7 @@ from unifg.errors import BackendError
 from unifg.machine.inner import inner
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
-from unifg.solvers.globalize.least_violation import Watch, leave, settle
+from unifg.solvers.globalize.least_violation import Watch, leave, resume, settle
 from unifg.solvers.globalize.line_search import Taken, search
 from unifg.solvers.globalize.merit import RowPrices
 from unifg.solvers.globalize.pace import creeps
@@ -154,9 +154,13 @@ class SQP(Solver):
                 continue
             if taken is None:
                 failures += 1
-                if failures == FAILURES:
-                    return settle(run, Status.STALLED)
                 damping = max(100.0 * damping, 1e-4)
+                if failures == FAILURES:
+                    if (ending := resume(run, Status.STALLED)) is not None:
+                        return ending
+                    failures, damping, missing = 0, SMALLEST_DAMPING, 0.0
+                    workspace.start(run.lin)
+                    merit = RowPrices(run.program, workspace.scaling.rows, run.multipliers, run.lin)
                 continue
             failures = 0
             answer, after, multipliers, step, length, corrected = taken

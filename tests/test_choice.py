@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -128,3 +129,37 @@ def test_refusals_name_the_measured_order() -> None:
     graph.minimize_scalar(lambda p: p[:, 0] ** 4, x, name="quartic")
     with pytest.raises(fg.BackendError, match="not a square; use InteriorPoint or SQP"):
         AugmentedLagrangian().solve(graph, {x: np.ones((1, 2))})
+
+
+@dataclass(kw_only=True)
+class Timed(InteriorPoint):
+    """Takes a given time, and ends as told."""
+
+    takes: float = 0.0
+    ends: fg.Status = fg.Status.STALLED
+
+    def solve(self, *arguments: Any, **options: Any) -> fg.Solution:
+        solution = InteriorPoint().solve(*arguments, **options)
+        solution.seconds, solution.status = self.takes, self.ends
+        return solution
+
+
+@pytest.mark.parametrize(
+    ("takes", "limit", "left"),
+    [(0.7, 1.0, 0.3), (0.0, 1.0, 1.0), (5.0, np.inf, np.inf), (1.0, 1.0, None), (2.0, 1.0, None)],
+)
+def test_the_second_backend_has_what_is_left_of_the_time(
+    takes: float, limit: float, left: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[float] = []
+
+    class Second(InteriorPoint):
+        def solve(self, *arguments: Any, **options: Any) -> fg.Solution:
+            given.append(self.time_limit)
+            return super().solve(*arguments, **options)
+
+    picked = choice.Choice(Timed(takes=takes, time_limit=limit), Second(time_limit=limit), "a test")
+    monkeypatch.setattr(choice, "choose", lambda *_, **__: picked)
+    solution = fg.solve(*circled(), time_limit=limit)
+    assert given == ([] if left is None else [pytest.approx(left)])
+    assert solution.converged is (left is not None)

@@ -38,7 +38,7 @@ UNSOLVED: dict[str, set[str]] = {
     # at 1e-12 of the residuals.
     "LevenbergMarquardt": {"Jennrich and Sampson", "Powell's singular function"},
     "DogLeg": {"Freudenstein and Roth", "Beale", "Jennrich and Sampson"},
-    "KKT": {"HS27", "Wood"},
+    "KKT": {"HS27"},
     # A largest penalty leaves violations; and large penalties are hard least-squares problems.
     "Penalty": {
         *("HS13", "HS15", "HS17", "HS20", "HS27", "HS58", "discs that touch"),

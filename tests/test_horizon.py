@@ -632,6 +632,57 @@ def test_the_solver_is_given_what_is_left_of_the_deadline() -> None:
     assert loop.sources == {"solved": 3}
 
 
+class Delayed:
+    """A prepared backend that takes a given time, notes what it may take, and finds a plan or none."""
+
+    def __init__(self, inner: fg.Prepared, clock: list[float], takes: float, status: fg.Status | None = None) -> None:
+        self.inner, self.solver, self.clock, self.takes, self.status = inner, inner.solver, clock, takes, status
+        self.limits: list[float] = []
+
+    def solve(self, guess: Any, **options: Any) -> fg.Solution:
+        self.limits.append(self.solver.time_limit)
+        self.clock[0] += self.takes
+        given, self.solver.time_limit = self.solver.time_limit, np.inf
+        solution = self.inner.solve(guess, **options)
+        self.solver.time_limit = given
+        solution.status = self.status or solution.status
+        if self.status is not None:
+            solution.violation = 1.0
+        return solution
+
+
+def test_time_limits_of_the_backends_own_are_kept() -> None:
+    """The loop takes from them what the deadline leaves, and never adds."""
+    now = [0.0]
+    own = InteriorPoint(time_limit=0.03)
+    loop = line_loop(solver=own, cold=InteriorPoint(time_limit=0.04), deadline=0.1, clock=lambda: now[0])
+    loop.warm, loop.cold = (Delayed(run, now, 0.0) for run in (loop.warm, loop.cold))  # type: ignore[assignment]
+    drive(loop, 4)
+    assert loop.cold.limits == pytest.approx([0.04])  # type: ignore[attr-defined]
+    assert loop.warm.limits == pytest.approx([0.03] * 3)  # type: ignore[attr-defined]
+    assert own.time_limit == 0.03
+    assert loop.sources == {"solved": 4}
+
+
+@pytest.mark.parametrize(
+    ("takes", "own", "limits"),
+    [(0.07, np.inf, [0.03]), (0.07, 0.02, [0.02]), (0.0999, np.inf, [0.0001]), (0.1, np.inf, []), (0.4, np.inf, [])],
+)
+def test_the_second_backend_has_what_is_left_of_the_deadline(takes: float, own: float, limits: list[float]) -> None:
+    """It is not asked when nothing is left, and the backend that was handed over stays as it is."""
+    now, second = [0.0], InteriorPoint(time_limit=own)
+    loop = line_loop(second=second, deadline=0.1, clock=lambda: now[0])
+    assert loop.second is not None
+    runs = [Delayed(run, now, takes, fg.Status.STALLED) for run in (loop.warm, loop.cold)]
+    loop.warm, loop.cold = runs  # type: ignore[assignment]
+    other = Delayed(loop.second, now, 0.0)
+    loop.second = other  # type: ignore[assignment]
+    plans, _ = drive(loop, 1)
+    assert other.limits == pytest.approx(limits, abs=1e-9)
+    assert second.time_limit == own
+    assert loop.rescues == len(limits) and plans[0].rescued is bool(limits)
+
+
 def test_a_loop_that_ended_early_begins_anew() -> None:
     loop = line_loop(BIASED, coupling="joint")
     first, _ = drive(loop, 9)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numba
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from unifg.answers.multipliers import Slopes, estimated
 from unifg.answers.solver import Solver, SolveState
 from unifg.solvers import (
     KKT,
@@ -20,6 +22,7 @@ from unifg.solvers import (
     InteriorPoint,
     LevenbergMarquardt,
     Penalty,
+    choice,
 )
 from unifg.typing import Array
 
@@ -47,7 +50,9 @@ class Liar(Solver):
 
     def iterate(self, run: SolveState, workspace: Any) -> fg.Status:
         moved = run.program.retract(run.values, np.array([self.point]) - run.values.flat)
-        run.accept(run.program.linearize(moved), np.array([self.multiplier]), 1.0, 1.0)
+        multipliers = np.zeros(len(run.multipliers))
+        multipliers[:1] = self.multiplier
+        run.accept(run.program.linearize(moved), multipliers, 1.0, 1.0)
         run.status = fg.Status.CONVERGED
         return fg.Status.CONVERGED
 
@@ -244,3 +249,184 @@ def test_data_switch_a_term_off_in_silence(caplog: pytest.LogCaptureFixture) -> 
     graph.minimize(fg.prior, x, [0.0, 0.0])
     assert LevenbergMarquardt().solve(graph, {x: np.ones((1, 2))}, data=off).converged
     assert caplog.text == ""
+
+
+def flat(row: Callable[[Array], Array], cost: float, rows: float, unknown: float) -> tuple[fg.Graph, fg.Family]:
+    """Minimise 1/2 (x - 1)^2 where a row is zero, in other units of cost, row and unknown."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(lambda p: p / unknown - 1.0, x, sigma=cost**-0.5)
+    graph.constrain(lambda p: rows * row(p / unknown), x, lower=0.0, upper=0.0, name="row")
+    return graph, x
+
+
+@pytest.mark.parametrize("unknown", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("rows", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("cost", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize(
+    ("row", "start", "point", "slope", "degenerate"),
+    [
+        (np.exp, 0.0, -19.0, np.exp(-19.0), True),
+        (lambda p: p**3, 2.0, 1e-4, 3e-8, True),
+        (lambda p: p**3, 2.0, 0.5, 0.75, False),
+        (lambda p: np.sin(1e-5 * p), 2.0, 1e-8, 1e-5, False),
+    ],
+    ids=["exp", "cube", "slope", "small slope"],
+)
+def test_degenerate_multipliers_have_no_units(
+    row: Callable[[Array], Array],
+    start: float,
+    point: float,
+    slope: float,
+    degenerate: bool,
+    cost: float,
+    rows: float,
+    unknown: float,
+) -> None:
+    """A row whose slope is gone needs a multiplier that is huge in any unit."""
+    graph, x = flat(row, cost, rows, unknown)
+    program = graph.compile()
+    slopes = Slopes(program)
+    for value in (start, point):
+        lin = program.linearize({x: np.full((1, 1), unknown * value)})
+        slopes.see(lin.constraint_jacobian, lin.gradient)
+    multipliers = np.array([-cost * (point - 1.0) / (rows * slope)])
+    assert np.abs(program.lagrangian_gradient(lin, multipliers)).max() < 1e-6 * cost / unknown
+    assert slopes.degenerate(multipliers, 1e-6) is degenerate
+
+
+@pytest.mark.parametrize("solver", [SQP(), SQP(hessian="exact"), KKT()], ids=["sqp", "sqp-exact", "kkt"])
+@pytest.mark.parametrize(("row", "start"), [(np.exp, 0.0), (np.exp, 2.0), (lambda p: p**3, 1.0)])
+def test_rows_that_lose_their_slope_are_no_success(solver: Solver, row: Callable[[Array], Array], start: float) -> None:
+    """They used to be CONVERGED, with multipliers of 1e8 that the test divides by."""
+    graph, x = flat(row, 1.0, 1.0, 1.0)
+    guess = {x: np.full((1, 1), start)}
+    solution = solver.solve(graph, guess)
+    assert solution.status is fg.Status.DEGENERATE, solution.report()
+    assert "have lost their slope" in solution.report()
+    with pytest.raises(fg.NotConverged):
+        solver.solve(graph, guess, check=True)
+    # Another time, another tolerance: both scaled, nothing changes.
+    for unit in (1e-3, 1e3):
+        scaled, x = flat(row, unit, unit, 1.0)
+        again = replace(solver, tolerance=1e-6 * unit).solve(scaled, {x: guess[next(iter(guess))]})
+        assert again.status is fg.Status.DEGENERATE, (unit, again.report())
+
+
+def test_the_second_backend_is_asked_where_the_first_ends_degenerate(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, x = flat(lambda p: p**3, 1.0, 1.0, 1.0)
+    asked: list[str] = []
+
+    class Other(InteriorPoint):
+        def solve(self, *arguments: Any, **options: Any) -> fg.Solution:
+            asked.append("second")
+            return super().solve(*arguments, **options)
+
+    monkeypatch.setattr(choice, "choose", lambda *_, **__: choice.Choice(SQP(), Other(), "a test"))
+    fg.solve(graph, {x: np.ones((1, 1))})
+    assert asked == ["second"]
+
+
+@pytest.mark.parametrize("solver", [InteriorPoint(), SQP(), AugmentedLagrangian()], ids=lambda s: s.name)
+def test_long_chains_of_constraints_are_not_degenerate(solver: Solver) -> None:
+    """Their multipliers add up over the length."""
+    count = 4000
+    graph = fg.Graph()
+    x, u = graph.variables("x", fg.Rn(2), count), graph.variables("u", fg.Rn(1), count - 1)
+
+    def pendulum(a: Array, b: Array, u: Array) -> Array:
+        return np.concatenate(
+            [b[:, :1] - a[:, :1] - 0.1 * a[:, 1:], b[:, 1:] - a[:, 1:] - 0.1 * (u - np.sin(a[:, :1]))], 1
+        )
+
+    graph.fix(x[0], [0.0, 0.0])
+    graph.constrain(pendulum, x[:-1], x[1:], u, lower=0.0, upper=0.0)
+    graph.constrain(fg.prior, x[-1], [0.5, 0.0], lower=0.0, upper=0.0)
+    graph.bound(u, lower=-2.0, upper=2.0)
+    graph.minimize(fg.prior, u, [0.0])
+    graph.minimize(fg.prior, x, [0.4, 0.0], sigma=0.3)
+    solution = solver.solve(graph, {x: np.zeros((count, 2)), u: np.zeros((count - 1, 1))})
+    assert solution.status is fg.Status.CONVERGED, solution.report()
+
+
+def test_an_exact_optimum_is_found_out_where_the_linear_system_was_singular() -> None:
+    """From the centre of a circle its row has no slope: the first step reaches the optimum with a multiplier of 1e9."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(fg.prior, x, [1.0, 0.0])
+    graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0, name="circle")
+    solution = InteriorPoint().solve(graph, {x: np.zeros((1, 2))}, check=True)
+    assert solution.dual("circle").item() == pytest.approx(0.0, abs=1e-9)
+    assert solution.stationarity <= 1e-9
+
+
+@pytest.mark.parametrize(
+    ("point", "multiplier", "found"), [(1.0, 50.0, 2.0), (1.0, 0.0, 2.0), (0.5, 1.0, None), (1.5, 1.0, None)]
+)
+def test_multipliers_of_a_stalled_solve_are_estimated_from_the_gradients(
+    point: float, multiplier: float, found: float | None
+) -> None:
+    """Only of rows at their limits, where they are met."""
+
+    class Stalls(Liar):
+        def iterate(self, run: SolveState, workspace: Any) -> fg.Status:
+            super().iterate(run, workspace)
+            run.status = fg.Status.STALLED
+            return fg.Status.STALLED
+
+    graph, x = limited()
+    graph.bound(x, lower=-9.0, name="far")
+    backend = Stalls(point, multiplier)
+    backend.max_iterations = 3
+    solution = backend.solve(graph, {x: np.zeros((1, 1))})
+    assert solution.converged is (found is not None)
+    assert solution.dual("limit").item() == pytest.approx(multiplier if found is None else found)
+
+
+def test_estimated_multipliers_have_the_sign_of_their_limits() -> None:
+    """Pulled away from its limit, a row has none; between limits that meet it may have either."""
+    for goal, lower, expected in ((3.0, -np.inf, 2.0), (0.0, -np.inf, 0.0), (3.0, 1.0, 2.0), (0.0, 1.0, -1.0)):
+        graph = fg.Graph()
+        x = graph.variables("x", fg.Rn(1), 1)
+        graph.minimize(fg.prior, x, [goal])
+        graph.constrain(lambda p: p, x, lower=lower, upper=1.0)
+        program = graph.compile()
+        multipliers = estimated(program, program.linearize({x: np.ones((1, 1))}), 1e-6)
+        assert multipliers is not None and multipliers.item() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("watched", [False, True])
+@pytest.mark.parametrize("solver", [s for s in EVERY if s.constraints == "all"], ids=lambda s: s.name)
+def test_rows_between_fixed_variables_are_judged_first_and_named(solver: Solver, watched: bool) -> None:
+    """No step changes them: nothing is gained by an iteration."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 3)
+    where = graph.data("where", [[0.0, 0.0], [1.0, 0.5]])
+    graph.fix(x[:2], where)
+    graph.minimize(fg.prior, x, [3.0, 1.0])
+    graph.constrain(lambda a, b: b - a, x[:-1], x[1:], lower=-1.0, upper=1.0, name="step")
+    graph.bound(x, upper=2.0, name="fence")
+    run = replace(solver, keep_values=watched).prepare(graph)
+    guess = {x: np.zeros((3, 2))}
+    assert run.solve(guess).converged
+    solution = run.solve(guess, data={where: np.array([[0.0, 0.0], [1.0, 1.5]])})
+    assert solution.status is fg.Status.INFEASIBLE and solution.iterations == 0 and not solution.converged
+    assert solution.worst == ("step", 0) and solution.violation == pytest.approx(0.5)
+    assert "all fixed" in solution.report() and "'step', factor 0" in solution.report()
+    # The largest violation that can be mended is not the one that is named.
+    solution = run.solve({x: np.full((3, 2), 90.0)}, data={where: np.array([[1.5, 0.0], [2.5, 0.0]])})
+    assert solution.status is fg.Status.INFEASIBLE and solution.worst == ("fence", 1)
+    within = run.solve(guess, data={where: np.array([[0.0, 0.0], [1.0, 1.0 + 1e-7]])})
+    assert within.status is not fg.Status.INFEASIBLE and within.iterations > 0
+
+
+def test_check_names_violated_rows_between_fixed_variables() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 3)
+    graph.fix(x[:2], [[0.0, 0.0], [1.0, 1.5]])
+    graph.minimize(fg.prior, x, [3.0, 1.0])
+    graph.constrain(lambda a, b: b - a, x[:-1], x[1:], lower=-1.0, upper=1.0, name="step")
+    report = graph.check({x: np.zeros((3, 2))})
+    (finding,) = report.findings
+    assert (finding.kind, finding.term, finding.index) == ("violated and fixed", "step", 0)
+    assert "violated by 0.5, and all its variables are fixed" in finding.message

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from unifg.models import unicycle
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
 from variants import CONSTRAINED, EQUALITIES_ONLY
@@ -79,3 +80,25 @@ def test_bounds_are_kept_and_the_squares_of_the_rest_are_least(name: str, case: 
     np.testing.assert_allclose(program.violation(rows)[program.bound_rows], 0.0, atol=1e-12)
     for family, value in expected.items():
         np.testing.assert_allclose(np.abs(solution[graph.families[family]]), value, atol=1e-5)
+
+
+BEHIND = [InteriorPoint(), SQP(), SQP(hessian="exact"), AugmentedLagrangian()]
+
+
+@pytest.mark.parametrize("solver", BEHIND, ids=["ipm", "sqp", "sqp-exact", "alm"])
+@pytest.mark.parametrize("count", [15, 20, 25])
+def test_a_hard_goal_past_a_disc_dead_ahead_is_reached(solver: fg.Solver, count: int) -> None:
+    """By symmetry every step goes through the disc, to a saddle of the violation, which is none of its minima."""
+    graph = fg.Graph()
+    x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
+    graph.fix(x[0], [0.0, 0.0, 0.0])
+    graph.minimize(fg.prior, u, [0.0, 0.0])
+    graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], 4.0 / count, lower=0.0, upper=0.0, name="motion")
+    graph.constrain(lambda p: p[:, :2] - np.array([3.0, 0.0]), x[-1], lower=0.0, upper=0.0, name="goal")
+    graph.constrain(
+        lambda p: np.linalg.norm(p[:, :2] - np.array([1.5, 0.0]), axis=1, keepdims=True) - 0.4, x[1:], lower=0.0
+    )
+    graph.bound(u, lower=[-1.5, -3.0], upper=[1.5, 3.0])
+    straight = np.linspace([0.0, 0.0, 0.0], [3.0, 0.0, 0.0], count + 1)
+    solution = solver.solve(graph, {x: straight, u: np.tile([0.75, 0.0], (count, 1))}, check=True)
+    assert np.abs(solution[x][:, 1]).max() > 0.3  # round it, on one side

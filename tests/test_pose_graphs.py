@@ -236,7 +236,7 @@ def test_damping_does_not_stiffen_a_chain() -> None:
         graph, _, guess = manhattan(1000, seed).pose_graph.graph()
         bare, damped = (solver().solve(graph, guess, check=True) for solver in (GaussNewton, LevenbergMarquardt))
         assert damped.iterations == bare.iterations < 8
-        assert LevenbergMarquardt(damping=1e-4).solve(graph, guess).iterations > damped.iterations
+        assert LevenbergMarquardt(damping=1e-3).solve(graph, guess).iterations > damped.iterations
 
 
 def test_correlations_count() -> None:

@@ -35,13 +35,34 @@ def settle(run: SolveState, status: Status) -> Status:
 
     A solve that has met its constraints somewhere has seen that they can be met: it stays where it is.
     """
-    if run.status is not None or run.has_been_feasible:
+    found = _settled(run)
+    return status if found is None or found[1] is False else Status.LOCALLY_INFEASIBLE
+
+
+def resume(run: SolveState, status: Status) -> Status | None:
+    """End a solve that stalled as :func:`settle` does, or None once the iterate was moved to where it is feasible.
+
+    That happens once, as it has been feasible then. Multipliers begin anew.
+    """
+    found = _settled(run)
+    if found is None or found[1]:
+        return status if found is None else Status.LOCALLY_INFEASIBLE
+    if np.abs(run.program.violation(found[0].constraints)).max(initial=0.0) > run.tolerance:
         return status
+    run.multipliers = np.zeros(len(run.multipliers))
+    run.begin_at(found[0])
+    return run.status
+
+
+def _settled(run: SolveState) -> tuple[Linearization, bool] | None:
+    """As :func:`nearest`, where the solve then ends if it is least; None where that is not asked."""
+    if run.status is not None or run.has_been_feasible:
+        return None
     found, least = nearest(run)
     if least:
         run.begin_at(found)
-        run.status = status = Status.LOCALLY_INFEASIBLE
-    return status
+        run.status = Status.LOCALLY_INFEASIBLE
+    return found, least
 
 
 def nearest(run: SolveState) -> tuple[Linearization, bool]:
@@ -82,7 +103,7 @@ def _downhill(run: SolveState, lin: Linearization) -> Linearization | None:
         start = program.linearize(values)
         if not start.finite or (k == 0 and not _squared(program, start) < (1.0 - LESS) * here):
             continue
-        found = least_violation(program, start, run.tolerance, lambda: run.out_of_time)
+        found = least_violation(program, start, run.tolerance, lambda: run.out_of_time, convex=k > 0)
         if found.finite and _squared(program, found) < (1.0 - LESS) * here:
             return found
     return None
@@ -93,7 +114,11 @@ def _squared(program: Program, lin: Linearization) -> float:
 
 
 def least_violation(
-    program: Program, lin: Linearization, tolerance: float, out_of_time: Callable[[], bool] = lambda: False
+    program: Program,
+    lin: Linearization,
+    tolerance: float,
+    out_of_time: Callable[[], bool] = lambda: False,
+    convex: bool = False,
 ) -> Linearization:
     """Descend on the violation until it is stationary, gone, or nothing helps.
 
@@ -105,6 +130,7 @@ def least_violation(
         lin: where to begin.
         tolerance: largest violation that counts as none.
         out_of_time: asked before every step whether to end where it is.
+        convex: take no step of an indefinite model, which may lead to a saddle; slow where some direction stays so.
     """
     solver = program.systems.normal()
     lin = within_bounds(program, lin)
@@ -118,7 +144,7 @@ def least_violation(
             return lin
         size = np.maximum(size, model.size)
         while damping <= LARGEST_DAMPING:
-            if solver.factor(model.damped(damping, size)):
+            if solver.factor(model.damped(damping, size)) and (solver.definite or not convex):
                 values = program.within_bounds(program.retract(lin.values, -solver.solve(model.gradient)))
                 trial = program.evaluate(values)
                 there = 0.5 * float((program.violation(trial.constraints) ** 2).sum()) if trial.finite else np.inf

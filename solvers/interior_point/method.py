@@ -146,21 +146,29 @@ class InteriorPoint(Solver):
     def _attempt(self, run: SolveState, workspace: Workspace) -> Status | None:
         """From where the workspace is to one of the endings."""
         program, work, now = run.program, workspace.work, workspace.now
-        now["assisted"], now["watched"], now["stage"] = not program.fully_compiled, not run.alone, state.MOVED
-        if not run.alone:
+        now["assisted"], now["watched"], now["stage"] = not program.fully_compiled, not run.alone, state.LINEARIZED
+        if run.alone:
+            if program.fully_compiled:
+                workspace.call("renew")
+            else:
+                workspace.take(program.linearize(program.columns.view(work.values.copy())))
+            run.slopes.see(work.constraint_jacobian, work.gradient)
+        else:
             if not np.array_equal(run.lin.values.flat, work.values):
                 run.begin_at(program.linearize(program.columns.view(work.values.copy())))
                 if run.status is not None:
                     return None
             workspace.take(run.lin)
-            now["stage"] = state.LINEARIZED
         interrupted, seen, now["answer"] = False, now["iteration"], NO_ANSWER
         try:
             while workspace.asks():
                 if run.alone:
                     run.iterations = now["iteration"]
-                if now["answer"] == state.TRY and run.out_of_time:
-                    break
+                if now["answer"] == state.TRY:
+                    if run.alone:
+                        run.consider(now["cost"], work.constraints, workspace._values(), work.multipliers.copy())
+                    if run.out_of_time:
+                        break
                 if now["answer"] == state.SHOW and now["iteration"] > seen:
                     seen = now["iteration"]
                     details = _details(now["mu"], now["delta"], now["gauss_newton"])
@@ -283,7 +291,10 @@ class Workspace:
         now["tolerance"] = 0.0 if run.program.least_squares else run.tolerance
         now["asked"], now["scaling"] = 0.0, bool(options.scaling)
         now["step_tolerance"] = options.step_tolerance
-        now["violation_tolerance"], now["clocked"] = options.violation_tolerance, options.time_limit < np.inf
+        now["violation_tolerance"], now["clocked"] = (
+            options.violation_tolerance,
+            run.alone or options.time_limit < np.inf,
+        )
         now["keeping"] = max(run.tolerance, options.violation_tolerance if options.step_tolerance > 0.0 else 0.0)
         now["iteration"], now["kept"], now["raises"] = 0, 0, 0
         work.row_units[:] = work.units[:] = 1.0

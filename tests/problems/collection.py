@@ -32,8 +32,8 @@ BACKENDS: dict[str, fg.Solver] = {
     "InteriorPoint": InteriorPoint(),
 }
 
-OPTIMUM, OTHER, INFEASIBLE_POINT = "optimum", "other", "infeasible"
-RIGHT = (OPTIMUM, OTHER, INFEASIBLE_POINT)
+OPTIMUM, OTHER, DEGENERATE_POINT, INFEASIBLE_POINT = "optimum", "other", "degenerate", "infeasible"
+RIGHT = (OPTIMUM, OTHER, DEGENERATE_POINT, INFEASIBLE_POINT)
 SAME_COST = 1e-5  # relative to max(1, |cost|)
 UNQUALIFIED_COST = 1e-2
 
@@ -43,9 +43,9 @@ class Outcome:
     """What a backend made of a problem.
 
     Attributes:
-        verdict: "optimum" (the known one), "other" (a KKT point listed with the problem), "infeasible" (said so, and
-            there is no answer), else the status, or "unknown point" for a KKT point nobody has listed and "disproved"
-            for a claim that the judge rejects.
+        verdict: "optimum" (the known one), "other" (a KKT point listed with the problem), "degenerate" (said so at an
+            optimum that has no multipliers), "infeasible" (said so, and there is no answer), else the status, or
+            "unknown point" for a KKT point nobody has listed and "disproved" for a claim that the judge rejects.
         iterations: spent.
         cost: at the end.
     """
@@ -76,11 +76,13 @@ def verdict(case: Problem, graph: fg.Graph, solution: fg.Solution) -> str:
     """Name what a solution is."""
     if solution.status is fg.Status.LOCALLY_INFEASIBLE and not case.feasible:
         return INFEASIBLE_POINT
-    if not (solution.converged or (solution.status is fg.Status.UNDETERMINED and not case.determined)):
+    degenerate = solution.status is fg.Status.DEGENERATE and not case.qualified
+    if not (degenerate or solution.converged or (solution.status is fg.Status.UNDETERMINED and not case.determined)):
         return solution.status.name.lower().replace("_", " ")
     if judge(graph, solution).worst() > case.judged:
         return "disproved"
-    return _point(case, solution.cost)
+    found = _point(case, solution.cost)
+    return DEGENERATE_POINT if degenerate and found == OPTIMUM else found
 
 
 def _point(case: Problem, cost: float) -> str:

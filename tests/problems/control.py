@@ -62,8 +62,8 @@ OPTIMA: dict[tuple[str, bool, int], tuple[float, ...]] = {
     ("curve", True, 50): (6.91008,),
     ("ahead", False, 20): (561.41452,),
     ("ahead", False, 50): (558.59179,),
-    ("ahead", True, 20): (579.75063,),
-    ("ahead", True, 50): (608.83744,),
+    ("ahead", True, 20): (579.75063, 586.14768),
+    ("ahead", True, 50): (608.83744, 580.25905),
     ("behind", False, 20): (54.47372,),
     ("behind", False, 50): (59.47520,),
     ("behind", False, 100): (59.47490,),
@@ -77,7 +77,7 @@ OPTIMA: dict[tuple[str, bool, int], tuple[float, ...]] = {
     ("goto", False, 20): (3292.64495,),
     ("goto", False, 50): (3287.28806,),
     ("goto", True, 20): (3403.82537, 3438.70),
-    ("goto", True, 50): (3399.72386, 3432.35),
+    ("goto", True, 50): (3399.72386, 3432.35, 3387.08409),
 }
 
 

@@ -1,8 +1,8 @@
 """``graph.check(guess)``: mistakes found before a solve, by term, family and index.
 
 Looks for residuals that are not finite, attached Jacobians that disagree with numerical differentiation,
-unknowns that nothing determines, and constraints whose rows depend on each other at the guess. Says of every term
-how it is evaluated.
+unknowns that nothing determines, constraints that are violated between fixed variables, and constraints whose rows
+depend on each other at the guess. Says of every term how it is evaluated.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from unifg.typing import Array, ArrayLike
 
 JACOBIAN_TOLERANCE = 1e-5  # relative; a central difference is good to about 1e-9 where the residual is smooth
 PIVOT_TOLERANCE = 1e-11  # relative to the largest pivot of the damped normal equations
+VIOLATED = 1e-6  # as the default tolerance of backends
 DENSE_ROWS = 2000  # above this many constraint rows the dependence test, which is dense, is skipped
 
 
@@ -31,7 +32,7 @@ class Finding:
     """One mistake.
 
     Attributes:
-        kind: "not finite", "wrong Jacobian", "undetermined" or "dependent constraints".
+        kind: "not finite", "wrong Jacobian", "undetermined", "violated and fixed" or "dependent constraints".
         message: what was found and what to do.
         term, family, index: where, as far as it has a place.
     """
@@ -88,6 +89,7 @@ def _check(program: Program, guess: Mapping[Family, ArrayLike], data: Mapping[Da
             findings.append(finding)
     if not any(f.kind == "not finite" for f in findings):
         findings += _undetermined(program, values)
+        findings += _fixed(program, values)
         findings += _dependent(program, values)
     return Report(tuple(findings), {term.name: term.route for term in program.terms})
 
@@ -181,6 +183,27 @@ def _null_direction(factorization: Factorization, size: int) -> Array:
         vector = factorization.solve(vector)
         vector /= np.abs(vector).max()
     return vector
+
+
+def _fixed(program: Program, values: Values) -> list[Finding]:
+    """Violated rows that no step can change, one finding for each factor."""
+    outside = program.violation(program.evaluate(values).constraints)
+    found: dict[tuple[str, int], float] = {}
+    for row in program.fixed_rows().tolist():
+        if abs(outside[row]) > VIOLATED:
+            place = program.row_name(row)
+            found[place] = max(found.get(place, 0.0), abs(float(outside[row])))
+    return [
+        Finding(
+            "violated and fixed",
+            f"term '{term}': factor {index} is violated by {size:.3g}, and all its variables are fixed; change their "
+            "values, free one, or widen the limits",
+            term,
+            None,
+            index,
+        )
+        for (term, index), size in found.items()
+    ]
 
 
 def _dependent(program: Program, values: Values) -> list[Finding]:

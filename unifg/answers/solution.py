@@ -58,6 +58,8 @@ class Solution:
         iterations: number of iterations taken.
         seconds: wall-clock time of the solve.
         solver: name of the backend.
+        returned: number of the iteration that is returned; 0 for the guess. Not the last one where a limit, a stall or
+            an interruption ended the solve and an earlier iterate has less cost plus price times violation.
         in_python: seconds of them spent in residuals that Python evaluates, see ``graph.check``.
         verdict: which measurements it believes, from solves that decide that.
         picked: for what the backend was picked, where the caller named none.
@@ -83,6 +85,7 @@ class Solution:
         iterations: int,
         seconds: float,
         solver: str,
+        returned: int,
     ) -> None:
         """Assembled by :class:`unifg.Solver`."""
         self._program = program
@@ -102,12 +105,18 @@ class Solution:
         self.iterations = iterations
         self.seconds = seconds
         self.solver = solver
+        self.returned = returned
 
     @property
     def history(self) -> History:
-        """One row per iteration, row 0 being the start; ``history.plot()`` draws them."""
+        """One row per iteration, row 0 being the start; ``history.plot()`` draws them.
+
+        The row that is returned is marked in its details, where it is not the last.
+        """
         if not isinstance(self._history, History):
             self._history = History(self._history() if callable(self._history) else self._history)
+            if self.returned < len(self._history) - 1:
+                self._history[self.returned].details["returned"] = 1
         return self._history
 
     @history.setter

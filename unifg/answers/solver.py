@@ -15,6 +15,8 @@ import numpy as np
 
 from unifg.answers.conditioning import HARDLY
 from unifg.answers.history import HEADER, Deferred, Iteration, factor_norms, line
+from unifg.answers.incumbent import Incumbent, Incumbents
+from unifg.answers.multipliers import Slopes, estimated
 from unifg.answers.optimality import infeasible_stationary, optimality, within_bounds
 from unifg.answers.rehearsal import rehearse
 from unifg.answers.relative_offset import Factored
@@ -38,6 +40,16 @@ Callback: TypeAlias = Callable[[Iteration], bool | None]
 
 UNBOUNDED_COST = -1e20
 EVERY = 100  # solves of a loop after which answers are verified, besides the 1st, 2nd, 4th, ... and new comparisons
+FEW = 3  # iterations that are asked for as such, one after the other in a control loop
+WITHOUT_SUCCESS = (
+    Status.ITERATION_LIMIT,
+    Status.TIME_LIMIT,
+    Status.STALLED,
+    Status.SINGULAR,
+    Status.NOT_FINITE,
+    Status.INTERRUPTED,
+)
+"""Endings that return the best iterate."""
 
 
 class Backend(ABC):
@@ -198,6 +210,8 @@ class SolveState:
         tolerance: of the KKT test.
         lent: the backend's factorisation of a matrix near the Hessian of the objective, which the KKT test of least
             squares may use and overwrite; None where the backend has no such thing.
+        slopes: the largest so far.
+        incumbents: iterates one of which is returned without success.
     """
 
     def __init__(self, solver: Solver, program: Program, values: Values, multipliers: Array, callback: Callback | None):
@@ -210,10 +224,11 @@ class SolveState:
         self.tolerance = solver.tolerance
         self.history: list[Iteration] = []
         self.status: Status | None = None
-        self._best: tuple[float, float] | None = None
+        self.incumbents = Incumbents()
         self._recall: Callable[[], list[Iteration]] | None = None
         self._least, self._least_values, self._start = np.inf, values, values
         self.lent: Factored | None = None
+        self.slopes = Slopes(program)
         self.iterations = 0
         if solver.verbose:
             logger.info(HEADER)
@@ -241,8 +256,8 @@ class SolveState:
         **details: float | int | str,
     ) -> None:
         """Make ``lin`` the present iterate: measure it, record a row, decide whether to go on."""
-        self._move(lin, multipliers)
         self.iterations = len(self.history)
+        self._move(lin, multipliers)
         deferred = Deferred(lambda: factor_norms(self.program, lin, self.program.violation(lin.constraints)))
         row = Iteration(
             self.iterations,
@@ -263,7 +278,6 @@ class SolveState:
         self.history.append(row)
         if self._solver.verbose:
             logger.info(line(row))
-        self._keep_best()
         self.status = self._decide_in_time()
         if self._callback is not None and self._callback(row) and self.status is None:
             self.status = Status.INTERRUPTED
@@ -286,27 +300,49 @@ class SolveState:
             iterations: how many there were.
             history: makes their rows when somebody asks for them.
         """
-        start, carried = self.values, self.multipliers
-        self._move(lin, multipliers)
-        if not self.optimality.finite:
-            self._move(self.program.linearize(start), carried)
-            self._keep_best()
-            self._move(lin, multipliers)
-        self._keep_best()
         self.iterations, self._recall = iterations, history
+        self._move(lin, multipliers)
         self.status = self._decide()
 
     def _move(self, lin: Linearization, multipliers: Array) -> None:
         self.lin, self.values, self.multipliers = lin, lin.values, multipliers
+        if len(multipliers):
+            self.slopes.see(lin.constraint_jacobian, lin.gradient)
         self.optimality = optimality(self.program, lin, multipliers, self.tolerance, self.lent, self._start.flat)
         if self.optimality.violation < self._least:
             self._least, self._least_values = self.optimality.violation, lin.values
+        if self.optimality.finite:
+            self.consider(lin.cost, lin.constraints, lin.values, multipliers)
+
+    def consider(self, cost: float, constraints: Array, values: Values, multipliers: Array) -> None:
+        """Take note of an iterate that may be returned if the solve ends without success.
+
+        Args:
+            cost: objective.
+            constraints: (M,) there.
+            values: the iterate, which is not written to any more.
+            multipliers: (M,) there, the same.
+        """
+        violation = float(np.abs(self.program.violation(constraints)).sum()) if len(constraints) else 0.0
+        self.incumbents.see(Incumbent(self.iterations, cost, violation, values, multipliers))
 
     def begin_at(self, lin: Linearization) -> None:
         """Move the start, as onto the bounds, without spending an iteration."""
         self._move(lin, self.multipliers)
-        self._keep_best()
         self.status = self._decide_in_time()
+
+    def look_at_fixed(self) -> None:
+        """End before the first iteration where a violated row touches nothing but fixed variables."""
+        rows = self.program.fixed_rows()
+        if self.status is not None or not len(rows):
+            return
+        point = self.program.evaluate(self.values) if self.alone else self.lin
+        outside = np.abs(self.program.violation(point.constraints)[rows])
+        if outside.max() > self.tolerance:
+            if self.alone:
+                self.accept(self.program.linearize(self.values), self.multipliers, 0.0, 0.0)
+            self.optimality = self.optimality._replace(worst_row=int(rows[outside.argmax()]))
+            self.status = Status.INFEASIBLE
 
     def search(self, workspace: Any) -> None:
         """Take the first steps along the search Jacobians; the multipliers wait, and the true numbers are recorded.
@@ -325,7 +361,7 @@ class SolveState:
 
     def keep_with(self, error: Exception) -> None:
         """Hand what has been reached along with an error, as its attribute ``reached``, and say so in a note."""
-        if self._best is None:
+        if not self.incumbents:
             return
         with suppress(Exception):  # the functions may raise again
             self.status = Status.INTERRUPTED
@@ -353,11 +389,11 @@ class SolveState:
         return infeasible_stationary(self.program, self.lin, self.tolerance)
 
     def finish(self, reason: Status | None) -> Solution:
-        """Return the last iterate, judged by the KKT test of the original problem.
+        """Return the last iterate, or after a solve without success the best one, judged by the KKT test.
 
-        No ranking of iterates comes before the backend's own choice: a step of a real-time iteration may raise every
-        merit, and would never be taken from a feasible start. Only where the last iterate is not finite does the best
-        of the others stand in for it.
+        No ranking of iterates comes before the backend's own choice where it succeeded, where a stop rule fired, and
+        where a step or a few of them are all that was asked for: a step of a real-time iteration may raise every merit,
+        and would never be taken from a feasible start.
         """
         status = self.status or reason or Status.STALLED
         if status is Status.STALLED and self.infeasible_stationary():
@@ -366,11 +402,14 @@ class SolveState:
             status = Status.STALLED
         if status is Status.LOCALLY_INFEASIBLE and (within := within_bounds(self.program, self.lin)) is not self.lin:
             self._move(within, self.multipliers)
-        if not self.optimality.finite:
-            self._move(self._best_lin, self._best_multipliers)
+        returned = self._return_best(status)
+        if status in (Status.STALLED, Status.SINGULAR) and self.optimality.violation <= self.tolerance:
+            self._estimate()
         measured = self.optimality
         if measured.passes(self.tolerance) and status is not Status.UNBOUNDED:
             status = Status.CONVERGED if measured.weakest > HARDLY else Status.HARDLY_DETERMINED
+            if len(self.multipliers) and self.slopes.degenerate(self.multipliers, self.tolerance):
+                status = Status.DEGENERATE
         elif measured.holds(self.tolerance) and not measured.determined:
             status = Status.UNDETERMINED
         elif measured.holds(self.tolerance) and status is not Status.UNBOUNDED:
@@ -390,15 +429,39 @@ class SolveState:
             self.iterations,
             self.seconds,
             self._solver.name,
+            returned,
         )
         solution.in_python = self.program.python_seconds - self._in_python
         return solution
+
+    def _estimate(self) -> None:
+        """Take multipliers that are made of the gradients here, if all KKT numbers are better with them."""
+        before, found = self.optimality, estimated(self.program, self.lin, self.tolerance)
+        if found is None or before.holds(self.tolerance):
+            return
+        after = optimality(self.program, self.lin, found, self.tolerance)
+        pairs = zip(after[:3], before[:3], strict=True)
+        if all(better <= worse for better, worse in pairs) and after[:3] != before[:3]:
+            self.multipliers, self.optimality = found, after
+
+    def _return_best(self, status: Status) -> int:
+        """Go back to the best iterate where the ending asks for it; returns the number of what is returned."""
+        asked = self._solver.max_iterations <= FEW or getattr(self._solver, "step_tolerance", 0.0) == np.inf
+        sound = asked or status not in WITHOUT_SUCCESS or self.optimality.holds(self.tolerance)
+        if self.optimality.finite and sound:
+            return self.iterations
+        best = self.incumbents.best
+        if best.values is not self.values or best.multipliers is not self.multipliers:
+            self._move(self.program.linearize(best.values), best.multipliers)
+        return best.number
 
     def _decide(self) -> Status | None:
         if not self.optimality.finite:
             return Status.NOT_FINITE
         if self.lin.cost < UNBOUNDED_COST:  # out there, derivatives may be lost to rounding and look like zero
             return Status.UNBOUNDED
+        if self.optimality.stationarity == np.inf:  # a saddle or maximum, where no model shows a way
+            return Status.STALLED
         if self.optimality.holds(self.tolerance):
             if not self.optimality.determined:
                 return Status.UNDETERMINED
@@ -409,15 +472,6 @@ class SolveState:
 
     def _decide_in_time(self) -> Status | None:
         return self._decide() or (Status.TIME_LIMIT if self.out_of_time else None)
-
-    def _keep_best(self) -> None:
-        """What to return if the last iterate is not finite: feasible ones rank by stationarity, others by violation."""
-        measured = self.optimality
-        feasible = measured.violation <= self.tolerance
-        error = max(measured.stationarity, measured.complementarity)
-        rank = (0.0, error) if feasible else (measured.violation, error)
-        if self._best is None or (measured.finite and rank <= self._best):
-            self._best, self._best_lin, self._best_multipliers = rank, self.lin, self.multipliers
 
 
 class Prepared:
@@ -527,6 +581,7 @@ class Prepared:
     def _finished(self, run: SolveState) -> Solution:
         """The solution of a solve that has begun."""
         self._refuse_not_finite(run)
+        run.look_at_fixed()
         reason = None
         if run.status is None:
             self.allocate()
@@ -534,7 +589,7 @@ class Prepared:
                 run.search(self._workspace)
                 reason = self.solver.iterate(run, self._workspace)
             except KeyboardInterrupt:
-                if run._best is None:
+                if not run.incumbents:
                     raise  # there is nothing to return
                 run.status = Status.INTERRUPTED
             except Exception as error:

@@ -15,12 +15,20 @@ class Status(Enum):
         "The KKT conditions of the problem hold to the tolerance, but some direction is so weakly determined that few "
         "digits of it are known; look at solution.conditioning, add a prior or another measurement."
     )
+    DEGENERATE = (
+        "The KKT conditions hold to the tolerance, but only with huge multipliers: constraints have lost their slope "
+        "there, and the point need not be an optimum; state them with a slope where they are met."
+    )
     STOP_RULE = "The chosen stop rule ended the loop, but the KKT conditions do not hold to the tolerance."
     ITERATION_LIMIT = "The iteration limit was reached before the KKT conditions held; raise max_iterations."
     TIME_LIMIT = "The time limit was reached before the KKT conditions held; raise time_limit."
     STALLED = "No step improved the merit any more, though the KKT conditions do not hold to the tolerance."
     LOCALLY_INFEASIBLE = (
         "The point is stationary for the violation of the constraints: no nearby point violates them less."
+    )
+    INFEASIBLE = (
+        "A constraint whose variables are all fixed is violated, and no step can change that: change what is fixed, or "
+        "the limits."
     )
     UNBOUNDED = "The objective fell below every reasonable value: it is probably unbounded below."
     UNDETERMINED = (

@@ -157,10 +157,11 @@ class Loop:
             term.state(graph, self.x, self.u)
         weigh(graph.terms[before:], control_weight)
         self._handles = handles_of(graph)
-        timed = [replace(own, time_limit=min(own.time_limit, deadline)) for own in (solver, cold or solver)]
+        backends = solver, cold or solver, second or solver
+        timed = [replace(own, time_limit=min(own.time_limit, deadline)) for own in backends]
         self._limits = [own.time_limit for own in timed]
-        self.warm, self.cold = (own.prepare(graph) for own in timed)
-        self.second = None if second is None else second.prepare(graph)
+        self.warm, self.cold = (own.prepare(graph) for own in timed[:2])
+        self.second = None if second is None else timed[2].prepare(graph)
         self.kept = Kept(steps, robot, between)
         self.judge: Judge = judge or KeepThenBrake(robot)
         self.starts: Starts = starts or Starts()
@@ -317,7 +318,7 @@ class Loop:
         if left <= 0.0:
             return first, False
         if np.isfinite(left):
-            other.solver.time_limit = left
+            other.solver.time_limit = min(self._limits[2], left)
         start = self.starts.after_failure or self.starts.cold
         states, controls = (
             (np.tile(now.present, (self.steps + 1, 1)), np.zeros((self.steps, self.robot.control.storage)))

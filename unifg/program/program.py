@@ -491,6 +491,10 @@ class Program:
         outside(constraints, self.lower, self.upper, found)
         return found
 
+    def fixed_rows(self) -> IntArray:
+        """Constraint rows none of whose variables is unknown."""
+        return self.once(_fixed_rows)
+
     def once(self, find: Callable[[Program], T]) -> T:
         """What a function finds out about this program, found when first asked for and kept as long as the program."""
         if find not in self._found:
@@ -598,6 +602,12 @@ def _linearize_at_once(shares: Shares, given: tuple[Any, ...], size: Array, grad
 def _entrance() -> int:
     """Of a linearisation that is shared."""
     return entrance(passes.linearize_at_once)
+
+
+def _fixed_rows(program: Program) -> IntArray:
+    touched = np.zeros(program.constraints.count, dtype=bool)
+    touched[program.constraints.free_rows] = True
+    return np.flatnonzero(~touched)
 
 
 def _stacked(parts: list[Array]) -> Array:
