@@ -170,6 +170,8 @@ def prepare_arguments(name: str, arguments: tuple[Any, ...], active: Any) -> tup
                 lengths.append((f"family '{argument.family.name}'", argument.count))
         elif isinstance(argument, Data) and argument.each:
             lengths.append((f"data '{argument.name}'", len(argument.value)))
+        elif isinstance(argument, np.ma.MaskedArray):
+            doubles(f"term '{name}': an argument", argument, term=name)
     if not any(isinstance(argument, Selection) for argument in normal):
         raise GraphError(f"term '{name}' has no variable among its arguments: pass a family or a selection", term=name)
     if active is not None:

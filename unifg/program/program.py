@@ -129,7 +129,8 @@ class Program:
         self.python_seconds = 0.0
         read = {value for term in self.terms for value in term.data}
         read |= {fix.value for fix in graph.fixes if isinstance(fix.value, Data)}
-        self._binding, self._vetted = Binding(declared, filter(read.__contains__, declared.values())), False
+        self._binding = Binding(declared, filter(read.__contains__, declared.values()), graph.terms)
+        self._vetted = False
         self._bind_first()
 
     @property
