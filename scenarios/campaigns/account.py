@@ -117,8 +117,8 @@ def consistency(sheet: Sheet) -> list[Block]:
     return [
         Heading("Consistency of the estimate"),
         Words(
-            f"Mean NEES of one tick drawn per drive, over {len(drawn)} drives: {mean:.2f}; {DIMENSION} is expected, 95 % "
-            f"band {low:.2f} to {high:.2f}. The covariances are {verdict}."
+            f"Mean NEES of one tick drawn per drive, over {len(drawn)} drives: {mean:.2f}; {DIMENSION} is expected, "
+            f"95 % band {low:.2f} to {high:.2f}. The covariances are {verdict}."
         ),
     ]
 
