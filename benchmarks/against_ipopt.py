@@ -14,7 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -23,21 +23,24 @@ from scipy.optimize import brentq
 import unifg as fg
 from benchmarks.compiled_peers import COMPILER
 from benchmarks.compiled_peers import compiled as in_machine_code
+from benchmarks.printed import numbers
 from benchmarks.report import command, machine, publish, table, words
 from benchmarks.timing import interleave, number, pin
 from unifg.models import obstacles, potential, unicycle
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
 
-# The paper's rows: initial cost; final cost, iterations and seconds of its solver; the same of IPOPT.
-PAPER = (
-    (7938.200, (53.612, 118, 0.011), (50.423, 445, 1.459)),
-    (3367.190, (68.682, 125, 0.013), (63.744, 809, 2.497)),
-    (6199.650, (64.588, 158, 0.013), (60.097, 931, 2.943)),
-    (22011.100, (447.180, 189, 0.031), (443.779, 479, 1.872)),
-    (27744.090, (568.386, 366, 0.055), (563.406, 549, 1.951)),
-    (21341.260, (484.154, 294, 0.043), (480.467, 439, 1.682)),
-)
+Row: TypeAlias = tuple[float, tuple[float, int, float], tuple[float, int, float]]
+
+
+def _rows() -> tuple[Row, ...]:
+    """The paper's: initial cost; final cost, iterations and seconds of its solver; the same of IPOPT."""
+    of = partial(numbers, "bazzana", "Table III")
+    found = list(zip(of("final_cost"), map(int, of("iterations")), of("time"), strict=True))
+    return tuple(zip(of("initial_cost"), found[::2], found[1::2], strict=True))
+
+
+PAPER = _rows()
 STEPS, DT, SPEED, HULL, CLEAR = 30, 0.1, 0.5, 0.17, 0.03
 PATH, EFFORT, STIFF, PUSH = np.array([10.0, 10.0, 1.0]), np.array([0.1, 0.1]), 3000.0, 20.0
 LIMIT = 1.0

@@ -14,12 +14,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.kept_rows import ROWS, keep, restore
 from benchmarks.large_maps import CAMPAIGNS
+from benchmarks.printed import numbers, pairs
 from benchmarks.report import OUT, command, machine, publish, table
 from unifg.scenarios.campaigns.account import differences
 from unifg.scenarios.campaigns.campaign import EPISODES, code_of_scenario, replay_command, run_campaign, write_manifest
@@ -43,32 +45,20 @@ Pair = tuple[float, float]
 class Reported:
     """What the paper reports of a leg: path length [m] and duration [s], his and those of the ROS stack."""
 
-    length: Pair | None
+    length: Pair
     duration: Pair
     ros_length: Pair
     ros_duration: Pair
 
 
-# The text of the paper at hand has lost his own lengths in Table I. In Table II the durations of BC and CD stand the
-# wrong way round: 86 m in 159 s and 142 m in 91 s are 0.54 and 1.56 m/s, and exchanged they are 0.95 and 0.89 m/s.
-PAPER: dict[str, dict[str, Reported]] = {
-    "department": {
-        "AC": Reported(None, (197.663, 1.63), (171.39, 2.99), (186.13, 4.77)),
-        "CB": Reported(None, (193.80, 4.35), (169.37, 1.09), (190.78, 13.21)),
-        "BD": Reported(None, (189.84, 1.07), (165.91, 0.26), (176.45, 1.06)),
-        "DE": Reported(None, (104.43, 1.24), (89.66, 0.19), (97.32, 0.87)),
-        "EA": Reported(None, (108.74, 1.37), (91.66, 0.95), (108.46, 13.00)),
-        "AB": Reported(None, (31.59, 1.18), (18.07, 0.21), (25.73, 0.78)),
-        "BC": Reported(None, (194.11, 3.57), (169.43, 0.21), (182.08, 1.46)),
-        "CD": Reported(None, (33.67, 1.14), (19.07, 0.33), (27.31, 0.47)),
-    },
-    "factory": {
-        "AB": Reported((154.30, 1.03), (182.06, 1.63), (148.47, 0.27), (197.25, 11.78)),
-        "BC": Reported((86.52, 0.31), (158.96, 1.73), (83.99, 0.18), (172.09, 9.16)),
-        "CD": Reported((142.06, 0.76), (91.22, 0.65), (136.97, 0.26), (97.99, 5.59)),
-        "DE": Reported((130.88, 1.31), (147.81, 3.00), (124.99, 0.19), (161.27, 10.99)),
-    },
-}
+def _reported(table: str) -> dict[str, Reported]:
+    """A table of the paper by legs."""
+    ours, ros = "Ours", "ROS Navigation Stack"
+    columns = [pairs("bazzana", f"{table} ({part}), {who}") for who in (ours, ros) for part in "ab"]
+    return {leg: Reported(*(column[leg] for column in columns)) for leg in columns[0]}
+
+
+PAPER = {"department": _reported("Table I"), "factory": _reported("Table II")}
 TITLES = {"department": "Table I: eight legs of a department", "factory": "Table II: four legs of a factory"}
 CAMPAIGN_NAMES = (*PAPER, *(name + OTHERS for name in PAPER))
 
@@ -206,7 +196,7 @@ def lengths(sheet: Sheet, paper: Mapping[str, Reported]) -> str:
     rows = []
     for coupling, leg in sheet.outcomes:
         his, ros = paper[leg].length, paper[leg].ros_length
-        rows.append((*_begin(sheet, (coupling, leg), LENGTH), "-" if his is None else _pair(his), _pair(ros)))
+        rows.append((*_begin(sheet, (coupling, leg), LENGTH), _pair(his), _pair(ros)))
     return table(head, rows, 2)
 
 
@@ -291,15 +281,19 @@ def together(sheets: Sequence[Sheet]) -> str:
     say = [f"{drives} drives, {many} of each leg and coupling in the tables (the paper: {RUNS} of each leg)."]
     if all(spreads.values()):
         length, duration = spreads[LENGTH], spreads[DURATION]
+        section = partial(numbers, "bazzana", "section VII-B")
+        (mean, mean_ros), (mean_s, mean_s_ros) = section("mean_spread_length"), section("mean_spread_duration")
+        (most, most_s), (most_ros, most_s_ros) = section("greatest_spread"), section("greatest_spread_ros")
         say.append(
-            f"The standard deviation is on average {np.mean(length):.2f} % of the path length (paper: 0.60 %; ROS: "
-            f"0.85 %), at most {max(length):.2f} % (1.43 %; 1.74 %), and {np.mean(duration):.2f} % of the duration "
-            f"(1.88 %; 3.56 %), at most {max(duration):.2f} % (3.74 %; 11.99 %)."
+            f"The standard deviation is on average {np.mean(length):.2f} % of the path length (paper: {mean:.2f} %; "
+            f"ROS: {mean_ros:.2f} %), at most {max(length):.2f} % ({most:.2f} %; {most_ros:.2f} %), and "
+            f"{np.mean(duration):.2f} % of the duration ({mean_s:.2f} %; {mean_s_ros:.2f} %), at most "
+            f"{max(duration):.2f} % ({most_s:.2f} %; {most_s_ros:.2f} %)."
         )
     factor = simulated / max(seconds, 1e-9)
     say.append(
         f"{simulated / 3600.0:.2f} h were driven in {seconds / 3600.0:.2f} h of a processor, {factor:.1f} times real "
-        "time (the paper: 12 h for Table I)."
+        f"time (the paper: {numbers('bazzana', 'section VII-B', 'hours')[0]:g} h for Table I)."
     )
     return " ".join(say)
 

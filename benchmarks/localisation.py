@@ -20,6 +20,7 @@ import numpy as np
 from scipy import ndimage
 
 from benchmarks import runs
+from benchmarks.printed import texts
 from benchmarks.report import command, listing, machine, publish, shared
 from benchmarks.routes import drawn
 from unifg.files.carmen import read_carmen
@@ -48,9 +49,11 @@ UNKNOWN, CARRIED, DRIVEN = "start unknown", "carried elsewhere", "as driven"
 INTEL = "real log"
 # The package's documentation says so where recovery is wanted; and so large a building takes more particles.
 RECOVERING = MonteCarloSettings(slow=0.001, fast=0.1, particles=(2000, 20000))
+_ERRORS = {name: text.replace("±", "+-") for name, text in texts("bazzana", "section VII-A, Fig. 6").items()}
 PAPER = (
-    "Bazzana et al. report 0.087 +- 0.023 m and 0.022 +- 0.027 rad for their graph, 0.090 +- 0.023 m and 0.014 +- "
-    "0.019 rad for AMCL, in ROS stage with a lidar, a map and wheels that the paper does not state."
+    f"Bazzana et al. report {_ERRORS['translation']} and {_ERRORS['rotation']} for their graph, "
+    f"{_ERRORS['translation_amcl']} and {_ERRORS['rotation_amcl']} for AMCL, in ROS stage with a lidar, a map and "
+    "wheels that the paper does not state."
 )
 
 Tick: TypeAlias = tuple[Scan | None, Array | None, Array]

@@ -227,7 +227,7 @@ def hover_attitude(parameters: Parameters) -> Array:
     length = math.hypot(x, y, z)
     if z <= 0.0:
         raise ModelError(f"an updraft of {parameters.updraft:g} m/s^2 carries the vehicle: it cannot hover")
-    return SO3.from_quaternion_wxyz(np.array([length + z, -y, x, 0.0]) / math.hypot(length + z, x, y))
+    return SO3.from_quaternion(np.array([length + z, -y, x, 0.0]) / math.hypot(length + z, x, y), order="wxyz")
 
 
 def _lift(parameters: Parameters) -> tuple[float, float, float]:

@@ -268,6 +268,8 @@ def _warm_up(chosen: argparse.Namespace) -> int:
         parts = (len(done.compiled), "compiled"), (len(done.generated), "generated"), (len(done.read), "read")
         text = ", ".join(f"{count} functions {what}" for count, what in parts if count)
         print(f"{text or 'everything is there: found'} in {time.perf_counter() - began:.1f} s")
+        if lacking := chosen.module.missing():
+            print(f"scenarios are left out, they need {lacking}: pip install 'unifg[scenarios]'")
     return SUCCEEDED
 
 

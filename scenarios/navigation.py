@@ -416,16 +416,16 @@ class Episode:
     def _arrived(self, goal: int) -> bool:
         """Whether the robot believes to be there, by an estimate that leaves room for being wrong.
 
-        The room between what it believes to be near and what the truth must confirm is ``SURE`` standard deviations, in
-        the worst direction.
+        ``SURE`` standard deviations, in the worst direction, fit between where it believes to be and what the truth
+        must confirm.
         """
         covariance, goal_pose = self.pilot.estimator.covariance, self.goals[goal]
         spread = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
         off, turned = (SURE * np.sqrt(max(variance, 0.0)) for variance in (spread, float(covariance[2, 2])))
-        sure = off <= TRUE_DISTANCE - REACHED_DISTANCE and turned <= TRUE_HEADING - REACHED_HEADING
-        if self.pilot.verdict.rests or not sure:
+        if self.pilot.verdict.rests:
             return False
-        return _near(self.pilot.pose, goal_pose, REACHED_DISTANCE, REACHED_HEADING)
+        distance, heading = min(REACHED_DISTANCE, TRUE_DISTANCE - off), min(REACHED_HEADING, TRUE_HEADING - turned)
+        return _near(self.pilot.pose, goal_pose, distance, heading)
 
     def _confirmed(self, goal: int) -> bool:
         """Whether the robot truly is where it believes to have arrived."""

@@ -369,3 +369,120 @@ def test_many_tags_and_lines_of_any_form(tmp_path: Path) -> None:
     assert sum(graph.skipped.values()) == 180 and graph.skipped["TAG0"] == 14 and graph.skipped["TAG89"] == 1
     with pytest.raises(FileFormatError, match=r"field theta is '1\\xa02', not a number"):
         read_g2o(write(tmp_path, "VERTEX_SE2 0 0 0 1\u00a02\n"))
+
+
+@pytest.mark.parametrize(
+    ("text", "extra", "tag"),
+    [
+        (PLANAR, "EDGE_SE3:QUAT 10 7 1 2 3 0 0 0 1 " + " ".join(["1"] * 21), "EDGE_SE3:QUAT"),
+        (SPATIAL, "\nEDGE_SE2 6989586621679009792 6989586621679009793 1 0 0 1 0 0 1 0 1", "EDGE_SE2"),
+        (SPATIAL, "\nEDGE_PRIOR_SE2 6989586621679009792 1 0 0 1 0 0 1 0 1", "EDGE_PRIOR_SE2"),
+    ],
+)
+def test_lines_of_the_other_dimension_are_counted_and_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, text: str, extra: str, tag: str
+) -> None:
+    with caplog.at_level(logging.WARNING, "unifg"):
+        graph = read_g2o(write(tmp_path, text + extra + "\n"))
+    assert graph.skipped == {tag: 1}
+    assert f"{tag} (1)" in caplog.text
+
+
+def test_toro_counts_lines_of_the_other_dimension(tmp_path: Path) -> None:
+    text = "VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEDGE2 0 1 1 0 0 1 0 1 1 0 0\nEDGE3 0 1 1 0 0 0 0 0 " + "1 " * 21
+    assert read_toro(write(tmp_path, text, "a.graph")).skipped == {"EDGE3": 1}
+
+
+@pytest.mark.parametrize("norm", [1.002, 0.5])
+def test_quaternions_far_from_norm_one_are_remarked(tmp_path: Path, norm: float) -> None:
+    lines = f"VERTEX_SE3:QUAT 0 0 0 0 0 0 {0.6 * norm} {0.8 * norm}\nVERTEX_SE3:QUAT 1 0 0 0 0 0 0 1.0009\n"
+    graph = read_g2o(write(tmp_path, lines))
+    (remark,) = graph.remarks
+    assert "1 of 2 quaternions" in remark and "line 1" in remark and f"{norm:g}" in remark
+    np.testing.assert_allclose(graph.poses[0, 3:], [0.8, 0.0, 0.0, 0.6])
+    np.testing.assert_allclose(graph.poses[1, 3:], [1.0, 0.0, 0.0, 0.0])
+
+
+def test_trajectories_name_quaternions_far_from_norm_one(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    from unifg.files.kitti import read_kitti
+    from unifg.files.tum import read_tum
+
+    with caplog.at_level(logging.WARNING, "unifg"):
+        read_tum(write(tmp_path, "0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1.0009\n2 1 2 3 0 0 0 2\n", "a.tum"))
+    assert "1 of 3 quaternions" in caplog.text and "line 3" in caplog.text
+    caplog.clear()
+    scaled = " ".join(f"{1.002 * v}" for v in (1, 0, 0, 5, 0, 1, 0, 6, 0, 0, 1, 7))
+    with caplog.at_level(logging.WARNING, "unifg"):
+        read_kitti(write(tmp_path, "1 0 0 5 0 1 0 6 0 0 1 7\n" + scaled + "\n", "a.txt"))
+    assert "1 of 2 rotation matrices" in caplog.text and "line 2" in caplog.text
+
+
+PRIORS = """\
+VERTEX_SE2 0 0 0 0
+VERTEX_SE2 1 1 0 0
+EDGE_SE2 0 1 1 0 0 100 0 0 100 0 100
+EDGE_PRIOR_SE2 0 5 6 0.5 100 0 0 100 0 100
+"""
+
+
+def test_a_prior_holds_the_map_where_it_says(tmp_path: Path) -> None:
+    path = write(tmp_path, PRIORS)
+    graph = read_g2o(path)
+    assert not graph.skipped and not len(graph.anchors(priors=True)[0])
+    problem, x, guess = graph.graph()
+    solution = fg.solve(problem, guess)
+    np.testing.assert_allclose(solution[x][0], [5.0, 6.0, 0.5], atol=1e-7)
+    np.testing.assert_allclose(solution[x][1], fg.SE2.compose([5.0, 6.0, 0.5], [1.0, 0.0, 0.0]), atol=1e-7)
+    assert graph.chi2("g2o") == pytest.approx(100.0 * (61.0 + 0.25))
+    assert graph.with_poses(solution[x]).chi2() == pytest.approx(0.0, abs=1e-9)
+    again = read_g2o(write_g2o(tmp_path / "again.g2o", graph))
+    same(again, graph)
+    np.testing.assert_array_equal(again.priors["pose"].measured, graph.priors["pose"].measured)
+    np.testing.assert_array_equal(again.priors["pose"].information, graph.priors["pose"].information)
+
+
+def test_positions_in_the_plane_hold_it_by_two_poses(tmp_path: Path) -> None:
+    one = PRIORS.replace("EDGE_PRIOR_SE2 0 5 6 0.5 100 0 0 100 0 100", "EDGE_PRIOR_SE2_XY 0 5 6 1 0 1")
+    graph = read_g2o(write(tmp_path, one))
+    assert graph.anchors(priors=True)[0].tolist() == [0]  # nothing measures the heading
+    graph = read_g2o(write(tmp_path, one + "EDGE_PRIOR_SE2_XY 1 5 7 1 0 1\n"))
+    assert not len(graph.anchors(priors=True)[0])
+    problem, x, guess = graph.graph()
+    solution = fg.solve(problem, guess)
+    np.testing.assert_allclose(solution[x], [[5.0, 6.0, np.pi / 2], [5.0, 7.0, np.pi / 2]], atol=1e-6)
+    np.testing.assert_array_equal(read_g2o(write_g2o(tmp_path / "b.g2o", graph)).priors["position"].pose, [0, 1])
+
+
+@pytest.mark.parametrize("tag", ["EDGE_SE3_PRIOR", "EDGE_PRIOR_SE3"])
+@pytest.mark.parametrize("parameter", [True, False])
+def test_priors_in_space_are_read_in_both_spellings(
+    tmp_path: Path, rng: np.random.Generator, tag: str, parameter: bool
+) -> None:
+    root = rng.normal(size=(6, 6))
+    information = root @ root.T + np.eye(6)
+    triangle = " ".join(repr(v) for v in information[np.triu_indices(6)].tolist())
+    offset, pose = fg.SE3.random(rng), fg.SE3.random(rng)
+    words = {name: " ".join(map(repr, fg.SE3.to_quaternion(x, order="xyzw").tolist())) for name, x in
+             (("offset", offset), ("pose", pose))}  # fmt: skip
+    lines = ["VERTEX_SE3:QUAT 4 0 0 0 0 0 0 1", f"{tag} 4 {'9 ' if parameter else ''}{words['pose']} {triangle}"]
+    if parameter:
+        lines.append(f"PARAMS_SE3OFFSET 9 {words['offset']}")
+    graph = read_g2o(write(tmp_path, "\n".join(lines)))
+    prior = graph.priors["pose"]
+    at = offset if parameter else fg.SE3.identity()
+    np.testing.assert_allclose(prior.measured[0], fg.SE3.compose(pose, fg.SE3.inverse(at)), atol=1e-12)
+    x = fg.SE3.retract(prior.measured[0], 0.3 * rng.normal(size=6))
+    error = fg.SE3.local(pose, fg.SE3.compose(x, at))  # where the sensor is, against where it was measured
+    assert graph.with_poses(x[None]).chi2() == pytest.approx(error @ information @ error, rel=1e-9)
+    again = read_g2o(write_g2o(tmp_path / "again.g2o", graph))
+    np.testing.assert_array_equal(again.priors["pose"].information, prior.information)
+
+
+def test_what_is_wrong_with_a_prior_is_named_with_its_line(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="line 5: there is no pose 7"):
+        read_g2o(write(tmp_path, PRIORS + "EDGE_PRIOR_SE2 7 0 0 0 1 0 0 1 0 1\n"))
+    with pytest.raises(FileFormatError, match="line 5: there is no PARAMS_SE3OFFSET 3"):
+        text = SPATIAL + "\nEDGE_SE3_PRIOR 6989586621679009792 3 0 0 0 0 0 0 1 " + "1 " * 21
+        read_g2o(write(tmp_path, text))
+    with pytest.raises(FileFormatError, match="TORO files have no"):
+        write_toro(tmp_path / "a.graph", read_g2o(write(tmp_path, PRIORS)))

@@ -49,6 +49,6 @@ def test_what_was_recorded_compares_equal_and_anything_else_fails(
     assert len(json.loads(file.read_text())) == 2
 
 
-def test_rows_of_real_solves_repeat_to_the_bit() -> None:
+def test_rows_of_real_solves_repeat_to_the_bit(shared_data: Path) -> None:
     tasks = dict(list(golden.of_ecg2o())[:7])
     assert [task() for task in tasks.values()] == [task() for task in tasks.values()]

@@ -189,16 +189,16 @@ def test_quaternion_orders() -> None:
     quarter = SO3.exp([0.0, 0.0, PI / 2])  # about z: x goes to y
     np.testing.assert_allclose(quarter, [h, 0, 0, h], atol=1e-15)
     np.testing.assert_allclose(SO3.act(quarter, [1.0, 0.0, 0.0]), [0, 1, 0], atol=1e-15)
-    np.testing.assert_allclose(SO3.from_quaternion_wxyz([2, 0, 0, 2]), [h, 0, 0, h], atol=1e-15)
-    np.testing.assert_allclose(SO3.from_quaternion_xyzw([0, 0, -2, -2]), [h, 0, 0, h], atol=1e-15)
-    np.testing.assert_allclose(SO3.to_quaternion_xyzw(-quarter), [0, 0, h, h], atol=1e-15)
-    np.testing.assert_allclose(SO3.to_quaternion_wxyz(-quarter), [h, 0, 0, h], atol=1e-15)
+    np.testing.assert_allclose(SO3.from_quaternion([2, 0, 0, 2], order="wxyz"), [h, 0, 0, h], atol=1e-15)
+    np.testing.assert_allclose(SO3.from_quaternion([0, 0, -2, -2], order="xyzw"), [h, 0, 0, h], atol=1e-15)
+    np.testing.assert_allclose(SO3.to_quaternion(-quarter, order="xyzw"), [0, 0, h, h], atol=1e-15)
+    np.testing.assert_allclose(SO3.to_quaternion(-quarter, order="wxyz"), [h, 0, 0, h], atol=1e-15)
 
 
 def test_against_scipy(rng: Generator) -> None:
     d = rng.standard_normal((50, 3))
     x, peer = SO3.exp(d), Rotation.from_rotvec(d)
-    assert_close(SO3.from_quaternion_xyzw(peer.as_quat()), x)
+    assert_close(SO3.from_quaternion(peer.as_quat(), order="xyzw"), x)
     assert_close(SO3.to_matrix(x), peer.as_matrix())
     assert_close(SO3.from_matrix(peer.as_matrix()), x)
     assert_close(SO3.from_rpy(d[:, 0], d[:, 1], d[:, 2]), SO3.from_matrix(Rotation.from_euler("xyz", d).as_matrix()))
@@ -231,7 +231,7 @@ def test_rotation_matrices_come_back(rng: Generator) -> None:
     half_turns = np.array(
         [[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1], [0, 0.6, 0.8, 0], [0.5, 0.5, 0.5, 0.5], [1, 0, 0, 0]]
     )
-    x = np.concatenate([SO3.random(rng, (200,)), SO3.from_quaternion_wxyz(half_turns)])
+    x = np.concatenate([SO3.random(rng, (200,)), SO3.from_quaternion(half_turns, order="wxyz")])
     back = SO3.from_matrix(SO3.matrix(x))
     assert_close(SO3.matrix(back), SO3.matrix(x), 2e-15)
     pose = SE3.random(rng, (2, 5))
@@ -252,9 +252,9 @@ def test_nearest_rotation(rng: Generator) -> None:
 
 def test_refusals() -> None:
     with pytest.raises(UnifgError, match=r"quaternion \(1,\) \[0. 0. 0. 0.\] names no rotation"):
-        SO3.from_quaternion_wxyz([[1, 0, 0, 0], [0, 0, 0, 0]])
+        SO3.from_quaternion([[1, 0, 0, 0], [0, 0, 0, 0]], order="wxyz")
     with pytest.raises(UnifgError, match="names no rotation"):
-        SO3.from_quaternion_xyzw([np.nan, 0, 0, 1])
+        SO3.from_quaternion([np.nan, 0, 0, 1], order="xyzw")
     with pytest.raises(UnifgError, match=r"matrix \(0, 2\) has singular values .* no single nearest"):
         SO3.from_matrix(np.array([[np.eye(3), np.eye(3), np.zeros((3, 3))]]))
     with pytest.raises(UnifgError, match="no single nearest"):

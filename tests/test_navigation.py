@@ -408,7 +408,7 @@ class Doubting:
 
 @pytest.mark.parametrize(
     ("sigma", "arrives"),
-    [((0.01, 0.01, 0.01), True), ((0.04, 0.01, 0.01), False), ((0.01, 0.04, 0.01), False), ((0.01, 0.01, 0.04), False)],
+    [((0.01, 0.01, 0.01), True), ((0.07, 0.01, 0.01), False), ((0.01, 0.07, 0.01), False), ((0.01, 0.01, 0.07), False)],
 )
 def test_who_does_not_know_where_he_is_has_not_arrived(sigma: tuple[float, float, float], arrives: bool) -> None:
     """Believed to be at the goal, by an estimate whose three standard deviations leave what the truth must confirm."""
@@ -418,6 +418,10 @@ def test_who_does_not_know_where_he_is_has_not_arrived(sigma: tuple[float, float
     episode.pilot.estimator = Doubting(episode.pilot.estimator, turn @ np.diag(np.square(sigma)) @ turn.T)
     assert episode._arrived(0) == arrives
     episode.pilot.pose = episode.goals[0] + np.array([0.11, 0.0, 0.0])
+    assert not episode._arrived(0)
+    episode.pilot.pose = episode.goals[0] + np.array([0.06, 0.0, 0.0])
+    assert episode._arrived(0) == arrives
+    episode.pilot.estimator.covariance = 0.05**2 * np.eye(3)  # three of them and 0.06 m are more than 0.2 m
     assert not episode._arrived(0)
 
 

@@ -380,6 +380,27 @@ def test_names_cannot_become_paths_or_markup() -> None:
     assert data_of(page)["title"].startswith("</script>") and legend(page)[0] == "a/b"
 
 
+@pytest.mark.parametrize("word", ["@@VIEWER@@", "@@COMMANDS@@", "@@DATA@@", "@@LIVE@@"])
+def test_words_of_the_template_may_be_names(word: str) -> None:
+    scene = Scene(word)
+    scene.points(word, [[0.0, 1.0]])
+    scene.label(word, [0.0, 0.0])
+    page = scene.html()
+    around = without_viewer(page)  # which stands in it once
+    assert len(around) < 100_000 and around.count("</script>") == 3
+    assert data_of(page)["title"] == data_of(page)["labels"][0]["text"] == legend(page)[0] == word
+    assert word in objects(page)
+
+
+def test_lone_surrogates_may_be_in_names(tmp_path: Path) -> None:
+    scene = Scene("title \ud800")
+    scene.points("name \udc80", [[0.0, 1.0]])
+    scene.label("label \udfff", [0.0, 0.0])
+    page = scene.save(tmp_path / "scene.html").read_text(encoding="utf-8")
+    assert "name %dc80" in objects(page)
+    assert data_of(page)["title"] == "title \ud800" and legend(page)[0] == "name \udc80"
+
+
 def test_long_ways_over_many_ticks_stay_small() -> None:
     """2000 poses in each of 300 frames are 600 000; the page says how many of them it shows."""
     scene = Scene("long", dt=0.1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -64,3 +66,34 @@ def test_the_command_says_what_the_archive_is_behind(
     monkeypatch.setattr(warm, "outdated", lambda: changed)
     assert command.main(["warmup", "--check"]) == (1 if changed else 0)
     assert all(name in capsys.readouterr().out for name in changed)
+
+
+WITHOUT_EXTRAS = """
+import sys
+from importlib.abc import MetaPathFinder
+
+class Missing(MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("pymunk", "matplotlib", "meshcat", "PIL", "tqdm", "yaml"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Missing())
+from unifg.machine.tally import Tally
+from unifg.scenarios import command
+from unifg.scenarios.commands import warm
+
+def perform(name, works, progress, anew):
+    print(name, sum(title.startswith("pose graph") for title, _ in works()))
+    return Tally()
+
+warm.perform = perform
+sys.exit(command.main(["warmup"]))
+"""
+
+
+def test_the_library_is_compiled_without_extras() -> None:
+    done = subprocess.run([sys.executable, "-c", WITHOUT_EXTRAS], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("library 2\n")
+    assert "scenarios are left out, they need pymunk: pip install 'unifg[scenarios]'" in done.stdout
+    assert warm.missing() == ""

@@ -166,7 +166,7 @@ def solve(
         callback: called with every row of the history; returning True ends the solve.
         tolerance: of the KKT test.
         time_limit: seconds for both together.
-        verbose: log one line per iteration.
+        verbose: log one line per iteration, or print it where logging is not configured.
 
     Raises:
         GraphError: when the graph, guess or data is malformed.

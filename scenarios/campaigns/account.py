@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from unifg.scenarios.campaigns.campaign import replay_command
 from unifg.scenarios.campaigns.campaign_plot import outcomes_picture, values_picture
@@ -26,8 +27,9 @@ from unifg.style.figures import write_figure
 from unifg.typing import Array
 from unifg.whole import write_whole
 
-__all__ = ["differences", "outcome_table", "value_table", "write_report"]
+__all__ = ["consistency", "differences", "outcome_table", "value_table", "write_report"]
 
+NEES, DIMENSION = "nees.drawn", 3  # measure of a drive, and its degrees of freedom
 FIRST = 6  # measures in front where a campaign states none
 LISTED = 200  # failures that are listed
 FOLDER = "report"  # of pictures, inside that of the campaign
@@ -66,6 +68,7 @@ def write_report(folder: Path, against: Path | None = None, any_code: bool = Fal
         for measure in rest:
             inner += [Words(f"{measure}:"), value_table(sheet, measure)]
         blocks.append(Fold(f"{len(rest)} more measures", inner))
+    blocks += consistency(sheet)
     blocks += differences(sheet, shown)
     if against is not None:
         blocks += _beside(sheet, load(against, any_code), shown)
@@ -97,6 +100,27 @@ def value_table(sheet: Sheet, measure: str) -> Table:
         rows.append((*combination, *_told(values)))
     head = (*sheet.axes, "n", "mean", "std", "std %", "95 % interval of the mean", "least", "greatest")
     return Table(head, rows, len(sheet.axes))
+
+
+def consistency(sheet: Sheet) -> list[Block]:
+    """Verdict on the covariances of the estimate, by the NEES of one tick drawn per drive; nothing without drives.
+
+    Draws of different drives are independent, so their mean times their number is chi-squared with three degrees of
+    freedom for each (Bar-Shalom et al. 2001, section 5.4).
+    """
+    drawn = np.array([value for found in sheet.values.get(NEES, {}).values() for value in found.values()])
+    if not len(drawn):
+        return []
+    low, high = (float(2.0 * gammaincinv(0.5 * DIMENSION * len(drawn), p) / len(drawn)) for p in (0.025, 0.975))
+    mean = float(drawn.mean())
+    verdict = "too small" if mean > high else "too large" if mean < low else "consistent with the errors"
+    return [
+        Heading("Consistency of the estimate"),
+        Words(
+            f"Mean NEES of one tick drawn per drive, over {len(drawn)} drives: {mean:.2f}; {DIMENSION} is expected, "
+            f"95 % band {low:.2f} to {high:.2f}. The covariances are {verdict}."
+        ),
+    ]
 
 
 def differences(sheet: Sheet, measures: Sequence[str]) -> list[Block]:

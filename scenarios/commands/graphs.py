@@ -81,6 +81,7 @@ def metrics(solved: SolvedGraph) -> dict[str, Any]:
         "loop_closures": len(graph.closures),
         "landmarks": len(graph.landmarks),
         "sightings": sum(map(len, graph.sightings.values())),
+        "priors": sum(map(len, graph.priors.values())),
         "skipped_lines": dict(graph.skipped),
         "solver": solution.solver,
         "robust": settings.robust,

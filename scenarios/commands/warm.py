@@ -9,23 +9,32 @@ from pathlib import Path
 import unifg as fg
 from unifg.machine import shipped
 from unifg.machine.tally import Tally
-from unifg.scenarios import course, flight, manoeuvres, navigation, safe_flight, velocity_tracking
-from unifg.scenarios.commands.outcome import Progress
-from unifg.scenarios.flying.flight_pilot import COUPLINGS
-from unifg.warming import Job, jobs, perform
+from unifg.warming import Job, Progress, jobs, perform
 
-__all__ = ["outdated", "run", "ship"]
+__all__ = ["missing", "outdated", "run", "ship"]
 
 LIBRARY = Path(fg.__file__).resolve().parent
 
 
+def missing() -> str:
+    """Name of a package that the scenarios need and that is not installed, "" without one."""
+    try:
+        list(_scenarios())
+    except ModuleNotFoundError as error:
+        return error.name or str(error)
+    return ""
+
+
 def run(progress: Progress, anew: bool = False) -> Tally:
-    """Compile what the library and its scenarios can reach, or find that it is there."""
+    """Compile what the library and its scenarios can reach, or find that it is there; no scenarios without extras."""
+    if missing():
+        return perform("library", lambda: list(jobs()), progress, anew)
     return perform("all", lambda: [*jobs(), *_scenarios()], progress, anew)
 
 
 def ship(progress: Progress) -> Path:
     """Compile everything anew and write the archive of half compiled kernels that comes with the library."""
+    list(_scenarios())  # raises without the extras that they need
     with shipped.recording() as recorder:
         run(progress, anew=True)
     recorder.write(shipped.ARCHIVE, _root())
@@ -43,6 +52,10 @@ def _root() -> Path:
 
 
 def _scenarios() -> Iterator[Job]:
+    """Jobs of the scenarios, which need extras."""
+    from unifg.scenarios import course, flight, manoeuvres, navigation, safe_flight, velocity_tracking
+    from unifg.scenarios.flying.flight_pilot import COUPLINGS
+
     for coupling in ("sequential", "joint"):
         drive = navigation.NavigationSettings(coupling=coupling)
         yield f"navigation, {coupling}", partial(navigation.Episode, drive)

@@ -15,7 +15,15 @@ import unifg as fg
 from unifg.horizon import Now, Robot, Window
 from unifg.models import lidar, odometry, unicycle
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.driving.localiser import BEAM_SIGMA, MATCHING
+from unifg.models.odometry import predict
+from unifg.scenarios.driving.localiser import (
+    BEAM_SIGMA,
+    FEWEST_BEAMS,
+    MATCHING,
+    deskewed,
+    least,
+    scan_covariance,
+)
 from unifg.scenarios.seeing.readings import Scan
 from unifg.solvers import GaussNewton
 from unifg.typing import Array, ArrayLike, IntArray
@@ -108,6 +116,7 @@ class Smoother:
 
     Attributes:
         window: the past.
+        covariance: (3, 3) of the present pose, in the tangent space, by what the scans leave unexplained.
     """
 
     def __init__(
@@ -119,16 +128,13 @@ class Smoother:
             solver=GaussNewton(max_iterations=12, step_tolerance=1e-3), rounds=ROUNDS, steady=STEADY,
         )  # fmt: skip
         self._looked = True
+        self._map, self._noise = distance_map, odometry.OdometryNoise()
+        self.covariance = self.window.state_covariance
 
     @property
     def pose(self) -> Array:
         """(3,) present pose by the past alone [m, m, rad]."""
         return self.window.present
-
-    @property
-    def covariance(self) -> Array:
-        """(3, 3) of the present pose, in the tangent space."""
-        return self.window.state_covariance
 
     @property
     def iterations(self) -> int:
@@ -142,16 +148,22 @@ class Smoother:
 
     def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
         """Move the window by odometry (2,), None for none, attach the scan, if there is one, and register it."""
+        skew = np.zeros((3, 3))
         if odometry is not None:
+            self.covariance = predict(self.pose, self.covariance, odometry, dt, self._noise)[1]
             self.window.move(odometry)
+            scan, skew = deskewed(scan, odometry)
         self._looked = scan is not None
         if scan is not None:
             self.look(scan)
         self.window.estimate()
+        if scan is not None and lidar.usable(scan.ranges).sum() >= FEWEST_BEAMS:
+            self.covariance = least(self.covariance, scan_covariance(self._map, scan, self.pose) + skew)
 
     def reset(self, pose: Array, sigma: Array) -> None:
         """Begin anew at a pose (3,), believed with ``sigma`` (3,)."""
         self.window.reset(pose, sigma)
+        self.covariance = np.diag(sigma**2)
 
     def look(self, scan: Scan) -> None:
         """Attach a scan to the present."""

@@ -214,6 +214,8 @@ class Pilot(Generic[PlannerT]):
         )
         if not looked:
             self.estimator.update(seen, wheels, s.dt)
+        if seen is not None and wheels is not None:
+            seen = seen.deskewed(wheels)
         pose = self.pose = self.estimator.pose
         self.clock.split("localise")
         found = None if seen is None else explained(self._map, seen, pose)
@@ -228,6 +230,7 @@ class Pilot(Generic[PlannerT]):
             corrected=found is not None and not self.estimator.refused, share=self.share, predicted=predicted,
             pose=pose, covariance=self.estimator.covariance, wheels=wheels,
             trusted="wheels" not in self.door.refused, asked=self.driven,
+            blind=0.0 if seen is None else seen.blind,
         )  # fmt: skip
         why = self.door.refused.get("lidar", "") or self.estimator.refused
         verdict = self.supervisor.judge(signals.values(), {"fix": why, "odometry": self.door.refused.get("wheels", "")})

@@ -18,6 +18,7 @@ __all__ = ["RAMPS", "DriveSignals"]
 RAMPS: Mapping[str, Ramp] = {
     "fix": Ramp("no scan says where it is", 0.15, 0.2, lost=1.0),  # [s] since the last that did
     "unexplained": Ramp("the scan does not fit the map", 0.45, 0.6, lost=0.6),  # share of beams
+    "blind": Ramp("the lidar sees nothing in a sector", 0.15, 1.0, least=0.3),  # [rad]
     "spread": Ramp("where it is, is known to decimetres only", 0.12, 0.35, lost=0.5),  # [m]
     "plan": Ramp("no plan", 0.45, 1.0, least=0.3),  # [s] since the last; at rest there is nothing to plan from
     "tick": Ramp("ticks take longer than they last", 1.0, 3.0, least=0.3),  # durations of a tick
@@ -50,7 +51,7 @@ class DriveSignals:
         self._dt = dt
         self.motors = MotorLag(dt, most)
         self._fix = self._plan = self._odometry = self._took = 0.0
-        self._share, self._spread = 1.0, 0.0
+        self._share, self._spread, self._blind = 1.0, 0.0, 0.0
         self._asked: deque[Array] = deque([np.zeros(2)], maxlen=LATELY)
         self._missed: deque[float] = deque(maxlen=AGREE)
         self._shifts: deque[tuple[float, float]] = deque(maxlen=WAY)
@@ -68,6 +69,7 @@ class DriveSignals:
         wheels: Array | None,
         trusted: bool,
         asked: Array,
+        blind: float = 0.0,
     ) -> None:
         """Take in what a tick has estimated.
 
@@ -80,7 +82,9 @@ class DriveSignals:
             wheels: (2,) velocities they have made [m/s, rad/s]; None at the first tick.
             trusted: whether they measured these.
             asked: (2,) velocities asked for.
+            blind: width of the widest sector of the scan whose beams are all lost [rad].
         """
+        self._blind = blind
         self._fix = 0.0 if corrected else self._fix + self._dt
         self._share = share if corrected else self._share
         spread = covariance[:2, :2]
@@ -130,6 +134,7 @@ class DriveSignals:
         return {
             "fix": self._fix,
             "unexplained": 1.0 - self._share,
+            "blind": self._blind,
             "spread": self._spread,
             "plan": self._plan,
             "tick": self._took / self._dt,

@@ -2,8 +2,8 @@
 
 Neither the map nor the estimate, the tracker nor the plan is asked. A control is reached in a tick and then braked
 along its arc; where the hull would come nearer to the end of a beam than it may, the control is slowed, as far as
-braking goes. Three neighbouring beams have to agree, so noise and single echoes stop nobody; where most beams ahead
-are lost, the way is not known to be free.
+braking goes. Three neighbouring beams have to agree, so noise and single echoes stop nobody. Where most beams ahead
+are lost, the way is not known to be free; a sector that no beam has looked into is occupied from the hull on.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ BIAS = 0.015  # [m] by which the nearest of many noisy beams looks nearer than w
 COMING = 1e-4  # [m] by which something near already may come nearer
 AHEAD = 0.6  # [rad] to both sides of the motion where beams have to be there
 SEEN = 0.5  # share of them
+STEP = 0.04  # [rad] between places of the rim of the hull beside which nothing is seen
 
 
 @dataclass(frozen=True)
@@ -69,15 +70,18 @@ class LastStop:
         v, omega = control.tolist()
         away = np.abs(np.remainder(scan.angles - (0.0 if v > 0.0 else np.pi) + np.pi, 2.0 * np.pi) - np.pi)
         ahead = away < AHEAD
-        if np.isnan(scan.ranges[ahead]).mean() > 1.0 - SEEN:
+        if not ahead.any() or np.isnan(scan.ranges[ahead]).mean() > 1.0 - SEEN:
             return False
         mean = abs(v) if last is None else 0.5 * (abs(v) + max(last * np.sign(v), 0.0))
         length = mean * self.dt + 0.5 * v * v / self.deceleration
-        ranges = agreed(scan.ranges)
+        ranges = agreed(scan)
         near = ranges < length + self.radius
-        if not near.any():
+        hidden = [begin + np.arange(STEP, width, STEP) for begin, width in scan.unseen.tolist()]
+        angles = np.concatenate([scan.angles[near], *hidden])
+        if not len(angles):
             return True
-        points = ranges[near, None] * np.column_stack([np.cos(scan.angles[near]), np.sin(scan.angles[near])])
+        rim = np.full(len(angles) - int(near.sum()), self.radius)
+        points = np.concatenate([ranges[near], rim])[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
         along = np.linspace(0.0, length, SAMPLES)
         turn = along * omega / abs(v)
         reach = np.sign(v) * along * np.sinc(0.5 * turn / np.pi)  # the chord of the arc
@@ -86,9 +90,10 @@ class LastStop:
         return bool((gap.min(axis=1) >= np.minimum(self.radius - BIAS, gap[:, 0] - COMING)).all())
 
 
-def agreed(ranges: Array) -> Array:
+def agreed(scan: Scan) -> Array:
     """(B,) the middle one of each beam and its neighbours [m]; what is lost is infinitely far."""
-    whole = np.where(np.isnan(ranges), np.inf, ranges)
-    three = np.sort(np.stack([np.roll(whole, 1), whole, np.roll(whole, -1)]), axis=0)
+    whole = np.where(np.isnan(scan.ranges), np.inf, scan.ranges)
+    around = np.concatenate([whole[-1:], whole, whole[:1]] if scan.closed else [whole[:1], whole, whole[-1:]])
+    three = np.sort(np.stack([around[:-2], whole, around[2:]]), axis=0)
     middle: Array = three[1]
     return middle

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from unifg.errors import ScenarioError
-from unifg.lie import wrap_angle
+from unifg.lie import SE2, wrap_angle
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.metrics import spread, statistics, timing
 from unifg.scenarios.ways.polyline import path_length
 from unifg.typing import Array
 
-__all__ = ["episode_metrics", "pose_errors"]
+__all__ = ["consistency", "episode_metrics", "nees", "pose_errors"]
 
 
 def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
@@ -63,6 +63,7 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         "mean_speed_m_per_s": length / duration,
         "min_clearance_m": float(np.min(log.clearance)),
         "localisation_error_m": spread(position),
+        "nees": consistency(log),
         "localisation_error_rad": spread(heading),
         "odometry_error_m": spread(odometry_position),
         "odometry_error_rad": spread(odometry_heading),
@@ -81,6 +82,33 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         "tick_ms": timing(log.tick_ms),
         **statistics(log),
     }
+
+
+def consistency(log: EpisodeLog) -> dict[str, float]:
+    """How well the covariances fit the errors: the mean NEES, and that of one tick drawn by the seed.
+
+    Errors of neighbouring ticks are correlated, so only one tick of a drive is an independent draw of chi-squared with
+    three degrees of freedom.
+    """
+    values = nees(log.estimate, log.true_pose, log.covariance)
+    chosen = np.random.default_rng([56, log.seed, len(values)]).integers(len(values))
+    return {"mean": float(values.mean()), "drawn": float(values[chosen])}
+
+
+def nees(estimate: Array, truth: Array, covariance: Array) -> Array:
+    """Normalised estimation error squared e' P^-1 e (Bar-Shalom et al. 2001, section 5.4), three on average.
+
+    Args:
+        estimate: (n, 3) [m, m, rad].
+        truth: (n, 3) [m, m, rad].
+        covariance: (n, 3, 3) in the tangent space at the estimate.
+
+    Returns:
+        (n,).
+    """
+    error = SE2.local(estimate, truth)
+    found: Array = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+    return found
 
 
 def pose_errors(estimate: Array, truth: Array) -> tuple[Array, Array]:

@@ -142,6 +142,7 @@ class MonteCarlo:
         if odometry is not None:
             u = np.asarray(odometry, dtype=np.float64)[None]
             self._since = unicycle.step(self._since[None], u, dt)[0]
+            scan = None if scan is None else scan.deskewed(u[0])
         far = np.hypot(*self._since[:2]) >= self.own.moved[0] or abs(self._since[2]) >= self.own.moved[1]
         if scan is None or not (far or self._fresh) or not lidar.usable(scan.ranges).any():
             self.pose = SE2.compose(self._mean[None], self._since[None])[0]

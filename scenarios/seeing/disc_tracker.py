@@ -236,8 +236,7 @@ class DiscTracker:
         offset = centre - pose[:2]
         distance = np.linalg.norm(offset, axis=1)
         bearing = np.arctan2(offset[:, 1], offset[:, 0]) - pose[2]
-        spacing = 2.0 * np.pi / len(scan.angles)
-        half = np.maximum(0.5 * rows.radius[which] / np.maximum(distance, 0.1), 0.6 * spacing)
+        half = np.maximum(0.5 * rows.radius[which] / np.maximum(distance, 0.1), 0.6 * scan.spacing)
         away = np.abs((scan.angles - bearing[:, None] + np.pi) % (2.0 * np.pi) - np.pi)
         aimed = (away < half[:, None]) & ~np.isnan(scan.ranges)
         clear = aimed & (scan.ranges > (distance + 0.1)[:, None])

@@ -101,7 +101,7 @@ class DiscFinder:
         clusters = self._cluster(scan, points, unexplained) if unexplained.any() else None
         if clusters is None:
             return Discs.none()
-        centre, radius, radius_sigma = self._fit(clusters, 2.0 * np.pi / len(scan.angles))
+        centre, radius, radius_sigma = self._fit(clusters, scan.spacing)
         return Discs(centre @ rotation.T + (x, y), radius, radius_sigma, np.linalg.norm(centre, axis=1))
 
     def _cluster(self, scan: Scan, points: Array, unexplained: BoolArray) -> _Clusters | None:
@@ -109,9 +109,8 @@ class DiscFinder:
 
         Returns None when nothing is left.
         """
-        beams = len(points)
-        spacing = 2.0 * np.pi / beams
-        first = int(np.argmin(unexplained))  # an explained beam: no cluster crosses it
+        beams, spacing = len(points), scan.spacing
+        first = int(np.argmin(unexplained)) if scan.closed else 0  # an explained beam: no cluster crosses it
         order = (np.flatnonzero(np.roll(unexplained, -first)) + first) % beams
         chosen = points[order]
         ranges = scan.ranges[order]
@@ -133,8 +132,9 @@ class DiscFinder:
         ends = np.append(starts[1:], len(label)) - 1
         label = np.cumsum(np.diff(label, prepend=label[:1]) != 0)
         # NaN compares False: next to a lost beam an edge is not in plain view.
-        before = scan.ranges[(order[starts] - 1) % beams] > ranges[starts] + _BEHIND
-        after = scan.ranges[(order[ends] + 1) % beams] > ranges[ends] + _BEHIND
+        around = scan.ranges if scan.closed else np.append(scan.ranges, np.nan)
+        before = around[(order[starts] - 1) % len(around)] > ranges[starts] + _BEHIND
+        after = around[(order[ends] + 1) % len(around)] > ranges[ends] + _BEHIND
         filled = ((order[ends] - order[starts]) % beams) * spacing
         return _Clusters(
             points=chosen,

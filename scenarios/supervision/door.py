@@ -69,7 +69,7 @@ class Door:
 
         Args:
             scan: as it arrived; None where none did.
-            now: [s]. A scan without a stamp counts as new.
+            now: [s]. A scan whose stamp is None counts as new.
         """
         found, wrong = self._look(scan, now)
         self._note("lidar", wrong)
@@ -81,12 +81,14 @@ class Door:
         ranges, angles = _numbers(scan.ranges, (self._beams,)), _numbers(scan.angles, (self._beams,))
         if ranges is None or angles is None or not np.isfinite(angles).all():
             return None, "not the size of a scan"
-        stamp = _number(scan.time)
+        stamp = now if scan.time is None else _number(scan.time)
+        if math.isnan(stamp):
+            return None, "its time is not a number"
         if stamp > now + EARLY:
             return None, "from the future"
         if now - stamp > self.settings.oldest + EARLY:
             return None, "too old"
-        if stamp <= self._time:
+        if scan.time is not None and stamp <= self._time:
             return None, "not newer than the last"
         if self._repeats(ranges):
             return None, "the last one once more"
@@ -95,8 +97,10 @@ class Door:
         if measured.sum() < s.fewest:
             return None, _emptiness(ranges, s.nearest)
         self._last, self._since[:] = ranges.copy(), 0.0
-        self._time = stamp if math.isfinite(stamp) else self._time
-        return Scan(angles, np.where(ranges >= s.nearest, ranges, np.nan), scan.time), ""
+        self._time = stamp
+        turn = _number(scan.turn)
+        turn = turn if 0.0 <= turn <= s.oldest else 0.0
+        return Scan(angles, np.where(ranges >= s.nearest, ranges, np.nan), stamp, turn), ""
 
     def _repeats(self, ranges: Array) -> bool:
         """Whether noise has not changed a single beam though the robot has moved."""

@@ -23,14 +23,15 @@ __all__ = ["DRIVE_FAULTS", "FLIGHT_FAULTS", "DriveFaults", "Fault", "FlightFault
 
 DRIVE_FAULTS = (
     "lidar-nan", "lidar-inf", "lidar-max", "lidar-negative", "lidar-frozen", "lidar-dropped", "lidar-delayed",
-    "beams-missing", "odometry-nan", "odometry-slip", "wheel-dead", "kidnapped", "wrong-map", "solver-timeout",
-    "actuator-lag",
+    "lidar-blind", "beams-missing", "odometry-nan", "odometry-slip", "wheel-dead", "kidnapped", "wrong-map",
+    "solver-timeout", "actuator-lag",
 )  # fmt: skip
 """Of the driving robot."""
 
 FLIGHT_FAULTS = ("detector-lost", "detector-false", "thrust-loss", "gust", "solver-timeout")
 """Of the quadrotor."""
 
+BLIND = 0.3  # [rad] to both sides of straight ahead, where a lidar that is half covered sees nothing
 LATE = 0.4  # [s] by which a delayed scan comes late
 RANGE_MAX = 12.0  # [m]; what a lidar that sees nothing may say
 SPIN = 1.6  # wheels that slip turn so many times as far as the robot goes
@@ -127,6 +128,8 @@ class DriveFaults(_Faults):
             return replace(scan, angles=scan.angles[:-1], ranges=scan.ranges[:-1])
         if self._frozen is not None and self._frozen is not scan:
             return replace(self._frozen, time=now)  # with a stamp that does not tell
+        if self.hold("lidar-blind", now):
+            return replace(scan, ranges=np.where(np.abs(scan.angles) < BLIND, math.nan, scan.ranges))
         flat = {"lidar-nan": math.nan, "lidar-inf": math.inf, "lidar-max": RANGE_MAX}
         for kind, value in flat.items():
             if self.hold(kind, now):

@@ -20,7 +20,7 @@ import pymunk
 
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
-from unifg.scenarios.options import not_negative, option, share
+from unifg.scenarios.options import not_negative, option, positive, share
 from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.worlds.drivetrain import Drivetrain, Wheels, slip_at
 from unifg.scenarios.worlds.rectangles import wall_rectangles
@@ -43,7 +43,7 @@ _WALLS = -1  # owner of all walls together; obstacles are owned by their index
 
 @dataclass(frozen=True)
 class LidarModel:
-    """Lidar at the robot's centre, beams evenly over a full turn from -pi.
+    """Lidar at the robot's centre, beams evenly over its field of view.
 
     Attributes:
         beams: number of beams.
@@ -52,7 +52,8 @@ class LidarModel:
         dropout: probability that a beam is lost.
         clutter: probability that a beam returns too soon, from anywhere before what it should have met.
         mixed: probability that a beam beside an edge returns from between what its neighbours meet.
-        turn: duration of one turn [s], during which the robot moves; the robot takes all beams for those of its end.
+        turn: duration of one turn [s], during which the robot moves.
+        field: of view, its middle ahead [rad]; a full turn begins behind.
     """
 
     beams: int = 360
@@ -62,11 +63,18 @@ class LidarModel:
     clutter: float = option(0.0, text=share, metavar="SHARE")
     mixed: float = option(0.0, text=share, metavar="SHARE")
     turn: float = option(0.0, text=not_negative, metavar="S", flag="scan-time")
+    field: float = option(2.0 * math.pi, text=positive, metavar="RAD", flag="field-of-view")
+
+    def __post_init__(self) -> None:
+        """Refuse a field of view that is none."""
+        if not 0.0 < self.field <= 2.0 * math.pi + 1e-9:
+            raise ScenarioError(f"the lidar's field of view must be in (0, 2 pi] rad, got {self.field:g}")
 
     @property
     def angles(self) -> Array:
         """(B,) beam directions in the body frame [rad]."""
-        return -np.pi + 2.0 * np.pi * np.arange(self.beams) / self.beams
+        ends = self.beams if self.field >= 2.0 * math.pi - 1e-9 else self.beams - 1
+        return -0.5 * self.field + self.field * np.arange(self.beams) / ends
 
 
 @dataclass(frozen=True)
@@ -286,7 +294,7 @@ class World:
         seen = np.isfinite(ranges)
         ranges[seen] = np.clip(ranges[seen] + noise[seen], 0.0, reach)
         ranges[lost] = np.nan
-        return Scan(self._angles.copy(), ranges, self.time)
+        return Scan(self._angles.copy(), ranges, self.time, lidar.turn)
 
     def _track(self, times: Array) -> Array:
         """(n, 3) where the robot was at times (n,) from now on, none of them positive [m, m, rad]."""

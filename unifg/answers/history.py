@@ -7,6 +7,7 @@ value. The square root of the sum of squares over a term (for scalar costs the s
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -165,9 +166,18 @@ class History(list[Iteration]):
         return draw_descent(np.array([row.cost for row in self]), errors)
 
 
+logger = logging.getLogger("unifg")
 HEADER = (
     f"{'iter':>4} {'cost':>13} {'station.':>9} {'violation':>9} {'complem.':>9} {'|step|':>9} {'length':>7}  details"
 )
+
+
+def show(text: str) -> None:
+    """Log a line, or write it to standard error where logging would drop it."""
+    if logger.hasHandlers() and logger.isEnabledFor(logging.INFO):
+        logger.info(text)
+    else:
+        logging.StreamHandler().emit(logger.makeRecord(logger.name, logging.INFO, "", 0, text, (), None))
 
 
 def line(row: Iteration) -> str:

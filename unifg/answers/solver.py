@@ -14,7 +14,7 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 
 from unifg.answers.conditioning import HARDLY
-from unifg.answers.history import HEADER, Deferred, Iteration, factor_norms, line
+from unifg.answers.history import HEADER, Deferred, Iteration, factor_norms, line, show
 from unifg.answers.incumbent import Incumbent, Incumbents
 from unifg.answers.multipliers import Slopes, estimated
 from unifg.answers.optimality import infeasible_stationary, optimality, within_bounds
@@ -105,7 +105,8 @@ class Solver(Backend):
         tolerance: for the KKT test of :mod:`unifg.answers.optimality`.
         max_iterations: iterations (linear systems or subproblems solved) before giving up.
         time_limit: seconds before giving up, checked once an iteration.
-        verbose: log one line per iteration at level INFO to the logger ``unifg``.
+        verbose: log one line per iteration at level INFO to the logger ``unifg``; where logging is not configured for
+            it, the lines go to standard error.
         keep_values: keep the values of every iterate in the history, for pictures of a solve.
         keep_residuals: keep the residual norm of every factor in the history, one number per factor and row.
         search_iterations: the first so many steps use the search Jacobians of residuals that have one, and are taken
@@ -231,7 +232,7 @@ class SolveState:
         self.slopes = Slopes(program)
         self.iterations = 0
         if solver.verbose:
-            logger.info(HEADER)
+            show(HEADER)
         self.values, self.multipliers, self.penalties = values, multipliers, np.zeros(len(multipliers))
         self.alone = not (self.watched or solver.search_iterations) and solver.runs_alone(program)
         if not self.alone:
@@ -277,7 +278,7 @@ class SolveState:
             deferred()
         self.history.append(row)
         if self._solver.verbose:
-            logger.info(line(row))
+            show(line(row))
         self.status = self._decide_in_time()
         if self._callback is not None and self._callback(row) and self.status is None:
             self.status = Status.INTERRUPTED

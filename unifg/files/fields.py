@@ -6,6 +6,7 @@ first that is wrong.
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 import reprlib
@@ -20,6 +21,8 @@ from unifg.typing import Array, IntArray
 
 __all__ = ["decimal", "finite", "integer", "norms", "read_fields"]
 
+logger = logging.getLogger("unifg")
+NEAR = 1e-3  # distance from a rotation that is not remarked
 _EXACT = float(2**53)  # whole numbers up to here are exact in float64
 _WHOLE = re.compile(r"[+-]?[0-9]+")
 _SMALLEST_NORM, _LARGEST_NORM = 1e-6, 1e6  # of a quaternion that says something about a rotation
@@ -115,12 +118,13 @@ def read_fields(
     return whole, table
 
 
-def norms(quaternions: Array, place: Callable[[int], str]) -> Array:
-    """What quaternions are to be divided by.
+def norms(quaternions: Array, place: Callable[[int], str], say: Callable[[str], None] = logger.warning) -> Array:
+    """What quaternions are to be divided by; norms farther than 1e-3 from one are remarked.
 
     Args:
         quaternions: (n, 4).
         place: what says where one of them stands.
+        say: takes the remark.
 
     Returns:
         (n,), exactly one where a quaternion is of norm one but for rounding.
@@ -135,5 +139,11 @@ def norms(quaternions: Array, place: Callable[[int], str]) -> Array:
         k = int(bad[0])
         long = math.hypot(*quaternions[k].tolist())
         raise FileFormatError(f"{place(k)}: the quaternion {quaternions[k]} has norm {long:g}, not one")
+    far = np.flatnonzero(np.abs(np.sqrt(squared) - 1.0) > NEAR)
+    if far.size:
+        say(
+            f"{far.size} of {len(quaternions)} quaternions have norms farther than {NEAR:g} from one and were "
+            f"normalised, first {place(int(far[0]))} of norm {np.sqrt(squared[far[0]]):.6g}"
+        )
     found: Array = np.where(np.abs(squared - 1.0) <= _UNIT, 1.0, np.sqrt(squared))
     return found

@@ -9,7 +9,9 @@
 ``EDGE_SE2_XY``          pose landmark x y and 3 numbers
 ``EDGE_BEARING_SE2_XY``  pose landmark bearing information; ``EDGE_RANGE_SE2_XY`` with a distance
 ``EDGE_SE3_TRACKXYZ``    pose landmark parameter x y z and 6 numbers
-``PARAMS_SE3OFFSET``     parameter x y z qx qy qz qw: place of the sensor of ``EDGE_SE3_TRACKXYZ`` on the body
+``PARAMS_SE3OFFSET``     parameter x y z qx qy qz qw: place of the sensor on the body
+``EDGE_PRIOR_SE2``       pose x y theta and 6 numbers; ``EDGE_PRIOR_SE2_XY`` pose x y and 3 numbers
+``EDGE_SE3_PRIOR``       pose parameter x y z qx qy qz qw and 21 numbers; also ``EDGE_PRIOR_SE3``, and without parameter
 ``FIX``                  id ...: known vertices
 ``BR``                   GTSAM: pose landmark bearing range and two standard deviations
 ``ODOMETRY``             GTSAM: i j dx dy dtheta and the upper triangle of the *covariance*, row by row (6 numbers)
@@ -23,7 +25,10 @@ a spanning tree of the edges. Which *residual* an information matrix belongs to 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from dataclasses import fields as fields_of
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +52,7 @@ from unifg.files.tagged import (
 )
 from unifg.lie import SE2, SE3
 from unifg.pose_graphs.information import Repair
-from unifg.pose_graphs.pose_graph import Edges, PoseGraph, Sightings
+from unifg.pose_graphs.pose_graph import Edges, PoseGraph, Priors, Sightings
 from unifg.typing import Array, IntArray
 
 __all__ = ["parse_g2o", "read_g2o", "write_g2o"]
@@ -55,16 +60,20 @@ __all__ = ["parse_g2o", "read_g2o", "write_g2o"]
 _POSE = {3: "id x y theta", 7: "id x y z qx qy qz qw"}
 _EDGE = {3: "i j dx dy dtheta", 7: "i j dx dy dz qx qy qz qw"}
 _SMALLEST_SIGMA = 1e-12  # [m] or [rad]
-_KNOWN = {
-    "VERTEX_SE2", "EDGE_SE2", "VERTEX_XY", "EDGE_SE2_XY", "EDGE_BEARING_SE2_XY", "EDGE_RANGE_SE2_XY", "BR",
+_PLANAR = {
+    "VERTEX_SE2", "EDGE_SE2", "VERTEX_XY", "EDGE_SE2_XY", "EDGE_BEARING_SE2_XY", "EDGE_RANGE_SE2_XY", "BR", "FIX",
+    "ODOMETRY", "LANDMARK", "EDGE_PRIOR_SE2", "EDGE_PRIOR_SE2_XY",
+}  # fmt: skip
+_SPATIAL_PRIORS = ("EDGE_SE3_PRIOR", "EDGE_PRIOR_SE3")  # as g2o spells it, and as its other tags are spelled
+_SPATIAL = {
     "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "VERTEX_TRACKXYZ", "EDGE_SE3_TRACKXYZ", "PARAMS_SE3OFFSET", "FIX",
-    "ODOMETRY", "LANDMARK",
+    *_SPATIAL_PRIORS,
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """Measurements of one kind: identifiers (n, 2), lines they stand in (n,), values (n, p), information (n, q, q)."""
+    """Measurements of one kind: identifiers (n, 2), or (n, 1) of priors, lines (n,), values (n, p), information."""
 
     names: NDArray[np.int64]
     lines: IntArray
@@ -94,7 +103,6 @@ def read_g2o(path: str | Path, limits: Limits = LIMITS, *, repair: Repair | None
 
 def parse_g2o(file: TaggedFile, repair: Repair | None = None) -> PoseGraph:
     """The pose graph of a file that has been read already; see `read_g2o`."""
-    skipped = report_skipped(file, _KNOWN)
     planar, spatial = "VERTEX_SE2" in file, "VERTEX_SE3:QUAT" in file
     given = planar or spatial
     if not given:
@@ -102,14 +110,17 @@ def parse_g2o(file: TaggedFile, repair: Repair | None = None) -> PoseGraph:
     if planar == spatial:
         what = "both VERTEX_SE2 and VERTEX_SE3:QUAT" if planar else "neither VERTEX_SE2 nor VERTEX_SE3:QUAT"
         raise FileFormatError(f"{file.path}: found {what} lines; a pose graph has poses of one kind")
+    skipped = report_skipped(file, *((_PLANAR, "in the plane") if planar else (_SPATIAL, "in space")))
     remarks = Remarks(file, repair)
-    edges = _planar_edges(file) if planar else _spatial_edges(file)
-    sightings = _planar_sightings(file) if planar else _spatial_sightings(file)
+    offsets = _Offsets(file, remarks)
+    edges = _planar_edges(file) if planar else _spatial_edges(file, remarks)
+    sightings = _planar_sightings(file) if planar else _spatial_sightings(file, offsets)
+    priors = _planar_priors(file) if planar else _spatial_priors(file, offsets, remarks)
     if given:
         vertices = file.block("VERTEX_SE2" if planar else "VERTEX_SE3:QUAT", 1, _POSE[3 if planar else 7])
         points = file.block("VERTEX_XY", 1, "id x y") if planar else file.block("VERTEX_TRACKXYZ", 1, "id x y z")
         ids, point_ids = vertices.integers[:, 0], points.integers[:, 0]
-        poses = vertices.numbers if planar else spatial_poses(file, vertices, vertices.numbers)
+        poses = vertices.numbers if planar else spatial_poses(file, vertices, vertices.numbers, remarks.say)
         landmarks = points.numbers
         distinct(file, np.concatenate([ids, point_ids]), np.concatenate([vertices.lines, points.lines]))
     else:
@@ -133,12 +144,21 @@ def parse_g2o(file: TaggedFile, repair: Repair | None = None) -> PoseGraph:
         )
         for kind, seen in sightings.items()
     }
-    report_isolated(file, "pose", ids, np.concatenate([first, second, *(seen.pose for seen in looked.values())]))
+    held = {
+        kind: Priors(
+            places.of(seen.names[:, 0], seen.lines, "pose"),
+            seen.values,
+            remarks.weights(f"priors '{kind}'", seen.information, np.repeat(seen.names, 2, axis=1), seen.lines),
+        )
+        for kind, seen in priors.items()
+    }
+    touched = [first, second, *(seen.pose for seen in (*looked.values(), *held.values()))]
+    report_isolated(file, "pose", ids, np.concatenate(touched))
     seen_points = [np.zeros(0, dtype=np.intp), *(seen.landmark for seen in looked.values())]
     report_isolated(file, "landmark", point_ids, np.concatenate(seen_points))
     found = PoseGraph(
         ids, poses, joined, point_ids, landmarks, looked, _fixed(file, places, point_places), skipped,
-        remarks=tuple(remarks.sentences),
+        remarks=tuple(remarks.sentences), priors=held,
     )  # fmt: skip
     return found if given else placed_along(file, found)
 
@@ -180,22 +200,33 @@ def write_g2o(path: str | Path, pose_graph: PoseGraph) -> Path:
         else:
             name = {"point": "EDGE_SE2_XY", "bearing": "EDGE_BEARING_SE2_XY", "range": "EDGE_RANGE_SE2_XY"}[kind]
             lines += decimal_lines(path, name, names, numbers)
+    for kind, held in pose_graph.priors.items():
+        numbers = np.concatenate([_scalar_last(held.measured), upper_triangle(held.information)], axis=1)
+        names = [ids[held.pose]]
+        if spatial:
+            if "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1" not in lines:
+                lines.append("PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1")
+            lines += decimal_lines(path, "EDGE_SE3_PRIOR", [*names, np.zeros(len(held), dtype=np.int64)], numbers)
+        else:
+            lines += decimal_lines(path, "EDGE_PRIOR_SE2" if kind == "pose" else "EDGE_PRIOR_SE2_XY", names, numbers)
     return write_text(path, "\n".join(lines) + "\n")
 
 
-def spatial_poses(file: TaggedFile, block: Block, poses: Array) -> Array:
+def spatial_poses(file: TaggedFile, block: Block, poses: Array, say: Callable[[str], None]) -> Array:
     """SE3 poses from x y z qx qy qz qw, quaternions normalised; those of norm one stay as they are, bit by bit.
+
+    Norms farther than 1e-3 from one are remarked through ``say``.
 
     Raises:
         FileFormatError: a quaternion, named by its line, is nearly zero or huge.
     """
-    norm = norms(poses[:, 3:], lambda row: f"{file.path}, line {block.lines[row]}")
+    norm = norms(poses[:, 3:], lambda row: f"{file.path}, line {block.lines[row]}", say)
     return np.column_stack([poses[:, :3], poses[:, 6] / norm, poses[:, 3:6] / norm[:, None]])
 
 
 def _scalar_last(poses: Array) -> Array:
     """Spatial poses in the order of the file; planar ones as they are."""
-    return poses if poses.shape[1] == 3 else poses[:, [0, 1, 2, 4, 5, 6, 3]]
+    return poses if poses.shape[1] < 7 else poses[:, [0, 1, 2, 4, 5, 6, 3]]
 
 
 def _planar_edges(file: TaggedFile) -> _Seen:
@@ -213,11 +244,11 @@ def _planar_edges(file: TaggedFile) -> _Seen:
     )
 
 
-def _spatial_edges(file: TaggedFile) -> _Seen:
+def _spatial_edges(file: TaggedFile, remarks: Remarks) -> _Seen:
     """The same in space, where GTSAM has g2o's tag only."""
     edges = file.block("EDGE_SE3:QUAT", 2, f"{_EDGE[7]} {triangle_names(6)}")
-    values, information = spatial_poses(file, edges, edges.numbers[:, :7]), from_triangle(edges.numbers[:, 7:], 6)
-    return _Seen(edges.integers, edges.lines, values, information)
+    values = spatial_poses(file, edges, edges.numbers[:, :7], remarks.say)
+    return _Seen(edges.integers, edges.lines, values, from_triangle(edges.numbers[:, 7:], 6))
 
 
 def _inverted(file: TaggedFile, block: Block, triangles: Array, dim: int) -> Array:
@@ -272,19 +303,72 @@ def _planar_sightings(file: TaggedFile) -> dict[str, _Seen]:
     return found
 
 
-def _spatial_sightings(file: TaggedFile) -> dict[str, _Seen]:
+class _Offsets:
+    """Places of sensors on the body."""
+
+    def __init__(self, file: TaggedFile, remarks: Remarks) -> None:
+        """Read them."""
+        block = file.block("PARAMS_SE3OFFSET", 1, "parameter x y z qx qy qz qw")
+        distinct(file, block.integers[:, 0], block.lines)
+        self._places = Places(file, block.integers[:, 0])
+        self._poses = spatial_poses(file, block, block.numbers, remarks.say)
+
+    def of(self, parameters: NDArray[np.int64], lines: IntArray) -> Array:
+        """(n, 7) body_T_sensor of parameters (n,) named in lines (n,)."""
+        return self._poses[self._places.of(parameters, lines, "PARAMS_SE3OFFSET")]
+
+
+def _spatial_sightings(file: TaggedFile, offsets: _Offsets) -> dict[str, _Seen]:
     """The same in space. A sensor that is not at the origin of the body is moved there, with its information."""
     block = file.block("EDGE_SE3_TRACKXYZ", 3, f"pose landmark parameter x y z {triangle_names(3)}")
     if not len(block):
         return {}
-    offsets = file.block("PARAMS_SE3OFFSET", 1, "parameter x y z qx qy qz qw")
-    distinct(file, offsets.integers[:, 0], offsets.lines)
-    body_T_sensor = spatial_poses(file, offsets, offsets.numbers)
-    used = body_T_sensor[Places(file, offsets.integers[:, 0]).of(block.integers[:, 2], block.lines, "PARAMS_SE3OFFSET")]
+    used = offsets.of(block.integers[:, 2], block.lines)
     turn = SE3.matrix(used)[:, :3, :3]
-    information = turn @ from_triangle(block.numbers[:, 3:], 3) @ np.swapaxes(turn, 1, 2)
-    information = 0.5 * (information + np.swapaxes(information, 1, 2))
+    information = _transported(turn, from_triangle(block.numbers[:, 3:], 3))
     return {"point": _Seen(block.integers[:, :2], block.lines, SE3.act(used, block.numbers[:, :3]), information)}
+
+
+def _transported(by: Array, information: Array) -> Array:
+    """(n, d, d) information of errors ``by.T e``, symmetric to the bit."""
+    moved = by @ information @ np.swapaxes(by, 1, 2)
+    return np.asarray(0.5 * (moved + np.swapaxes(moved, 1, 2)), dtype=np.float64)
+
+
+def _planar_priors(file: TaggedFile) -> dict[str, _Seen]:
+    """Measurements of single poses by kind."""
+    found = {}
+    for kind, tag, names, size, dim in (
+        ("pose", "EDGE_PRIOR_SE2", "pose x y theta", 3, 3),
+        ("position", "EDGE_PRIOR_SE2_XY", "pose x y", 2, 2),
+    ):
+        block = file.block(tag, 1, f"{names} {triangle_names(dim)}")
+        if len(block):
+            information = from_triangle(block.numbers[:, size:], dim)
+            found[kind] = _Seen(block.integers, block.lines, block.numbers[:, :size].copy(), information)
+    return found
+
+
+def _spatial_priors(file: TaggedFile, offsets: _Offsets, remarks: Remarks) -> dict[str, _Seen]:
+    """The same in space.
+
+    The error Log(measured^-1 x offset) of a sensor is Ad(offset^-1) times that of the body, whose pose was measured as
+    measured offset^-1.
+    """
+    fields = f"x y z qx qy qz qw {triangle_names(6)}"
+    parts = []
+    for tag in _SPATIAL_PRIORS:
+        with_offset = any(len(words) != 29 for _, words in islice(file.words(tag), 1))  # 29 are those of no parameter
+        block = file.block(tag, 1 + with_offset, f"pose {'parameter ' if with_offset else ''}{fields}")
+        measured = spatial_poses(file, block, block.numbers[:, :7], remarks.say)
+        information = from_triangle(block.numbers[:, 7:], 6)
+        if with_offset:
+            back = SE3.inverse(offsets.of(block.integers[:, 1], block.lines))
+            measured = SE3.compose(measured, back)
+            information = _transported(np.swapaxes(SE3.adjoint(back), 1, 2), information)
+        parts.append(_Seen(block.integers[:, :1], block.lines, measured, information))
+    joined = [np.concatenate([getattr(part, name.name) for part in parts]) for name in fields_of(_Seen)]
+    return {"pose": _Seen(*joined)} if len(joined[0]) else {}
 
 
 def _fixed(file: TaggedFile, *places: Places) -> tuple[int, ...]:

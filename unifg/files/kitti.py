@@ -5,17 +5,21 @@ Format: the README of https://www.cvlibs.net/datasets/kitti/eval_odometry.php.
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
 
 from unifg.errors import FileFormatError
 from unifg.files.contents import LIMITS, Limits, write_text
+from unifg.files.fields import NEAR
 from unifg.files.tables import Table
 from unifg.lie import SE2, SE3
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["read_kitti", "write_kitti"]
+
+logger = logging.getLogger("unifg")
 
 _FIELDS = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
 _ROTATION = 1e-2  # largest |R'R - I| that rounding and single precision excuse
@@ -39,11 +43,16 @@ def read_kitti(path: str | Path, limits: Limits = LIMITS) -> Array:
     matrices = rows.numbers.reshape(-1, 3, 4)
     rotations = matrices[:, :, :3]
     with np.errstate(all="ignore"):
-        right = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2), initial=0.0) < _ROTATION
-        right &= np.linalg.det(rotations) > 0.0
+        off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2), initial=0.0)
+        right = (off < _ROTATION) & (np.linalg.det(rotations) > 0.0)
     if not right.all():
         k = int(np.flatnonzero(~right)[0])
         raise rows.refuse(k, "columns 1 to 3, 5 to 7, 9 to 11 are not a rotation matrix")
+    if (far := np.flatnonzero(off > 2.0 * NEAR)).size:  # of R'R, which is twice as far as R
+        logger.warning(
+            "%d of %d rotation matrices are farther than %g from a rotation, and the nearest is taken; first: %s",
+            len(far), len(off), NEAR, rows.place(int(far[0])),
+        )  # fmt: skip
     full = np.tile(np.eye(4), (len(matrices), 1, 1))
     full[:, :3] = matrices
     return SE3.from_matrix(full)

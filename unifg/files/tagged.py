@@ -208,12 +208,12 @@ def some(names: list[int]) -> str:
     return ", ".join(map(str, names[:5])) + (", ..." if len(names) > 5 else "")
 
 
-def report_skipped(file: TaggedFile, known: set[str]) -> dict[str, int]:
-    """Tags that nobody reads, with their counts, after one warning that names them."""
+def report_skipped(file: TaggedFile, known: set[str], where: str) -> dict[str, int]:
+    """Tags that are not read in a graph in the plane or in space (``where``), with counts; a warning names them."""
     skipped = {tag: count for tag, count in file.counts().items() if tag not in known}
     if skipped:
         named = ", ".join(f"{tag} ({count})" for tag, count in sorted(skipped.items()))
-        logger.warning("%s: lines left out because their tags are not read: %s", file.path, named)
+        logger.warning("%s: lines left out because their tags are not read %s: %s", file.path, where, named)
     return skipped
 
 

@@ -38,7 +38,6 @@ from unifg.typing import Array
 
 __all__ = ["parse_toro", "read_toro", "write_toro"]
 
-_KNOWN = {"VERTEX2", "EDGE2", "VERTEX3", "EDGE3"}
 _PLANAR_ORDER = [0, 1, 3, 5, 2, 4]  # where the row-by-row entries xx xy xt yy yt tt stand in TORO's list ...
 _TO_ROWS = [0, 1, 4, 2, 5, 3]  # ... and TORO's xx xy yy tt xt yt in the row-by-row list
 
@@ -64,7 +63,6 @@ def read_toro(path: str | Path, limits: Limits = LIMITS, *, repair: Repair | Non
 
 def parse_toro(file: TaggedFile, repair: Repair | None = None) -> PoseGraph:
     """The pose graph of a file that has been read already; see `read_toro`."""
-    skipped = report_skipped(file, _KNOWN)
     planar, spatial = "VERTEX2" in file, "VERTEX3" in file
     given = planar or spatial
     if not given:
@@ -72,6 +70,8 @@ def parse_toro(file: TaggedFile, repair: Repair | None = None) -> PoseGraph:
     if planar == spatial:
         what = "both VERTEX2 and VERTEX3" if planar else "neither VERTEX2 nor VERTEX3"
         raise FileFormatError(f"{file.path}: found {what} lines; a pose graph has poses of one kind")
+    size, where = ("2", "in the plane") if planar else ("3", "in space")
+    skipped = report_skipped(file, {f"VERTEX{size}", f"EDGE{size}"}, where)
     if planar:
         vertices = file.block("VERTEX2", 1, "id x y theta")
         edges = file.block("EDGE2", 2, "i j dx dy dtheta Ixx Ixy Iyy Itt Ixt Iyt")
@@ -106,11 +106,12 @@ def write_toro(path: str | Path, pose_graph: PoseGraph) -> Path:
         The path written.
 
     Raises:
-        FileFormatError: the pose graph has landmarks, or a number is not finite.
+        FileFormatError: the pose graph has landmarks or priors, or a number is not finite.
     """
     path, edges, ids = Path(path), pose_graph.edges, pose_graph.ids
-    if len(pose_graph.landmarks):
-        raise FileFormatError(f"{path}: TORO files have no landmarks; write g2o")
+    if len(pose_graph.landmarks) or pose_graph.priors:
+        found = "landmarks" if len(pose_graph.landmarks) else "priors"
+        raise FileFormatError(f"{path}: TORO files have no {found}; write g2o")
     triangle = upper_triangle(edges.information)
     poses, measured, name = pose_graph.poses, edges.measured, "2"
     if poses.shape[1] == 7:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from inspect import cleandoc, getdoc
 from types import FunctionType
 from typing import Any, Literal, TypeAlias
 
 from unifg.errors import GraphError
 from unifg.kernels.kernel import Kernel
+from unifg.lie import Manifold
 from unifg.machine.jit import is_compiled
 from unifg.typing import Array
 
@@ -34,6 +35,7 @@ class Residual:
         rows: m, of a ``function`` that a user has compiled for one factor.
         derivatives: "trace" to insist on exact ones, "trace first" to prefer them to the Jacobian, "differences" to
             refuse them, empty for what is possible.
+        elements: place and manifold of arguments that are elements of one, where a kernel does not say so.
     """
 
     function: Function
@@ -44,6 +46,7 @@ class Residual:
     search_kernel: Kernel | None = None
     rows: int = 0
     derivatives: str = ""
+    elements: tuple[tuple[int, Manifold], ...] = field(default=(), compare=False, repr=False)
 
     def __call__(self, *arguments: Any) -> Array:
         """Evaluate the residual."""

@@ -22,10 +22,12 @@ def doubles(what: str, given: Any, *, term: str | None = None, flags: bool = Fal
         flags: whether an array of booleans is returned as it is.
 
     Raises:
-        GraphError: it is ragged, or holds text, booleans, complex numbers or objects.
+        GraphError: it is ragged or masked, or holds text, booleans, complex numbers or objects.
     """
     if type(given) is np.ndarray and given.dtype == np.float64:
         return given
+    if isinstance(given, np.ma.MaskedArray):
+        raise GraphError(f"{what} is a masked array: fill it, or leave out what is masked by active=", term=term)
     try:
         array = np.asarray(given)
     except Exception as error:

@@ -8,7 +8,7 @@ variables they are given. Jacobians are in right perturbation, X Exp(d); equatio
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from inspect import cleandoc
 from typing import Any, cast
@@ -187,13 +187,15 @@ def _complete(
     assert isinstance(manifold, Manifold)
     functions = functions_of(manifold)
     if isinstance(manifold, Rn):
-        return residual(Kernel(vectors, arguments, manifold.dim, name=name, linear=True))
-    if isinstance(manifold, LieGroup) and functions is not None:
-        return residual(Kernel(groups(manifold, functions), arguments, manifold.dim, name=name))
-    if functions is not None and not isinstance(manifold, LieGroup):
-        return _by_differences(manifold, functions, name)
-    function = batched(manifold)
-    return residual(function, function.derivative, name)
+        made = residual(Kernel(vectors, arguments, manifold.dim, name=name, linear=True))
+    elif isinstance(manifold, LieGroup) and functions is not None:
+        made = residual(Kernel(groups(manifold, functions), arguments, manifold.dim, name=name))
+    elif functions is not None and not isinstance(manifold, LieGroup):
+        made = _by_differences(manifold, functions, name)
+    else:
+        function = batched(manifold)
+        made = residual(function, function.derivative, name)
+    return replace(made, elements=tuple((place, manifold) for place in range(len(arguments))))
 
 
 def _by_differences(manifold: Manifold, functions: Functions, name: str) -> Residual:

@@ -7,6 +7,7 @@ term, over the stacked tangent spaces, holds how they are correlated.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from typing import cast
 
@@ -16,7 +17,7 @@ from unifg.errors import GraphError
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import Residual, residual
 from unifg.lie import SE2, SE3, SE23, SO2, SO3, LieGroup, Manifold, Rn, se2, se3, se23, so2, so3
-from unifg.lie.product import leaves
+from unifg.lie.product import Product, leaves
 from unifg.machine.calls import local_matrix, vector
 from unifg.machine.jit import compiled
 from unifg.typing import Array
@@ -48,7 +49,10 @@ def joint_prior(*manifolds: Manifold, offset: bool = False) -> Residual:
     """
     if not manifolds:
         raise GraphError("joint_prior: name the manifold of at least one variable")
-    return _complete(manifolds, offset)
+    parts = {f"part{k}": manifold for k, manifold in enumerate(manifolds)}
+    offsets = {"offset": Rn(sum(manifold.dim for manifold in manifolds))} if offset else {}
+    reference: Manifold = Product(**parts, **offsets)
+    return replace(_complete(manifolds, offset), elements=tuple(enumerate([*manifolds, reference])))
 
 
 @cache

@@ -19,6 +19,7 @@ from unifg.errors import GraphError
 from unifg.kernels.residuals import Residual, as_residual, residual
 from unifg.kernels.robust import Loss
 from unifg.language.doubles import doubles
+from unifg.language.elements import on_manifolds
 from unifg.language.factors import ManifoldResidual
 from unifg.language.inventory import inventory
 from unifg.language.terms import Constraint, Cost, Fix, Parameter, ScalarCost, Term, prepare_arguments
@@ -355,7 +356,7 @@ class Statement:
                 raise GraphError(f"term '{name or title(function)}': give sigma or information, not both", term=name)
             wrapped = complete(function, arguments, name)
             unique = self._unique(name, wrapped.name, replaced)
-            normal, rows, active, count = self._arguments(unique, arguments, active)
+            normal, rows, active, count = self._arguments(unique, wrapped, arguments, active)
             if robust is not None and (isinstance(robust, type) or not hasattr(robust, "weight")):
                 raise GraphError(
                     f"term '{unique}': robust= must be a loss such as fg.Huber(1.345), found {robust!r}", term=unique
@@ -376,7 +377,7 @@ class Statement:
         with placed(name, arguments):
             wrapped = complete(function, arguments, name)
             unique = self._unique(name, wrapped.name, replaced)
-            normal, rows, active, count = self._arguments(unique, arguments, active)
+            normal, rows, active, count = self._arguments(unique, wrapped, arguments, active)
             size = rows_of(unique, wrapped, normal, count, scalar=True)
             return ScalarCost(unique, wrapped, normal, active, count, size, rows=rows)
 
@@ -393,7 +394,7 @@ class Statement:
         with placed(name, arguments):
             wrapped = complete(function, arguments, name)
             unique = self._unique(name, wrapped.name, replaced)
-            normal, rows, active, count = self._arguments(unique, arguments, active)
+            normal, rows, active, count = self._arguments(unique, wrapped, arguments, active)
             size = rows_of(unique, wrapped, normal, count)
             lower, upper = _given("a constraint", unique, lower, upper)
             lower, upper = check_limits(unique, lower, upper, count, size)
@@ -416,15 +417,13 @@ class Statement:
                     "component, or use constrain with a function",
                     family=selection.family.name,
                 )
-            unique = self._unique(name, f"{selection.family.name} bounds", replaced)
-            normal, rows, active, count = self._arguments(unique, (selection,), None)
+            unique, wrapped = self._unique(name, f"{selection.family.name} bounds", replaced), residual(itself)
+            normal, rows, active, count = self._arguments(unique, wrapped, (selection,), None)
             size = selection.manifold.dim
             lower, upper = _given("a bound", unique, lower, upper)
             lower, upper = check_limits(unique, lower, upper, count, size)
             self._own_data(unique, lower, upper)
-            return Constraint(
-                unique, residual(itself), normal, active, count, size, lower, upper, is_bound=True, rows=rows
-            )
+            return Constraint(unique, wrapped, normal, active, count, size, lower, upper, is_bound=True, rows=rows)
 
     def _fix(self, name: str | None, stated: tuple[Any, ...], replaced: Fix | None = None) -> Fix:
         if len(stated) != 2:
@@ -483,14 +482,14 @@ class Statement:
             self._data.pop(handle.name, None)
 
     def _arguments(
-        self, name: str, arguments: tuple[Any, ...], active: Any
+        self, name: str, wrapped: Residual, arguments: tuple[Any, ...], active: Any
     ) -> tuple[tuple[Any, ...], tuple[bool | None, ...], Any, int]:
         normal, rows, active, count = prepare_arguments(name, arguments, active)
         for argument in normal:
             if isinstance(argument, Selection):
                 self._own(argument, name)
         self._own_data(name, *normal, active)
-        return normal, rows, active, count
+        return on_manifolds(name, wrapped, normal, active), rows, active, count
 
     def _own(self, selection: Selection, term: str) -> None:
         if self.families.get(selection.family.name) is not selection.family:

@@ -180,6 +180,8 @@ def prepare_arguments(
         elif rows[place]:
             what = f"data '{argument.name}'" if isinstance(argument, Data) else f"argument {place}, by fg.each,"
             lengths.append((what, len(argument.value if isinstance(argument, Data) else argument)))
+        elif isinstance(argument, np.ma.MaskedArray):
+            doubles(f"term '{name}': an argument", argument, term=name)
     if not any(isinstance(argument, Selection) for argument in normal):
         raise GraphError(f"term '{name}' has no variable among its arguments: pass a family or a selection", term=name)
     if active is not None:

@@ -25,6 +25,7 @@ from unifg.lie.manifold import LieGroup
 from unifg.lie.series import b_slope, c_slope, c_value, k_curve, k_slope, k_value, x_cot_x
 from unifg.lie.so3 import (
     SO3,
+    Order,
     coefficients,
     half_log,
     half_turn,
@@ -255,6 +256,14 @@ def bend(d: Array, v: Array, out: Array) -> None:
         out[i, 3 + i] += k * pz + slope * wp * wz
 
 
+def _rows(pose: ArrayLike) -> Array:
+    """Poses as an array with a last axis of 7."""
+    x = np.asarray(pose, dtype=np.float64)
+    if x.shape[-1:] != (7,):
+        raise UnifgError(f"poses are (..., 7) arrays, found shape {x.shape}")
+    return x
+
+
 class SE3Group(LieGroup):
     """Rigid motions of space; use the ready-made object ``SE3``.
 
@@ -299,6 +308,24 @@ class SE3Group(LieGroup):
         result[..., :3] = p
         result[..., 3:] = q
         return result
+
+    def from_quaternion(self, pose: ArrayLike, /, *, order: Order) -> Array:
+        """Return the elements of (..., 7) rows, position [m] then quaternion, as TUM and g2o files have them.
+
+        Args:
+            pose: (..., 7).
+            order: of the quaternion, "xyzw" or "wxyz"; see ``SO3.from_quaternion``.
+
+        Raises:
+            UnifgError: as ``SO3.from_quaternion``, or when the last axis has another length than 7.
+        """
+        x = _rows(pose)
+        return self.from_parts(x[..., :3], SO3.from_quaternion(x[..., 3:], order=order))
+
+    def to_quaternion(self, x: ArrayLike, /, *, order: Order) -> Array:
+        """Return (..., 7) rows, position [m] then unit quaternion with w >= 0 in the order "xyzw" or "wxyz"."""
+        x = _rows(x)
+        return self.from_parts(x[..., :3], SO3.to_quaternion(x[..., 3:], order=order))
 
     def from_matrix(self, m: ArrayLike, /) -> Array:
         """Return the poses of (..., 4, 4) homogeneous matrices, with the nearest rotation: ``SO3.from_matrix``.

@@ -14,6 +14,7 @@ logarithm reads the half angle from ``atan2(|v|, w)``, which is accurate at ever
 from __future__ import annotations
 
 import math
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from unifg.lie.so2 import wrap
 from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike, BoolArray
 
+Order: TypeAlias = Literal["wxyz", "xyzw"]
 UNIT = 1e-9  # how far the norm of a valid quaternion may be from 1
 AMBIGUOUS = 1e-14  # gap, over the largest singular value, below which the nearest rotation is anyone's guess
 DRIFT = 4e-15  # of |q|^2; below it a product keeps its digits, so that a zero step changes none
@@ -308,6 +310,16 @@ _normalise, _from_matrix = over_one(normalise, 4, 4), over_one(from_matrix, 9, 4
 _from_rpy, _to_rpy = over_one(from_rpy, 3, 4), over_one(to_rpy, 4, 3)
 
 
+def _reordered(quaternion: ArrayLike, order: Order, by: int) -> Array:
+    """(..., 4) with the scalar rolled from last to first (by 1) or back (by -1), if it is last in ``order``."""
+    q = np.asarray(quaternion, dtype=np.float64)
+    if order not in ("wxyz", "xyzw"):
+        raise UnifgError(f"order= of a quaternion is 'wxyz' or 'xyzw', found {order!r}")
+    if q.shape[-1:] != (4,):
+        raise UnifgError(f"quaternions are (..., 4) arrays, found shape {q.shape}")
+    return np.roll(q, by, axis=-1) if order == "xyzw" else q
+
+
 class SO3Group(LieGroup):
     """Rotations of space; use the ready-made object ``SO3``.
 
@@ -339,13 +351,17 @@ class SO3Group(LieGroup):
 
     # Constructors, and back.
 
-    def from_quaternion_wxyz(self, quaternion: ArrayLike, /) -> Array:
-        """Return the elements of (..., 4) quaternions, scalar first, of any length and sign.
+    def from_quaternion(self, quaternion: ArrayLike, /, *, order: Order) -> Array:
+        """Return the elements of (..., 4) quaternions of any length and sign.
+
+        Args:
+            quaternion: (..., 4).
+            order: "xyzw" for the scalar last, as in ROS, SciPy, TUM and g2o files; "wxyz" for the scalar first.
 
         Raises:
-            UnifgError: when one has no direction (all zero, or not finite).
+            UnifgError: when one has no direction (all zero, or not finite), or there is no such order.
         """
-        q = np.asarray(quaternion, dtype=np.float64)
+        q = _reordered(quaternion, order, 1)
         result = _normalise(q)
         bad = ~np.isfinite(result).all(axis=-1)
         if bad.any():
@@ -354,14 +370,6 @@ class SO3Group(LieGroup):
                 f"quaternion {index or ''} {q[index]} names no rotation: give one of non-zero, finite norm"
             )
         return result
-
-    def from_quaternion_xyzw(self, quaternion: ArrayLike, /) -> Array:
-        """Return the elements of (..., 4) quaternions, scalar last, of any length and sign.
-
-        Raises:
-            UnifgError: when one has no direction (all zero, or not finite).
-        """
-        return self.from_quaternion_wxyz(np.roll(np.asarray(quaternion, dtype=np.float64), 1, axis=-1))
 
     def from_matrix(self, m: ArrayLike, /) -> Array:
         """Return the rotations nearest to (..., 3, 3) matrices in the Frobenius norm.
@@ -397,13 +405,9 @@ class SO3Group(LieGroup):
         """Return ``Rz(yaw) Ry(pitch) Rx(roll)``, (..., 4), for angles [rad] of any shapes that broadcast."""
         return _from_rpy(np.stack(np.broadcast_arrays(roll, pitch, yaw), axis=-1))
 
-    def to_quaternion_wxyz(self, x: ArrayLike, /) -> Array:
-        """Return (..., 4) unit quaternions, scalar first, w >= 0."""
-        return _normalise(x)
-
-    def to_quaternion_xyzw(self, x: ArrayLike, /) -> Array:
-        """Return (..., 4) unit quaternions, scalar last, w >= 0."""
-        return np.roll(_normalise(x), -1, axis=-1)
+    def to_quaternion(self, x: ArrayLike, /, *, order: Order) -> Array:
+        """Return (..., 4) unit quaternions, w >= 0, in the order "xyzw" or "wxyz"; see :meth:`from_quaternion`."""
+        return _reordered(_normalise(x), order, -1)
 
     def to_matrix(self, x: ArrayLike, /) -> Array:
         """Return (..., 3, 3) rotation matrices; the same as :meth:`matrix`."""

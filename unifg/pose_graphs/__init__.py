@@ -6,7 +6,7 @@ from unifg.pose_graphs.generate import Simulated, manhattan, sphere
 from unifg.pose_graphs.information import Repair, indefinite, repaired
 from unifg.pose_graphs.initialise import Start, best_guess, chordal, lago, odometric, starts
 from unifg.pose_graphs.judgement import Judgement, judge
-from unifg.pose_graphs.pose_graph import Edges, PoseGraph, Sightings
+from unifg.pose_graphs.pose_graph import Edges, PoseGraph, Priors, Sightings
 from unifg.pose_graphs.residuals import bearing, bearing_range, chart_between, distance, sighting
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "Edges",
     "Judgement",
     "PoseGraph",
+    "Priors",
     "Repair",
     "Sightings",
     "Simulated",

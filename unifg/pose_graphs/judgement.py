@@ -98,12 +98,15 @@ def judge(pose_graph: PoseGraph, residual: ResidualName = "log") -> Judgement:
     for kind in pose_graph.sightings.values():
         rows += int(np.linalg.matrix_rank(kind.information, hermitian=True).sum())
         touched[kind.pose] = True
-    anchors, known = pose_graph.anchors()
+    for held in pose_graph.priors.values():
+        rows += int(np.linalg.matrix_rank(held.information, hermitian=True).sum())
+        touched[held.pose] = True
+    anchors, known = pose_graph.anchors(priors=True)
     added = ids[anchors][~np.isin(ids[anchors], np.array(pose_graph.fixed_ids, dtype=np.int64))]
     unknown = (len(ids) - len(anchors)) * pose_graph.group.dim
     unknown += (len(pose_graph.landmarks) - len(known)) * pose_graph.group.point_dim
     return Judgement(
-        float(squared.sum()) + pose_graph.seen_chi2(),
+        float(squared.sum()) + pose_graph.seen_chi2(residual),
         rows - unknown,
         np.stack([ids[edges.first[order]], ids[edges.second[order]]], axis=1),
         squared[order],

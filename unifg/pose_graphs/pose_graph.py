@@ -18,10 +18,10 @@ from unifg.kernels.robust import Loss
 from unifg.language.factors import ManifoldResidual, between
 from unifg.language.variables import Family
 from unifg.lie import SE2, SE3, LieGroup, Rn
-from unifg.pose_graphs.residuals import bearing, bearing_range, chart_between, distance, sighting
+from unifg.pose_graphs.residuals import bearing, bearing_range, chart_between, distance, position, sighting
 from unifg.typing import Array, BoolArray, IntArray
 
-__all__ = ["Edges", "Ids", "PoseGraph", "ResidualName", "RobustOn", "Sightings"]
+__all__ = ["Edges", "Ids", "PoseGraph", "Priors", "ResidualName", "RobustOn", "Sightings"]
 
 Ids: TypeAlias = NDArray[np.int64]
 ResidualName: TypeAlias = Literal["log", "g2o"]
@@ -91,6 +91,25 @@ class Sightings:
 
 
 @dataclass(frozen=True, eq=False)
+class Priors:
+    """Absolute measurements of poses.
+
+    Attributes:
+        pose: (k,) positions in `PoseGraph.poses`.
+        measured: (k, p).
+        information: (k, d, d), translation before rotation.
+    """
+
+    pose: IntArray
+    measured: Array
+    information: Array
+
+    def __len__(self) -> int:
+        """Number of priors."""
+        return len(self.pose)
+
+
+@dataclass(frozen=True, eq=False)
 class PoseGraph:
     """Poses in SE(2) or SE(3) with what has been measured between them.
 
@@ -107,6 +126,7 @@ class PoseGraph:
         placed: whether the poses were given; False where a reader had measurements only, and put the poses along a
             spanning tree of them.
         remarks: what else a reader found that may not be meant, or has repaired; sentences.
+        priors: measurements of single poses by kind: "pose" (k, storage) and, in the plane, "position" (k, 2) [m].
     """
 
     ids: Ids
@@ -119,6 +139,7 @@ class PoseGraph:
     skipped: Mapping[str, int] = field(default_factory=dict)
     placed: bool = True
     remarks: tuple[str, ...] = ()
+    priors: Mapping[str, Priors] = field(default_factory=dict)
 
     @property
     def group(self) -> LieGroup:
@@ -139,8 +160,9 @@ class PoseGraph:
     ) -> tuple[Graph, Family, dict[Family, Array]]:
         """State the factor graph.
 
-        The terms are called ``odometry``, ``closures`` and, by kind, ``point``, ``bearing``, ... Known poses are fixed;
-        every connected part of the graph without one has its first pose fixed where it is.
+        The terms are called ``odometry``, ``closures`` and, by kind, ``point``, ``bearing``, ..., ``pose prior`` and
+        ``position prior``. Known poses are fixed; every connected part of the graph without one has its first pose
+        fixed where it is, unless priors determine its place.
 
         Args:
             robust: loss on the whitened residuals of the loop closures.
@@ -183,7 +205,14 @@ class PoseGraph:
                     self._seen(kind), x[seen.pose], places[seen.landmark], measured,
                     information=seen.information, robust=everywhere, name=kind,
                 )  # fmt: skip
-        fixed, known = self.anchors()
+        for kind, held in self.priors.items():
+            function, reference = self._prior(kind, relative)
+            measured = graph.data(f"{kind} prior", held.measured, each=True)
+            graph.minimize(
+                function, *reference, x[held.pose], measured,
+                information=held.information, robust=everywhere, name=f"{kind} prior",
+            )  # fmt: skip
+        fixed, known = self.anchors(priors=True)
         if len(fixed):
             graph.fix(x[fixed], self.poses[fixed], name="anchor")
         if len(known):
@@ -194,11 +223,15 @@ class PoseGraph:
 
     def chi2(self, residual: ResidualName = "log") -> float:
         """Sum of r' Omega r over all measurements at the present values: no 1/2, no robust loss."""
-        return float(self.squared_errors(residual).sum()) + self.seen_chi2()
+        return float(self.squared_errors(residual).sum()) + self.seen_chi2(residual)
 
-    def seen_chi2(self) -> float:
-        """Sum of r' Omega r over the sightings at the present values."""
+    def seen_chi2(self, residual: ResidualName = "log") -> float:
+        """Sum of r' Omega r over the sightings and priors at the present values."""
         total = 0.0
+        for kind, held in self.priors.items():
+            function, reference = self._prior(kind, self._relative(residual))
+            whole = function.on(self.group) if isinstance(function, ManifoldResidual) else function
+            total += float(_squared(whole, held, *reference, self.poses[held.pose]).sum())
         for kind, seen in self.sightings.items():
             function = self._seen(kind)
             whole = function.on(self.group) if isinstance(function, ManifoldResidual) else function
@@ -210,12 +243,22 @@ class PoseGraph:
         function = self._relative(residual).on(self.group)
         return _squared(function, self.edges, self.poses[self.edges.first], self.poses[self.edges.second])
 
-    def anchors(self) -> tuple[IntArray, IntArray]:
-        """Positions of the poses and landmarks held fixed: those known, or the first pose of a connected part."""
+    def anchors(self, priors: bool = False) -> tuple[IntArray, IntArray]:
+        """Positions of the poses and landmarks held fixed: those known, or the first pose of a connected part.
+
+        Args:
+            priors: whether a part needs no fixed pose that priors determine: one of a whole pose, or those of so many
+                poses as a position has coordinates.
+        """
         known = np.array(self.fixed_ids, dtype=np.int64)
         poses, landmarks = np.flatnonzero(np.isin(self.ids, known)), np.flatnonzero(np.isin(self.landmark_ids, known))
         part = self.parts()
         held = np.concatenate([part[poses], part[len(self.poses) + landmarks]])
+        if priors and self.priors:
+            whole = np.concatenate([_full_rank(kind.information, self.group.dim) for kind in self.priors.values()])
+            where = np.concatenate([kind.pose for kind in self.priors.values()])
+            counts = np.bincount(part[np.unique(where)])
+            held = np.concatenate([held, part[where[whole]], np.flatnonzero(counts >= self.group.point_dim)])
         present, firsts = np.unique(part[: len(self.poses)], return_index=True)
         loose = firsts[~np.isin(present, held)]
         return np.sort(np.concatenate([poses, loose])), landmarks
@@ -231,6 +274,8 @@ class PoseGraph:
         for kind, seen in self.sightings.items():
             _require(f"a sighting of kind {kind!r}", "poses", (seen.pose,), count)
             _require(f"a sighting of kind {kind!r}", "landmarks", (seen.landmark,), len(self.landmarks))
+        for kind, held in self.priors.items():
+            _require(f"a prior of kind {kind!r}", "poses", (held.pose,), count)
         rows = [self.edges.first, *(seen.pose for seen in self.sightings.values())]
         columns = [self.edges.second, *(count + seen.landmark for seen in self.sightings.values())]
         return components(count + len(self.landmarks), np.concatenate(rows), np.concatenate(columns))
@@ -238,7 +283,7 @@ class PoseGraph:
     def _relative(self, residual: str) -> ManifoldResidual:
         if residual not in _RELATIVE:
             raise GraphError(f"residual is {residual!r}: expected {' or '.join(map(repr, _RELATIVE))}")
-        if not len(self.edges) and not self.sightings:
+        if not len(self.edges) and not self.sightings and not self.priors:
             raise GraphError("the pose graph has no measurement: there is nothing to solve")
         return _RELATIVE[residual]
 
@@ -246,6 +291,14 @@ class PoseGraph:
         if kind not in _SEEN:
             raise GraphError(f"sightings of kind {kind!r}: expected one of {', '.join(map(repr, _SEEN))}")
         return _SEEN[kind]
+
+    def _prior(self, kind: str, relative: ManifoldResidual) -> tuple[ManifoldResidual | Residual, list[Array]]:
+        """Residual of a prior, and what comes before the pose among its arguments."""
+        if kind == "pose":
+            return relative, [self.group.identity()]
+        if kind != "position" or self.group != SE2:
+            raise GraphError(f"priors of kind {kind!r} in {self.group.name}: expected 'pose' or, in SE2, 'position'")
+        return position, []
 
     def __repr__(self) -> str:
         """Counts."""
@@ -266,7 +319,13 @@ def _require(who: str, what: str, places: tuple[IntArray, ...], count: int) -> N
             raise GraphError(f"{who}, number {k}, names position {positions[k]}, and there are {count} {what}", index=k)
 
 
-def _squared(function: Residual, batch: Edges | Sightings, *points: Any) -> Array:
+def _full_rank(information: Array, dim: int) -> BoolArray:
+    """(k,) whether information matrices determine a whole pose."""
+    whole: BoolArray = np.linalg.matrix_rank(information, hermitian=True) == dim
+    return whole
+
+
+def _squared(function: Residual, batch: Edges | Sightings | Priors, *points: Any) -> Array:
     error = function(*points, batch.measured)
     result: Array = np.einsum("ni,nij,nj->n", error, batch.information, error)
     return result

@@ -37,8 +37,9 @@ def admit(pose_graph: PoseGraph) -> None:
     Raises:
         GraphError: the graph has landmarks, several poses of one part are known, or an information matrix is none.
     """
-    if len(pose_graph.landmarks):
-        raise GraphError("the chordal relaxation holds relative poses only: this graph has landmarks")
+    if len(pose_graph.landmarks) or pose_graph.priors:
+        found = "landmarks" if len(pose_graph.landmarks) else "priors"
+        raise GraphError(f"the chordal relaxation holds relative poses only: this graph has {found}")
     information = pose_graph.edges.information
     if not (np.isfinite(information).all() and np.isfinite(pose_graph.edges.measured).all()):
         raise GraphError("the chordal relaxation needs finite measurements and information matrices")

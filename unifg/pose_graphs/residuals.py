@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 from unifg.errors import GraphError
@@ -106,7 +107,8 @@ def _chart_kernel(space: bool) -> Kernel:
 def _build_chart(manifold: Manifold) -> Residual:
     if manifold not in (SE2, SE3):
         raise GraphError(f"chart_between needs poses in SE2 or SE3, found {manifold.name}; use between")
-    return residual(_chart_kernel(manifold == SE3))
+    elements = tuple((place, manifold) for place in range(3))
+    return replace(residual(_chart_kernel(manifold == SE3)), elements=elements)
 
 
 chart_between = ManifoldResidual(
@@ -119,6 +121,12 @@ of its quaternion, which is half the angle for small angles. ``between`` is the 
 order in the plane, not in space. measured is (storage,) or (n, storage).
 """,
 )
+
+
+def position(pose: Array, measured: Array) -> Array:
+    """Position (n, 2) of planar poses (n, 3) less what was measured (n, 2) [m]: g2o's EdgeSE2XYPrior."""
+    error: Array = pose[:, :2] - measured
+    return error
 
 
 # ---------------------------------------------------------------- sightings

@@ -6,11 +6,13 @@ where the loops over terms read them; Python hears only of data that something m
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
 from unifg.errors import GraphError
+from unifg.language.elements import elements_of, nearest, particular
+from unifg.language.terms import Term
 from unifg.language.variables import Data
 from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
@@ -25,13 +27,21 @@ class Binding:
         present: the value of every datum, an array that keeps its place.
     """
 
-    def __init__(self, known: Mapping[str, Data], used: Iterable[Data]) -> None:
+    def __init__(self, known: Mapping[str, Data], used: Iterable[Data], terms: Sequence[Term] = ()) -> None:
         """Make room.
 
         Args:
             known: the data of a graph by their names; the mapping may grow.
             used: those a program reads.
+            terms: that read them; what stands for elements of a manifold there is looked at as such.
         """
+        self._elements = [
+            (f"term '{term.name}': argument {place} of {term.residual.name}", argument, manifold, term)
+            for term in terms
+            for place, manifold in elements_of(term.residual).items()
+            if isinstance(argument := term.arguments[place], Data) and argument.value.dtype == FLOAT64
+            if particular(manifold)
+        ]
         self._known = known
         handles = list(dict.fromkeys(used))
         self._numbers = [handle for handle in handles if handle.value.dtype == FLOAT64]
@@ -72,7 +82,7 @@ class Binding:
         """Take new values, defaults for what is not named, and say what is not as it was.
 
         Raises:
-            GraphError: on unknown data, a changed shape, or NaN; nothing has changed then.
+            GraphError: on unknown data, a changed shape, NaN, or elements off their manifold; nothing has changed then.
         """
         slots = self._slots
         for handle, value in data.items():
@@ -92,6 +102,9 @@ class Binding:
                     )
                 slot[...] = handle.value
         flags = {handle: handle.check(data.get(handle, handle.value)) for handle in self._flags}
+        for what, handle, manifold, term in self._elements:
+            active = flags[term.active] if isinstance(term.active, Data) else term.active
+            slots[handle][...] = nearest(what, manifold, slots[handle], active, term.name)
         count = _renew(
             self._coming, self._flat, self._starts, self._changed, self._sources, self._targets, self._parameters
         )

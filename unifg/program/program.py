@@ -133,7 +133,8 @@ class Program:
         self.python_seconds = 0.0
         read = {value for term in self.terms for value in term.data}
         read |= {fix.value for fix in graph.fixes if isinstance(fix.value, Data)}
-        self._binding, self._vetted = Binding(declared, filter(read.__contains__, declared.values())), False
+        self._binding = Binding(declared, filter(read.__contains__, declared.values()), graph.terms)
+        self._vetted = False
         self._bind_first()
 
     @property
@@ -361,10 +362,10 @@ class Program:
                     cost += 0.5 * float(loss.value(squares[part]).sum())
             if self.scalar_terms:
                 cost += evaluate_scalars(table.arrays, values.flat, np.empty(table.scalars), self.scratch)
-                began = perf_counter()
-                for term in self._general:
-                    cost += float(term.residual(values).sum())
-                self.python_seconds += perf_counter() - began
+                if general := self._general:
+                    began = perf_counter()
+                    cost += sum(float(term.residual(values).sum()) for term in general)
+                    self.python_seconds += perf_counter() - began
         return Evaluation(cost, constraints)
 
     def linearize(self, values: Mapping[Family, Array], search: bool = False) -> Linearization:
@@ -425,8 +426,10 @@ class Program:
     ) -> float:
         """Add the slopes and second derivatives of costs that are no squares; return what they cost."""
         cost = float(add_scalars(self.arrays, values.flat, found, gradient, hessian, concavity, self.scratch))
+        if not (general := self._general):
+            return cost
         began = perf_counter()
-        for term in self._general:
+        for term in general:
             value = term.residual(values)
             cost += float(value.sum())
             found[term.place[ROW] : term.place[ROW] + term.count] = value

@@ -19,6 +19,7 @@ from unifg.kernels.residuals import Residual
 from unifg.kernels.robust import QUADRATIC, Form, Loss, form_of
 from unifg.kernels.whitening import DIAGONAL, FULL, quick_roots, reciprocals, square_roots
 from unifg.language.doubles import doubles
+from unifg.language.elements import elements_of, nearest, on_manifolds, quaternions_of
 from unifg.language.factors import prior
 from unifg.language.statement import AnyResidual, complete
 from unifg.language.terms import Cost, Parameter, prepare_arguments
@@ -134,9 +135,14 @@ class Types:
         variables = tuple([place for place in taken if isinstance(arguments[place], Selection)])
         if len(variables) != len(staged.families) or (trace is not None and _compiled_in(trace, arguments)):
             return
-        parameters, at = [], 0
+        parameters, quaternions, at = [], [], 0
+        elements = elements_of(complete(function, arguments))
         for place in taken:
             if place not in variables:
+                found = quaternions_of(elements[place]) if place in elements else []
+                if found is None:
+                    return
+                quaternions += [at + start for start in found]
                 parameters.append((place, at, at + arguments[place].size))
                 at += arguments[place].size
         row = self.fields[staged.kind]
@@ -145,7 +151,7 @@ class Types:
             self._kinds.clear()
         self._kinds[key] = Kind(
             staged.kind, staged.families, variables, tuple(parameters), whitening, size, at, staged.data.shape[1],
-            staged.name, function, trace,
+            staged.name, function, trace, tuple(quaternions),
         )  # fmt: skip
 
     def _looked_at(
@@ -164,6 +170,7 @@ class Types:
         if sigma is not None and information is not None:
             raise GraphError(f"term '{name}': give sigma or information, not both", term=name)
         normal, rows, active, count = prepare_arguments(name, arguments, active)
+        normal = on_manifolds(name, wrapped, normal, active)
         selections = [argument for argument in normal if isinstance(argument, Selection)]
         families: list[GrowingFamily] = []
         for selection in selections:
@@ -192,6 +199,10 @@ class Types:
                 self._remember(key, known)
         (kernel, _, trace), form = known, form or PLAIN
         values = [argument.value if isinstance(argument, Data) else argument for argument in normal]
+        for place, manifold in elements_of(wrapped).items():
+            if isinstance(normal[place], Data):
+                what = f"term '{name}': argument {place} of {wrapped.name}"
+                values[place] = nearest(what, manifold, values[place], None, name)
         filled = [np.empty((1, a.manifold.storage)) if isinstance(a, Selection) else a for a in values]
         if trace is not None:
             filled = trace.arguments(filled)

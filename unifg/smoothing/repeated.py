@@ -19,6 +19,7 @@ from unifg.program.traced import Trace
 from unifg.smoothing.families import GrowingFamily
 from unifg.typing import Array
 
+UNIT = 1e-9  # of squared norms, half of what the groups allow
 Key = tuple[Any, ...]
 
 
@@ -37,6 +38,7 @@ class Kind(NamedTuple):
         name: for messages.
         function: known to the key by its id, which stays its own for as long as it lives.
         trace: what the kernel was derived from, which may change.
+        quaternions: where those begin that must have norm one.
     """
 
     number: int
@@ -50,6 +52,7 @@ class Kind(NamedTuple):
     name: str
     function: Any
     trace: Trace | None
+    quaternions: tuple[int, ...]
 
 
 def key_of(
@@ -107,4 +110,9 @@ def numbers_of(kind: Kind, arguments: Sequence[Any], sigma: Any, information: An
         stack = np.array(information, ndmin=3, order="C")
         if stack.shape[1] != kind.size or stack.shape[2] != kind.size or not quick_roots(stack, data[:, kind.first :]):
             return None
-    return data if isfinite(sum(row.tolist())) else None  # a sum that overflows is looked at
+    found = row.tolist()
+    for k in kind.quaternions:
+        w, x, y, z = found[k : k + 4]
+        if not abs(w * w + x * x + y * y + z * z - 1.0) < UNIT:
+            return None
+    return data if isfinite(sum(found)) else None  # a sum that overflows is looked at

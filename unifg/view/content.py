@@ -17,7 +17,7 @@ from unifg.view.things import Thing
 __all__ = ["Body", "Content", "Layer", "Placement", "Shot"]
 
 _PALETTE = ("robot", "landmark", "horizon", "estimate", "moving", "trail", "odometry", "plan")
-_RESERVED = re.compile(r"[%/<>\x00-\x1f]")
+_RESERVED = re.compile(r"[%/<>\x00-\x1f\ud800-\udfff]")
 
 
 @dataclass

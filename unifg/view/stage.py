@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -209,6 +210,4 @@ def page_text(data: dict[str, Any], commands: list[str], *, connect: str = "", l
         "VIEWER": viewer_script(),
     }
     text = resources.files("unifg.view").joinpath("page.html").read_text(encoding="utf-8")
-    for name, part in parts.items():  # the viewer last: it is code in which no placeholder may be looked for
-        text = text.replace(f"@@{name}@@", part)
-    return text
+    return re.sub("@@([A-Z]+)@@", lambda found: parts[found[1]], text)  # in one pass: parts may hold such words, too

@@ -1,0 +1,291 @@
+"""Constants in the place of group elements: off the manifold they are refused, nearly on it they are normalised."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from own_manifolds import SphereManifold
+from unifg.solvers import GaussNewton
+from unifg.typing import Array, ArrayLike, BoolArray
+
+UNIT = np.array([0.5, -0.5, 0.5, 0.5])
+POSE = np.array([1.0, 2.0, 3.0, *UNIT])
+STEP = fg.SE3.exp(np.array([0.1, 0.2, 0.3, 0.4, -0.5, 0.6]))
+PAIR = fg.Product(pose=fg.SE3, bias=fg.Rn(2))
+
+
+def scaled(pose: Array, by: float) -> Array:
+    """A pose whose quaternion has norm ``by``."""
+    return np.concatenate([pose[:-4], by * pose[-4:]])
+
+
+def solved(manifold: fg.Manifold, value: ArrayLike, **options: Any) -> Array:
+    graph = fg.Graph()
+    x = graph.variables("x", manifold, 1)
+    graph.minimize(fg.prior, x, value, **options)
+    return np.asarray(fg.solve(graph, {x: manifold.identity()[None]})[x][0])
+
+
+@pytest.mark.parametrize("norm", [0.0, 0.5, 1.002, 0.998, np.nan, np.inf])
+@pytest.mark.parametrize(
+    ("manifold", "value"),
+    [(fg.SO3, UNIT), (fg.SE3, POSE), (fg.SE23, np.concatenate([np.zeros(6), UNIT])), (PAIR, [*POSE, 0.1, 0.2])],
+)
+def test_an_element_off_its_manifold_is_refused(manifold: fg.Manifold, value: ArrayLike, norm: float) -> None:
+    value = np.array(value)
+    start = {fg.SO3: 0, fg.SE3: 3, fg.SE23: 6, PAIR: 3}[manifold]
+    value[start : start + 4] *= norm
+    with pytest.raises(fg.GraphError, match=r"term 'level': argument 1.*row 0.*w first, norm 1") as raised:
+        solved(manifold, value, name="level")
+    assert raised.value.term == "level" and raised.value.index == 0
+
+
+@pytest.mark.parametrize("norm", [1.0009, 0.9991])
+def test_an_element_nearly_on_its_manifold_is_normalised(norm: float) -> None:
+    for manifold, value in ((fg.SO3, UNIT), (fg.SE3, POSE), (PAIR, np.array([0.0, *POSE[1:], 0.1, 0.2]))):
+        near = value.copy()
+        near[slice(0, 4) if manifold is fg.SO3 else slice(3, 7)] *= norm
+        found = solved(manifold, near, sigma=0.1)
+        np.testing.assert_allclose(manifold.local(value, found), 0.0, atol=1e-9)
+        assert fg.SE3.is_valid(found[:7]) if manifold is not fg.SO3 else fg.SO3.is_valid(found)
+
+
+def test_a_negative_quaternion_nearly_of_norm_one_is_normalised() -> None:
+    np.testing.assert_allclose(fg.SO3.local(UNIT, solved(fg.SO3, -1.0005 * UNIT)), 0.0, atol=1e-9)
+
+
+def test_a_refusal_names_the_row_and_leaves_the_graph_as_it_was() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE3, 4)
+    measured = np.tile(STEP, (3, 1))
+    measured[2] = scaled(measured[2], 0.5)
+    with pytest.raises(fg.GraphError, match=r"row 2.*family 'x'") as raised:
+        graph.minimize(fg.between, x[:-1], x[1:], measured, name="odometry")
+    assert (raised.value.term, raised.value.index) == ("odometry", 2)
+    assert not graph.terms
+
+
+def test_a_constant_pose_in_the_place_of_a_variable_is_an_element() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE3, 1)
+    with pytest.raises(fg.GraphError, match=r"argument 0.*w first, norm 1"):
+        graph.minimize(fg.between, scaled(POSE, 2.0), x, STEP)
+
+
+def test_the_reference_of_a_joint_prior_is_checked_part_by_part() -> None:
+    graph = fg.Graph()
+    x, b = graph.variables("x", fg.SE3, 1), graph.variables("b", fg.Rn(1), 1)
+    joint = fg.joint_prior(fg.SE3, fg.Rn(1), offset=True)
+    with pytest.raises(fg.GraphError, match=r"argument 2.*norm 1"):
+        graph.minimize(joint, x, b, [*scaled(POSE, 0.9), 5.0, *np.zeros(7)])
+    graph.minimize(joint, x, b, [*POSE, 5.0, *np.zeros(7)])
+
+
+@pytest.mark.parametrize("manifold", [fg.SO2, fg.SE2, fg.Rn(2)])
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_numbers_that_are_not_finite_are_refused(manifold: fg.Manifold, wrong: float) -> None:
+    value = manifold.identity()
+    value[-1] = wrong
+    with pytest.raises(fg.GraphError, match=r"argument 1.*row 0.*not finite"):
+        solved(manifold, value)
+
+
+def test_measurements_of_other_kernels_are_finite_too() -> None:
+    from unifg.models import landmarks
+
+    graph = fg.Graph()
+    x, spot = graph.variables("x", fg.SE2, 1), graph.variables("spot", fg.Rn(2), 1)
+    with pytest.raises(fg.GraphError, match=r"argument 2.*row 0.*not finite"):
+        graph.minimize(landmarks.bearing_range, x, spot, [0.1, np.nan], sigma=[0.1, 0.1])
+
+
+def test_a_placeholder_in_a_row_that_is_never_active_may_be_anything() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE3, 2)
+    graph.minimize(fg.prior, x, np.stack([POSE, np.zeros(7)]), active=[True, False])
+    with pytest.raises(fg.GraphError, match="row 1"):
+        graph.minimize(fg.prior, x, np.stack([POSE, np.zeros(7)]), active=[True, True])
+
+
+class Matrices(fg.LieGroup):
+    """Rotation matrices of the plane, row by row, by NumPy."""
+
+    name, storage, dim = "matrices", 4, 1
+
+    def identity(self) -> Array:
+        return np.array([1.0, 0.0, 0.0, 1.0])
+
+    def exp(self, d: ArrayLike, /) -> Array:
+        angle = np.asarray(d)[..., 0]
+        return np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], axis=-1)
+
+    def log(self, x: ArrayLike, /) -> Array:
+        x = np.asarray(x)
+        return np.arctan2(x[..., 2], x[..., 0])[..., None]
+
+    def compose(self, x: ArrayLike, y: ArrayLike, /) -> Array:
+        return self.exp(self.log(x) + self.log(y))
+
+    def inverse(self, x: ArrayLike, /) -> Array:
+        return self.exp(-self.log(x))
+
+    def adjoint(self, x: ArrayLike, /) -> Array:
+        return np.ones((*np.shape(x)[:-1], 1, 1))
+
+    def right_jacobian(self, d: ArrayLike, /) -> Array:
+        return np.ones((*np.shape(d)[:-1], 1, 1))
+
+    right_jacobian_inverse = right_jacobian
+
+    def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
+        return self.exp(rng.uniform(-3.0, 3.0, (*shape, 1)))
+
+    def is_valid(self, x: ArrayLike, /) -> BoolArray:
+        x = np.asarray(x, dtype=np.float64)
+        matrix = x.reshape(*x.shape[:-1], 2, 2)
+        return np.asarray(np.isclose(matrix @ np.swapaxes(matrix, -1, -2), np.eye(2), atol=1e-9).all(axis=(-2, -1)))
+
+
+def test_a_manifold_of_ones_own_is_asked_by_its_own_test() -> None:
+    matrices = Matrices()
+    with pytest.raises(fg.GraphError, match=r"argument 1.*row 0.*matrices"):
+        solved(matrices, 2.0 * matrices.identity())
+    found = solved(matrices, 1.0005 * matrices.exp([0.3]))
+    np.testing.assert_allclose(matrices.log(found), 0.3, atol=1e-9)
+
+
+class Unit(SphereManifold):
+    """Directions that say which vectors they are."""
+
+    def is_valid(self, x: ArrayLike, /) -> BoolArray:
+        return np.asarray(np.abs(np.linalg.norm(x, axis=-1) - 1.0) < 1e-9)
+
+
+def test_points_that_cannot_be_composed_are_asked_too() -> None:
+    with pytest.raises(fg.GraphError, match=r"argument 1.*row 0.*S2"):
+        solved(Unit(), [0.0, 0.0, 1.1])
+    np.testing.assert_allclose(solved(Unit(), [0.0, 0.0, 1.0005]), [0.0, 0.0, 1.0], atol=1e-6)
+
+
+def test_data_are_checked_at_statement_and_at_every_binding() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE3, 1)
+    wrong = graph.data("wrong", scaled(POSE, 0.5))
+    with pytest.raises(fg.GraphError, match=r"argument 1.*row 0.*w first, norm 1"):
+        graph.minimize(fg.prior, x, wrong)
+    goal = graph.data("goal", scaled(POSE, 1.0005))
+    graph.minimize(fg.prior, x, goal, name="goal")
+    solver = GaussNewton().prepare(graph)
+    guess = {x: POSE[None]}
+    np.testing.assert_allclose(solver.solve(guess)[x][0], POSE, atol=1e-9)
+    with pytest.raises(fg.GraphError, match=r"term 'goal': argument 1.*row 0.*w first, norm 1"):
+        solver.solve(guess, data={goal: scaled(POSE, 0.5)})
+    moved = fg.SE3.compose(POSE, STEP)
+    near = solver.solve(guess, data={goal: scaled(moved, 0.9995)})
+    np.testing.assert_allclose(fg.SE3.local(moved, near[x][0]), 0.0, atol=1e-9)
+    assert fg.SE3.is_valid(near[x]).all()
+    np.testing.assert_allclose(fg.SE3.local(POSE, solver.solve(guess)[x][0]), 0.0, atol=1e-9)
+
+
+def test_inactive_rows_of_data_may_be_anything() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE3, 2)
+    goals = graph.data("goals", np.stack([POSE, np.zeros(7)]), each=True)
+    used = graph.data("used", np.array([True, False]))
+    graph.minimize(fg.prior, x, goals, active=used)
+    graph.minimize(fg.prior, x, POSE, sigma=10.0)
+    solver, guess = GaussNewton().prepare(graph), {x: np.stack([POSE, POSE])}
+    assert solver.solve(guess).converged
+    with pytest.raises(fg.GraphError, match="row 1"):
+        solver.solve(guess, data={used: np.array([True, True])})
+
+
+@pytest.mark.parametrize("smoother", [fg.Incremental, lambda: fg.FixedLag(9)])
+def test_smoothers_check_every_factor_alike(smoother: Callable[[], Any]) -> None:
+    graph = smoother()
+    x = graph.variables("x", fg.SE3)
+    poses = np.stack([POSE, fg.SE3.compose(POSE, STEP), fg.SE3.compose(fg.SE3.compose(POSE, STEP), STEP)])
+    graph.minimize(fg.prior, x[0], scaled(POSE, 1.0005), sigma=0.1)
+    for k in range(2):  # the second is laid out without being looked at, where it can be
+        graph.minimize(fg.between, x[k], x[k + 1], scaled(STEP, 1.0 - 0.0005 * k), sigma=0.1)
+    for wrong in (scaled(STEP, 0.5), scaled(STEP, np.nan), scaled(STEP, 0.0)):
+        with pytest.raises(fg.GraphError, match=r"term 'between': argument 2.*row 0.*w first, norm 1"):
+            graph.minimize(fg.between, x[1], x[2], wrong, sigma=0.1)
+    graph.update({x: poses})
+    np.testing.assert_allclose(graph.cost, 0.0, atol=1e-12)
+
+
+def test_smoothers_ask_every_element_of_a_manifold_of_ones_own() -> None:
+    graph = fg.Incremental()
+    x = graph.variables("x", Unit())
+    for _ in range(2):
+        graph.minimize(fg.prior, x[0], np.array([0.0, 0.0, 1.0]), sigma=0.1)
+    with pytest.raises(fg.GraphError, match=r"row 0.*S2"):
+        graph.minimize(fg.prior, x[0], np.array([0.0, 0.0, 1.1]), sigma=0.1)
+
+
+MASKED = np.ma.MaskedArray([1.0, 2.0], mask=[False, True])
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        lambda g, x: g.minimize(fg.prior, x, MASKED),
+        lambda g, x: g.minimize(lambda p, c: p - c, x, MASKED),
+        lambda g, x: g.minimize(fg.prior, x, [0.0, 0.0], sigma=np.abs(MASKED)),
+        lambda g, x: g.bound(x, lower=MASKED),
+        lambda g, x: g.data("d", MASKED),
+        lambda g, x: g.fix(x[0], MASKED),
+        lambda g, x: fg.solve(g, {x: np.ma.MaskedArray(np.zeros((2, 2)))}),
+    ],
+)
+def test_masked_arrays_are_refused(state: Callable[[fg.Graph, fg.Family], object]) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 2)
+    graph.minimize(fg.prior, x, [0.0, 0.0], name="origin")
+    with pytest.raises(fg.GraphError, match="masked"):
+        state(graph, x)
+
+
+@pytest.mark.parametrize("value", [[1.0, 2.0, 90.0], [[0.0, 0.0, 0.1], [0.0, 0.0, -7.0]]])
+def test_a_prior_with_headings_beyond_a_turn_names_degrees(value: list[Any], caplog: pytest.LogCaptureFixture) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE2, len(np.atleast_2d(value)))
+    with caplog.at_level(logging.WARNING, "unifg"):
+        graph.minimize(fg.prior, x, value, name=f"compass {np.ndim(value)}")
+    assert f"term 'compass {np.ndim(value)}'" in caplog.text and "degrees" in caplog.text
+
+
+def test_a_prior_with_headings_of_a_turn_says_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    graph = fg.Graph()
+    x, y = graph.variables("x", fg.SE2, 1), graph.variables("y", fg.SE2, 1)
+    with caplog.at_level(logging.WARNING, "unifg"):
+        graph.minimize(fg.prior, x, [100.0, -200.0, 2.0 * math.pi])
+        graph.minimize(fg.between, x, y, [0.0, 0.0, 7.0])
+    assert not caplog.text
+
+
+def test_quaternions_spell_their_order() -> None:
+    w, x, y, z = UNIT
+    for scale in (1.0, 3.0):
+        np.testing.assert_allclose(fg.SO3.from_quaternion(scale * UNIT, order="wxyz"), UNIT)
+        np.testing.assert_allclose(fg.SO3.from_quaternion(scale * np.array([x, y, z, w]), order="xyzw"), UNIT)
+    row = np.array([1.0, 2.0, 3.0, x, y, z, w])
+    np.testing.assert_allclose(fg.SE3.from_quaternion(np.tile(row, (2, 1)), order="xyzw"), np.tile(POSE, (2, 1)))
+    np.testing.assert_allclose(fg.SE3.from_quaternion(POSE, order="wxyz"), POSE)
+    np.testing.assert_allclose(fg.SO3.to_quaternion(UNIT, order="xyzw"), [x, y, z, w])
+    np.testing.assert_allclose(fg.SO3.to_quaternion(-UNIT, order="wxyz"), UNIT)
+    np.testing.assert_allclose(fg.SE3.to_quaternion(POSE, order="xyzw"), row)
+    with pytest.raises(fg.UnifgError, match=r"order.*'wxyz' or 'xyzw'"):
+        fg.SO3.from_quaternion(UNIT, order="zyxw")  # type: ignore[arg-type]
+    with pytest.raises(fg.UnifgError, match="names no rotation"):
+        fg.SE3.from_quaternion(np.zeros(7), order="xyzw")
+    with pytest.raises(fg.UnifgError, match="7"):
+        fg.SE3.from_quaternion(UNIT, order="xyzw")

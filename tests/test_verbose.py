@@ -1,0 +1,56 @@
+"""Lines that ``verbose=True`` shows, whether or not logging is configured, and shares of time with their names."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.solvers import SQP, GaussNewton
+
+SCRIPT = """
+import sys, logging
+{configure}
+import numpy as np
+import unifg as fg
+graph = fg.Graph()
+x = graph.variables("x", fg.Rn(2), 1)
+graph.minimize(fg.prior, x, [1.0, 2.0])
+fg.solve(graph, {{x: np.zeros((1, 2))}}, verbose={verbose})
+"""
+
+
+@pytest.mark.parametrize("configure", ["", "logging.basicConfig()"])
+def test_verbose_prints_although_logging_is_not_configured(configure: str) -> None:
+    def said(verbose: bool) -> str:
+        script = SCRIPT.format(configure=configure, verbose=verbose)
+        return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stderr
+
+    lines = said(True).splitlines()
+    assert sum(line.startswith("iter ") for line in lines) == 1 and len(lines) >= 3
+    assert "iter" not in said(False)
+
+
+def test_verbose_logs_where_logging_is_configured(
+    caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(fg.prior, x, [1.0, 2.0])
+    with caplog.at_level(logging.INFO, "unifg"):
+        GaussNewton(verbose=True).solve(graph, {x: np.zeros((1, 2))})
+    assert "iter " in caplog.text
+    assert "iter " not in capsys.readouterr().err
+
+
+def test_costs_that_were_traced_take_no_time_in_python() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize_scalar(lambda p: np.cosh(p[:, 0] - 1.0) + p[:, 1] ** 2, x, name="bowl")
+    solution = SQP(hessian="exact").solve(graph, {x: np.full((1, 2), 3.0)}, check=True)
+    assert solution.converged and solution.in_python == 0.0
+    assert "in Python" not in solution.report()
