@@ -98,6 +98,38 @@ def test_a_wrong_derivative_at_the_answer_is_found(solver: fg.Solver, monkeypatc
     np.testing.assert_allclose(y - 2.5 + np.tanh(y) * (1.0 - np.tanh(y) ** 2), 0.0, atol=1e-5)
 
 
+def test_one_wrong_factor_is_named_and_a_factor_that_is_switched_off_is_not(wrong_above: Function) -> None:
+    wrong_above(1.2)
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), N)
+    active = graph.data("active", np.ones(N, dtype=bool), each=True)
+    graph.minimize(lambda x: np.tanh(x) + 0.0, x, active=active, name="own")
+    program = graph.compile()
+    values = program.values_from({x: np.zeros((N, 1))})
+    values[x][2] = 2.5
+    program.bind({active: np.arange(N) != 2})
+    assert not program.mistraced(values, True, 0)
+    program.bind({})
+    assert "at factor 2 of an answer" in program.mistraced(values, True, 0)["own"]
+
+
+def test_derivatives_are_compared_when_asked_and_along_another_direction_each_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def doubled(tape: Any, rows: Any, width: int) -> Any:
+        return {place: tape.apply(Op.ADD, node, node) for place, node in jacobian(tape, rows, width).items()}
+
+    monkeypatch.setattr("unifg.kernels.derive.expression.jacobian", doubled)
+    monkeypatch.setattr("unifg.kernels.derive.expression._WRITERS", "")
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), N)
+    graph.minimize(lambda x: np.sinh(x) * 0.5, x, name="own")
+    program = graph.compile()
+    values = program.values_from({x: np.full((N, 1), 0.3)})
+    assert not program.mistraced(values, False, 0)
+    assert "derivatives differ" in program.mistraced(values, True, 0)["own"]
+
+
 def test_insisting_on_the_trace_is_an_error_then(wrong_above: Function) -> None:
     wrong_above(1.2)
     graph, x, target = stated(fg.residual(lambda x: np.tanh(x), derivatives="trace"), constrained=False)
