@@ -153,6 +153,19 @@ def test_a_loop_is_verified_on_a_schedule(monkeypatch: pytest.MonkeyPatch) -> No
     assert [n for n, yes in enumerate(checked, 1) if yes] == [n for n, _ in asked]
 
 
+def test_a_solve_without_time_left_is_verified_after_the_next() -> None:
+    graph, x, target = stated(lambda x: np.cosh(x), constrained=False)
+    prepared = LevenbergMarquardt(max_iterations=50).prepare(graph)
+    guess = {x: np.full((N, 1), 3.0)}
+    found = [prepared.solve(guess).checked for _ in range(6)]
+    assert found == [True, True, False, True, False, False]
+    prepared.solver.time_limit = 0.0
+    assert not any(prepared.solve(guess).checked for _ in range(2))  # the eighth would have been
+    prepared.solver.time_limit = np.inf
+    assert [prepared.solve(guess).checked for _ in range(2)] == [True, False]
+    assert prepared.solve(guess, data={target: np.ones((N, 1))}).converged
+
+
 def test_where_nothing_is_traced_nothing_is_left_unchecked() -> None:
     graph = fg.Graph()
     x = graph.variables("x", fg.Rn(1), 1)

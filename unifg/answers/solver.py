@@ -486,7 +486,8 @@ class Prepared:
 
     Answers are verified by evaluating traced functions as written. Values: in solves 1, 2, 4, ..., in every 100th, and
     after solves in which a comparison of a trace comes out otherwise. Derivatives: in solves 1, 2, 4, ... A term whose
-    trace differs is left to Python, and the solve is repeated from there.
+    trace differs is left to Python, and the solve is repeated from there. Where the time limit has passed, the next
+    answer is verified instead.
 
     Attributes:
         solver: the backend and its options.
@@ -500,7 +501,7 @@ class Prepared:
         self._graph = graph or program.graph
         self._edition = self._graph.edition
         self._workspace: Any = None
-        self._solves = 0
+        self._solves, self._owed = 0, False
         self._turn = Turn()
         self._constraints = {
             t.name: (t, rows) for t, rows in zip(program.constraint_terms, program.slices, strict=True)
@@ -566,7 +567,9 @@ class Prepared:
         if solution.checked or not solution.finite or solution.status is Status.INTERRUPTED:
             return solution
         values = solution._lin.values
-        if not (slopes or self._solves % EVERY == 0 or program.conditions_changed(values)):
+        due = slopes or self._solves % EVERY == 0 or program.conditions_changed(values) or self._owed
+        self._owed = due and run.out_of_time  # verified after the next solve that leaves time for it
+        if not due or self._owed:
             return solution
         mistraced: dict[str, str] = {}
         while found := program.mistraced(values, slopes, self._solves):
