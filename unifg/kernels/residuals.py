@@ -76,13 +76,13 @@ def residual(
         rows: m, needed (and only then) when ``function`` is compiled with Numba. Such a function sees one factor:
             ``function(x, y, ..., measured, ..., r)`` with (storage,) arrays for variables, a number, vector or matrix
             for each parameter, and the (m,) residual to be written last. A parameter array with two axes holds one
-            row per factor; numbers and vectors are shared. ``jacobian``, if given, is compiled too and takes one
+            row per factor, and numbers and vectors are shared, unless declared by ``fg.each`` or ``fg.shared``. ``jacobian``, if given, is compiled too and takes one
             (m, d_k) block per variable in the place of r.
         derivatives: of a function without a Jacobian. None: it is traced (run once on symbols, differentiated
             exactly and made into machine code) where that is possible, and differenced where it is not, which
             ``graph.check`` and the log say. "trace" makes the second an error, and traces also functions that reach
-            what may change (methods, instances, dictionaries: their present content is compiled in) and those with a
-            Jacobian, which then only serves comparison. "trace first" uses the Jacobian where there is no trace.
+            what cannot be watched (its present content is compiled in) and those with a Jacobian, which then only
+            serves comparison. "trace first" uses the Jacobian where there is no trace.
             "differences" leaves the function as it is.
         about: what ``help`` says of the residual; defaults to the docstring of the function.
 
