@@ -422,7 +422,7 @@ def test_positions_of_first_guesses_heed_what_headings_say(
 def test_headings_of_first_guesses_are_weighed_by_what_is_left_of_them(
     method: Callable[[PoseGraph], Array],
 ) -> None:
-    """A small gap of heading around a loop is shared out by variances, positions free: not by entries of information."""
+    """A small gap of heading around a loop is shared out by variances, positions free, not by entries of matrices."""
     graph = correlated(fg.SE2, 2)
     edges = graph.edges[np.arange(8)]
     exact = fg.SE2.between(graph.poses[edges.first], graph.poses[edges.second])
