@@ -14,7 +14,6 @@ import numpy as np
 from unifg.program.program import Program
 from unifg.typing import Array
 
-
 MANY = 16  # iterates that wait until somebody compares them
 
 

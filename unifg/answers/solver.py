@@ -323,8 +323,9 @@ class SolveState:
 
         Args:
             cost: objective.
-            constraints, multipliers: (M,) there.
-            values: stored ones. None of the arrays may be written to any more.
+            constraints: (M,) there. None of the arrays may be written to any more.
+            values: stored ones.
+            multipliers: (M,) there.
         """
         self.incumbents.see(Incumbent(self.iterations, cost, constraints, values, multipliers))
 
