@@ -466,7 +466,7 @@ def swing_up() -> tuple[fg.Graph, dict[fg.Family, Array]]:
 
 
 def test_which_optimum_a_swing_up_finds_depends_on_the_first_penalty() -> None:
-    """Under a light one the motion is soft at first, and the pole goes another way; a heavy one stays with the guess."""
+    """Under a light one the motion is soft at first, and the pole goes elsewhere; a heavy one stays with the guess."""
     graph, guess = swing_up()
     others = [solver.solve(graph, guess, check=True).cost for solver in (InteriorPoint(), SQP())]
     heavy = AugmentedLagrangian(penalty=1e6).solve(graph, guess, check=True)

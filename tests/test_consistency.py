@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from unifg.errors import GraphError
+from unifg.lie import SE2
 from unifg.pose_graphs import Edges, PoseGraph, Simulated, manhattan, pairwise_consistent, sphere
 from unifg.pose_graphs.consistency import _clique
 from unifg.typing import BoolArray
@@ -97,3 +98,35 @@ def largest(agreeing: BoolArray) -> int:
             if all(agreeing[a, b] for a, b in combinations(chosen, 2)):
                 return size
     return 0
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_what_a_closure_is_sure_of_is_carried_to_its_other_end(turned: bool) -> None:
+    """Over a lever of ten metres, an error of heading is one of position, seen from the other end.
+
+    Two closures are exact. The third one's heading is off by two deviations, measured from the far end; the same
+    measurement is then written down from the near end, with its information carried by the adjoint.
+    """
+    count = 12
+    truth = np.column_stack([np.linspace(0.0, 11.0, count), np.zeros((count, 2))])
+    along = np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
+    ends = np.array([[0, 10], [1, 11], [10, 0]])
+    pairs = np.concatenate([along, ends])
+    measured = SE2.between(truth[pairs[:, 0]], truth[pairs[:, 1]])
+    measured[-1] = SE2.retract(measured[-1], np.array([0.0, 0.0, 0.02]))
+    information = np.tile(np.diag([1e8, 1e8, 1e8]), (len(pairs), 1, 1))
+    information[-1] = np.diag([1e6, 1e6, 1e4])
+    edges = Edges(pairs[:, 0], pairs[:, 1], measured, information)
+    graph = PoseGraph(np.arange(count), truth, edges)
+    if turned:
+        seen = np.linalg.inv(SE2.adjoint(measured[-1:]))[0]
+        ends[-1], measured[-1] = ends[-1][::-1], SE2.inverse(measured[-1:])[0]
+        carried = seen.T @ information[-1] @ seen
+        information[-1] = 0.5 * (carried + carried.T)
+        pairs = np.concatenate([along, ends])
+        graph = replace(graph, edges=Edges(pairs[:, 0], pairs[:, 1], measured, information))
+    assert pairwise_consistent(graph).all()
+    # Five times as far off it is not, whichever end it is seen from.
+    off = np.array([0.0, 0.0, 0.08]) if not turned else -SE2.adjoint(SE2.inverse(measured[-1:]))[0] @ [0.0, 0.0, 0.08]
+    measured[-1] = SE2.retract(measured[-1], off)
+    assert not pairwise_consistent(replace(graph, edges=replace(graph.edges, measured=measured)))[-1]

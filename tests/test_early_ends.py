@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -234,7 +235,7 @@ def test_a_limit_returns_the_iterate_of_least_merit(
     seen: list[tuple[float, float, float, Array]] = []
     accept = SolveState.accept
 
-    def noted(run: SolveState, lin: Linearization, multipliers: Array, *more: float, **details: float | str) -> None:
+    def noted(run: SolveState, lin: Linearization, multipliers: Array, *more: float, **details: Any) -> None:
         g, program = lin.constraints, run.program
         outside = float((np.maximum(g - program.upper, 0.0) + np.maximum(program.lower - g, 0.0)).sum())
         seen.append((lin.cost, outside, float(np.abs(multipliers).max(initial=0.0)), multipliers))
@@ -316,7 +317,7 @@ def test_a_feasible_guess_that_is_cheaper_is_returned(reason: fg.Status) -> None
 def test_an_infeasible_guess_that_costs_least_is_not_returned(reason: fg.Status) -> None:
     graph, x = wall(1.0)
     solution = Walks([3.0, 0.8, 0.2], 4.0, reason).solve(graph, {x: [[5.0]]})
-    assert (solution[x].item(), solution.returned) == (pytest.approx(0.8), 2)
+    assert solution[x].item() == pytest.approx(0.8) and solution.returned == 2
     # At a price of nothing, and without any multiplier, least cost is all there is.
     assert Walks([3.0, 0.8, 0.2], 0.0, reason).solve(graph, {x: [[4.9]]})[x].item() == 4.9
 

@@ -191,7 +191,7 @@ def test_iteration_limit_returns_the_better_of_start_and_end() -> None:
 def test_control_c_in_the_compiled_loop_ends_it(monkeypatch: pytest.MonkeyPatch, at: int | None) -> None:
     """Python learns of it when the iteration is over: what it found counts."""
     stated = Unicycle("straight", False, 20).formulation()
-    run = InteriorPoint().prepare(stated.graph)
+    run = InteriorPoint(time_limit=1e3).prepare(stated.graph)  # a loop that minds the time comes back at every step
     undisturbed = run.solve(stated.guess)
     call, loops = Workspace.call, list(range(undisturbed.iterations + 1))
     last = loops[-1] if at is None else at

@@ -286,10 +286,9 @@ def test_degenerate_multipliers_have_no_units(
     """A row whose slope is gone needs a multiplier that is huge in any unit."""
     graph, x = flat(row, cost, rows, unknown)
     program = graph.compile()
-    slopes = Slopes(program)
-    for value in (start, point):
-        lin = program.linearize({x: np.full((1, 1), unknown * value)})
-        slopes.see(lin.constraint_jacobian, lin.gradient)
+    first, lin = (program.linearize({x: np.full((1, 1), unknown * value)}) for value in (start, point))
+    slopes = Slopes(program, first.constraint_jacobian, first.gradient)
+    slopes.see(lin.constraint_jacobian, lin.gradient)
     multipliers = np.array([-cost * (point - 1.0) / (rows * slope)])
     assert np.abs(program.lagrangian_gradient(lin, multipliers)).max() < 1e-6 * cost / unknown
     assert slopes.degenerate(multipliers, 1e-6) is degenerate

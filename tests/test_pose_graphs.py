@@ -359,3 +359,79 @@ def test_parts_are_those_of_a_reference() -> None:
         first, second = rng.integers(0, count, (2, pairs))
         tied = coo_array((np.ones(pairs), (first, second)), shape=(count, count))
         assert np.array_equal(components(count, first, second), connected_components(tied, directed=False)[1])
+
+
+def test_lago_follows_the_surest_paths_and_not_the_lightest_tree() -> None:
+    """Each step of odometry is surer than any closure, all of them together lose count of whole turns."""
+    rng, count = np.random.default_rng(4), 600
+    truth = np.zeros((count, 3))
+    truth[:, 0] = np.arange(count)
+    along = np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
+    back = np.stack([np.zeros(count // 5, dtype=np.intp), np.arange(4, count, 5)], axis=1)
+    pairs = np.concatenate([along, back])
+    sigma = np.where(np.arange(len(pairs)) < count - 1, 0.2, 0.25)
+    measured = fg.SE2.between(truth[pairs[:, 0]], truth[pairs[:, 1]])
+    turn = sigma * rng.standard_normal(len(pairs))
+    measured[:, 2] = np.arctan2(np.sin(turn), np.cos(turn))
+    information = np.zeros((len(pairs), 3, 3))
+    information[:, 0, 0] = information[:, 1, 1] = 100.0
+    information[:, 2, 2] = sigma**-2.0
+    graph = PoseGraph(np.arange(count), truth, Edges(pairs[:, 0], pairs[:, 1], measured, information))
+    drift = np.abs(np.cumsum(measured[: count - 1, 2])).max()
+    assert drift > np.pi  # along odometry alone, the lightest tree
+    assert np.abs(lago(graph)[:, 2]).max() < 1.5
+
+
+def correlated(group: fg.LieGroup, seed: int) -> PoseGraph:
+    """A loop of eight poses with two chords, every information matrix full."""
+    rng = np.random.default_rng(seed)
+    truth = group.exp(rng.uniform(-1.0, 1.0, (8, group.dim)))
+    first, second = np.array([*range(8), 0, 2]), np.array([*range(1, 8), 0, 4, 6])
+    roots = 10.0 * (np.eye(group.dim) + 0.7 * rng.standard_normal((10, group.dim, group.dim)))
+    measured = group.retract(group.between(truth[first], truth[second]), 0.05 * rng.standard_normal((10, group.dim)))
+    return PoseGraph(np.arange(8), truth, Edges(first, second, measured, np.swapaxes(roots, 1, 2) @ roots))
+
+
+@pytest.mark.parametrize(("method", "group"), [(lago, fg.SE2), (chordal, fg.SE2), (chordal, fg.SE3)])
+def test_positions_of_first_guesses_heed_what_headings_say(
+    method: Callable[[PoseGraph], Array], group: fg.LieGroup
+) -> None:
+    """With rotations as found, no shift lowers the sum over translations and rotations of the errors, correlated."""
+    graph = correlated(group, 1)
+    dim, edges = group.point_dim, graph.edges
+
+    def cost(poses: Array) -> float:
+        error = group.between(edges.measured, group.between(poses[edges.first], poses[edges.second]))
+        both = np.concatenate([error[:, :dim], group.log(error)[:, dim:]], axis=1)
+        return float(np.einsum("ni,nij,nj->", both, edges.information, both))
+
+    poses = method(graph)
+    least = cost(poses)
+    for k in range(1, len(poses)):
+        for axis in range(dim):
+            sides = []
+            for step in (-1e-4, 1e-4):
+                moved = poses.copy()
+                moved[k, axis] += step
+                sides.append(cost(moved))
+            assert min(sides) > least
+            assert abs(sides[1] - sides[0]) < 1e-4 * (sum(sides) - 2.0 * least)
+
+
+@pytest.mark.parametrize("method", [lago, chordal])
+def test_headings_of_first_guesses_are_weighed_by_what_is_left_of_them(
+    method: Callable[[PoseGraph], Array],
+) -> None:
+    """A small gap of heading around a loop is shared out by variances, positions free, not by entries of matrices."""
+    graph = correlated(fg.SE2, 2)
+    edges = graph.edges[np.arange(8)]
+    exact = fg.SE2.between(graph.poses[edges.first], graph.poses[edges.second])
+    gap = 1e-4
+    exact[3, 2] += gap
+    loop = replace(graph, edges=replace(edges, measured=exact))
+    found = method(loop)
+    turned = fg.SE2.between(found[edges.first], found[edges.second])[:, 2] - exact[:, 2]
+    variance = np.linalg.inv(edges.information)[:, 2, 2]
+    np.testing.assert_allclose(turned, -gap * variance / variance.sum(), rtol=1e-3)
+    diagonal = 1.0 / edges.information[:, 2, 2]
+    assert np.abs(diagonal / diagonal.sum() - variance / variance.sum()).max() > 0.05

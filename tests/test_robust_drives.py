@@ -159,6 +159,7 @@ def test_the_command_doubts_odometry_when_told(tmp_path: Path, capsys: pytest.Ca
     found = json.loads((out / "metrics.json").read_text())
     assert found["robust_on"] == "all" and found["outliers"] == 3
     assert all(b - a == 1 for a, b in found["outlier_edges"])
+    assert found["groups"] == []
     said = capsys.readouterr().out
     assert "on measurements" in said and "3 of the measurements" in said
 
@@ -182,6 +183,16 @@ def test_a_group_that_agrees_with_itself_alone_is_named(seed: int, miss: tuple[f
     said = solution.verdict.sentence(solution.cost)
     assert f"15 in 'closures' ({', '.join(map(str, closures[:5]))}, ...); {'without' if kept else 'with'} them" in said
     assert f"'poses' {member} by {far:.3g}" in said and group.sentence() in solution.report()
+
+
+def test_the_command_names_groups(tmp_path: Path) -> None:
+    clean, truth = drive(4, replace(CALM, closures=20))
+    graph, wrong = aliased(clean, truth, 4, (20.0, 5.0, 0.1))
+    file, out = write_g2o(tmp_path / "drive.g2o", graph), tmp_path / "out"
+    assert command.main(["solve", str(file), "--robust", "gnc", "--no-scene", "--out", str(out)]) == 0
+    (group,) = (one for one in json.loads((out / "metrics.json").read_text())["groups"] if len(one["factors"]) == 15)
+    assert group["kept"] and group["term"] == "closures" and group["cost"] > 80.0
+    assert group["factors"] == np.flatnonzero(wrong[~graph.edges.odometry]).tolist()
 
 
 def test_a_group_is_taken_out_as_dense_algebra_does() -> None:
@@ -277,7 +288,7 @@ def test_scale_does_not_decide_where_nothing_is_trusted(seed: int) -> None:
     edges = replace(sim.pose_graph.edges, information=0.02 * sim.pose_graph.edges.information)
     graph = replace(sim.pose_graph, edges=edges)
     for everywhere in ("closures", "all"):
-        stated, _, guess = graph.graph(robust=LOSS, robust_on=everywhere)  # type: ignore[arg-type]
+        stated, _, guess = graph.graph(robust=LOSS, robust_on=everywhere)
         staged, stages = graduated_non_convexity._staged(stated)
         search = graduated_non_convexity._Search(GraduatedNonConvexity(), stated, staged, stages, None, None)
         found = search.best(guess)

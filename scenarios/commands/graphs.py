@@ -109,6 +109,12 @@ def metrics(solved: SolvedGraph) -> dict[str, Any]:
         "outliers": int(solved.outliers.sum()),
         "outlier_edges": _pairs(solved),
         "rivals": [] if solution.verdict is None else [rival.cost for rival in solution.verdict.rivals],
+        "groups": []
+        if solution.verdict is None
+        else [
+            {"term": one.term, "factors": one.factors.tolist(), "kept": one.kept, "cost": one.other.cost}
+            for one in solution.verdict.groups
+        ],
         "seconds": {name: round(value, 6) for name, value in solved.seconds.items()},
     }
 

@@ -107,14 +107,34 @@ class InteriorPoint(Solver):
 
     def iterate(self, run: SolveState, workspace: Workspace) -> Status | None:
         """Iterate to convergence; where that is not to be had, to a point of least violation, or on from another."""
+        start, carried = run.values, run.multipliers
         reason = self._iterate(run, workspace)
         now = workspace.now
+        if run.alone and not now["clocked"] and run.returns_best(run.status or reason):
+            self._replay(run, workspace, start, carried)
         if self.step_tolerance > 0.0 and now["kept"] and run.optimality.violation > now["keeping"]:
             ending = run.status or reason
             if ending in (Status.TIME_LIMIT, Status.ITERATION_LIMIT):  # what kept the constraints may be acted on
                 run.begin_at(run.program.linearize(run.program.columns.view(workspace.work.kept.copy())))
                 run.status = ending
         return reason
+
+    def _replay(self, run: SolveState, workspace: Workspace, start: Values, carried: Array) -> None:
+        """Take note of all iterates of a solve without success, which nobody has looked at: up to its first restart."""
+        reached = run.values, run.multipliers, run.iterations
+        run.values, run.multipliers = start, carried
+        now = workspace.prepare(run, self, clocked=True)
+        now["assisted"], now["watched"], now["stage"] = not run.program.fully_compiled, 0, state.MOVED
+        while workspace.asks():
+            self._note(run, workspace)
+        run.values, run.multipliers, run.iterations = reached
+
+    def _note(self, run: SolveState, workspace: Workspace) -> None:
+        """Take note of the iterate from which a step is to be made."""
+        now, work = workspace.now, workspace.work
+        run.iterations = now["iteration"]
+        if now["answer"] == state.TRY:
+            run.consider(now["cost"], work.constraints.copy(), work.values.copy(), work.multipliers.copy())
 
     def _iterate(self, run: SolveState, workspace: Workspace) -> Status | None:
         now = workspace.prepare(run, self)
@@ -152,7 +172,10 @@ class InteriorPoint(Solver):
                 workspace.call("renew")
             else:
                 workspace.take(program.linearize(program.columns.view(work.values.copy())))
-            run.slopes.see(work.constraint_jacobian, work.gradient)
+            run.see(work.constraint_jacobian, work.gradient)
+            run.look_at_fixed(work.constraints)
+            if run.status is not None:
+                return None
         else:
             if not np.array_equal(run.lin.values.flat, work.values):
                 run.begin_at(program.linearize(program.columns.view(work.values.copy())))
@@ -163,12 +186,9 @@ class InteriorPoint(Solver):
         try:
             while workspace.asks():
                 if run.alone:
-                    run.iterations = now["iteration"]
-                if now["answer"] == state.TRY:
-                    if run.alone:
-                        run.consider(now["cost"], work.constraints, workspace._values(), work.multipliers.copy())
-                    if run.out_of_time:
-                        break
+                    self._note(run, workspace)
+                if now["answer"] == state.TRY and run.out_of_time:
+                    break
                 if now["answer"] == state.SHOW and now["iteration"] > seen:
                     seen = now["iteration"]
                     details = _details(now["mu"], now["delta"], now["gauss_newton"])
@@ -277,8 +297,8 @@ class Workspace:
             work.trial_constraints[:] = found.constraints
         return answer in (state.TRY, state.LINEARIZE, state.BEND, state.EVALUATE, state.SHOW)
 
-    def prepare(self, run: SolveState, options: InteriorPoint) -> Fields:
-        """Set up one solve with the present data; returns the scalars."""
+    def prepare(self, run: SolveState, options: InteriorPoint, clocked: bool = False) -> Fields:
+        """Set up one solve with the present data, ``clocked`` to come back before every step; returns the scalars."""
         if self.program.equality is not self._held:  # which is a new array when limits have changed
             if not np.array_equal(self.program.equality, self.system.held):
                 self._build(options.max_iterations)
@@ -293,7 +313,7 @@ class Workspace:
         now["step_tolerance"] = options.step_tolerance
         now["violation_tolerance"], now["clocked"] = (
             options.violation_tolerance,
-            run.alone or options.time_limit < np.inf,
+            clocked or options.time_limit < np.inf,
         )
         now["keeping"] = max(run.tolerance, options.violation_tolerance if options.step_tolerance > 0.0 else 0.0)
         now["iteration"], now["kept"], now["raises"] = 0, 0, 0

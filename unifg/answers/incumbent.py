@@ -11,8 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from unifg.program.columns import Values
+from unifg.program.program import Program
 from unifg.typing import Array
+
+MANY = 16  # iterates that wait until somebody compares them
 
 
 class Incumbent(NamedTuple):
@@ -20,14 +22,16 @@ class Incumbent(NamedTuple):
 
     Attributes:
         number: of its row in the history; 0 for the guess.
-        cost, violation: objective, and sum of the violations of all rows.
-        values, multipliers: the iterate.
+        cost: objective.
+        constraints: (M,).
+        values: stored ones, of all families.
+        multipliers: (M,).
     """
 
     number: int
     cost: float
-    violation: float
-    values: Values
+    constraints: Array
+    values: Array
     multipliers: Array
 
 
@@ -35,29 +39,41 @@ class Incumbents:
     """What may still be the best iterate, at the present price or a higher one.
 
     Attributes:
-        price: of violation.
+        price: of violation, of the iterates that were compared.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, program: Program) -> None:
         """There is none yet."""
+        self._program = program
         self.price = 0.0
-        self._kept: list[Incumbent] = []
+        self._kept: list[tuple[float, Incumbent]] = []
+        self._waiting: list[Incumbent] = []
 
     def __bool__(self) -> bool:
         """Whether there is one."""
-        return bool(self._kept)
+        return bool(self._kept or self._waiting)
 
     def see(self, found: Incumbent) -> None:
-        """Take note of an iterate, which takes the place of equals."""
-        if len(found.multipliers):
-            self.price = max(self.price, float(np.abs(found.multipliers).max()))
-        self._kept = [k for k in self._kept if k.cost < found.cost or k.violation < found.violation]
-        if not any(k.cost <= found.cost and k.violation <= found.violation for k in self._kept):
-            self._kept.append(found)
-        least = self.best.violation
-        self._kept = [k for k in self._kept if k.violation <= least]
+        """Take note of an iterate, which costs nothing until iterates are compared."""
+        self._waiting.append(found)
+        if len(self._waiting) > MANY:
+            self._compare()
 
     @property
     def best(self) -> Incumbent:
         """The iterate of least merit, the last of equals."""
-        return min(reversed(self._kept), key=lambda k: k.cost + self.price * k.violation)
+        self._compare()
+        return min(reversed(self._kept), key=self._merit)[1]
+
+    def _compare(self) -> None:
+        for found in self._waiting:
+            self.price = max(self.price, float(np.abs(found.multipliers).max(initial=0.0)))
+            outside = float(np.abs(self._program.violation(found.constraints)).sum())
+            self._kept.append((outside, found))
+        self._waiting = []
+        if self._kept:
+            least = min(reversed(self._kept), key=self._merit)[0]
+            self._kept = [kept for kept in self._kept if kept[0] <= least]
+
+    def _merit(self, kept: tuple[float, Incumbent]) -> float:
+        return kept[1].cost + self.price * kept[0]

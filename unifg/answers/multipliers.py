@@ -19,7 +19,7 @@ import numpy as np
 from unifg.machine.jit import compiled
 from unifg.program.linearization import Linearization
 from unifg.program.program import Program
-from unifg.typing import Array
+from unifg.typing import Array, IntArray
 
 LARGEST = 1e6
 SUSPICIOUS = 1e3  # in the graph's own units; below it nobody looks
@@ -35,16 +35,14 @@ class Slopes:
         gradient: magnitudes over the full tangent space.
     """
 
-    def __init__(self, program: Program) -> None:
-        """Nothing is seen yet."""
+    def __init__(self, program: Program, jacobian: Array, gradient: Array) -> None:
+        """Begin with those at the start, which are copied."""
         self._program = program
-        self.jacobian = np.zeros(program.constraints.length)
-        self.gradient = np.zeros(program.columns.width)
+        self.jacobian, self.gradient = jacobian.copy(), gradient.copy()
 
     def see(self, jacobian: Array, gradient: Array) -> None:
-        """Take note of one point."""
-        _raise(jacobian, self.jacobian)
-        _raise(gradient, self.gradient)
+        """Take note of another point."""
+        _raise(jacobian, gradient, self.jacobian, self.gradient)
 
     def degenerate(self, multipliers: Array, tolerance: float) -> bool:
         """Whether multipliers are larger than constraints with a slope ever need.
@@ -53,13 +51,12 @@ class Slopes:
             multipliers: (M,).
             tolerance: of the KKT test; a cost whose gradient never exceeded it has no scale.
         """
-        program, size = self._program, float(np.abs(multipliers).sum())
-        gradient = self.gradient[program.columns.free]
-        largest = max(float(gradient.max(initial=0.0)), tolerance)
-        if not size * float(self.jacobian.max(initial=0.0)) > SUSPICIOUS * largest:
+        program = self._program
+        if not _size(multipliers, self.jacobian, self.gradient, program.columns.free, tolerance) > SUSPICIOUS:
             return False
+        gradient = np.abs(self.gradient[program.columns.free])
         rows, columns = program.constraints.free_rows, program.constraints.free_columns
-        entries = self.jacobian[program.constraints.free]
+        entries = np.abs(self.jacobian[program.constraints.free])
         unknowns, scale, cost = np.ones(program.size), np.ones(len(multipliers)), 1.0
         for _ in range(PASSES):
             scaled = entries * scale[rows] * unknowns[columns]
@@ -98,9 +95,24 @@ def estimated(program: Program, lin: Linearization, tolerance: float) -> Array |
 
 
 @compiled
-def _raise(found: Array, largest: Array) -> None:
-    """Write the larger magnitudes; what is not finite does not count."""
-    for k in range(len(found)):
-        size = abs(found[k])
-        if largest[k] < size < np.inf:
-            largest[k] = size
+def _raise(jacobian: Array, gradient: Array, largest: Array, steepest: Array) -> None:
+    """Keep the numbers of larger magnitude; what is not finite does not count."""
+    for k in range(len(jacobian)):
+        if abs(largest[k]) < abs(jacobian[k]) < np.inf:
+            largest[k] = jacobian[k]
+    for k in range(len(gradient)):
+        if abs(steepest[k]) < abs(gradient[k]) < np.inf:
+            steepest[k] = gradient[k]
+
+
+@compiled
+def _size(multipliers: Array, jacobian: Array, gradient: Array, free: IntArray, tolerance: float) -> float:
+    """Sum of the multipliers times the largest slope of a row, over that of the cost."""
+    total, largest, steepest = 0.0, 0.0, tolerance
+    for multiplier in multipliers:
+        total += abs(multiplier)
+    for slope in jacobian:
+        largest = max(largest, abs(slope))
+    for k in free:
+        steepest = max(steepest, abs(gradient[k]))
+    return total * largest / steepest

@@ -211,7 +211,7 @@ class SolveState:
         tolerance: of the KKT test.
         lent: the backend's factorisation of a matrix near the Hessian of the objective, which the KKT test of least
             squares may use and overwrite; None where the backend has no such thing.
-        slopes: the largest so far.
+        slopes: the largest so far, where there are constraints.
         incumbents: iterates one of which is returned without success.
     """
 
@@ -225,11 +225,11 @@ class SolveState:
         self.tolerance = solver.tolerance
         self.history: list[Iteration] = []
         self.status: Status | None = None
-        self.incumbents = Incumbents()
+        self.incumbents = Incumbents(program)
         self._recall: Callable[[], list[Iteration]] | None = None
         self._least, self._least_values, self._start = np.inf, values, values
         self.lent: Factored | None = None
-        self.slopes = Slopes(program)
+        self.slopes: Slopes | None = None
         self.iterations = 0
         if solver.verbose:
             show(HEADER)
@@ -307,38 +307,46 @@ class SolveState:
 
     def _move(self, lin: Linearization, multipliers: Array) -> None:
         self.lin, self.values, self.multipliers = lin, lin.values, multipliers
-        if len(multipliers):
-            self.slopes.see(lin.constraint_jacobian, lin.gradient)
+        self.see(lin.constraint_jacobian, lin.gradient)
         self.optimality = optimality(self.program, lin, multipliers, self.tolerance, self.lent, self._start.flat)
         if self.optimality.violation < self._least:
             self._least, self._least_values = self.optimality.violation, lin.values
         if self.optimality.finite:
-            self.consider(lin.cost, lin.constraints, lin.values, multipliers)
+            self.consider(lin.cost, lin.constraints.copy(), lin.values.flat, multipliers)
 
-    def consider(self, cost: float, constraints: Array, values: Values, multipliers: Array) -> None:
+    def see(self, jacobian: Array, gradient: Array) -> None:
+        """Take note of slopes of constraints and cost, as of :class:`unifg.answers.multipliers.Slopes`."""
+        if self.slopes is not None:
+            self.slopes.see(jacobian, gradient)
+        elif len(self.multipliers):
+            self.slopes = Slopes(self.program, jacobian, gradient)
+
+    def consider(self, cost: float, constraints: Array, values: Array, multipliers: Array) -> None:
         """Take note of an iterate that may be returned if the solve ends without success.
 
         Args:
             cost: objective.
-            constraints: (M,) there.
-            values: the iterate, which is not written to any more.
-            multipliers: (M,) there, the same.
+            constraints: (M,) there. None of the arrays may be written to any more.
+            values: stored ones.
+            multipliers: (M,) there.
         """
-        violation = float(np.abs(self.program.violation(constraints)).sum()) if len(constraints) else 0.0
-        self.incumbents.see(Incumbent(self.iterations, cost, violation, values, multipliers))
+        self.incumbents.see(Incumbent(self.iterations, cost, constraints, values, multipliers))
 
     def begin_at(self, lin: Linearization) -> None:
         """Move the start, as onto the bounds, without spending an iteration."""
         self._move(lin, self.multipliers)
         self.status = self._decide_in_time()
 
-    def look_at_fixed(self) -> None:
-        """End before the first iteration where a violated row touches nothing but fixed variables."""
+    def look_at_fixed(self, constraints: Array) -> None:
+        """End before the first iteration where a violated row touches nothing but fixed variables.
+
+        Args:
+            constraints: (M,) at the start.
+        """
         rows = self.program.fixed_rows()
         if self.status is not None or not len(rows):
             return
-        point = self.program.evaluate(self.values) if self.alone else self.lin
-        outside = np.abs(self.program.violation(point.constraints)[rows])
+        outside = np.abs(self.program.violation(constraints)[rows])
         if outside.max() > self.tolerance:
             if self.alone:
                 self.accept(self.program.linearize(self.values), self.multipliers, 0.0, 0.0)
@@ -409,7 +417,7 @@ class SolveState:
         measured = self.optimality
         if measured.passes(self.tolerance) and status is not Status.UNBOUNDED:
             status = Status.CONVERGED if measured.weakest > HARDLY else Status.HARDLY_DETERMINED
-            if len(self.multipliers) and self.slopes.degenerate(self.multipliers, self.tolerance):
+            if self.slopes is not None and self.slopes.degenerate(self.multipliers, self.tolerance):
                 status = Status.DEGENERATE
         elif measured.holds(self.tolerance) and not measured.determined:
             status = Status.UNDETERMINED
@@ -445,15 +453,19 @@ class SolveState:
         if all(better <= worse for better, worse in pairs) and after[:3] != before[:3]:
             self.multipliers, self.optimality = found, after
 
-    def _return_best(self, status: Status) -> int:
-        """Go back to the best iterate where the ending asks for it; returns the number of what is returned."""
+    def returns_best(self, status: Status | None) -> bool:
+        """Whether an ending asks for the best iterate instead of the last."""
         asked = self._solver.max_iterations <= FEW or getattr(self._solver, "step_tolerance", 0.0) == np.inf
         sound = asked or status not in WITHOUT_SUCCESS or self.optimality.holds(self.tolerance)
-        if self.optimality.finite and sound:
+        return not (self.optimality.finite and sound)
+
+    def _return_best(self, status: Status) -> int:
+        """Go back to the best iterate where the ending asks for it; returns the number of what is returned."""
+        if not self.returns_best(status):
             return self.iterations
         best = self.incumbents.best
-        if best.values is not self.values or best.multipliers is not self.multipliers:
-            self._move(self.program.linearize(best.values), best.multipliers)
+        if best.values is not self.values.flat or best.multipliers is not self.multipliers:
+            self._move(self.program.linearize(self.program.columns.view(best.values)), best.multipliers)
         return best.number
 
     def _decide(self) -> Status | None:
@@ -585,7 +597,8 @@ class Prepared:
     def _finished(self, run: SolveState) -> Solution:
         """The solution of a solve that has begun."""
         self._refuse_not_finite(run)
-        run.look_at_fixed()
+        if not run.alone:  # who runs alone looks for itself
+            run.look_at_fixed(run.lin.constraints)
         reason = None
         if run.status is None:
             self.allocate()

@@ -31,7 +31,8 @@ def pairwise_consistent(pose_graph: PoseGraph, probability: float = 0.9999, trie
 
     Drift is linearised at odometry: along drives whose heading is lost, right closures seem inconsistent. Closures
     between parts that odometry does not connect, such as the drives of two robots, are compared with others between the
-    same parts. Edges whose information is singular say too little to be tested, and stay.
+    same parts. Edges whose information is singular say too little to be tested, and stay. Wrong closures that agree
+    with each other, such as those of a street that looks like another, pass where they are more than the right ones.
 
     Args:
         pose_graph: relative poses; those in the graph do not matter.
