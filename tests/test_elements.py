@@ -254,6 +254,16 @@ def test_masked_arrays_are_refused(state: Callable[[fg.Graph, fg.Family], object
         state(graph, x)
 
 
+def test_smoothers_refuse_masked_arrays() -> None:
+    graph = fg.Incremental()
+    x = graph.variables("x", fg.Rn(2))
+    with pytest.raises(fg.GraphError, match="masked"):
+        graph.minimize(fg.prior, x[0], MASKED)
+    graph.minimize(fg.prior, x[0], np.zeros(2))
+    with pytest.raises(fg.GraphError, match=r"family 'x'.*masked"):
+        graph.update({x: MASKED})
+
+
 @pytest.mark.parametrize("value", [[1.0, 2.0, 90.0], [[0.0, 0.0, 0.1], [0.0, 0.0, -7.0]]])
 def test_a_prior_with_headings_beyond_a_turn_names_degrees(value: list[Any], caplog: pytest.LogCaptureFixture) -> None:
     graph = fg.Graph()
