@@ -283,12 +283,12 @@ def together(sheets: Sequence[Sheet]) -> str:
         length, duration = spreads[LENGTH], spreads[DURATION]
         section = partial(numbers, "bazzana", "section VII-B")
         (mean, mean_ros), (mean_s, mean_s_ros) = section("mean_spread_length"), section("mean_spread_duration")
-        (most, most_s), (most_ros, most_s_ros) = section("greatest_spread"), section("greatest_spread_ros")
+        (top, top_s), (top_ros, top_s_ros) = section("greatest_spread"), section("greatest_spread_ros")
         say.append(
             f"The standard deviation is on average {np.mean(length):.2f} % of the path length (paper: {mean:.2f} %; "
-            f"ROS: {mean_ros:.2f} %), at most {max(length):.2f} % ({most:.2f} %; {most_ros:.2f} %), and "
+            f"ROS: {mean_ros:.2f} %), at most {max(length):.2f} % ({top:.2f} %; {top_ros:.2f} %), and "
             f"{np.mean(duration):.2f} % of the duration ({mean_s:.2f} %; {mean_s_ros:.2f} %), at most "
-            f"{max(duration):.2f} % ({most_s:.2f} %; {most_s_ros:.2f} %)."
+            f"{max(duration):.2f} % ({top_s:.2f} %; {top_s_ros:.2f} %)."
         )
     factor = simulated / max(seconds, 1e-9)
     say.append(

@@ -176,10 +176,8 @@ def _solve_file(settings: SolveSettings, progress: Progress) -> SolvedGraph:
     progress(0.0, f"reading {legible(settings.file.name)}")
     read = read_pose_graph(settings.file, repair=settings.repair_information)
     clock.split("read")
-    weights = [
-        read.edges.information,
-        *(seen.information for seen in (*read.sightings.values(), *read.priors.values())),
-    ]
+    weights = [read.edges.information, *(seen.information for seen in read.sightings.values())]
+    weights += [prior.information for prior in read.priors.values()]
     if any(indefinite(information).any() for information in weights):
         raise ScenarioError(f"{settings.file}: {'; '.join(read.remarks)}: --repair-information zero or project")
     if not len(read.edges) and not read.sightings and not read.priors:

@@ -112,7 +112,7 @@ def test_the_ends_of_a_half_turn_are_no_neighbours() -> None:
 def test_a_disc_is_placed_by_a_lidar_of_any_field(lidar: LidarModel) -> None:
     place = (21.0, 9.6, -2.0)
     centre = SE2.act(np.array(place), np.array([1.2, 0.1]))
-    disc = Obstacle((float(centre[0]), float(centre[1])), 0.2)
+    disc = Obstacle(centre, 0.2)
     world = World(building_map(), place, [disc], np.random.default_rng(3), lidar=replace(lidar, dropout=0.0))
     found = DiscFinder(floor()).find(world.scan(), world.pose)
     near = np.hypot(*(found.centre - centre).T)

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import ecg2o
 from benchmarks.against_ipopt import PAPER as ROWS
 from benchmarks.experiments import PAPER as LEGS
 from benchmarks.printed import numbers, pairs, printed, texts
+from unifg.errors import ScenarioError
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 PAPERS = CHECKOUT.parent / "shared" / "papers"
@@ -68,3 +70,12 @@ def test_pages_show_what_is_printed() -> None:
     assert "99.6 %" in page("barriers.md") and "5.4 ms" in page("barriers.md") and "5.4 ms" in page("safety.md")
     velocity = page("velocity-tracking.md")
     assert "11 to 13" in velocity and "average of 20" in velocity and "8.7" not in velocity
+
+
+def test_the_papers_profile_is_not_replaced_by_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("UNIFG_DATA", str(tmp_path))
+    with pytest.raises(ScenarioError, match=r"velocity_profile_388\.csv.*UNIFG_DATA"):
+        ecg2o.drive(50)
+    (tmp_path / "profiles").mkdir()
+    with pytest.raises(ScenarioError, match=r"velocity_profile_388\.csv.*UNIFG_DATA"):
+        ecg2o.main(["--no-docs"])

@@ -14,7 +14,6 @@ import pytest
 import unifg as fg
 from judge import judge
 from scenes import check_offline, commands_of, data_of, tracks_of
-from unifg.errors import ScenarioError
 from unifg.models import vehicle
 from unifg.models.vehicle import Vehicle
 from unifg.scenarios import command, velocity_tracking
@@ -349,14 +348,3 @@ def test_profile_without_times_and_with_blank_lines(tmp_path: Path) -> None:
     with pytest.raises(fg.ScenarioError, match=r"a drive of 3 steps was asked for, and the profile profile\.csv has 2"):
         run_tracking(TrackingSettings(3, profile=path))
     assert run_tracking(TrackingSettings(1, profile=path)).succeeded
-
-
-def test_the_papers_profile_is_not_replaced_by_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from benchmarks import ecg2o
-
-    monkeypatch.setenv("UNIFG_DATA", str(tmp_path))
-    with pytest.raises(ScenarioError, match=r"velocity_profile_388\.csv.*UNIFG_DATA"):
-        ecg2o.drive(50)
-    (tmp_path / "profiles").mkdir()
-    with pytest.raises(ScenarioError, match=r"velocity_profile_388\.csv.*UNIFG_DATA"):
-        ecg2o.main(["--no-docs"])

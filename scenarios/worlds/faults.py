@@ -122,7 +122,7 @@ class DriveFaults(_Faults):
         if self.hold("lidar-dropped", now):
             return None
         if self.hold("lidar-delayed", now):
-            late = [old for old in self._scans if old.time <= now - LATE + 1e-9]
+            late = [old for old in self._scans if old.time is not None and old.time <= now - LATE + 1e-9]
             return late[-1] if late else None
         if self.hold("beams-missing", now):
             return replace(scan, angles=scan.angles[:-1], ranges=scan.ranges[:-1])

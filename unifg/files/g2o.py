@@ -152,7 +152,7 @@ def parse_g2o(file: TaggedFile, repair: Repair | None = None) -> PoseGraph:
         )
         for kind, seen in priors.items()
     }
-    touched = [first, second, *(seen.pose for seen in (*looked.values(), *held.values()))]
+    touched = [first, second, *(s.pose for s in looked.values()), *(prior.pose for prior in held.values())]
     report_isolated(file, "pose", ids, np.concatenate(touched))
     seen_points = [np.zeros(0, dtype=np.intp), *(seen.landmark for seen in looked.values())]
     report_isolated(file, "landmark", point_ids, np.concatenate(seen_points))

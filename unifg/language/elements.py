@@ -58,7 +58,7 @@ def on_manifolds(name: str, residual: Residual, arguments: Sequence[Any], active
     """
     result = list(arguments)
     elements = elements_of(residual)
-    wanted = active.value if isinstance(active, Data) else active
+    wanted: BoolArray | None = active.value.astype(bool) if isinstance(active, Data) else active
     for place, given in enumerate(arguments):
         if isinstance(given, Selection) or not (place in elements or residual.kernel is not None):
             continue

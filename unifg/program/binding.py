@@ -103,8 +103,8 @@ class Binding:
                 slot[...] = handle.value
         flags = {handle: handle.check(data.get(handle, handle.value)) for handle in self._flags}
         for what, handle, manifold, term in self._elements:
-            active = flags[term.active] if isinstance(term.active, Data) else term.active
-            slots[handle][...] = nearest(what, manifold, slots[handle], active, term.name)
+            mask = flags[term.active].astype(bool) if isinstance(term.active, Data) else term.active
+            slots[handle][...] = nearest(what, manifold, slots[handle], mask, term.name)
         count = _renew(
             self._coming, self._flat, self._starts, self._changed, self._sources, self._targets, self._parameters
         )

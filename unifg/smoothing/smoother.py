@@ -10,6 +10,7 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.kernels.robust import Loss
+from unifg.language.doubles import doubles
 from unifg.language.statement import AnyResidual
 from unifg.language.terms import Parameter
 from unifg.language.variables import Data, Selection, Variable, as_selection
@@ -354,7 +355,7 @@ class Smoother:
         """Values of new members as (n, storage)."""
         if self.families.get(getattr(family, "name", "")) is not family:
             raise GraphError(f"update: {family!r} is not a family of this smoother")
-        array = np.array(value, dtype=np.float64, ndmin=2, order="C")
+        array = np.array(doubles(f"update: the values of family '{family.name}'", value), ndmin=2, order="C")
         storage = family.manifold.storage
         if array.ndim != 2 or array.shape[1] != storage:
             raise GraphError(
