@@ -80,9 +80,9 @@ def residual(
             (m, d_k) block per variable in the place of r.
         derivatives: of a function without a Jacobian. None: it is traced (run once on symbols, differentiated
             exactly and made into machine code) where that is possible, and differenced where it is not, which
-            ``graph.check`` and the log say. "trace" makes the second an error, and traces also functions that reach
-            what cannot be watched (its present content is compiled in) and those with a Jacobian, which then only
-            serves comparison. "trace first" uses the Jacobian where there is no trace.
+            ``graph.check`` and the log say. "trace" makes the second an error, and also traces functions
+            that reach what cannot be watched (its present content is compiled in) and those with a Jacobian, which
+            then only serves comparison. "trace first" uses the Jacobian where there is no trace.
             "differences" leaves the function as it is.
         about: what ``help`` says of the residual; defaults to the docstring of the function.
 
