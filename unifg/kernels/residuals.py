@@ -76,8 +76,8 @@ def residual(
         rows: m, needed (and only then) when ``function`` is compiled with Numba. Such a function sees one factor:
             ``function(x, y, ..., measured, ..., r)`` with (storage,) arrays for variables, a number, vector or matrix
             for each parameter, and the (m,) residual to be written last. A parameter array with two axes holds one
-            row per factor, and numbers and vectors are shared, unless declared by ``fg.each`` or ``fg.shared``. ``jacobian``, if given, is compiled too and takes one
-            (m, d_k) block per variable in the place of r.
+            row per factor, and numbers and vectors are shared, unless declared by ``fg.each`` or ``fg.shared``.
+            ``jacobian``, if given, is compiled too and takes one (m, d_k) block per variable in the place of r.
         derivatives: of a function without a Jacobian. None: it is traced (run once on symbols, differentiated
             exactly and made into machine code) where that is possible, and differenced where it is not, which
             ``graph.check`` and the log say. "trace" makes the second an error, and also traces functions
