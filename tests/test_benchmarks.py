@@ -142,7 +142,7 @@ def test_the_page_of_the_collection_counts_what_was_found(monkeypatch: pytest.Mo
     results = collection.measure()
     assert results["GaussNewton"].keys() == {"Beale"}
     text = collection.render(results)
-    assert "| SQP | 3 | 2 | 0 | 1 | 0 | 100.0 % |" in text
+    assert "| SQP | 3 | 2 | 0 | 0 | 1 | 0 | 100.0 % |" in text
     assert "| GaussNewton | singular | Beale |" in text
     outcome = attempt("HS21", BACKENDS["SQP"])
     assert outcome is not None and f"| HS21 | {outcome.iterations} |" in text

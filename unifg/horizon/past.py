@@ -201,7 +201,7 @@ class Past:
             self.reach = max(self.reach, int((last - first).max()))
             if self._history.filled:
                 continue
-            switch = graph.data(f"{term.name}: entered", np.ones(term.count, dtype=bool), each=True)
+            switch = graph.data(f"{term.name}: entered", np.zeros(term.count, dtype=bool), each=True)  # none has yet
             own[switch], term.active = term.active, switch
             switches.append((switch, first.astype(np.intp)))
         return switches, own

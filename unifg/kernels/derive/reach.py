@@ -368,7 +368,8 @@ def classes_of(value: Any) -> list[type]:
     if type(value) is SimpleNamespace:
         return [SimpleNamespace]
     strange = any(
-        owner.__module__.partition(".")[0] in sys.stdlib_module_names - {"__main__", "types", "abc", "typing"}
+        owner.__module__.partition(".")[0] in sys.stdlib_module_names - {"__main__", "abc", "typing"}
+        or _trusted(owner.__module__)
         or "__getattribute__" in vars(owner)
         or "__getattr__" in vars(owner)
         or "__slots__" in vars(owner)
