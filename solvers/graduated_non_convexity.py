@@ -281,7 +281,7 @@ class _Search:
                 yield {**values_of(guess), **make()}
 
     def _within(self, found: Solution) -> bool:
-        """Whether an answer leaves every measurement within its threshold."""
+        """Test whether an answer leaves every measurement within its threshold."""
         squares = self._run.program.linearize(found.values).squares
         parts = {term.name: part for term, part in self._run.program.table.robust}
         return all(
@@ -431,7 +431,7 @@ class _Search:
         return None
 
     def _prefers(self, one: _Answer, other: _Answer, spare: float) -> bool:
-        """Whether an answer costs less than another once the noise of each term has the size found for both.
+        """Test whether an answer costs less than another once the noise of each term has the size found for both.
 
         Where every term has a loss, no measurement is trusted, and scale does not tell which of two that contradict
         each other is wrong: the cost as stated decides.
@@ -563,7 +563,7 @@ class _Answer:
 
     @property
     def consistent(self) -> bool:
-        """Whether the sum of all squares is no larger than what is stated makes likely."""
+        """Test whether the sum of all squares is no larger than what is stated makes likely."""
         from scipy.special import chdtri  # slow to load
 
         return self.scatter.freedom < 1.0 or self.scatter.squared <= float(chdtri(self.scatter.freedom, CHANCE))

@@ -39,7 +39,7 @@ class Scan:
 
     @property
     def closed(self) -> bool:
-        """Whether the last beam is the neighbour of the first: a field of view of a full turn."""
+        """Test whether the last beam is the neighbour of the first: a field of view of a full turn."""
         return bool(self.angles[-1] - self.angles[0] + 1.5 * self.spacing > 2.0 * math.pi)
 
     @property

@@ -50,7 +50,7 @@ class Incumbents:
         self._waiting: list[Incumbent] = []
 
     def __bool__(self) -> bool:
-        """Whether there is one."""
+        """Test whether there is one."""
         return bool(self._kept or self._waiting)
 
     def see(self, found: Incumbent) -> None:

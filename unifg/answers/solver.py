@@ -454,7 +454,7 @@ class SolveState:
             self.multipliers, self.optimality = found, after
 
     def returns_best(self, status: Status | None) -> bool:
-        """Whether an ending asks for the best iterate instead of the last."""
+        """Test whether an ending asks for the best iterate instead of the last."""
         asked = self._solver.max_iterations <= FEW or getattr(self._solver, "step_tolerance", 0.0) == np.inf
         sound = asked or status not in WITHOUT_SUCCESS or self.optimality.holds(self.tolerance)
         return not (self.optimality.finite and sound)

@@ -33,7 +33,7 @@ def elements_of(residual: Residual) -> dict[int, Manifold]:
 
 
 def particular(manifold: Manifold) -> bool:
-    """Whether finite numbers may be no element."""
+    """Test whether finite numbers may be no element."""
     return any(getattr(type(leaf), "is_valid", None) is not ManifoldBase.is_valid for leaf, _, _ in leaves(manifold))
 
 

@@ -302,7 +302,7 @@ class Program:
         self.renew_verifications()
 
     def conditions_changed(self, values: Values) -> bool:
-        """Whether comparisons of watched traces come out otherwise than when this was last asked."""
+        """Test whether comparisons of watched traces come out otherwise than when this was last asked."""
         changed = False
         for watcher in self._watchers:
             changed |= watcher.conditions_changed(values)

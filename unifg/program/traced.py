@@ -125,7 +125,7 @@ def unclear_places(present: Sequence[Any], rows: Sequence[bool | None], count: i
 
 
 def has_rows(value: Any, declared: bool | None) -> bool:
-    """Whether an argument of a compiled function of one factor has a row for each: matrices, unless declared."""
+    """Test whether an argument of a compiled function of one factor has a row for each: matrices, unless declared."""
     return np.ndim(value) > 1 if declared is None else declared
 
 
@@ -403,7 +403,7 @@ class _Reading:
     fixed: bool
 
     def of(self, batch: Batch, named: Sequence[Array]) -> tuple[list[Given], list[tuple[Array, bool]]]:
-        """What stands in the place of each argument, and the named arrays that are parameters."""
+        """Return the inputs in the places of the arguments, and the named arrays that are parameters."""
         if batch.single is not None:
             rows = batch.rows_of(batch.present)
             return [

@@ -56,7 +56,7 @@ class Verification:
         return self._watch != 0
 
     def conditions_changed(self, values: Values) -> bool:
-        """Whether a comparison comes out otherwise than when this was last asked."""
+        """Test whether a comparison comes out otherwise than when this was last asked."""
         before = self._before
         self._evaluate(self._watch, values, self._outcome, NO_SLOPES)
         self._before = self._outcome.tobytes()

@@ -47,7 +47,7 @@ def matmul(a: Any, b: Any) -> Any:
 
 
 def _truths(array: Any) -> bool:
-    """Whether the entries of an array are truth values."""
+    """Test whether the entries of an array are truth values."""
     return array.size > 0 and is_truth(next(array.flat))
 
 

@@ -380,7 +380,7 @@ def classes_of(value: Any) -> list[type]:
 
 
 def is_operator(owner: type, name: str) -> bool:
-    """Whether an attribute of a class is a method that an operator calls, or a call."""
+    """Test whether an attribute of a class is a method that an operator calls, or a call."""
     hidden = ("__init__", "__new__", "__repr__", "__init_subclass__", "__post_init__", "__setattr__", "__delattr__")
     return name.startswith("__") and name not in hidden and isinstance(vars(owner)[name], FunctionType)
 

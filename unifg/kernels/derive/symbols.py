@@ -32,7 +32,7 @@ class TraceError(UnifgError):
 
 
 def is_truth(item: Any) -> bool:
-    """Whether an entry is a truth value, whose sum is `or` and whose product is `and`."""
+    """Test whether an entry is a truth value, whose sum is `or` and whose product is `and`."""
     if isinstance(item, Symbol):
         return item.tape.op[item.node] in _TRUTHS or item.node in item.tape.truths
     return isinstance(item, bool | np.bool_)
@@ -349,7 +349,7 @@ def _carried(name: str) -> Callable[..., Any]:
 
 
 def _distinguishes(other: float) -> bool:
-    """Whether a comparison with a number may differ between batches of two rows and more."""
+    """Test whether a comparison with a number may differ between batches of two rows and more."""
     return type(other) is not Length and other > 1
 
 
@@ -497,7 +497,7 @@ def _remainder(a: Any, b: Any) -> Any:
 
 
 def _signed(a: Any) -> Any:
-    """Whether a number has a minus sign, as -0.0 has."""
+    """Test whether a number has a minus sign, as -0.0 has."""
     zero = _apply(Op.AND, _apply(Op.EQUAL, a, 0.0), _apply(Op.LESS, _apply(Op.DIVIDE, 1.0, a), 0.0))
     return _apply(Op.OR, _apply(Op.LESS, a, 0.0), zero)
 
