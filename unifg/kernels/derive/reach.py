@@ -367,9 +367,10 @@ def classes_of(value: Any) -> list[type]:
     owners = [owner for owner in type(value).__mro__ if owner is not object]
     if type(value) is SimpleNamespace:
         return [SimpleNamespace]
+    if isinstance(value, Lookup):  # a table that never changes: its own methods take symbols
+        return []
     strange = any(
         owner.__module__.partition(".")[0] in sys.stdlib_module_names - {"__main__", "abc", "typing"}
-        or _trusted(owner.__module__)
         or "__getattribute__" in vars(owner)
         or "__getattr__" in vars(owner)
         or "__slots__" in vars(owner)
