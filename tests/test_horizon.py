@@ -622,6 +622,27 @@ def test_a_plan_that_comes_too_late_serves_the_next_tick() -> None:
     assert loop.guess is not None
 
 
+def test_a_plan_is_verified_in_idle_time_where_that_is_long_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    loop = line_loop(clock=lambda: now[0])
+    assert loop.idle() == {}
+    drive(loop, 3)
+    assert loop.solution is not None
+    loop.solution.checked = False
+    mistraced = loop.warm.program.mistraced
+
+    def slow(*arguments: Any) -> dict[str, str]:
+        now[0] += 0.5
+        return mistraced(*arguments)
+
+    monkeypatch.setattr(loop.warm.program, "mistraced", slow)
+    assert loop.idle(0.1) == {} and loop.solution.checked  # how long it takes is known from now on
+    drive(loop, 2)
+    loop.solution.checked = False
+    assert loop.idle(0.1) == {} and not loop.solution.checked
+    assert loop.idle(0.6) == {} and loop.solution.checked
+
+
 def test_the_solver_is_given_what_is_left_of_the_deadline() -> None:
     """With no time at all the solve ends at once, and the robot does what it does without a plan."""
     loop = line_loop(deadline=1e-9)

@@ -26,9 +26,12 @@ def wrong_above() -> Iterator[Function]:
     """A ufunc whose trace is wrong above a limit, as a fault of the tracer would be."""
     honest = symbols.UFUNCS["tanh"]
 
-    def faulty(limit: float) -> None:
-        wrong = symbols.UFUNCS["tanh"] = lambda a: symbols.choose(
-            symbols.UFUNCS["less"](a, limit), honest(a), honest(a) + (a - limit)
+    def faulty(limit: float, *, smooth: bool = False) -> None:
+        exp = symbols.UFUNCS["exp"]
+        wrong = symbols.UFUNCS["tanh"] = lambda a: (
+            honest(a) + exp(50.0 * (a - limit))
+            if smooth
+            else symbols.choose(symbols.UFUNCS["less"](a, limit), honest(a), honest(a) + (a - limit))
         )
         symbols.Symbol.tanh = lambda self: wrong(self)  # type: ignore[attr-defined]
 
@@ -272,3 +275,21 @@ def test_fields_of_discs_and_costs_with_kinks_raise_no_alarm(seed: int) -> None:
     line = np.linspace(np.zeros(3), [4.5, 0.0, 0.0], steps + 1)
     solution = InteriorPoint(max_iterations=80).solve(graph, {x: line, u: np.full((steps, 2), 0.5)})
     assert solution.checked and not solution.mistraced
+
+
+def test_the_last_answer_is_verified_in_idle_time(wrong_above: Function) -> None:
+    """Between the solves that are verified by themselves, and for the last solution alone."""
+    wrong_above(2.0, smooth=True)  # no comparison that would come out otherwise
+    graph, x, target = stated(lambda x: 0.1 * np.tanh(x), constrained=False)
+    prepared = GaussNewton().prepare(graph)
+    first = prepared.solve({x: np.zeros((N, 1))})
+    for _ in range(5):
+        solution = prepared.solve({x: np.zeros((N, 1))})
+    late = prepared.solve({x: np.zeros((N, 1))}, data={target: np.full((N, 1), 2.0)})
+    assert first.checked and not solution.checked and not late.checked
+    with pytest.raises(fg.UnifgError, match="only the last solution"):
+        prepared.verify(solution)
+    found = prepared.verify(late)
+    assert found.keys() == {"own"} == late.mistraced.keys() and not late.checked
+    again = prepared.solve({x: np.zeros((N, 1))}, data={target: np.full((N, 1), 2.0)})
+    assert np.abs(again[x] - late[x]).max() > 1e-3 and prepared.verify(again) == {} and again.checked

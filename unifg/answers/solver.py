@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeAlias
+from weakref import ReferenceType, ref
 
 import numpy as np
 
@@ -514,6 +515,7 @@ class Prepared:
         self._edition = self._graph.edition
         self._workspace: Any = None
         self._solves, self._owed = 0, False
+        self._last: ReferenceType[Solution] | None = None
         self._turn = Turn()
         self._constraints = {
             t.name: (t, rows) for t, rows in zip(program.constraint_terms, program.slices, strict=True)
@@ -566,6 +568,7 @@ class Prepared:
         if not isinstance(guess, Mapping) and guess.penalties:
             run.penalties = self._stacked("penalties", guess.penalties)
         solution = self._verified(self._finished(run), run, callback)
+        self._last = ref(solution)
         if check and not solution.converged:
             raise NotConverged(solution)
         return solution
@@ -593,6 +596,32 @@ class Prepared:
                 break
         solution.checked, solution.mistraced, solution.seconds = solution.finite, mistraced, run.seconds
         return solution
+
+    def verify(self, solution: Solution) -> dict[str, str]:
+        """Evaluate traced functions as written at the last answer, with the data of that solve.
+
+        For the idle time of a control loop. Sets ``solution.checked``, and ``solution.mistraced`` where a term differs.
+
+        Args:
+            solution: returned by the last :meth:`solve`.
+
+        Returns:
+            Reasons by the names of terms whose traces differ; from the next solve on they are evaluated by Python.
+
+        Raises:
+            BackendError: while another thread solves the graph, or for a solution of another solve.
+        """
+        if self._last is None or solution is not self._last():
+            raise BackendError("only the last solution can be verified: the data of others are not kept")
+        if not self._turn.acquire(blocking=False):
+            raise BackendError(f"this prepared {self.solver.name} is at work in another thread: prepare one for each")
+        try:
+            with self.program.turn:
+                found = self.program.mistraced(solution._lin.values, True, self._solves)
+        finally:
+            self._turn.release()
+        solution.checked, solution.mistraced, self._owed = not found, {**solution.mistraced, **found}, False
+        return found
 
     def _finished(self, run: SolveState) -> Solution:
         """The solution of a solve that has begun."""
@@ -637,7 +666,7 @@ class Prepared:
 
     def __getstate__(self) -> dict[str, Any]:
         """Workspaces hold compiled objects that do not pickle; they are rebuilt on first use."""
-        return {**self.__dict__, "_workspace": None}
+        return {**self.__dict__, "_workspace": None, "_last": None}
 
     def _stacked(self, what: str, given: Mapping[str, Numbers]) -> Array:
         """(M,) multipliers or penalties, zero where none are given."""

@@ -172,6 +172,7 @@ class Loop:
         self.milliseconds: deque[float] = deque(maxlen=TIMES)
         self.guess: Guess | None = None
         self.solution: Solution | None = None
+        self._solved_by, self._verification_time = self.warm, 0.0
         self.sent: Array = np.zeros((delay, robot.control.storage))
         self.lagging, self.failed = 0, False
         self._believe_nothing()
@@ -251,6 +252,29 @@ class Loop:
             begin = self._clock()
             return self._plan(self.now(present, given, statics), begin)
 
+    def idle(self, seconds: float = np.inf) -> dict[str, str]:
+        """Verify the last solution by the functions as written, while nothing is due: after the control was applied.
+
+        Nothing is done without a solution, for a verified one, and where the last verification took longer than
+        ``seconds``.
+
+        Args:
+            seconds: until the next tick.
+
+        Returns:
+            Reasons by the names of terms whose traces differ; from the next tick on they are evaluated by Python.
+
+        Raises:
+            BackendError: while another thread plans.
+        """
+        with self._alone():
+            if self.solution is None or self.solution.checked or self._verification_time > seconds:
+                return {}
+            begin = self._clock()
+            found = self._solved_by.verify(self.solution)
+            self._verification_time = self._clock() - begin
+            return found
+
     @contextmanager
     def _alone(self) -> Iterator[None]:
         """Refuse what another thread asks for meanwhile: it would not be in time."""
@@ -293,7 +317,7 @@ class Loop:
         solution, rescued = run.solve(self.tie.begin(guess, now), data=data), False
         if self.second is not None and self._refuses(solution, now):
             solution, rescued = self._ask(self.second, solution, now, data, begin)
-        self.solution = solution
+        self.solution, self._solved_by = solution, self.second if rescued and self.second else run
         self.statuses[solution.status] += 1
         choice = self.decide(solution, now, late=self._clock() - begin > self._deadline)
         self._believe(solution, choice, present)
