@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from unifg.machine.calls import RETRACTION, address, call_retraction, local_matrix, local_vector, matrix, vector
-from unifg.machine.jit import compiled, in_order, is_compiled, stamp
+from unifg.machine.fingerprint import fingerprint, is_compiled
+from unifg.machine.jit import compiled, in_order
 from unifg.machine.links import LAYOUT
 from unifg.machine.vectors import load, splat, store, total
 from unifg.typing import Array
@@ -71,7 +72,7 @@ def stamps_callees() -> None:
     def caller(x: Array, d: Array, out: Array) -> None:
         double(x, d, out)
 
-    assert is_compiled(caller) and stamp(caller) != stamp(double)
+    assert is_compiled(caller) and fingerprint(caller) != fingerprint(double)
 
 
 def test_constants_are_stamped_in_full() -> None:
@@ -87,8 +88,8 @@ def test_constants_are_stamped_in_full() -> None:
     table, other = np.zeros(5000), np.zeros(5000)
     other[2500] = 1e-12
     assert repr(table) == repr(other)
-    assert stamp(reading(table)) != stamp(reading(other))
-    assert stamp(reading(table)) == stamp(reading(table.copy()))
+    assert fingerprint(reading(table)) != fingerprint(reading(other))
+    assert fingerprint(reading(table)) == fingerprint(reading(table.copy()))
 
 
 @in_order

@@ -110,8 +110,8 @@ def _caches() -> Iterator[Finding]:
     else:
         yield from _cache(_roots(folder))
     if shipped.archive().usable:
-        changed = shipped.outdated(Path(fg.__file__).resolve().parent.parent)
-        behind = f"; {len(changed)} files have changed since and are compiled instead" if changed else ""
+        changed = shipped.outdated()
+        behind = f"; {len(changed)} functions have changed since and are compiled instead" if changed else ""
         yield Finding(
             "caches", f"kernels that come half compiled fit this Python and Numba{behind}", not changed or None
         )

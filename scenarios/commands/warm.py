@@ -37,18 +37,13 @@ def ship(progress: Progress) -> Path:
     list(_scenarios())  # raises without the extras that they need
     with shipped.recording() as recorder:
         run(progress, anew=True)
-    recorder.write(shipped.ARCHIVE, _root())
+    recorder.write(shipped.ARCHIVE)
     return shipped.ARCHIVE
 
 
 def outdated() -> list[str]:
-    """Files that have changed since the archive was written, below the folder of the checkout."""
-    return shipped.outdated(_root())
-
-
-def _root() -> Path:
-    """The folder below which all sources lie: of the checkout, whose side folders stand beside ``unifg``."""
-    return LIBRARY.parent
+    """Functions that have changed since the archive was written."""
+    return shipped.outdated()
 
 
 def _scenarios() -> Iterator[Job]:

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeAlias
 from unifg.errors import GraphError
 from unifg.kernels.kernel import Kernel
 from unifg.lie import Manifold
-from unifg.machine.jit import is_compiled
+from unifg.machine.fingerprint import is_compiled
 from unifg.typing import Array
 
 Function: TypeAlias = Callable[..., Array]

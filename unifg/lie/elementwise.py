@@ -18,7 +18,8 @@ import numpy as np
 
 from unifg.errors import UnifgError
 from unifg.machine.calls import matrix, vector
-from unifg.machine.jit import compiled, is_compiled
+from unifg.machine.fingerprint import is_compiled
+from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike
 
 Scalar: TypeAlias = Callable[..., None]

@@ -8,11 +8,11 @@ Compiled functions let other threads run while they do: who calls one sees to it
 (:mod:`unifg.turns`).
 
 Numba's own cache looks at the file a function stands in and nothing else: it would go on running old code of a
-callee in another file, and never find again a function that closes over another one. It believes what it reads, and
-two processes that compile at once may take each other's files. Here the stamp of a function covers the files of
-everything it calls, and each signature has a file of its own that is read whole or not at all. Where none can be
-written, functions are compiled for the process at hand. What the cache does not have may have come with the library,
-half compiled (:mod:`unifg.machine.shipped`).
+callee in another file, compile anew after a comment, and never find again a function that closes over another one. It
+believes what it reads, and two processes that compile at once may take each other's files. Here a function is found by
+the fingerprint of its code and of everything it calls (:mod:`unifg.machine.fingerprint`), and each signature has a file
+of its own that is read whole or not at all. Where none can be written, functions are compiled for the process at hand.
+What the cache does not have may have come with the library, half compiled (:mod:`unifg.machine.shipped`).
 """
 
 from __future__ import annotations
@@ -21,24 +21,23 @@ import hashlib
 import logging
 import os
 import pickle
-from collections.abc import Callable, Iterator, Sequence
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from threading import Event
-from types import FunctionType, ModuleType
 from typing import Any, ClassVar, TypeVar, cast
 
 import llvmlite
 import numba
-import numpy as np
 from numba import types
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
-from numba.core.dispatcher import Dispatcher
 from numba.core.registry import cpu_target
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 from numba.core.sigutils import normalize_signature
 
 from unifg.machine import shipped
+from unifg.machine.fingerprint import fingerprint, generators
 from unifg.machine.objects import read_sealed, write_sealed
 from unifg.machine.tally import tally
 
@@ -93,11 +92,6 @@ def written(function: str, lines: Sequence[str], names: dict[str, Any], what: st
     return cast(Callable[..., None], dispatcher)
 
 
-def is_compiled(function: object) -> bool:
-    """Whether a function runs under Numba, whoever compiled it."""
-    return isinstance(function, Dispatcher)
-
-
 def folder_of(function: Any) -> Path | None:
     """Where the cache keeps a compiled function; None where nothing can be written."""
     path = function._cache.cache_path
@@ -107,11 +101,6 @@ def folder_of(function: Any) -> Path | None:
 def processor() -> str:
     """What code is generated for."""
     return repr(cpu_target.target_context.codegen().magic_tuple())
-
-
-def source_of(function: Any) -> FunctionType:
-    """The function in Python of a compiled one; any other as it is."""
-    return cast(FunctionType, getattr(function, "py_func", function))
 
 
 class _Nowhere(_CacheLocator):  # type: ignore[misc]
@@ -202,8 +191,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         if self._impl.check_cachable(result):
             self._keep(self._file(signature, result.codegen), self._impl.reduce(result))
         if shipped.recorder is not None:
-            key, source = self._shipping_key(signature), self._py_func.__code__.co_filename
-            shipped.recorder.keep(key, source, result, self._impl.reduce(result))
+            shipped.recorder.keep(self._shipping_key(signature), self._py_func, result, self._impl.reduce(result))
 
     def flush(self) -> None:
         """What is kept is found by what it was made of: there is nothing to begin anew."""
@@ -232,17 +220,20 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         tally.files.append(str(path))
 
     def _file(self, signature: Any, codegen: Any) -> Path | None:
-        """One for each signature, closure and processor."""
+        """One for each signature and processor; of functions made by another function, one for each that is made."""
         if self._cache_path is None:
             return None
-        arguments, alike = normalize_signature(signature)[0], stamp(self._py_func, lambda path: "")  # but for dates
-        parts = (*map(spelled, arguments), codegen.magic_tuple(), alike, *self._variant())
-        digest = hashlib.sha256(repr(parts).encode()).hexdigest()[:20]
-        return Path(self._cache_path, f"{self._impl.filename_base}.{digest}.code")
+        function = self._py_func
+        name = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}".replace("<", "").replace(">", "")
+        made = fingerprint(function) if "<" in function.__qualname__ else ""
+        arguments = normalize_signature(signature)[0]
+        parts = (sys.version_info[:2], function.__module__, *map(spelled, arguments), codegen.magic_tuple(), made)
+        digest = hashlib.sha256(repr((*parts, *self._variant())).encode()).hexdigest()[:20]
+        return Path(self._cache_path, f"{name}.{digest}.code")
 
     def _made(self) -> bytes:
-        """What code is made of: versions and sources."""
-        stated = f"{numba.__version__} {llvmlite.__version__} {stamp(self._py_func)}"
+        """Digest of versions, the function and its callees."""
+        stated = f"{numba.__version__} {llvmlite.__version__} {generators()} {fingerprint(self._py_func)}"
         return hashlib.sha256(stated.encode()).digest()
 
     def _variant(self) -> tuple[str, ...]:
@@ -254,7 +245,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         function = self._py_func
         arguments, _ = normalize_signature(signature)  # a dispatcher, too, tells functions by their arguments alone
         parts = (function.__module__, function.__qualname__, *map(spelled, arguments), *self._variant())
-        return hashlib.sha256(repr((*parts, stamp(function, shipped.content))).encode()).hexdigest()
+        return hashlib.sha256(repr((*parts, fingerprint(function))).encode()).hexdigest()
 
 
 class _CacheInOrder(_Cache):
@@ -270,55 +261,3 @@ def spelled(kind: Any) -> str:
         names = getattr(kind, "fields", ())
         return f"{type(kind).__name__} {kind.name if names else ''} {names} ({', '.join(map(spelled, kind.types))})"
     return str(kind)
-
-
-def _date(path: str) -> str:
-    """What changes when a file is written."""
-    status = os.stat(path)
-    return f"{status.st_mtime_ns} {status.st_size}"
-
-
-def stamp(function: Any, of_file: Callable[[str], str] = _date) -> str:
-    """Digest of the source files of a function and of every compiled function it calls or closes over.
-
-    Args:
-        function: compiled or not.
-        of_file: what stands for a file; raises OSError where there is none.
-    """
-    digest = hashlib.sha256()
-    for part in sorted(_parts(function, set(), of_file)):
-        digest.update(part.encode())
-    return digest.hexdigest()
-
-
-def _parts(function: Any, seen: set[int], of_file: Callable[[str], str]) -> Iterator[str]:
-    """What identifies a function: its name, its file, the numbers it closes over, its callees."""
-    python = source_of(function)
-    if id(python) in seen:
-        return
-    seen.add(id(python))
-    if getattr(function, "targetoptions", {}).get("fastmath") is False:
-        yield f"{python.__qualname__} in order"
-    code = python.__code__
-    try:
-        yield f"{python.__qualname__} {code.co_firstlineno} {of_file(code.co_filename)}"
-    except OSError:  # typed into an interpreter
-        yield f"{python.__qualname__} {code.co_code!r} {code.co_consts!r}"
-    for cell in python.__closure__ or ():
-        if is_compiled(cell.cell_contents):
-            yield from _parts(cell.cell_contents, seen, of_file)
-        else:
-            yield f"{python.__qualname__} {_constant(cell.cell_contents)}"
-    for name in code.co_names:
-        found = python.__globals__.get(name)
-        if isinstance(found, int | float | str | tuple | np.ndarray):  # constants are compiled in
-            yield f"{name} = {_constant(found)}"
-        candidates = [vars(found).get(n) for n in code.co_names] if isinstance(found, ModuleType) else [found]
-        for callee in candidates:
-            if is_compiled(callee):
-                yield from _parts(callee, seen, of_file)
-
-
-def _constant(value: Any) -> str:
-    """A number or an array in full: printed arrays leave out digits, and large ones their middle."""
-    return f"{value.shape} {value.tobytes().hex()}" if isinstance(value, np.ndarray) else repr(value)

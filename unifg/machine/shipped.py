@@ -4,27 +4,27 @@ Nine tenths of a first compilation are the same on every machine: types are infe
 optimised. An archive beside this file keeps what comes of it, one member per function and signature, so that a first
 use generates code for the processor at hand and nothing else. What it made is then in the cache on disk like any other.
 
-A member is found by a digest of the sources of a function and of all it calls and of its types; the archive as a whole
-by the versions of Python, Numba, llvmlite and of the primitives of this room, and by the platform. So code that has
-changed is never found and is compiled instead: an archive that is out of date costs time, and nothing else.
+A member is found by the fingerprint of a function and by its types; the archive as a whole by the versions of Python,
+Numba and llvmlite, by what generates instructions, and by the platform. So code that has changed is never found and is
+compiled instead: an archive that is out of date costs time, and nothing else. Comments, docstrings and other functions
+of a file change nothing.
 ``unifg warmup --ship`` writes it anew; :func:`outdated` says what has changed since.
 """
 
 from __future__ import annotations
 
-import hashlib
+import importlib
 import json
 import logging
-import os
 import pickle
 import sys
-import time
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache, lru_cache
+from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 from llvmlite import binding as llvm
@@ -32,36 +32,26 @@ from numba.core.bytecode import FunctionIdentity
 from numba.core.registry import cpu_target
 from numba.core.serialize import dumps
 
-from unifg.errors import UnifgError
+from unifg.machine.fingerprint import fingerprint, generators
 from unifg.whole import beside
 
 logger = logging.getLogger("unifg")
 
 ARCHIVE = Path(__file__).with_name("kernels.zip")
 ABOUT = "about.json"
-OF_INSTRUCTIONS = ("borrow", "calls", "jit", "links", "vectors")  # files of this room that say what is generated
 FIRST_NUMBER = 10**9  # of functions in the archive: Numba numbers those of a process from one, and names hold numbers
 LINKED_MANY_TIMES = "linkonce_odr"
 
 
 def versions() -> dict[str, str]:
-    """What code generated here depends on, besides the sources."""
-    room = hashlib.sha256()
-    for name in OF_INSTRUCTIONS:
-        room.update(Path(__file__).with_name(f"{name}.py").read_bytes())
+    """Versions that code generated here depends on, besides the functions."""
     return {
         "python": f"{sys.version_info.major}.{sys.version_info.minor}",
         "numba": metadata.version("numba"),
         "llvmlite": metadata.version("llvmlite"),
         "platform": str(llvm.get_process_triple()),
-        "instructions": room.hexdigest(),
+        "instructions": generators(),
     }
-
-
-@cache
-def content(path: str) -> str:
-    """Digest of a file."""
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
 class Archive:
@@ -77,7 +67,7 @@ class Archive:
         try:
             self._file = zipfile.ZipFile(path)
             self.about = json.loads(self._file.read(ABOUT))
-            kind, _ = self.about["versions"], self.about["sources"]
+            kind, _ = self.about["versions"], self.about["functions"]
         except FileNotFoundError:  # it is an archive that one may do without
             return
         except Exception as error:  # what is damaged may say anything
@@ -113,16 +103,24 @@ def archive() -> Archive:
     return Archive(ARCHIVE)
 
 
-def outdated(root: Path, path: Path = ARCHIVE) -> list[str]:
-    """What has changed since an archive was made: files below the folder of the library, or "archive" for the whole."""
+def outdated(path: Path = ARCHIVE) -> list[str]:
+    """Names of functions that have changed since an archive was made, or "archive" for the whole."""
     made = Archive(path)
     if not made.usable:
         return ["archive"]
+    return [name for name, digest in made.about["functions"].items() if _present(name) != digest]
 
-    def changed(name: str) -> bool:
-        return not (root / name).is_file() or content(str(root / name)) != made.about["sources"][name]
 
-    return [name for name in made.about["sources"] if changed(name)]
+def _present(name: str) -> str:
+    """Fingerprint of a function of a module by its full name; empty where there is none."""
+    module, _, qualname = name.partition(":")
+    try:
+        found: Any = importlib.import_module(module)
+        for part in qualname.split("."):
+            found = getattr(found, part)
+    except (ImportError, AttributeError):
+        return ""
+    return fingerprint(found)
 
 
 def _generated(bitcode: bytes) -> tuple[bytes, bytes]:
@@ -140,39 +138,25 @@ class Recorder:
 
     Attributes:
         members: of the archive to be, by their keys.
-        sources: the files that were compiled.
+        functions: fingerprints of what was compiled, by module and name; without those that functions make.
     """
 
     def __init__(self) -> None:
         """Nothing has been compiled."""
         self.members: dict[str, bytes] = {}
-        self.sources: set[str] = set()
-        self._began = time.time()
+        self.functions: dict[str, str] = {}
 
-    def keep(self, key: str, source: str, result: Any, reduced: tuple[Any, ...]) -> None:
-        """Add a function: its key, its file, what Numba made of it, and what the cache keeps of that."""
+    def keep(self, key: str, function: FunctionType, result: Any, reduced: tuple[Any, ...]) -> None:
+        """Add a function: its key, what Numba made of it, and what the cache keeps of that."""
         library = result.library
         self.members[key] = dumps(((library.name, library._final_module.as_bitcode()), *reduced[1:]))
-        self.sources.add(source)
+        name = f"{function.__module__}:{function.__qualname__}"
+        if digest := _present(name):
+            self.functions[name] = digest
 
-    def write(self, path: Path, root: Path) -> None:
-        """Write the archive.
-
-        Args:
-            path: of the file.
-            root: folder of the library; functions of other files are left out of the list of sources.
-
-        Raises:
-            UnifgError: a file was written meanwhile: what was compiled of it may be found under what stands there now.
-        """
-        changed = [source for source in self.sources if os.path.getmtime(source) > self._began]
-        if changed:
-            raise UnifgError(f"{min(changed)} was written while it was compiled: begin again")
-        inside = sorted(Path(source) for source in self.sources if Path(source).is_relative_to(root))
-        about = {
-            "versions": versions(),
-            "sources": {source.relative_to(root).as_posix(): content(str(source)) for source in inside},
-        }
+    def write(self, path: Path) -> None:
+        """Write the archive."""
+        about = {"versions": versions(), "functions": dict(sorted(self.functions.items()))}
         with beside(path) as own, zipfile.ZipFile(own, "w", zipfile.ZIP_LZMA) as file:
             for name, data in {ABOUT: json.dumps(about, indent=1).encode(), **self.members}.items():
                 file.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_LZMA)

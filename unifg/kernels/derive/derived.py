@@ -24,7 +24,7 @@ from unifg.kernels.derive.symbols import TraceError
 from unifg.kernels.derive.tape import Tape
 from unifg.kernels.derive.trace import Rebound, run
 from unifg.kernels.kernel import Argument, Kernel
-from unifg.machine.jit import is_compiled
+from unifg.machine.fingerprint import is_compiled
 from unifg.typing import Array
 
 logger = logging.getLogger("unifg")

@@ -20,7 +20,8 @@ from unifg.kernels.derive.symbols import Symbol, TraceError, node_of, symbols
 from unifg.kernels.derive.tape import Tape
 from unifg.kernels.derive.trace import Rebound, run
 from unifg.kernels.kernel import Argument, evaluate_rows
-from unifg.machine.jit import folder_of, is_compiled
+from unifg.machine.fingerprint import is_compiled
+from unifg.machine.jit import folder_of
 from unifg.machine.native import SOURCES, Native, generation
 from unifg.machine.objects import Objects
 from unifg.typing import Array, IntArray

@@ -22,7 +22,7 @@ from unifg.kernels.derive.lookup import Lookup
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import Residual
 from unifg.lie import Manifold
-from unifg.machine.jit import is_compiled
+from unifg.machine.fingerprint import is_compiled
 from unifg.typing import Array
 
 TRUSTED = (

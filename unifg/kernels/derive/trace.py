@@ -48,7 +48,7 @@ from unifg.kernels.kernel import NOTHING, Argument, Kernel
 from unifg.kernels.residuals import Residual
 from unifg.lie import ManifoldBase, Product, so2, wrap_angle
 from unifg.machine import calls
-from unifg.machine.jit import is_compiled, source_of
+from unifg.machine.fingerprint import is_compiled, source_of
 
 FUNCTIONS.update(TABLE)
 _AS_THEY_ARE = sys.stdlib_module_names | {"numpy", "numba"}  # modules of which no function is rebound
