@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.special
 
 from test_derive import curved, evaluated
+from unifg.kernels.derive import symbols
 from unifg.kernels.derive.expression import Expression, traced
 from unifg.kernels.derive.operations import GROUPED, STEADY, UNARY, Op
 from unifg.kernels.derive.tape import Tape
@@ -61,6 +63,33 @@ def test_every_operation_with_derivatives_has_a_rule_here() -> None:
     leaves = {Op.CONSTANT, Op.VARIABLE, Op.PARAMETER, Op.WEIGHT, Op.TANGENT}
     others = {Op.SELECT, Op.ENTRY} | GROUPED | STEADY | leaves
     assert set(ONE) == (UNARY - STEADY) and set(ONE) | set(TWO) | others == set(Op)
+
+
+JUDGEMENTS = (
+    "equal", "not_equal", "less", "less_equal", "greater", "greater_equal", "isfinite", "isinf", "isnan",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sorted(symbols.UFUNCS))
+def test_every_ufunc_is_that_of_numpy_or_scipy(name: str) -> None:
+    """At three points at least where it is finite; operators of one, two and truth values."""
+    ufunc = getattr(np, name, None) or getattr(scipy.special, name)
+    truth = name.startswith(("logical", "bitwise", "invert"))
+    near = np.array([-2.0, -0.75, -0.1, 0.0, 0.3, 0.5, 1.0, 1.6, 3.0])
+    places = np.array(np.meshgrid(*[near] * ufunc.nin)).reshape(ufunc.nin, -1).T
+
+    def rows(x: Any) -> Any:
+        given = [x[:, k : k + 1] > 0.4 if truth else x[:, k : k + 1] for k in range(ufunc.nin)]
+        found = ufunc(*given)
+        return np.where(found, 1.0, 0.0) if truth or name in JUDGEMENTS else found
+
+    expression = traced(rows, [Rn(ufunc.nin)])
+    with np.errstate(all="ignore"):
+        expected = rows(places)
+        found, _ = evaluated(expression, places, np.zeros((len(places), 0)))
+    finite = np.isfinite(expected)
+    assert finite.sum() >= 3
+    np.testing.assert_allclose(found[finite], expected[finite], rtol=1e-14, atol=1e-15)
 
 
 @pytest.mark.parametrize("op", [*ONE, *TWO], ids=lambda op: op.name)

@@ -210,11 +210,8 @@ class _Walk:
             return value
         if type(value).__module__.partition(".")[0] == "numpy" and callable(value) and hasattr(value, "__name__"):
             return "numpy", value.__name__, id(value)  # functions of NumPy that are not written in Python
-        if is_dataclass(value) and getattr(vars(type(value)).get("__dataclass_params__"), "frozen", False):
-            if not isinstance(value, Kernel):  # whose methods nobody changes
-                return self._instance(value, where)
-            parts = tuple(self.value(getattr(value, f.name), f"{where}.{f.name}") for f in fields(value))
-            return type(value), parts
+        if isinstance(value, Kernel) and is_dataclass(value):  # whose methods nobody changes
+            return type(value), tuple(self.value(getattr(value, f.name), f"{where}.{f.name}") for f in fields(value))
         return self._instance(value, where)
 
     def _named_tuple(self, value: Any, where: str) -> None:
