@@ -262,7 +262,7 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 27_850, "scenarios": 12_300, "benchmarks": 6_424, "tests": 32_125, "docs examples": 1_650,
+    "unifg solvers models": 27_850, "scenarios": 12_300, "benchmarks": 6_424, "tests": 32_150, "docs examples": 1_650,
     "unifg/kernels": 3_512, "unifg/program": 2_580, "models": 2_467, "unifg/elimination": 2_404, "solvers": 4_351,
     "unifg/answers": 1_770, "unifg/smoothing": 1_748, "unifg/lie": 1_691, "unifg/view": 1_411, "unifg/files": 1_204,
     "unifg/pose_graphs": 1_152, "unifg/horizon": 1_040, "unifg/language": 981, "unifg/machine": 846,
