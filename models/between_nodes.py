@@ -1,4 +1,4 @@
-"""What a clearance held at nodes is worth between them.
+"""Barriers between nodes, from clearances held at the nodes.
 
 Two ends of a step of length L lie outside a ball of radius rho + m. The straight way from one to the other stays
 outside the ball of radius rho + e if (rho + m)^2 >= (rho + e)^2 + L^2 / 4. A way that is accelerated by no more than a

@@ -28,7 +28,7 @@ CONTROL = Rn(2)
 
 @dataclass(frozen=True)
 class Bicycle:
-    """Where the axles are: distances from the centre of gravity to the front and to the rear one [m]."""
+    """Positions of the axles: distances from the centre of gravity to the front and to the rear one [m]."""
 
     front: float = 1.2
     rear: float = 1.4

@@ -115,7 +115,7 @@ def _felt(manifold: Hashable, gravity: tuple[float, ...]) -> StatedKernel:
 
 @dataclass(frozen=True)
 class SampleCounts:
-    """What became of the samples.
+    """Counts of samples by outcome.
 
     Attributes:
         kept: when data were asked for last.
@@ -291,7 +291,7 @@ class InertialMeasurements:
         return found
 
     def at(self, graph: Statement, times: ArrayLike, bias: ArrayLike) -> dict[Data, Array]:
-        """What a solve of a graph needs, for nodes that stand at these times; what is older is forgotten.
+        """Data of a graph for one solve, with nodes at these times; older samples are dropped.
 
         Args:
             graph: to which the factors have been added.

@@ -1,4 +1,4 @@
-"""Where a body was between two nodes: a measurement seldom falls on one.
+"""Pose of a body between two nodes, at which a measurement was taken.
 
 Nodes x at time 0 and y at time h; s = t / h in [0, 1]. The geodesic moves with a constant velocity of the body,
 

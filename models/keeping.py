@@ -32,7 +32,7 @@ EXACT = 1e4  # of the slack itself: more than any multiplier that a feasible pla
 
 
 class Answer(Protocol):
-    """What a solve returns, as far as it is read here."""
+    """The part of a solution that is read here."""
 
     def __getitem__(self, variable: Any) -> Array:
         """Values of a family."""

@@ -1,4 +1,4 @@
-"""What a quadrotor sees and feels: landmarks on the ground plane, its height, and which way is up.
+"""Sensors of a quadrotor: landmarks on the ground plane, height, and the direction of gravity.
 
 Bearing and range are those of a sensor that is kept level: both are measured in the ground plane, the bearing from
 the heading psi, the direction of R e1 seen from above. The heading is undefined where R e1 is vertical, and of no use

@@ -1,4 +1,4 @@
-"""Which landmark was that? Gating in units of what both are uncertain, then the nearest.
+"""Data association: gating in units of the innovation's covariance, then the nearest landmark.
 
 The gate is on the Mahalanobis distance of bearing and range from what is expected, with the covariance of state,
 landmark and sensor together (Neira and Tardos, IEEE Trans. Robotics and Automation 17 (2001), section II: individual

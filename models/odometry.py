@@ -57,7 +57,7 @@ def predict(pose: Array, covariance: Array, u: Array, dt: float, noise: Odometry
 
 
 def driven(steps: ArrayLike) -> Array:
-    """Where steps lead, each an arc of constant curvature, from the identity.
+    """Poses after steps, each an arc of constant curvature, from the identity.
 
     Args:
         steps: (n, 2) distance and turn of each [m, rad].
@@ -80,7 +80,7 @@ def driven(steps: ArrayLike) -> Array:
 
 
 def held(time: ArrayLike, velocity: ArrayLike, at: ArrayLike) -> Array:
-    """Where velocities lead that hold until the next one, at other times, from the identity at the first of these.
+    """Poses under velocities held until the next one, at other times, from the identity at the first of these.
 
     Args:
         time: (n,) of the velocities, rising [s]; before the first of them nothing moves.

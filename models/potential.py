@@ -83,7 +83,7 @@ def _steered(distance: Callable[..., None]) -> Callable[..., None]:
 
 
 class _Search:
-    """What to search with for a distance without a kernel."""
+    """Search for a distance without a kernel."""
 
     def __init__(self, true: Residual, vortex: float, aside: float) -> None:
         self.true, self.vortex, self.aside = true, vortex, aside

@@ -1,4 +1,4 @@
-"""What gyro and accelerometer say of the motion between two nodes, without knowing either (IMU preintegration).
+"""IMU preintegration: relative motion between two nodes, independent of the state.
 
 Forster, Carlone, Dellaert, Scaramuzza 2017, *On-manifold preintegration for real-time visual-inertial odometry*, in the
 exact form of Brossard, Barrau, Chauchat, Bonnabel 2021, *Associating uncertainty to extended poses for on Lie group IMU

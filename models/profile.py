@@ -1,4 +1,4 @@
-"""What soft margins and potentials make of a distance: a scalar function of it, row by row.
+"""Profiles of soft margins and potentials: scalar functions of a distance, row by row.
 
 With r = g(d) the Jacobian is g' times that of the distance, and the Hessian of w' r is that of the distance under the
 weights w g', and g'' times its gradients. A profile is compiled: ``profile(d, numbers)`` returns g, g' and g''.

@@ -75,7 +75,7 @@ UPDRAFT = Rn(1)
 
 @dataclass(frozen=True)
 class Parameters:
-    """What does not change in a flight.
+    """Constants of a flight.
 
     Attributes:
         mass: [kg].

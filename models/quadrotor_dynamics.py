@@ -1,4 +1,4 @@
-"""How a quadrotor moves, compiled: the implicit trapezoid with the derivatives of its defect, and RK-MK4.
+"""Compiled dynamics of a quadrotor: the implicit trapezoid with the derivatives of its defect, and RK-MK4.
 
 With the state (p, R, v), the body rates omega and the thrust T, both held over a step of length h, and
 

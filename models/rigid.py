@@ -1,4 +1,4 @@
-"""Where a state of a body in space keeps its position, its orientation and its velocity."""
+"""Storage of position, orientation and velocity in the state of a rigid body."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from unifg.lie import SE3, SE23, SO3, Manifold, Product, Rn
 
 
 def pose_parts(state: Manifold, what: str) -> tuple[slice, slice]:
-    """Where position and orientation are stored.
+    """Slices of position and orientation in the storage.
 
     Args:
         state: SE3, SE23, a product with components p in Rn(3) and R in SO3, or one with a component ``pose`` in SE3.
@@ -31,7 +31,7 @@ def pose_parts(state: Manifold, what: str) -> tuple[slice, slice]:
 
 
 def motion_parts(state: Manifold, what: str) -> tuple[slice, slice, slice]:
-    """Where position, velocity in the world and orientation are stored.
+    """Slices of position, velocity in the world and orientation in the storage.
 
     Args:
         state: SE23, or a product with components p and v in Rn(3) and R in SO3.

@@ -27,7 +27,7 @@ CLOSE = 1e-6  # of a step: how far from a node a stamp still falls on it
 
 
 class Nodes(Protocol):
-    """What a window knows of its nodes: :class:`unifg.horizon.History`."""
+    """Nodes of a window, as in :class:`unifg.horizon.History`."""
 
     times: Array
 
@@ -38,7 +38,7 @@ class Nodes(Protocol):
 
 
 class Present(Protocol):
-    """What a term of a window is asked with: :class:`unifg.horizon.Now`."""
+    """Context of a term in a window, as in :class:`unifg.horizon.Now`."""
 
     @property
     def statics(self) -> Mapping[str, Array]:
@@ -53,7 +53,7 @@ class Present(Protocol):
 
 @dataclass(frozen=True)
 class Counts:
-    """What became of the measurements.
+    """Counts of measurements by outcome.
 
     Attributes:
         placed: in slots, when data were asked for last.
@@ -210,7 +210,7 @@ class StampedMeasurements:
         return self._given(np.array(history.times), history.empty, offset)
 
     def at(self, graph: Statement, times: ArrayLike, offset: float = 0.0) -> dict[Data, Array]:
-        """What a solve of a graph needs, for nodes that stand at these times.
+        """Data of a graph for one solve, with nodes at these times.
 
         Args:
             graph: to which the factors have been added.
@@ -297,7 +297,7 @@ def state_whole(graph: Statement, stated: Callable[[Statement], None]) -> None:
 
 
 def _ranks(groups: IntArray) -> IntArray:
-    """How many of its group come before each entry."""
+    """Number of earlier entries of the same group."""
     order = np.argsort(groups, kind="stable")
     ordered = groups[order]
     ranks = np.empty(len(groups), dtype=np.intp)

@@ -63,12 +63,12 @@ class Tableau:
 
     @property
     def stages(self) -> int:
-        """How often a step evaluates F."""
+        """Evaluations of F in a step."""
         return len(self.weights)
 
     @property
     def explicit(self) -> bool:
-        """Whether a step can be taken without solving for its end."""
+        """True if a step can be taken without solving for its end."""
         return not any(self.ends)
 
     @cached_property

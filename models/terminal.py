@@ -1,4 +1,4 @@
-"""Where a plan may end: sets that a vehicle can stay in, so that the next plan exists (the X_f of eq. 4).
+"""Terminal sets: states a vehicle can stay in, so that the next plan exists (the X_f of eq. 4).
 
 A plan that satisfies hard barriers and ends in such a set can be continued by a step inside it; moved by one interval
 it is a plan of the next solve. So the hard form is never infeasible on the nominal vehicle, if it was not at first.

@@ -42,7 +42,7 @@ NUDGE = 1e-3  # of the differences that brackets are rounded from
 
 
 class Places(NamedTuple):
-    """Where some moments lie.
+    """Segments of a trajectory and positions within them.
 
     Attributes:
         first: (n,) first of the four control poses.
@@ -99,7 +99,7 @@ class CubicTrajectory:
         return CubicTrajectory, (self.group, self.start, self.spacing)
 
     def controls(self, end: float) -> int:
-        """How many control poses hold all moments up to an end [s].
+        """Number of control poses that hold all moments up to an end [s].
 
         Raises:
             ModelError: the end is not finite.
@@ -116,7 +116,7 @@ class CubicTrajectory:
         return self.start + self.spacing * (np.arange(count, dtype=np.float64) - 1.0)
 
     def places(self, times: ArrayLike, count: int) -> Places:
-        """Where (n,) moments [s] lie among this many control poses.
+        """Segments of (n,) moments [s] among this many control poses.
 
         Raises:
             ModelError: naming a moment before the start, after the end or not finite, or too few control poses.

@@ -127,7 +127,7 @@ def pose_steering(u: Array, h: Array) -> Array:
 
 
 class Forecast(NamedTuple):
-    """What is known after a step.
+    """Predicted belief after a step.
 
     Attributes:
         covariance: (n, 3, 3) of the truth about the estimate.

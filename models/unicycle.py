@@ -26,7 +26,7 @@ CONTROL = Rn(2)
 
 
 def _moves(x: Array, u: Array, dt: Array) -> Array:
-    """By how much the pose changes, with the heading at mid-step (eq. 12-14)."""
+    """Change of the pose with the heading at mid-step (eq. 12-14)."""
     along, turn = dt * u[:, 0], dt * u[:, 1]
     middle = x[:, 2] + 0.5 * turn
     return np.stack([along * np.cos(middle), along * np.sin(middle), turn], axis=1)

@@ -69,7 +69,7 @@ class Primal:
         return self.program.lagrangian_gradient(lin, after)[self.program.columns.free]
 
     def rounding(self, lin: Linearization, multipliers: Array, penalty: Array) -> float:
-        """What one unit in the last place of every coordinate is worth in :meth:`merit`.
+        """Change of :meth:`merit` by one unit in the last place of every coordinate.
 
         Far from the origin, as in map coordinates, this is more than the last steps of a solve can gain.
         """
@@ -104,7 +104,7 @@ class Primal:
         return after
 
     def bend(self, lin: Linearization, multipliers: Array) -> Array:
-        """What :meth:`curvature` leaves out of the Hessian: second derivatives of residuals and constraints.
+        """Second-order terms that :meth:`curvature` omits: second derivatives of residuals and constraints.
 
         Empty where there are none, and where they are not finite: a factor may have a kink or a pole there.
         """

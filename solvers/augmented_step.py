@@ -252,7 +252,7 @@ def minimize(
 
 @compiled
 def _damping(curvature: Array, indptr: IntArray, damping: float, added: Array) -> None:
-    """What Marquardt's damping adds to the diagonal, which is last in every column."""
+    """Marquardt's damping of the diagonal, which is last in every column."""
     largest = 0.0
     for k in range(len(added)):
         largest = max(largest, curvature[indptr[k + 1] - 1])

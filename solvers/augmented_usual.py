@@ -34,7 +34,7 @@ UNUSUAL, EXPECTED, FIRST_ORDER = range(3)
 
 
 class Problem(NamedTuple):
-    """What no iteration changes.
+    """Arrays that no iteration changes.
 
     Attributes:
         terms: of the program.
@@ -74,7 +74,7 @@ class Point(NamedTuple):
 
 
 class Work(NamedTuple):
-    """What an iteration reads and writes beside its two points.
+    """Arrays that an iteration reads and writes beside its two points.
 
     Attributes:
         numbers: (NUMBERS,) by the words above.

@@ -40,7 +40,7 @@ ELSEWHERE = {
 
 @dataclass(frozen=True)
 class Choice:
-    """Who is to solve a graph, and why.
+    """Backend chosen for a graph, with the reason.
 
     Attributes:
         first: is tried.
@@ -79,7 +79,7 @@ def choose(
 
 
 def _kind(program: Program) -> tuple[str, bool]:
-    """What decides, in words, and whether all costs are squares."""
+    """Deciding property in words, and true if all costs are squares."""
     if program.scalar_terms:
         return f"the scalar cost '{program.scalar_terms[0].name}'", False
     if not program.constraint_terms:

@@ -37,7 +37,7 @@ UNCHECKED = 1e-9  # share of a residual that the others can see: below, it is ro
 
 @dataclass(frozen=True)
 class Scatter:
-    """How much the measurements that count scatter.
+    """Variance factor of the measurements in use.
 
     Attributes:
         squared: sum of their weighted squared residuals.
@@ -60,7 +60,7 @@ class Scatter:
         return min(1.0, self.squared / float(chdtri(self.freedom, 1.0 - CHANCE)))
 
     def contradicts(self, innovation: Array, size: int, count: int) -> BoolArray:
-        """Whether measurements scatter more than the others, with a chance of ``CHANCE`` for a mistake in ``count``.
+        """Test whether measurements scatter more than the others, at a false-alarm rate of ``CHANCE`` in ``count``.
 
         Args:
             innovation: (n,) what the sum of squares loses with each of them.
@@ -91,7 +91,7 @@ class Scatter:
 
 
 class Innovations:
-    """What the measurements that count say about each other and about the rest.
+    """Innovations of the measurements in use and of the others.
 
     Attributes:
         determined: whether they determine every unknown.

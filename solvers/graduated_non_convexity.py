@@ -127,7 +127,7 @@ class _Stage:
 
     @property
     def heard(self) -> bool:
-        """Whether no factor pulls much less for being farther off than another one."""
+        """True if no factor pulls much less for being farther off than another one."""
         if not len(self.squared):
             return True
         pulls = self.now.weight(self.squared) * np.sqrt(self.squared)
@@ -137,7 +137,7 @@ class _Stage:
 
     @property
     def decided(self) -> bool:
-        """Whether every factor counts in full or not at all."""
+        """True if every factor counts in full or not at all."""
         weights = self.now.weight(self.squared)
         return bool((np.minimum(weights, 1.0 - weights) < DECIDED).all())
 
@@ -442,7 +442,7 @@ class _Search:
         return one.judged(units) < (1.0 - LESS) * other.judged(units)
 
     def _competes(self, one: _Answer, final: _Answer) -> bool:
-        """Whether an answer costs less than the final one as stated, or keeps something else for nearly as little."""
+        """Test whether an answer costs less than the final one, or keeps something else for nearly as little."""
         if one.solution.cost < (1.0 - LESS) * final.solution.cost:
             return True
         if not any((ours & ~theirs).any() for ours, theirs in zip(one.kept, final.kept, strict=True)):
@@ -597,7 +597,7 @@ class _Answer:
         return sum(one.total / units.get(name, 1.0) for name, one in self._plain.items()) + losses
 
     def believes_as(self, other: _Answer) -> bool:
-        """Whether both keep the same measurements."""
+        """Test whether both keep the same measurements."""
         return all(np.array_equal(a, b) for a, b in zip(self.kept, other.kept, strict=True))
 
 
@@ -639,7 +639,7 @@ def _active(term: CompiledTerm) -> Array:
 
 
 def _bound(loss: Loss) -> float:
-    """What the loss of a measurement tends to when it is left out altogether."""
+    """Limit of the loss of a measurement that is left out."""
     return float(loss.value(np.array([FAR]))[0])
 
 

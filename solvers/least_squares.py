@@ -241,6 +241,6 @@ class Path:
         return step
 
     def decrease(self, step: Array) -> float:
-        """What the quadratic model promises."""
+        """Decrease predicted by the quadratic model."""
         curved = self.program.normal.times(self.hessian, step)
         return -inner(step, self.gradient + 0.5 * curved)

@@ -114,7 +114,7 @@ class Penalty(Solver):
         return False
 
     def _violated(self, run: SolveState) -> bool:
-        """Whether the constraints as they are ask for a heavier weight."""
+        """Test whether the constraints as they are ask for a heavier weight."""
         return max(run.optimality.violation, run.optimality.complementarity) > self.tolerance
 
 

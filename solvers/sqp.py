@@ -217,7 +217,7 @@ class SQP(Solver):
     def _search(
         self, run: SolveState, workspace: UsualSubproblems, merit: RowPrices, qp: QP, answer: QPAnswer, accuracy: float
     ) -> Taken | None:
-        """How far to go."""
+        """Step length."""
         program, lin = run.program, run.lin
         if self.full_steps:
             reached = program.linearize(program.retract(lin.values, answer.step))
@@ -292,7 +292,7 @@ def _size(run: SolveState, workspace: UsualSubproblems) -> float:
 
 
 def _kind(qp: QP, answer: QPAnswer) -> str:
-    """Which Hessian a step was found with."""
+    """Kind of Hessian a step was found with."""
     if qp.curved_by is None or answer.route == "elastic":
         return "gauss-newton"
     return "exact" if qp.weights is None else "exact, with squares"

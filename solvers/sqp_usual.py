@@ -43,7 +43,7 @@ FULL, CORRECTED, HALVED = range(3)
 
 
 class Problem(NamedTuple):
-    """What no iteration changes.
+    """Arrays that no iteration changes.
 
     Attributes:
         terms: of the program.
@@ -76,7 +76,7 @@ class Problem(NamedTuple):
 
 
 class Work(NamedTuple):
-    """What an iteration reads and writes beside its two points.
+    """Arrays that an iteration reads and writes beside its two points.
 
     Attributes:
         numbers: (NUMBERS,) by the words above.
@@ -207,7 +207,7 @@ class UsualSubproblems(Subproblems):
         return answer, Taken(reached, work.step, float(numbers[LENGTH]), dual)
 
     def by_first(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
-        """What :meth:`take` has left, or as :class:`Subproblems`."""
+        """The subproblem that :meth:`take` has left, or as :class:`Subproblems`."""
         found, self._answered = self._answered, None
         return super().by_first(qp, multipliers, accuracy) if found is None else found
 
@@ -405,5 +405,5 @@ def _bend(limits: Array, there: Array, here: Array, linear: Array, out: Array) -
 
 @compiled
 def _outside(value: float, lower: float, upper: float) -> float:
-    """By how much a row is violated."""
+    """Violation of a row."""
     return max(value - upper, lower - value, 0.0)

@@ -22,7 +22,7 @@ class Turn(RLock):  # type: ignore[misc]
 
     @property
     def mine(self) -> bool:
-        """Whether this thread holds it."""
+        """True if this thread holds it."""
         return bool(self._is_owned())  # type: ignore[attr-defined]
 
     def __reduce__(self) -> tuple[type[Turn], tuple[()]]:

@@ -82,7 +82,7 @@ def perform(name: str, works: Callable[[], list[Job]], progress: Progress | None
 
 
 def _holds(mark: Path, present: str) -> bool:
-    """Whether a mark speaks of the present sources, and all that it speaks of is there."""
+    """Test whether a mark speaks of the present sources, and all that it speaks of is there."""
     try:
         written = json.loads(mark.read_text(encoding="utf-8"))
         return bool(written["of"] == present) and all(Path(file).exists() for file in written["files"])
@@ -102,7 +102,7 @@ def _present() -> str:
 
 
 def jobs() -> Iterator[Job]:
-    """What there is to compile: titles and functions."""
+    """Titles and functions to compile."""
     for solver, mode in _backends():
         yield f"{solver.name} {mode}".strip(), partial(rehearse, solver)
     yield "checks", _check
@@ -211,7 +211,7 @@ def _pose_graph(simulated: Simulated) -> None:
 
 
 def _share() -> None:
-    """What threads share of a solve, where there can be some."""
+    """Compile the parallel parts of a solve, if there are several threads."""
     count = threads()
     if cores() < 2:
         return

@@ -14,7 +14,7 @@ from threading import get_ident
 
 @contextmanager
 def beside(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Where to write instead of ``path``: what stands there at the end of the block takes its place, if nothing raised.
+    """Yield a temporary path that atomically replaces ``path`` on success.
 
     The name ends as that of ``path`` does, for writers that look at it. Links are followed; what is no file, such as
     ``/dev/stdout``, is written to directly.

@@ -1,1 +1,1 @@
-"""What makes steps from bad guesses safe: merits, a line search, damping, and the way to the least violation."""
+"""Globalisation: merit functions, line search, damping, and feasibility restoration."""

@@ -1,4 +1,4 @@
-"""Where a solve ends that cannot meet its constraints: the nearest point that violates them least.
+"""Feasibility restoration: the nearest point of least violation, for constraints that cannot be met.
 
 A merit function or an elastic problem stalls at a point that is stationary for its own measure of violation. From there
 a damped Newton method on 1/2 |violation|^2 finds a point that is stationary for the measure of
@@ -66,7 +66,7 @@ def _settled(run: SolveState) -> tuple[Linearization, bool] | None:
 
 
 def nearest(run: SolveState) -> tuple[Linearization, bool]:
-    """Where descent on the violation from the present iterate ends, and whether nothing near that violates less."""
+    """End of the descent on the violation from the present iterate, and true if nothing near violates less."""
     found = within_bounds(run.program, run.lin)
     if not infeasible_stationary(run.program, found, run.tolerance):
         found = least_violation(run.program, found, run.tolerance, lambda: run.out_of_time)
@@ -79,7 +79,7 @@ def nearest(run: SolveState) -> tuple[Linearization, bool]:
 
 
 def leave(run: SolveState) -> Status | None:
-    """Where the violation is stationary: LOCALLY_INFEASIBLE, or None once the iterate was moved to violate less."""
+    """LOCALLY_INFEASIBLE at a stationary violation; None after the iterate was moved to violate less."""
     within = within_bounds(run.program, run.lin)
     found = _downhill(run, within)
     if found is None:
@@ -175,7 +175,7 @@ class Watch:
         self._least = np.inf
 
     def calls(self, run: SolveState) -> bool:
-        """Whether it is time; asked once an iteration, and after every call half as often."""
+        """Test whether it is time; asked once an iteration, and after every call half as often."""
         violation = run.optimality.violation
         if violation <= run.tolerance or violation < FALLING * self._least:
             self._least, self._waited = min(violation, self._least), 0

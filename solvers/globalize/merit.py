@@ -113,7 +113,7 @@ class OnePrice(Merit):
         return point.cost + self.price * float(self.outside(point.constraints).sum())
 
     def rounding(self, lin: Linearization) -> float:
-        """What the merit owes to coordinates that are rounded where they are stored, by half a spacing in every row."""
+        """Rounding of the merit: coordinates off by half a spacing in every row."""
         largest = float(np.abs(self.program.columns.values(lin.values).flat).max(initial=0.0))
         return self.price * 0.5 * float(np.spacing(largest)) * len(lin.constraints)
 

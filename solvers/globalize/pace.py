@@ -1,4 +1,4 @@
-"""Whether a solve creeps: converges, but so slowly that another model of the problem pays for itself."""
+"""Slow convergence: detection of solves for which another model of the problem pays off."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PROGRESS = 0.1  # of the error, that a sound linear convergence leaves after the
 
 
 def creeps(history: Sequence[Iteration]) -> bool:
-    """Whether the last iterations have left more than a tenth of what misses the KKT conditions."""
+    """Test whether the last iterations have left more than a tenth of what misses the KKT conditions."""
     if len(history) <= PATIENCE:
         return False
     return _missing(history[-1]) > PROGRESS * _missing(history[-1 - LOOK_BACK])

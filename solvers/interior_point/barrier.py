@@ -203,7 +203,7 @@ def _forces(
 
 @compiled
 def _far_from_one(terms: TermArrays, jacobian: Array) -> bool:
-    """Whether some row of the constraint Jacobian has its largest entry far from one."""
+    """Test whether some row of the constraint Jacobian has its largest entry far from one."""
     fields = terms.fields
     for t in range(len(fields)):
         term = fields[t]

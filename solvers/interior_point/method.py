@@ -88,7 +88,7 @@ class InteriorPoint(Solver):
                 raise BackendError(f"{self.name}: {name} must be positive, found {value}")
 
     def runs_alone(self, program: Program) -> bool:
-        """Whether the loop may make the whole solve; that of least squares is tested outside, at every step."""
+        """Test whether the loop may make the whole solve; that of least squares is tested outside, at every step."""
         return not program.least_squares
 
     def workspace(self, program: Program) -> Workspace:
@@ -212,7 +212,7 @@ class InteriorPoint(Solver):
 
 
 class Workspace:
-    """What is kept between solves of one structure."""
+    """Memory kept between solves of one structure."""
 
     def __init__(self, program: Program) -> None:
         """Analyse the KKT matrix and compile."""
@@ -267,7 +267,7 @@ class Workspace:
         self._links, self.now = Fields(self.problem.links), Fields(self.work.scalars)
 
     def _unequal(self, term: IntArray) -> bool:
-        """Whether a row of the table is a term with inequality rows."""
+        """Test whether a row of the table is a term with inequality rows."""
         rows = slice(term[ROW], term[ROW] + term[COUNT] * term[ROWS])
         return term[KIND] != COST and not self.program.equality[rows].all()
 
@@ -391,7 +391,7 @@ def _largest(violation: Array) -> float:
 
 
 def _details(mu: float, delta: float, gauss_newton: float) -> dict[str, float | int | str]:
-    """What a row of the history shows beside the KKT numbers."""
+    """Columns of the history beside the KKT numbers."""
     details: dict[str, float | int | str] = {"mu": float(mu)}
     if delta:
         details["shift"] = float(delta)

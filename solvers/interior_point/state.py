@@ -1,4 +1,4 @@
-"""What the interior point remembers between the calls of its compiled functions, as plain arrays."""
+"""State of the interior point between calls of its compiled functions, as plain arrays."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ FILTER = 400  # pairs of theta and phi that are remembered
 
 
 class Problem(NamedTuple):
-    """What one structure needs and no iteration changes.
+    """Arrays of one structure that no iteration changes.
 
     Attributes:
         links: (1,) addresses of compiled functions.
@@ -148,7 +148,7 @@ class Problem(NamedTuple):
 
 
 class Work(NamedTuple):
-    """What the method remembers; each array with its shape, whose words :func:`empty_work` is told.
+    """Arrays of the method with their shapes, whose words :func:`empty_work` is given.
 
     Attributes:
         scalars: (1,) of `NOW`.

@@ -74,7 +74,7 @@ class ExactHessian:
         return self._definite.factor(hessian) and self._definite.definite
 
     def _inertia_is_right(self, qp: QP, weights: Array) -> bool:
-        """Whether H with squares of the weighted rows is positive definite where the equalities leave freedom."""
+        """Test whether H with squares of the weighted rows is positive definite where the equalities leave freedom."""
         program, n = self.program, self.program.size
         if self._system is None or not np.array_equal(self._system.held, program.equality):
             self._system = program.systems.kkt(program.equality)
@@ -110,7 +110,7 @@ def active_inequalities(program: Program, lin: Linearization, multipliers: Array
 
 
 def holds(qp: QP, answer: QPAnswer, accuracy: float) -> bool:
-    """Whether the inequalities whose squares were added are active in the answer, as was assumed.
+    """Test whether the inequalities whose squares were added are active in the answer, as was assumed.
 
     One that is not would need a multiplier of the wrong sign to undo its square.
     """

@@ -1,4 +1,4 @@
-"""Which route solves a subproblem: the one asked for, a fallback where it misses, the elastic one where rows clash."""
+"""Routes of a subproblem: the one asked for, a fallback where it misses, the elastic one where rows clash."""
 
 from __future__ import annotations
 
@@ -137,11 +137,11 @@ class Subproblems:
         return self.elastic.solve(elastic(), max(10.0 * float(np.abs(multipliers).max(initial=0.0)), 1e3))
 
     def by_first(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
-        """What the first route says."""
+        """Answer of the first route."""
         return solve_convex(self.first, qp, multipliers, accuracy)
 
     def _contradicts(self, qp: QP, answer: QPAnswer) -> bool:
-        """Whether an answer leaves most of the violation, as the least error of contradicting rows does."""
+        """Test whether an answer leaves most of the violation, as the least error of contradicting rows does."""
         if answer.error <= 0.1 * self.tolerance:  # which is no less than what is left
             return False
         linear = qp.linear(answer.step)

@@ -68,7 +68,7 @@ class Scaling:
 
     @cached_property
     def neutral(self) -> bool:
-        """Whether all factors are one."""
+        """True if all factors are one."""
         return bool((self.columns == 1.0).all() and (self.rows == 1.0).all())
 
     @cached_property
@@ -201,7 +201,7 @@ def _equilibrate(
 
 @compiled
 def _modest(columns: Array, rows: Array, of_bounds: BoolArray) -> bool:
-    """Whether no factor, but for those of bounds, is large or small."""
+    """Test whether no factor, but for those of bounds, is large or small."""
     for factor in columns:
         if not 1.0 / MODEST <= factor <= MODEST:
             return False

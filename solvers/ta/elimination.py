@@ -153,7 +153,7 @@ class Conditional:
 
 @dataclass(frozen=True, eq=False)
 class Elimination:
-    """What elimination leaves: a Bayes net.
+    """Result of elimination: a Bayes net.
 
     Attributes:
         conditionals: in the order of elimination.

@@ -1,1 +1,1 @@
-"""What is asked of a graph: solve, check, how good, how sure, and why not."""
+"""Questions to a graph: solve, check, fit, covariance, and reasons of failure."""

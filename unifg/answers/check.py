@@ -57,7 +57,7 @@ class Report:
     routes: dict[str, str] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
-        """Whether nothing was found."""
+        """Test whether nothing was found."""
         return not self.findings
 
     def __str__(self) -> str:

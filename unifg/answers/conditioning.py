@@ -1,4 +1,4 @@
-"""How well the normal equations of a solution are conditioned, and how well they were solved.
+"""Conditioning of the normal equations at a solution, and accuracy of their solution.
 
 The unknowns are scaled so that the diagonal is one: units say nothing, and what is left is how hard some directions are
 to tell apart. The condition in the 1-norm is estimated from a few solves (N. Higham, "FORTRAN codes for estimating the
@@ -40,7 +40,7 @@ class Conditioning(NamedTuple):
 
 
 def cheap(program: Program) -> bool:
-    """Whether a report may factorise."""
+    """Test whether a report may factorise."""
     fronts = program.systems.normal().structure.plan.fronts[:-1].astype(np.float64)
     pivots, rows = fronts[:, PIVOTS], fronts[:, ROWS]
     return float((pivots * (pivots**2 / 3.0 + pivots * rows + rows**2)).sum()) <= EFFORT

@@ -26,7 +26,7 @@ WORST = 3  # factors named
 
 @dataclass(frozen=True)
 class Fit:
-    """What least squares says about its own measurements.
+    """Goodness of fit of least squares.
 
     Attributes:
         chi2: sum of squared whitened residuals, as robust losses weigh them.
@@ -41,7 +41,7 @@ class Fit:
 
     @property
     def far(self) -> bool:
-        """Whether residuals are far larger than stated."""
+        """True if residuals are far larger than stated."""
         return is_far(self.chi2, self.freedom)
 
     def sentence(self) -> str:
@@ -54,7 +54,7 @@ class Fit:
 
 
 def is_far(chi2: float, freedom: int) -> bool:
-    """Whether residuals are far larger than stated, and not by chance."""
+    """Test whether residuals are far larger than stated, and not by chance."""
     if not (freedom > 0 and chi2 > FAR * freedom):
         return False
     from scipy.special import chdtrc  # slow to load, and seldom asked
@@ -63,7 +63,7 @@ def is_far(chi2: float, freedom: int) -> bool:
 
 
 def ratio_sentence(chi2: float, freedom: int) -> str:
-    """What residuals far larger than stated may mean."""
+    """Reasons for residuals far larger than stated, as a sentence."""
     return (
         f"residuals are {(chi2 / freedom) ** 0.5:.3g} times as large as stated: weights are too sure, some "
         "measurements are wrong, or this is not the best solution"

@@ -61,7 +61,7 @@ class Graph(Statement):
         return compile_graph(self)
 
     def elimination_tree(self) -> EliminationTree:
-        """How the engine eliminates the variables of this graph: its Bayes tree, to print and to look at."""
+        """Bayes tree of the elimination of this graph, to print and to draw."""
         program = self.compile()
         columns, blocks = program.columns, program.blocks
         first = [int(columns.free[k]) for k in np.unique(blocks, return_index=True)[1]]

@@ -1,4 +1,4 @@
-"""What happened during a solve: one row per iteration, and how badly each factor fits where somebody asks.
+"""History of a solve: one row per iteration, and on demand the norm of each factor.
 
 A factor of a cost has the norm of its whitened residual, before any robust loss; a factor of a constraint or a bound
 the norm of what lies outside its limits, in the constraint's own units; a factor of a scalar cost the magnitude of its
@@ -43,7 +43,7 @@ class FactorNorms(Mapping[str, Array]):
         return self._parts[term]
 
     def __contains__(self, term: object) -> bool:
-        """Whether a term has that name."""
+        """Test whether a term has that name."""
         return term in self._parts
 
     def __iter__(self) -> Iterator[str]:

@@ -36,7 +36,7 @@ class Incumbent(NamedTuple):
 
 
 class Incumbents:
-    """What may still be the best iterate, at the present price or a higher one.
+    """Candidates for the best iterate, at the present penalty parameter or a higher one.
 
     Attributes:
         price: of violation, of the iterates that were compared.

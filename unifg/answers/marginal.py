@@ -29,7 +29,7 @@ NOTHING_KNOWN = 1e-12  # smaller eigenvalues of a scaled information matrix are 
 
 @dataclass
 class Dense:
-    """Where the entries of some rows go in a dense matrix over some columns.
+    """Positions of the entries of some rows in a dense matrix over some columns.
 
     Attributes:
         rows: (m,) which rows of the stacked Jacobian.
@@ -57,7 +57,7 @@ class Dense:
 
 @dataclass
 class Removal:
-    """What one marginalisation needs to know of a graph's structure.
+    """Structure of one marginalisation.
 
     Attributes:
         costs: rows of the costs that touch what is removed.
@@ -103,7 +103,7 @@ def marginal_prior(
     equality: BoolArray | None = None,
     offset: bool = False,
 ) -> tuple[Array, Array]:
-    """What terms that touch ``remove`` say about ``keep`` once ``remove`` is eliminated.
+    """Marginal prior on ``keep`` of the terms that touch ``remove``, which is eliminated.
 
     Exact where the terms are linear. Elsewhere it is their quadratic model at ``lin``: costs by Gauss-Newton,
     constraints to first order, without the curvature of constraints that multipliers would weigh.

@@ -45,7 +45,7 @@ class Slopes:
         _raise(jacobian, gradient, self.jacobian, self.gradient)
 
     def degenerate(self, multipliers: Array, tolerance: float) -> bool:
-        """Whether multipliers are larger than constraints with a slope ever need.
+        """Test whether multipliers are larger than constraints with a slope ever need.
 
         Args:
             multipliers: (M,).

@@ -67,15 +67,15 @@ class Optimality(NamedTuple):
     weakest: float = 1.0
 
     def holds(self, tolerance: float) -> bool:
-        """Whether all three numbers are within ``tolerance``."""
+        """Test whether all three numbers are within ``tolerance``."""
         return self.finite and max(self.stationarity, self.violation, self.complementarity) <= tolerance
 
     def passes(self, tolerance: float) -> bool:
-        """Whether all three numbers are known to be within ``tolerance``, at a point that is determined."""
+        """Test whether all three numbers are known to be within ``tolerance``, at a point that is determined."""
         return self.determined and self.holds(tolerance) and self.rounding <= tolerance
 
     def blurred(self, tolerance: float) -> bool:
-        """Whether rounding above ``tolerance`` is all that differences still see of the stationarity."""
+        """Test whether rounding above ``tolerance`` is all that differences still see of the stationarity."""
         sound = self.finite and max(self.violation, self.complementarity) <= tolerance
         return sound and self.stationarity <= self.rounding and self.rounding > tolerance
 
@@ -123,7 +123,7 @@ def optimality(
 
 
 def _relative_rounding(program: Program, lin: Linearization, multipliers: Array) -> float:
-    """By how much differences may be wrong about a relative offset."""
+    """Error bound of a relative offset found from differences."""
     rounding = gradient_rounding(program, lin, multipliers)
     size = math.sqrt(inner(lin.residual, lin.residual))
     if not len(rounding) or size == 0.0:
@@ -229,7 +229,7 @@ def _measure(
 
 
 def infeasible_stationary(program: Program, lin: Linearization, tolerance: float) -> bool:
-    """Whether the point is stationary for 1/2 |violation|^2 without being feasible, in whatever units the unknowns are.
+    """Test whether an infeasible point is stationary for 1/2 |violation|^2, in whatever units the unknowns are.
 
     It is where the best step of :class:`unifg.answers.violation.ViolationModel` promises nothing that counts. Bounds of
     the unknowns are kept, since they can be: a point outside them is looked at where it is brought back, and descent

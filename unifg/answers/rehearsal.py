@@ -55,12 +55,12 @@ def rehearse(solver: Any) -> None:
 
 
 def _of_others(record: logging.LogRecord) -> bool:
-    """Whether a message is about terms that a user has stated."""
+    """Test whether a message is about terms that a user has stated."""
     return MARK not in record.getMessage()
 
 
 def _mode(solver: Any) -> object:
-    """Which code a backend runs: its class and the options that are words."""
+    """Code that a backend runs: its class and the options that are words."""
     options = fields(solver) if is_dataclass(solver) else ()
     return type(solver), *((f.name, v) for f in options if isinstance(v := getattr(solver, f.name), str | bool))
 

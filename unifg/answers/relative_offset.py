@@ -63,7 +63,7 @@ DAMPED = 1e2  # a direction this many times stiffer than the damping is seen thr
 
 
 class Factored(Protocol):
-    """What a backend can lend: its factorisation of a matrix near the Hessian.
+    """Factorisation of a matrix near the Hessian, lent by a backend.
 
     Attributes:
         solver: the factorisation.
@@ -115,7 +115,7 @@ def relative_offset(
 
 
 class Structure:
-    """What does not change between points of one graph.
+    """Constants of one graph, the same at all points.
 
     Attributes:
         counted: (C,) rows that touch an unknown; empty when all do. Costs between fixed variables are constants.
@@ -294,7 +294,7 @@ def _bent(program: Program, lin: Linearization, solver: Factorization) -> Factor
 
 
 def _regular(program: Program, hessian: Array, diagonal: Array, lent: Factored) -> bool:
-    """Whether a factor near the Hessian shows that every direction is determined."""
+    """Test whether a factor near the Hessian shows that every direction is determined."""
     if not (_sound(lent.solver, diagonal, program.size) and diagonal.all()):
         return False
     if lent.damping == 0.0:
@@ -344,7 +344,7 @@ def _climb(
 
 
 def _sound(solver: Factorization, diagonal: Array, size: int, weak: float = WEAK) -> bool:
-    """Whether all pivots stand out from rounding errors."""
+    """Test whether all pivots stand out from rounding errors."""
     if not solver.definite:
         return False
     plan = solver.plan
@@ -380,7 +380,7 @@ def _idle(program: Program, diagonal: Array) -> BoolArray:
 
 
 def _extents(program: Program) -> tuple[IntArray, IntArray, Array]:
-    """Where the numbers stand that say how large each unknown coordinate is; angles have none, but a least size."""
+    """Positions of numbers that give the scale of each unknown; none for angles, which have a least size."""
     first, last, kinds = (place[program.columns.free] for place in program.columns.extents)
     angles = (kinds == ANGLE) | (kinds == TURN)
     return np.where(angles, 0, first), np.where(angles, 0, last), angles.astype(np.float64)

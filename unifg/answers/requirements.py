@@ -1,4 +1,4 @@
-"""What a backend refuses, by name, before the first iteration."""
+"""Requirements of backends: refusals by name, before the first iteration."""
 
 from __future__ import annotations
 

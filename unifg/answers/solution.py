@@ -1,4 +1,4 @@
-"""What every backend returns, and what the next solve may start from."""
+"""Solution of a backend, and guesses made of it."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ class Solution:
 
     @property
     def converged(self) -> bool:
-        """Whether the KKT conditions hold to the tolerance."""
+        """True if the KKT conditions hold to the tolerance."""
         return self.status.converged
 
     @property
@@ -171,7 +171,7 @@ class Solution:
         return self._lin.values[selection.family][selection.indices][:, selection.storage].copy()
 
     def selections(self, term: str) -> list[Selection]:
-        """What the factors of a term touch: its variable arguments, in order; one of length 1 is shared by all factors.
+        """Variable arguments of a term, in order; one of length 1 is shared by all factors.
 
         Raises:
             GraphError: when no term has that name.
@@ -332,7 +332,7 @@ class Solution:
 
     @cached_property
     def conditioning(self) -> Conditioning | None:
-        """How well the normal equations are conditioned here, and solved; None but for pure least squares.
+        """Conditioning of the normal equations here, and accuracy of their solution; None but for pure least squares.
 
         One factorisation and a few solves, when first asked for.
         """
@@ -394,7 +394,7 @@ class Solution:
         return held
 
     def _selection(self, variable: Variable | str) -> Selection:
-        """What is meant, if it is part of this solution."""
+        """The selection named, if it is part of this solution."""
         if isinstance(variable, str):
             if variable not in self.families:
                 raise GraphError(

@@ -54,7 +54,7 @@ WITHOUT_SUCCESS = (
 
 
 class Backend(ABC):
-    """What solves a graph.
+    """Solver of a graph.
 
     Attributes:
         constraints: which it takes.
@@ -174,7 +174,7 @@ class Solver(Backend):
         require(program, self.name, self.constraints, self.scalar_costs)
 
     def runs_alone(self, program: Program) -> bool:
-        """Whether :meth:`iterate` evaluates the start and ends with :meth:`SolveState.conclude` when nobody watches.
+        """Test whether :meth:`iterate` evaluates the start and ends with :meth:`SolveState.conclude` if unwatched.
 
         Such a backend minds the time limit itself.
         """
@@ -182,7 +182,7 @@ class Solver(Backend):
 
     @abstractmethod
     def workspace(self, program: Program) -> Any:
-        """What the backend keeps between solves of one structure."""
+        """Memory that the backend keeps between solves of one structure."""
 
     @abstractmethod
     def iterate(self, run: SolveState, workspace: Any) -> Status | None:
@@ -246,7 +246,7 @@ class SolveState:
 
     @property
     def out_of_time(self) -> bool:
-        """Whether the time limit has passed."""
+        """True if the time limit has passed."""
         return self.seconds > self._solver.time_limit
 
     def accept(
@@ -287,7 +287,7 @@ class SolveState:
 
     @property
     def watched(self) -> bool:
-        """Whether somebody looks at every iteration: a callback, a log, kept values or residuals."""
+        """True if somebody looks at every iteration: a callback, a log, kept values or residuals."""
         solver = self._solver
         return bool(self._callback or solver.verbose or solver.keep_values or solver.keep_residuals)
 
@@ -390,12 +390,12 @@ class SolveState:
 
     @property
     def has_been_feasible(self) -> bool:
-        """Whether the start or an iterate met the constraints, which proves that they can be met."""
+        """True if the start or an iterate met the constraints, which proves that they can be met."""
         _ = self.least_violated
         return self._least <= self.tolerance
 
     def infeasible_stationary(self) -> bool:
-        """Whether no nearby point violates the constraints less, though they are violated."""
+        """Test whether no nearby point violates the constraints less, though they are violated."""
         return infeasible_stationary(self.program, self.lin, self.tolerance)
 
     def finish(self, reason: Status | None) -> Solution:
@@ -647,7 +647,7 @@ class Prepared:
 
     @property
     def stale(self) -> bool:
-        """Whether the graph has been changed since."""
+        """True if the graph has been changed since."""
         return self._graph.edition != self.program.graph.edition
 
     def _say_if_stale(self) -> None:

@@ -48,5 +48,5 @@ class Status(Enum):
 
     @property
     def converged(self) -> bool:
-        """Whether a solution is claimed."""
+        """True if a solution is claimed."""
         return self in (Status.CONVERGED, Status.HARDLY_DETERMINED)

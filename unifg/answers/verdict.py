@@ -1,4 +1,4 @@
-"""Which measurements an answer believes, and which answers compete with it."""
+"""Outlier report: measurements kept and left out by an answer, and answers that compete with it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SHOWN = 5  # factors that a sentence names
 
 
 class Answer(Protocol):
-    """What a rival is asked: a solution."""
+    """Competing solution."""
 
     @property
     def cost(self) -> float:
@@ -22,7 +22,7 @@ class Answer(Protocol):
 
     @property
     def verdict(self) -> Verdict[Any] | None:
-        """Which measurements it believes."""
+        """Measurements kept."""
 
 
 AnswerT = TypeVar("AnswerT", bound=Answer)
@@ -56,7 +56,7 @@ class Group(Generic[AnswerT]):
 
 @dataclass(frozen=True, eq=False)
 class Verdict(Generic[AnswerT]):
-    """What a solve that tells right measurements from wrong ones found.
+    """Outlier report of a solve that separates right measurements from wrong ones.
 
     Attributes:
         kept: (n,) per term with a loss that leaves out: whether a factor counts.
@@ -86,7 +86,7 @@ class Verdict(Generic[AnswerT]):
         object.__setattr__(self, "doubted", {name: self.doubted.get(name, NONE) for name in self.kept})
 
     def sentence(self, cost: float) -> str:
-        """What is kept, and a warning where there are rivals.
+        """Summary of the measurements kept, with a warning if other answers compete.
 
         Args:
             cost: of the answer this belongs to.
@@ -108,7 +108,7 @@ class Verdict(Generic[AnswerT]):
 
 
 def _named(factors: dict[str, IntArray]) -> str:
-    """How many factors of which term, the first of them by number."""
+    """Factors counted by term, the first of them by number."""
     parts = []
     for name, which in factors.items():
         listed = ", ".join(map(str, which[:SHOWN].tolist())) + (", ..." if len(which) > SHOWN else "")

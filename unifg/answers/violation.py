@@ -63,7 +63,7 @@ class ViolationModel:
         return entries
 
     def stationary(self, tolerance: float) -> bool:
-        """Whether the step to the minimum of the model decreases the value by nothing that counts.
+        """Test whether the step to the minimum of the model decreases the value by nothing that counts.
 
         Args:
             tolerance: of the violation.

@@ -24,7 +24,7 @@ NOTHING = np.zeros(0)
 
 
 class Structure(NamedTuple):
-    """What the analysis found.
+    """Result of the symbolic analysis.
 
     Attributes:
         plan: arguments of the compiled kernels, without memory to work in.

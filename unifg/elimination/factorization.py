@@ -35,7 +35,7 @@ NOTHING = np.zeros(0)
 
 
 class Symbolic:
-    """What factorisations of one pattern share: the structure asked for, analysed when first needed, once.
+    """Symbolic structure shared by factorisations of one pattern: analysed once, when first needed.
 
     Attributes:
         pattern: upper triangle of the matrices.
@@ -222,7 +222,7 @@ class Factorization:
 
     @property
     def definite(self) -> bool:
-        """Whether the last factorisation succeeded with positive pivots only."""
+        """True if the last factorisation succeeded with positive pivots only."""
         return self._ready and self.inertia[1] == 0
 
     @property
@@ -383,7 +383,7 @@ class Factorization:
 
     @property
     def _shared(self) -> bool:
-        """Whether several threads work on it."""
+        """True if several threads work on it."""
         return threads() > 1 and len(self.plan.part) > 0
 
     def _forget(self) -> None:

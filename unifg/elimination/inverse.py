@@ -101,7 +101,7 @@ def invert(plan: Plan, owner: IntArray, wanted: BoolArray, panels: Array, free: 
 
 @compiled
 def locate(plan: Plan, owner: IntArray, scalars: IntArray, places: IntArray) -> bool:
-    """Where the entries of the inverse between some scalars are kept.
+    """Positions of the entries of the inverse between some scalars.
 
     Args:
         plan: laid out.

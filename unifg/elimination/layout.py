@@ -1,4 +1,4 @@
-"""Where everything goes: panels, update matrices, row indices, and each entry of the pattern."""
+"""Memory layout: panels, update matrices, row indices, and each entry of the pattern."""
 
 from __future__ import annotations
 

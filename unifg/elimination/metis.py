@@ -17,7 +17,7 @@ from unifg.typing import IntArray
 
 
 def installed() -> bool:
-    """Whether the extra is there."""
+    """Test whether the extra is there."""
     return find_spec("pymetis") is not None
 
 

@@ -73,7 +73,7 @@ APART = 8  # columns and rows: kernels write back up to three numbers beyond a c
 
 @compiled
 def chunks_of(work: float) -> int:
-    """How many chunks so many multiplications are worth."""
+    """Number of chunks for so many multiplications."""
     return max(1, min(MOST, int(work / FEWEST)))
 
 
@@ -95,7 +95,7 @@ def column_of(chunk: int, chunks: int, start: int, stop: int) -> int:
 
 @compiled
 def phases_of(plan: Plan) -> int:
-    """How many phases :func:`work_on` has at most."""
+    """Largest number of phases of :func:`work_on`."""
     count = 5
     for s in range(plan.shape[FRONTS]):
         if plan.part[s] == PARTS:
@@ -109,7 +109,7 @@ def phases_of(plan: Plan) -> int:
 
 @compiled
 def work_on(plan: Plan, data: Array, added: Array, counters: Address, told: IntArray) -> None:
-    """What one of several threads does, see the module.
+    """Work of one thread, see the module.
 
     Args:
         plan: with parts.
@@ -276,7 +276,7 @@ def _sweep(
 
 @compiled
 def substitute(plan: Plan, right: Array, out: Array, own: Array, counters: Address) -> None:
-    """What one of several threads does for a solution.
+    """Work of one thread for a solution.
 
     Args:
         plan: factorised, with parts.
@@ -354,7 +354,7 @@ def _entrances() -> tuple[Address, Address]:
 
 
 def factor_at_once(plan: Plan, data: Array, added: Array) -> bool:
-    """What :func:`fronts.factor` does, to the bit, by as many threads as there are."""
+    """Parallel :func:`fronts.factor`, with the same bits."""
     told = np.empty((PARTS + 1, len(plan.state)), np.int64)
     counters = np.zeros(2 * phases_of(plan), np.int64)
     share(_entrances()[0], (plan, data, added, counters.ctypes.data, told))
@@ -368,6 +368,6 @@ def factor_at_once(plan: Plan, data: Array, added: Array) -> bool:
 
 
 def solve_at_once(plan: Plan, right: Array, out: Array) -> None:
-    """What :func:`substitution.solve` does, by as many threads as there are; ``out`` is not ``right``."""
+    """Parallel :func:`substitution.solve`; ``out`` is not ``right``."""
     own, counters = np.empty((PARTS, len(plan.work))), np.zeros(6, np.int64)
     share(_entrances()[1], (plan, right, out, own, counters.ctypes.data))

@@ -75,7 +75,7 @@ class Symmetric:
         return place
 
     def positions(self, rows: IntArray, columns: IntArray) -> IntArray:
-        """Where the given entries are stored."""
+        """Positions of the given entries."""
         return np.searchsorted(self.columns * self.size + self.indices, columns * self.size + rows)
 
     def times(self, data: Array, vector: Array) -> Array:

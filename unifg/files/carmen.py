@@ -34,7 +34,7 @@ _ENDING = 3  # time, computer, time since the beginning
 
 @dataclass(frozen=True, eq=False)
 class Odometry:
-    """What the wheels said.
+    """Wheel odometry.
 
     Attributes:
         time: (n,) time of the logger [s].

@@ -1,4 +1,4 @@
-"""What stands in a file: its bytes, unpacked, and its text, within limits that a file cannot exceed by itself.
+"""Bytes of a file, unpacked, and its text, within limits that a file cannot exceed by itself.
 
 A few kilobytes may unpack to gigabytes, an image of one line may claim 1e10 pixels, and a number may have a million
 digits. Who has such files raises the limit that the error names.
@@ -26,7 +26,7 @@ _SEPARATORS = (b"\xc2\x85", b"\xe2\x80\xa8", b"\xe2\x80\xa9")  # lines end here 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a file may hold at most.
+    """Upper limits of a file's content.
 
     Attributes:
         unpacked: bytes, after unpacking.

@@ -42,7 +42,7 @@ TENS: Array = np.array([float(10**exponent) for exponent in range(EXACT + 1)])
 
 @compiled
 def is_blank(byte: int) -> bool:
-    """Whether a byte separates words; see `BLANKS`."""
+    """Test whether a byte separates words; see `BLANKS`."""
     return byte == 32 or byte == 9 or byte == 13
 
 

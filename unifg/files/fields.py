@@ -119,7 +119,7 @@ def read_fields(
 
 
 def norms(quaternions: Array, place: Callable[[int], str], say: Callable[[str], None] = logger.warning) -> Array:
-    """What quaternions are to be divided by; norms farther than 1e-3 from one are remarked.
+    """Norms to divide quaternions by; those farther than 1e-3 from one are remarked.
 
     Args:
         quaternions: (n, 4).

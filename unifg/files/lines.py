@@ -1,4 +1,4 @@
-"""Where the lines of a text file stand, and with which words they begin: one compiled pass over its bytes."""
+"""Lines of a text file and their first words: one compiled pass over its bytes."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def _find_lines(
 
 @compiled
 def _same(data: NDArray[np.uint8], first: int, end: int, other: int, other_end: int) -> bool:
-    """Whether two pieces of text are alike."""
+    """Test whether two pieces of text are alike."""
     if end - first != other_end - other:
         return False
     for k in range(end - first):

@@ -1,4 +1,4 @@
-"""What a reader of pose graphs looks for in the measurements, and says: indefinite weights, lines that repeat."""
+"""Checks of measurements read from pose graphs: indefinite weights, lines that repeat."""
 
 from __future__ import annotations
 

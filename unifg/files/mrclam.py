@@ -40,7 +40,7 @@ _TURN = 2.0 * np.pi
 
 @dataclass(frozen=True, eq=False)
 class MrclamLog:
-    """What one robot logged, and what is known of the room.
+    """Log of one robot, with the ground truth of the room.
 
     Times are seconds by one clock for all robots of a folder, since 1970 in published logs, and do not run backwards.
 

@@ -25,7 +25,7 @@ __all__ = ["PlazaLog", "read_plaza", "write_plaza"]
 
 @dataclass(frozen=True, eq=False)
 class PlazaLog:
-    """What the wheels and the radio said, by one clock; times do not run backwards.
+    """Odometry and ranges of a log by one clock; times do not run backwards.
 
     Attributes:
         odometry_time: (n,) [s].

@@ -33,7 +33,7 @@ _PIXEL_OCCUPIED, _PIXEL_FREE, _PIXEL_UNKNOWN = 0, 254, 205
 
 @dataclass(frozen=True, eq=False)
 class OccupancyMap:
-    """What is known to be occupied and what is known to be free; the rest is unknown.
+    """Cells known to be occupied and cells known to be free; the rest is unknown.
 
     Attributes:
         occupied: (H, W) bool, row 0 at the lowest y of the map's own frame.

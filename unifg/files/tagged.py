@@ -62,7 +62,7 @@ class Block:
 
 
 class _Lines(NamedTuple):
-    """Where lines begin after their tag and end, (n,) places in the text, and (n,) their numbers, from 1."""
+    """Starts of lines after their tag and their ends, (n,) places in the text, and (n,) their numbers, from 1."""
 
     begin: IntArray
     end: IntArray
@@ -107,7 +107,7 @@ class TaggedFile:
         return cls(legible(path), content, result)
 
     def __contains__(self, tag: str) -> bool:
-        """Whether there is a line with a tag."""
+        """Test whether there is a line with a tag."""
         return tag in self.lines
 
     def counts(self) -> dict[str, int]:
@@ -143,7 +143,7 @@ class TaggedFile:
 
 
 class Places:
-    """Where identifiers stand among the vertices of a file."""
+    """Positions of identifiers among the vertices of a file."""
 
     def __init__(self, file: TaggedFile, identifiers: NDArray[np.int64]) -> None:
         """Of distinct identifiers (n,); the file is for messages."""

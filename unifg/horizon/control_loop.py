@@ -33,7 +33,7 @@ LEAST_TIME = 1e-4  # [s] a solver is given however late it is
 
 @dataclass(frozen=True)
 class Starts:
-    """Where solves begin that have no last answer to go on from.
+    """Initial guesses of solves without a last answer.
 
     Attributes:
         cold: ``cold(now)`` gives states (N + 1, storage) and controls (N, m); None: stay, with the control zero.
@@ -286,7 +286,7 @@ class Loop:
             self._turn.release()
 
     def now(self, present: ArrayLike, given: Any = None, statics: Mapping[str, Array] | None = None) -> Now[Any]:
-        """What terms are asked with; arguments as of :meth:`plan`."""
+        """Context for the terms; arguments as of :meth:`plan`."""
         history = None if self.window is None else self.window.history
         known = {static.name: static.values for static in self.robot.statics} if history is None else history.statics
         given_statics = {name: self._static(name, value, known) for name, value in (statics or {}).items()}
@@ -331,13 +331,13 @@ class Loop:
         )  # fmt: skip
 
     def _refuses(self, solution: Solution, now: Now[Any]) -> bool:
-        """Whether the judge would have something else applied than the plan."""
+        """Test whether the judge would have something else applied than the plan."""
         return self.judge(solution, solution[self.x], solution[self.u], now, self.kept).source != "solved"
 
     def _ask(
         self, other: Prepared, first: Solution, now: Now[Any], data: dict[Data, ArrayLike], begin: float
     ) -> tuple[Solution, bool]:
-        """What another backend finds, and True, if the judge takes it; else the first solution, and False."""
+        """Solution of another backend and True, if the acceptance policy takes it; else the first and False."""
         left = self._deadline - (self._clock() - begin)
         if left <= 0.0:
             return first, False
@@ -379,13 +379,13 @@ class Loop:
         return choice
 
     def _acting(self, now: Now[Any]) -> Now[Any]:
-        """What terms are asked with, when the plan acts."""
+        """Context for the terms at the time the plan acts."""
         if not self.delay:
             return now
         return replace(now, present=self.robot.rollout(now.present, self.sent)[-1], last=self.sent[-1].copy())
 
     def begin(self, now: Now[Any]) -> tuple[Prepared, Guess]:
-        """Which backend solves next, and from where."""
+        """Backend of the next solve, and its guess."""
         if self.guess is not None:
             carry = self.starts.carry
             return self.warm, self.guess if carry is None else carry(self.guess, now)
@@ -454,7 +454,7 @@ class Loop:
             self._believe_nothing()
 
     def _believe_nothing(self) -> None:
-        """What is known before the first tick."""
+        """Beliefs before the first tick."""
         self.applied = np.zeros(self.robot.control.storage)
         self.sent = np.zeros_like(self.sent)
         self.solution = None

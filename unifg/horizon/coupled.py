@@ -1,4 +1,4 @@
-"""How the future is tied to the past: two graphs that share nothing, two that share a belief, or one graph."""
+"""Coupling of horizon and window: two graphs that share nothing, two that share a belief, or one graph."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ LEAST_SIGMA = 1e-6  # of what the past knows for certain
 
 
 class Tie(Protocol):
-    """What ties the horizon to what is known.
+    """Coupling of the horizon to the estimate.
 
     Attributes:
         ahead: the nodes of the future, the present first.
@@ -89,7 +89,7 @@ class Given:
                 graph.fix(family, static.values, name=f"{static.name}, given")
 
     def data(self, now: Now[Any]) -> dict[Data, ArrayLike]:
-        """What is given."""
+        """Data of a given present."""
         found: dict[Data, ArrayLike] = {self._start: now.present}
         return found | {data: now.statics[name] for name, data in self._statics.items()}
 
@@ -163,7 +163,7 @@ class Joined:
         self._limits.append((key, place, lower, upper))
 
     def data(self, now: Now[Any]) -> dict[Data, ArrayLike]:
-        """What the window knows, and where it puts what may be pulled."""
+        """Data of the window, and of the reference of a bounded pull."""
         found = self.past.data(now)
         for key, place, lower, upper in self._limits:
             shape = lower.value.shape
@@ -187,7 +187,7 @@ class Joined:
         return replace(guess, values={**guess.values, **self.past.guess(), x: nodes})
 
     def believed(self, solution: Solution) -> tuple[Array, dict[str, Array]]:
-        """What the solve says."""
+        """Estimate taken from the solve."""
         return solution[self._present][0], {family.name: solution[family] for family in self.past.statics}
 
 

@@ -1,4 +1,4 @@
-"""What a tick decides: a plan, where it comes from, and what is done when a solve gives none."""
+"""Decision of a tick: a plan, its source, and the fallback after a failed solve."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from unifg.typing import Array
 
 @dataclass(frozen=True)
 class Plan:
-    """What a tick decided.
+    """Decision of a tick.
 
     Attributes:
         controls: (N, m), the first to be applied when the plan acts: now, or after the loop's delay.
@@ -47,7 +47,7 @@ class Plan:
 
     @property
     def emergency(self) -> bool:
-        """Whether the solve gave nothing that may be applied."""
+        """True if the solve gave nothing that may be applied."""
         return self.source != "solved"
 
 
@@ -92,7 +92,7 @@ class Kept:
 
 @dataclass(frozen=True)
 class Choice:
-    """What is applied at a tick.
+    """Controls applied at a tick.
 
     Attributes:
         controls: (N, m).
@@ -149,7 +149,7 @@ class KeepThenBrake:
         return self.instead(now, kept)
 
     def instead(self, now: Now[Any], kept: Kept) -> Choice:
-        """What is done without a plan of this tick."""
+        """Fallback without a plan of this tick."""
         count = len(kept.controls)
         braking = kept.within(np.tile(np.zeros(kept.controls.shape[1]), (count, 1)))
         if self.brake is not None:

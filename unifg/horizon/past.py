@@ -44,7 +44,7 @@ class Arrival(Protocol):
         ...
 
     def more(self, dim: int) -> int:
-        """How many numbers follow the storage in the reference, for a prior over ``dim`` tangents; at rest all zero."""
+        """Numbers that follow the storage in the reference, for a prior over ``dim`` tangents; at rest all zero."""
         ...
 
     def express(self, here: Array, step: Array, lowest: Array, information: Array) -> tuple[Array, Array]:
@@ -80,7 +80,7 @@ class Tangent:
 
 
 class Left:
-    """What is known of what has left the window.
+    """Marginal prior of the nodes that left the window.
 
     Attributes:
         initial: reference (storage,) and information (d, d) about the node everything began at.
@@ -207,7 +207,7 @@ class Past:
         return switches, own
 
     def _state_priors(self, graph: Graph) -> None:
-        """What was believed at the start, what has left, and what holds empty places."""
+        """Priors at the start, of dropped nodes, and of empty places."""
         x, history, left = self.x, self._history, self._left
         self._beginning = x[:1] if history.filled else x  # of a window that is never empty it leaves at once
         self._initial = graph.data("initial", np.zeros(len(self._beginning), dtype=bool), each=True)
@@ -253,7 +253,7 @@ class Past:
         return tuple(self._statics.values())
 
     def data(self, now: Now[Any]) -> dict[Data, ArrayLike]:
-        """What the window knows."""
+        """Data of the window."""
         history, left = self._history, self._left
         found = values_of(self._terms, now, self._handles)
         for switch, first in self._entered:
@@ -278,7 +278,7 @@ class Past:
         return found
 
     def guess(self) -> dict[Family, Array]:
-        """What is believed about everything but the nodes."""
+        """Beliefs about everything but the nodes."""
         history = self._history
         steps = {family: history.steps[name] for name, family in self._steps.items()}
         return steps | {family: history.statics[name] for name, family in self._statics.items()}
@@ -337,7 +337,7 @@ def without(information: Array, columns: IntArray) -> Array:
 
 
 def _leaves(term: Stated) -> bool:
-    """Whether a term is marginalised: costs and equalities, no inequalities."""
+    """Test whether a term is marginalised: costs and equalities, no inequalities."""
     if not isinstance(term, Constraint):
         return True
     if isinstance(term.lower, Data) or isinstance(term.upper, Data):

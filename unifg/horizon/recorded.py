@@ -1,4 +1,4 @@
-"""What was done and measured at the last nodes, and what is believed of them: numbers, no graph.
+"""Controls, measurements and beliefs of the last nodes: numbers, no graph.
 
 Nodes run from the oldest to the present one. While fewer than L steps have been made the oldest places are empty.
 """
@@ -77,7 +77,7 @@ class History:
 
     @property
     def full(self) -> bool:
-        """Whether the next step drops the oldest node."""
+        """True if the next step drops the oldest node."""
         return self.entered == self.length
 
     @property

@@ -1,4 +1,4 @@
-"""Who moves: where its state and its controls live, and what else is unknown that past and future share."""
+"""Robot: manifolds of state and control, and constant unknowns shared by past and future."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Static:
 
     @property
     def known(self) -> bool:
-        """Whether it is no unknown at all."""
+        """True if it is no unknown at all."""
         return not np.any(self.sigma)
 
     def family(self, graph: Statement) -> Family:

@@ -1,4 +1,4 @@
-"""What a window or a horizon says, in terms: each stated once, whatever graphs it comes to stand in.
+"""Terms of a window or a horizon: each defined once, whatever graphs it is added to.
 
 A term is an object with two methods. ``state(graph, x, u)`` adds costs and constraints on the nodes it is given, of the
 past or of the future; ``data(now)`` gives the values of the data that it declared, by their names. The same object may
@@ -28,7 +28,7 @@ G = TypeVar("G")
 
 @dataclass(frozen=True)
 class Now(Generic[G]):
-    """What terms may ask for at a tick.
+    """Context of terms at a tick.
 
     Attributes:
         given: what the caller hands to this tick: a reference, a goal, a map.
@@ -137,14 +137,14 @@ class Measurement:
         )
 
     def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
-        """What was measured."""
+        """Measurements."""
         values, measured = now.past.recorded(self.name)
         return {self.name: values, f"{self.name}: measured": measured}
 
 
 @dataclass(frozen=True)
 class Dynamics:
-    """How the robot moves from node to node, by the controls between them: in the past or in the future.
+    """Dynamics from node to node by the controls between them: in the past or in the future.
 
     Attributes:
         residual: ``residual(x, u, x_next, h)`` or, with statics, ``residual(x, u, s_1, ..., x_next, h)``: (n, m).

@@ -165,7 +165,7 @@ class Window:
         raise GraphError(f"the robot has no static '{name}' with a member {member}", family=name)
 
     def _arriving(self, name: str, member: int) -> Place:
-        """Where a static's member is in the arrival."""
+        """Position of a static's member in the arrival."""
         state, reach = self.robot.state, self._past.reach
         sizes = (reach * state.storage, "storage"), (reach * state.dim, "dim")
         reference, information = (self._member(name, member, at, size) for at, size in sizes)
@@ -266,7 +266,7 @@ class Window:
             self.left.departure = None  # it was found without this measurement
 
     def now(self, given: Any, last: Array | None = None) -> Now[Any]:
-        """What terms may ask for now; ``last`` (m,) is the control applied last."""
+        """Context of terms; ``last`` (m,) is the control applied last."""
         history = self.history
         applied = history.controls[-1] if last is None else last
         statics = {name: values.copy() for name, values in history.statics.items()}
@@ -277,7 +277,7 @@ class Window:
         return self._past.data(self.now(given))
 
     def guess(self) -> dict[Family, Array]:
-        """What is believed, by the families of the window's own graph."""
+        """Beliefs by the families of the window's own graph."""
         return {self._past.x.family: self._past.nodes(), **self._past.guess()}
 
     @in_turn

@@ -1,1 +1,1 @@
-"""What one factor is: kernel, differences, whitening, losses, and a factor by itself."""
+"""One factor: kernel, differences, whitening, losses, and a factor by itself."""

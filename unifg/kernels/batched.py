@@ -124,7 +124,7 @@ class Batched:
         return array
 
     def _as_array(self, result: Any) -> Array:
-        """What was returned, if it is no array yet.
+        """Array of a returned value.
 
         Raises:
             GraphError: it cannot become one.
@@ -207,7 +207,7 @@ class Batched:
 
 
 def changes(name: str, place: int) -> str:
-    """What to say of a function that writes where it should read."""
+    """Message about a function that writes to its arguments."""
     return f"term '{name}': its function changes its argument {place}, which belongs to the solver: work on a copy"
 
 

@@ -321,7 +321,7 @@ def gradient_and_hessian(
 
 
 def scalar_slopes(many: Many, directions: Directions, points: Sequence[Array]) -> tuple[Array, Array, Array]:
-    """What :func:`gradient_and_hessian` returns, of a function (n,) of many moves."""
+    """Result of :func:`gradient_and_hessian`, for a function (n,) of many moves."""
     near, width = Near(directions, points), directions.width
     first, steps = near.steps(FIRST), near.steps(SECOND)
     values = many(near, first, directions.two_sided)

@@ -79,7 +79,7 @@ class Kernel:
 
     @property
     def derived(self) -> bool:
-        """Whether second derivatives are generated when they are first asked for."""
+        """True if second derivatives are generated when they are first asked for."""
         return False
 
     @property

@@ -125,7 +125,7 @@ def _compiled(
 
 
 def _parameter(name: str, offset: int, shape: tuple[int, ...]) -> str:
-    """How the function sees one parameter."""
+    """One parameter as the function takes it."""
     if not shape:
         return f"p[{offset}]"
     if len(shape) == 1:

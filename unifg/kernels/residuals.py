@@ -1,4 +1,4 @@
-"""What a user writes: plain batched functions, with or without their Jacobians."""
+"""Residuals: plain batched functions, with or without their Jacobians."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ class Formula:
 
     @property
     def form(self) -> Form:
-        """How compiled code knows it."""
+        """Form of the loss in compiled code."""
         raise NotImplementedError
 
     def value(self, squared: Array) -> Array:
@@ -95,7 +95,7 @@ class Huber(Formula):
 
     @property
     def form(self) -> Form:
-        """By k."""
+        """Form with k."""
         return HUBER, self.threshold, 0.0
 
 
@@ -115,7 +115,7 @@ class Cauchy(Formula):
 
     @property
     def form(self) -> Form:
-        """By k^2."""
+        """Form with k^2."""
         return CAUCHY, self.scale**2, 0.0
 
 
@@ -137,7 +137,7 @@ class Tukey(Formula):
 
     @property
     def form(self) -> Form:
-        """By c^2."""
+        """Form with c^2."""
         return TUKEY, self.threshold**2, 0.0
 
 
@@ -165,7 +165,7 @@ class DCS(Formula):
 
     @property
     def form(self) -> Form:
-        """By Phi."""
+        """Form with Phi."""
         return SCALED, self.phi, 0.0
 
 
@@ -188,7 +188,7 @@ class GemanMcClure(Formula):
 
     @property
     def form(self) -> Form:
-        """By the bound mu c^2."""
+        """Form with the bound mu c^2."""
         return GEMAN_MCCLURE, self.mu * self.scale**2, 0.0
 
     def surrogates(self, largest: float, growth: float) -> Iterator[Loss]:
@@ -227,7 +227,7 @@ class TruncatedLeastSquares(Formula):
 
     @property
     def form(self) -> Form:
-        """By c and mu."""
+        """Form with c and mu."""
         return TRUNCATED, self.threshold, self.mu
 
     def surrogates(self, largest: float, growth: float) -> Iterator[Loss]:
@@ -275,7 +275,7 @@ def positive(value: float, name: str) -> None:
 
 
 def form_of(loss: Loss | None) -> Form | None:
-    """How compiled code knows a loss; None where its formulas are Python, also in a subclass of a shipped one."""
+    """Form of a loss in compiled code; None where its formulas are Python, also in a subclass of a shipped one."""
     if loss is None:
         return QUADRATIC, 0.0, 0.0
     shipped = isinstance(loss, Formula) and (type(loss).value, type(loss).weight) == (Formula.value, Formula.weight)

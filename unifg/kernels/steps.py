@@ -1,4 +1,4 @@
-"""How far to step when something is differenced, and along what: one rule for all derivatives by differences.
+"""Step lengths and directions of differences: one rule for all derivatives by differences.
 
 A central difference over +-h is wrong by about h^2 of the third derivative, and by eps M / h where the function rounds
 numbers of size M. Coordinates far from the origin are such numbers, so h grows with the cube root of their size; it
@@ -133,7 +133,7 @@ def steps_for(sizes: Array, root: int) -> Array:
 
 
 def uncertainties(size: Array, steps: Array) -> Array:
-    """By how much derivatives by two points may be wrong where numbers of these sizes are rounded."""
+    """Error bounds of derivatives by two points where numbers of these sizes are rounded."""
     result: Array = ROUNDINGS * EPSILON * size / (2.0 * steps)
     return result
 
@@ -172,7 +172,7 @@ def largest(v: Array, start: int, dim: int, least: float) -> float:
 
 @compiled
 def uncertainty(size: float, step: float) -> float:
-    """By how much a derivative by two points may be wrong where numbers of this size are rounded."""
+    """Error bound of a derivative by two points where numbers of this size are rounded."""
     return ROUNDINGS * EPSILON * size / (2.0 * step)
 
 

@@ -1,1 +1,1 @@
-"""What a user states: variables, terms, residuals, the graph."""
+"""Model of a problem: variables, terms, residuals, the graph."""

@@ -33,7 +33,7 @@ class Group:
 
     @property
     def first(self) -> Term:
-        """Which stands for all."""
+        """First of the equal ones."""
         return self.terms[0]
 
     @property
@@ -130,7 +130,7 @@ def _listed(stated: Term | Fix) -> str:
 
 
 def weight(term: Term) -> str:
-    """How a cost is weighed, or the limits of a constraint, in a few characters."""
+    """Weight of a cost, or the limits of a constraint, in a few characters."""
     if isinstance(term, Cost):
         words = []
         for name, value in (("sigma", term.sigma), ("information", term.information)):
@@ -181,13 +181,13 @@ def _selected(selection: Selection) -> str:
 
 
 def _evaluated(group: Group, routes: Mapping[str, str]) -> str:
-    """By whom a term is evaluated and how differentiated, as ``graph.check`` says it, without the reasons."""
+    """Evaluation and differentiation of a term, as in ``graph.check``, without the reasons."""
     said = [routes[term.name].partition(":")[0] if term.name in routes else _stated(term) for term in group.terms]
     return "; ".join(word for word, _ in groupby(sorted(said)))
 
 
 def _stated(term: Term) -> str:
-    """What the statement alone says of that."""
+    """The same by the definition alone."""
     own = term.residual
     if isinstance(term, Constraint) and term.is_bound:
         return "the variable itself"

@@ -77,7 +77,7 @@ def _complete(manifolds: tuple[Manifold, ...], offset: bool) -> Residual:
 
 
 def _kind(leaf: Manifold) -> int | None:
-    """How the kernel compares elements of ``leaf``; None when it cannot."""
+    """Comparison of elements of ``leaf`` by the kernel; None when it has none."""
     if isinstance(leaf, Rn):
         return VECTOR
     return GROUPS.get(leaf)

@@ -565,7 +565,7 @@ def _overlap(first: Selection, second: Selection) -> bool:
 
 
 def title(function: Any) -> str:
-    """What a residual is called."""
+    """Name of a residual."""
     return getattr(function, "name", None) or getattr(function, "__name__", None) or "residual"
 
 

@@ -41,7 +41,7 @@ class Term:
 
     @property
     def kind(self) -> str:
-        """What it is, in a word."""
+        """Kind of term, in a word."""
         return "cost"
 
     @property
@@ -93,7 +93,7 @@ class ScalarCost(Term):
 
     @property
     def kind(self) -> str:
-        """What it is, in a word."""
+        """Kind of term, in a word."""
         return "scalar cost"
 
 
@@ -113,7 +113,7 @@ class Constraint(Term):
 
     @property
     def kind(self) -> str:
-        """What it is, in a word: an equality where no data can set the limits apart."""
+        """Kind of term, in a word: an equality where no data can set the limits apart."""
         if self.is_bound:
             return "bound"
         if isinstance(self.lower, Data) or isinstance(self.upper, Data):
@@ -137,16 +137,16 @@ class Fix:
 
     @property
     def kind(self) -> str:
-        """What it is, in a word."""
+        """Kind of term, in a word."""
         return "fix"
 
     @property
     def data(self) -> list[Data]:
-        """What it reads."""
+        """Data that it reads."""
         return [self.value] if isinstance(self.value, Data) else []
 
     def __repr__(self) -> str:
-        """What is fixed."""
+        """Fixed members."""
         return f"<fix '{self.name}': {self.selection!r}>"
 
 

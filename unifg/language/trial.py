@@ -105,7 +105,7 @@ def _as_jacobian(name: str, block: Any) -> Array:
 
 
 def tried(batched: Batched, points: Sequence[Array], arguments: Callable[[], str]) -> Array:
-    """What a function returns; an error of its own is given a note about what it was called with."""
+    """Result of a function; an error of its own is given a note about the arguments."""
     try:
         with np.errstate(all="ignore"):
             return batched.at(points)

@@ -196,7 +196,7 @@ def as_selection(variable: Variable) -> Selection:
 
 
 def is_variable(argument: Any) -> bool:
-    """Whether a term's argument is an unknown rather than a constant."""
+    """Test whether a term's argument is an unknown rather than a constant."""
     return isinstance(argument, Family | Selection)
 
 
@@ -220,7 +220,7 @@ def pick(indices: IntArray, index: Index, family: Family) -> IntArray:
 
 
 def _no_member(indices: IntArray, index: Any, family: Family, error: Exception) -> str:
-    """What to say of an index that selects no members."""
+    """Message about an index that selects no members."""
     if isinstance(index, tuple):
         return (
             f"family '{family.name}' is indexed by its members alone, found {index!r}: {_components(family)}; single "
@@ -232,7 +232,7 @@ def _no_member(indices: IntArray, index: Any, family: Family, error: Exception) 
 
 
 def has_component(manifold: Manifold, name: str) -> bool:
-    """Whether ``manifold`` is a product with a component of that name."""
+    """Test whether ``manifold`` is a product with a component of that name."""
     return isinstance(manifold, Product) and name in manifold.components
 
 
@@ -247,7 +247,7 @@ def no_component(family: Family, name: str, within: str | None = None) -> str:
 
 
 def _components(family: Family) -> str:
-    """Which components the members of a family have, spelled as they are selected."""
+    """Components of the members of a family, spelled as they are selected."""
     if not isinstance(family.manifold, Product):
         return f"its members are elements of {family.manifold.name}, which is no product and has no components"
     names = list(family.manifold.components)

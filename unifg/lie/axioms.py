@@ -1,4 +1,4 @@
-"""Whether a manifold keeps its promises: the axioms, tried at random points, near the edges, with short and long steps.
+"""Axioms of a manifold, tested at random points, near the edges, with short and long steps.
 
 Sola et al., "A micro Lie theory", arXiv:1812.01537, states what is asked of groups; equation numbers are its own.
 """
@@ -53,7 +53,7 @@ class Breach:
 
 @dataclass(frozen=True)
 class Axioms:
-    """What :func:`check_manifold` found.
+    """Result of :func:`check_manifold`.
 
     Attributes:
         name: of the manifold.
@@ -67,7 +67,7 @@ class Axioms:
 
     @property
     def ok(self) -> bool:
-        """Whether all hold."""
+        """True if all hold."""
         return not self.breaches
 
     def require(self) -> None:
@@ -311,7 +311,7 @@ def _group_claims(g: LieGroup, x: Array, y: Array, z: Array, d: Array, units: Ar
 
 
 def _compiled_claims(m: Manifold, x: Array, y: Array, d: Array, units: Array) -> Iterator[_Claim]:
-    """What is asked of functions of one element."""
+    """Axioms of functions of one element."""
     functions = functions_of(m)
     for name, (given, result) in LAYOUTS.items():
         function = getattr(functions, name, None)

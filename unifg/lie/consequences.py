@@ -1,4 +1,4 @@
-"""What follows from the exponential, the logarithm, the product and the inverse of a group, for one element at a time.
+"""Operations derived from the exponential, the logarithm, the product and the inverse of a group, for one element.
 
 A group of one's own states these four; whatever else it does not state is made of them here. Nothing is differenced but
 the second derivatives. With Ad(x) d = Log(x Exp(d) x^-1), which holds for every d within the reach of the logarithm,
@@ -29,7 +29,7 @@ WEIGHTS = tuple(float(weight) for weight in 0.5 * _weights)
 
 
 class Rule(NamedTuple):
-    """How a function is made.
+    """Rule that makes a function.
 
     Attributes:
         needs: names of the functions it is made of.

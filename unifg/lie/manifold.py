@@ -1,4 +1,4 @@
-"""What a graph needs from a manifold, and what a Lie group offers on top.
+"""Interfaces of a manifold and of a Lie group.
 
 Source of symbols and formulas: Sola, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics",
 arXiv:1812.01537.
@@ -64,7 +64,7 @@ class Manifold(Protocol):
 
 
 class ManifoldBase(ABC):
-    """What manifolds share that are written as classes: values, equal by kind and size, hashable, picklable, stateless.
+    """Base of manifolds written as classes: values, equal by kind and size, hashable, picklable, stateless.
 
     A manifold of one's own states ``retract`` and ``local`` by compiled functions
     (:func:`unifg.lie.elementwise.elementwise`) or as ordinary methods for batches; where they are compiled, solvers and

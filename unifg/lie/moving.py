@@ -15,7 +15,7 @@ ADDITION = 0  # in the place of an address: the retraction is a sum
 
 
 class Move(NamedTuple):
-    """How compiled code moves points of a manifold that is no product.
+    """Compiled retraction of points of a manifold that is no product.
 
     Attributes:
         where: address of its retraction, or ADDITION.
@@ -27,7 +27,7 @@ class Move(NamedTuple):
 
 
 def move_of(manifold: Manifold) -> Move | None:
-    """How points of a manifold that is no product move; None when it has only a batched retraction."""
+    """Retraction of points of a manifold that is no product; None when it has only a batched one."""
     if isinstance(manifold, Rn):
         return Move(ADDITION, None)
     functions = functions_of(manifold)

@@ -25,12 +25,12 @@ WORD = ir.IntType(64)
 
 
 def described(arrays: Sequence[Any]) -> IntArray:
-    """Where flat arrays begin and how long they are: what the function made by :func:`opener` reads."""
+    """Addresses and lengths of flat arrays, as read by the function made by :func:`opener`."""
     return np.array([[array.ctypes.data, len(array)] for array in arrays], dtype=np.int64).ravel()
 
 
 def opener(form: Callable[..., T], dtypes: Sequence[np.dtype[Any]]) -> Callable[[int], T]:
-    """What compiled code calls to find a named tuple of flat arrays by the address of their description.
+    """Function for compiled code that opens a named tuple of flat arrays by the address of their description.
 
     What it does not use of them costs nothing.
 

@@ -59,6 +59,6 @@ class Block:
         self.arrays = [self._flat[part] for part in self._parts]
 
     def copied(self) -> list[Array]:
-        """What the arrays hold now, in arrays that nobody else writes to."""
+        """Copies of the arrays."""
         flat = self._flat.copy()
         return [flat[part] for part in self._parts]

@@ -27,7 +27,7 @@ _addresses: WeakKeyDictionary[Callable[..., Any], dict[tuple[Any, ...], int]] = 
 
 
 def address(function: Callable[..., Any], arguments: tuple[Any, ...]) -> int:
-    """Where the machine code of a compiled function stands, for the given argument types.
+    """Address of the machine code of a compiled function, for the given argument types.
 
     The caller keeps ``function`` alive for as long as the address is used.
     """
@@ -41,7 +41,7 @@ def address(function: Callable[..., Any], arguments: tuple[Any, ...]) -> int:
 
 
 def _primitive(generator: Callable[..., Any]) -> Any:
-    """What compiled functions call and Numba replaces by the instructions ``generator`` emits."""
+    """Function for compiled code that Numba replaces by the instructions ``generator`` emits."""
     primitive = intrinsic(prefer_literal=True)(generator)
     # Kernels are pickled with what they call. Numba would rebuild a primitive that no longer sees literals.
     primitive.__class__ = type("Primitive", (type(primitive),), {"__reduce__": lambda self: self._name})

@@ -93,13 +93,13 @@ def written(function: str, lines: Sequence[str], names: dict[str, Any], what: st
 
 
 def folder_of(function: Any) -> Path | None:
-    """Where the cache keeps a compiled function; None where nothing can be written."""
+    """Cache folder of a compiled function; None where nothing can be written."""
     path = function._cache.cache_path
     return None if path is None else Path(path)
 
 
 def processor() -> str:
-    """What code is generated for."""
+    """Processor that code is generated for."""
     return repr(cpu_target.target_context.codegen().magic_tuple())
 
 
@@ -138,7 +138,7 @@ def _say_unwritable(where: str = "no folder for compiled functions can be writte
 
 
 class _Implementation(CompileResultCacheImpl):  # type: ignore[misc]
-    """Where files stand, as Numba finds it, or nowhere."""
+    """Folders of the cache, as Numba finds them, or none."""
 
     _locator_classes: ClassVar[list[Any]] = [
         # without a home, "~" would be a folder of the working directory
@@ -194,10 +194,10 @@ class _Cache(FunctionCache):  # type: ignore[misc]
             shipped.recorder.keep(self._shipping_key(signature), self._py_func, result, self._impl.reduce(result))
 
     def flush(self) -> None:
-        """What is kept is found by what it was made of: there is nothing to begin anew."""
+        """Do nothing: code is found by its fingerprint, so there is nothing to begin anew."""
 
     def _read(self, path: Path, signature: Any, target: Any) -> Any:
-        """What a file keeps of the function as it is now, None if it is of another or cannot be read."""
+        """Read the code of the function as it is now; None if a file is of another or cannot be read."""
         if (content := read_sealed(path)) is None or not content.startswith(made := self._made()):
             return None
         try:
@@ -237,11 +237,11 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         return hashlib.sha256(stated.encode()).digest()
 
     def _variant(self) -> tuple[str, ...]:
-        """What else code depends on."""
+        """Further parts of the key."""
         return ()
 
     def _shipping_key(self, signature: Any) -> str:
-        """What the function is called in an archive that is made elsewhere: no date and no processor."""
+        """Key of the function in an archive that is made elsewhere: no date and no processor."""
         function = self._py_func
         arguments, _ = normalize_signature(signature)  # a dispatcher, too, tells functions by their arguments alone
         parts = (function.__module__, function.__qualname__, *map(spelled, arguments), *self._variant())

@@ -57,7 +57,7 @@ def link_like(function: Callable[..., Any], result: Any, *arguments: Any) -> int
 
 
 def _calling(result: Any) -> Any:
-    """What compiled code calls as ``f(address, (argument, ...))``; the arguments have the types the tuple says."""
+    """Function for compiled code, ``f(address, (argument, ...))``; the arguments have the types of the tuple."""
 
     def primitive(typing: Any, where: Any, arguments: Any) -> Any:
         kinds = tuple(types.unliteral(kind) for kind in arguments.types)

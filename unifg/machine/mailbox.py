@@ -1,4 +1,4 @@
-"""How a compiled pass is shared by threads that the interpreter's lock never stops.
+"""Work queue: a compiled pass shared by threads that the interpreter's lock never stops.
 
 A thread that would take a job in Python waits for the lock, is put to sleep for it, and comes tens of microseconds late
 to a pass of hundreds. So helpers stay in one compiled loop that looks into a mailbox: five integers, of which the
@@ -58,7 +58,7 @@ _store = cast(Callable[[Any], Address], intrinsic(_stored))  # on the stack of t
 
 
 def arguments_at(kinds: Sequence[Any]) -> Callable[[Address], Any]:
-    """What a compiled pass calls to find its arguments, of these types, by the address it is given."""
+    """Function for a compiled pass that finds its arguments, of these types, by the address it is given."""
     whole = types.Tuple(list(kinds))
 
     def found(typing: Any, where: Any) -> Any:
@@ -72,7 +72,7 @@ def arguments_at(kinds: Sequence[Any]) -> Callable[[Address], Any]:
 
 
 def entrance(share: Callable[[Address], None]) -> Address:
-    """Where a compiled pass begins that takes the address of its arguments; who calls keeps it alive."""
+    """Address of a compiled pass that takes the address of its arguments, which the caller keeps alive."""
     return link(share, NOTHING, ADDRESS)
 
 

@@ -118,13 +118,13 @@ def _frame(arguments: tuple[Any, ...]) -> tuple[str, str, str]:
 
 @cache
 def _processor() -> tuple[str, str, str]:
-    """What code is generated for: triple, name and features."""
+    """Target of generated code: triple, name and features."""
     features = binding.get_host_cpu_features().flatten()
     return binding.get_default_triple(), binding.get_host_cpu_name(), features
 
 
 @cache
 def _machine(level: int) -> Any:
-    """What generates code for this processor."""
+    """Code generator for this processor."""
     triple, name, features = _processor()
     return binding.Target.from_triple(triple).create_target_machine(cpu=name, features=features, opt=level)

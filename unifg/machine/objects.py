@@ -32,7 +32,7 @@ def write_sealed(path: Path, content: bytes) -> None:
 
 
 def read_sealed(path: Path) -> bytes | None:
-    """What was written; None where nothing is, nothing can be read, or what is there is damaged, which is said."""
+    """Content of a file; None where nothing is, nothing can be read, or what is there is damaged, which is logged."""
     try:
         read = path.read_bytes()
     except OSError:
@@ -57,7 +57,7 @@ class Objects:
         self._most, self._written, self._writable = most, 0, True
 
     def find(self, key: str) -> bytes | None:
-        """What is kept under a key, if it is there and whole."""
+        """Content kept under a key, if it is there and whole."""
         if self.folder is None or os.environ.get(SWITCH) == "0":
             return None
         path = self.folder / key

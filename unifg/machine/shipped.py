@@ -79,7 +79,7 @@ class Archive:
             logger.info("the kernels that come with unifg are of another kind (%s)", ", ".join(different))
 
     def find(self, key: str) -> Any:
-        """What Numba's cache keeps of a function, with code for this processor; None where there is nothing."""
+        """Entry of Numba's cache for a function, with code for this processor; None where there is nothing."""
         if not self.usable or key not in self._file.NameToInfo:
             return None
         try:

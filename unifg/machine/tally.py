@@ -1,4 +1,4 @@
-"""What is compiled, and what is read from the cache, while the process runs: counted, announced, undisturbed.
+"""Compile counter: functions compiled and read from the cache while the process runs.
 
 A loop that must keep its period looks at the count before and after a tick. The first compilation of a process is
 announced, because it may take seconds; what is read from the cache is not. While Numba works it leaves hundreds of
@@ -40,7 +40,7 @@ class Tally:
 
     @property
     def everything(self) -> int:
-        """How many functions were not in memory when they were wanted."""
+        """Number of functions that were not in memory."""
         return len(self.compiled) + len(self.generated) + len(self.read)
 
 
@@ -50,7 +50,7 @@ tally = Tally()
 
 @contextmanager
 def counting() -> Iterator[Tally]:
-    """What a block adds to the tally; complete when it is left."""
+    """Counts of a block; complete when it is left."""
     marks = len(tally.compiled), len(tally.generated), len(tally.read), len(tally.files)
     added = Tally()
     try:

@@ -1,4 +1,4 @@
-"""How many threads share the work of one solve: one, unless more are asked for.
+"""Number of threads that share the work of one solve: one, unless more are asked for.
 
 Compiled passes let other threads run, so that the parts of a large pass can run at once. What is shared out, and how,
 does not depend on the machine: the same number of threads gives the same answer.
@@ -85,12 +85,12 @@ def use_threads(count: int) -> None:
 
 
 def threads() -> int:
-    """How many there are."""
+    """Number of threads."""
     return 1 if _crew is None else 1 + _crew.size
 
 
 def cores() -> int:
-    """How many cores this process may use."""
+    """Number of cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

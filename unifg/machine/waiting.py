@@ -1,4 +1,4 @@
-"""How threads that share a pass get along in compiled code: they take chunks of a phase, and wait for each other.
+"""Synchronisation of threads that share a compiled pass: chunks of a phase, and barriers.
 
 Each phase has two counters, of chunks taken and of chunks done.
 """

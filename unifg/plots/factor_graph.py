@@ -103,7 +103,7 @@ def _draw_score(families: Sequence[Family], terms: Sequence[Term], fixes: Sequen
 
 
 def _places(families: Sequence[Family], terms: Sequence[Term]) -> dict[Family, Array]:
-    """Where the members of each family stand from left to right: below those of larger ones that they are joined to."""
+    """Places of the members of each family from left to right: below those of larger ones that they are joined to."""
     order = sorted(families, key=lambda family: -family.count)
     places = {order[0]: np.arange(order[0].count, dtype=np.float64)}
     width = float(order[0].count - 1)
@@ -208,7 +208,7 @@ def _draw_factors(
 
 
 def _squares(terms: Sequence[Term], places: Mapping[Family, Array]) -> list[Array]:
-    """Where the factors of one line stand: amid their variables, beside each other."""
+    """Places of the factors of one line: amid their variables, beside each other."""
     amid = []
     for term in terms:
         ends = [np.broadcast_to(places[s.family][s.indices], (term.count,)) for s in term.selections]
@@ -223,7 +223,7 @@ def _active(term: Term) -> BoolArray:
 
 
 def _fixed(family: Family, fixes: Iterable[Fix]) -> BoolArray:
-    """Which members are fixed altogether."""
+    """Members that are fixed altogether."""
     held = np.zeros(family.count)
     for fix in fixes:
         if fix.selection.family is family:
@@ -252,7 +252,7 @@ def _named(manifold: Manifold) -> str:
 
 
 def _components(group: Group) -> str:
-    """Which components a term is about."""
+    """Components that a term reads."""
     parts = [f"{s.family.name}.{s.component}" for s in group.first.selections if s.component]
     return "on " + ", ".join(dict.fromkeys(parts)) if parts else ""
 
@@ -325,7 +325,7 @@ def _draw_grouped(families: Sequence[Family], terms: Sequence[Term], fixes: Sequ
 
 
 def _joined(group: Group) -> str:
-    """How many variables one factor has, where there are several."""
+    """Number of variables of one factor, where there are several."""
     count = len(group.first.selections)
     return f"joins {count}" if count > 1 else ""
 
@@ -340,7 +340,7 @@ def _title(families: Sequence[Family], terms: Sequence[Term]) -> str:
 
 
 def _key(ax: Axes, terms: Sequence[Term], fixes: Sequence[Fix]) -> None:
-    """What circles and squares mean, of those that there are."""
+    """Legend of circles and squares."""
     style: dict[str, Any] = {"ls": "none", "mec": INK}
     ax.plot([], [], marker="o", mfc="white", label="variable", **style)
     if fixes:

@@ -101,7 +101,7 @@ def draw_shown(parts: Sequence[Shown], title: str = "") -> Figure:
 
 
 def _panels(leaf: Shown) -> list[Callable[[Shown, Axes], object]]:
-    """What is drawn of a component."""
+    """Panels of a component."""
     if leaf.manifold == SE2:
         return [draw_path]
     if leaf.manifold == SE3:
@@ -203,7 +203,7 @@ def _draw_angles(part: Shown, ax: Axes) -> Axes:
 def _curves(
     part: Shown, ax: Axes, shown: Callable[[Array], Array], names: Sequence[str], title: str, unit: str
 ) -> Axes:
-    """What is to be shown of each member over its index, with bands and limits."""
+    """Curves of each member over its index, with bands and limits."""
     from matplotlib.ticker import MaxNLocator
 
     index, values = part.members, shown(part.values)

@@ -27,7 +27,7 @@ TRIES = 30  # closures from which a clique is grown
 
 
 def pairwise_consistent(pose_graph: PoseGraph, probability: float = 0.9999, tries: int = TRIES) -> BoolArray:
-    """Which edges to keep: odometry, and a large set of closures of which every two are consistent.
+    """Edges to keep: odometry, and a large set of closures of which every two are consistent.
 
     Drift is linearised at odometry: along drives whose heading is lost, right closures seem inconsistent. Closures
     between parts that odometry does not connect, such as the drives of two robots, are compared with others between the
@@ -120,7 +120,7 @@ def _test(
     bound: float,
     agree: BoolArray,
 ) -> None:
-    """Whether loops of one closure with others close: e' S^-1 e against a bound, S by Cholesky.
+    """Test whether loops of one closure with others close: e' S^-1 e against a bound, S by Cholesky.
 
     Args:
         error: (k, d) of the loops.

@@ -1,4 +1,4 @@
-"""What a solved pose graph says about itself: residuals against what was stated, and what nothing determines.
+"""Judgement of a solved pose graph: residuals against the stated noise, and what nothing determines.
 
 The sum of squared residuals, chi2, is expected to be as large as there are degrees of freedom: rows of measurements
 less unknowns. Published information matrices are seldom calibrated, so a ratio is a hint and never a verdict; one that
@@ -52,11 +52,11 @@ class Judgement:
 
     @property
     def far(self) -> bool:
-        """Whether residuals are far larger than stated."""
+        """True if residuals are far larger than stated."""
         return is_far(self.chi2, self.freedom)
 
     def sentences(self) -> list[str]:
-        """What a user should know; empty when there is nothing to say."""
+        """Remarks on the solution; empty when there are none."""
         said = []
         if self.far:
             said.append(ratio_sentence(self.chi2, self.freedom))

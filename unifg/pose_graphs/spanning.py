@@ -101,5 +101,5 @@ def _pop(keys: Array, nodes: IntArray, size: int) -> int:
 
 @compiled
 def _before(key: float, node: int, other_key: float, other: int) -> bool:
-    """Whether one entry comes before another: of equal ones the lower number."""
+    """Test whether one entry comes before another: of equal ones the lower number."""
     return key < other_key or (key == other_key and node < other)

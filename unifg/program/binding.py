@@ -60,7 +60,7 @@ class Binding:
         return [flat[first:last].reshape(handle.value.shape) for handle, first, last in bounds]
 
     def place(self, handle: Data) -> IntArray:
-        """Where each number of a datum stands, in the shape of the datum; what :meth:`carry` takes."""
+        """Position of each number of a datum, in the shape of the datum; for :meth:`carry`."""
         first = int(self._starts[self._numbers.index(handle)])
         return first + np.arange(handle.value.size).reshape(handle.value.shape)
 
@@ -140,7 +140,7 @@ def _renew(
     targets: IntArray,
     parameters: Array,
 ) -> int:
-    """How many data are not as they were; -1 - k without any change when the k-th holds NaN."""
+    """Number of data that have changed; -1 - k without any change when the k-th holds NaN."""
     for k in range(len(changed)):
         for i in range(starts[k], starts[k + 1]):
             if coming[i] != coming[i]:

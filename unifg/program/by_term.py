@@ -28,7 +28,7 @@ class ByTerm(dict[str, Array]):
 
     @property
     def intact(self) -> bool:
-        """Whether ``flat`` still says it all: nobody has put another array in the place of a term's."""
+        """True if ``flat`` still says it all: nobody has put another array in the place of a term's."""
         return len(self) == len(self._views) and all(map(is_, self.values(), self._views))
 
     def __reduce__(self) -> tuple[type[dict[str, Array]], tuple[dict[str, Array]]]:

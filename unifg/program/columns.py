@@ -1,4 +1,4 @@
-"""Where each variable is stored, where its tangent coordinates stand, and which of them are unknown."""
+"""Columns: storage and tangent coordinates of each variable, and which of them are unknown."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Values(dict[Family, Array]):
 
     @property
     def intact(self) -> bool:
-        """Whether ``flat`` still says it all: nobody has put another array in the place of a family's."""
+        """True if ``flat`` still says it all: nobody has put another array in the place of a family's."""
         return len(self) == len(self._views) and all(map(is_, self.values(), self._views))
 
     def __reduce__(self) -> tuple[type[Values], tuple[Columns, Array]]:
@@ -143,7 +143,7 @@ class Columns:
         return variable, np.concatenate([[0], np.cumsum(free)])
 
     def all_fixed(self, family: Family) -> bool:
-        """Whether nothing of the family is unknown."""
+        """Test whether nothing of the family is unknown."""
         offset = self.offsets[family]
         return bool((self.unknown[offset : offset + family.count * family.manifold.dim] < 0).all())
 

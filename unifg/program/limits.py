@@ -1,4 +1,4 @@
-"""By how much rows are outside their limits."""
+"""Distances of rows from their limits."""
 
 from __future__ import annotations
 

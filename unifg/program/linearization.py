@@ -1,4 +1,4 @@
-"""What a program says about a point, with and without derivatives, and products with its stacked Jacobians."""
+"""Linearisation of a program at a point, with and without derivatives, and products with its stacked Jacobians."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Evaluation:
 
     @property
     def finite(self) -> bool:
-        """Whether every number is finite."""
+        """Test whether every number is finite."""
         return bool(math.isfinite(self.cost) and all_finite(self.constraints))
 
 
@@ -80,7 +80,7 @@ class Linearization:
 
     @property
     def finite(self) -> bool:
-        """Whether every number is finite."""
+        """True if every number is finite."""
         return bool(
             math.isfinite(self.cost)
             and all_finite(self.gradient)
@@ -175,7 +175,7 @@ class Rows:
 
     @property
     def indptr(self) -> IntArray:
-        """Where each column of the compressed matrix starts."""
+        """Start of each column of the compressed matrix."""
         return self._compressed[2]
 
     def compress(self, entries: Array) -> Array:
@@ -192,7 +192,7 @@ class Rows:
 
 @compiled
 def all_finite(numbers: Array) -> bool:
-    """Whether every number is finite."""
+    """Test whether every number is finite."""
     for number in numbers:
         if not math.isfinite(number):
             return False

@@ -148,7 +148,7 @@ add_plane, add_space = _adding(PLANE), _adding(SPACE)
 
 @compiled
 def paired(columns: IntArray, positions: IntArray, dim: int) -> bool:
-    """Whether all places of factors with two variables of d columns each follow from those of a few.
+    """Test whether all places of factors with two variables of d columns each follow from those of a few.
 
     Args:
         columns: (n, 2 d) full tangent columns of the factors.

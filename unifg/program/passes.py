@@ -286,7 +286,7 @@ def _linearize_together(
     scratch: Array,
     counters: Address,
 ) -> None:
-    """What one of several threads does of :func:`linearize`: shares of the factors, then of the sums of all shares.
+    """Work of one thread in :func:`linearize`: shares of the factors, then of the sums of all shares.
 
     Args:
         terms: as there, and so the next eight; places as :func:`unifg.program.shares.apart` has them.
@@ -355,7 +355,7 @@ _of_linearize = arguments_at(
 
 @compiled
 def linearize_at_once(where: Address) -> None:
-    """What one of several threads does of :func:`linearize`, by the address of its arguments."""
+    """Work of one thread in :func:`linearize`, by the address of its arguments."""
     (
         terms, values, search, residual, jacobian, constraints, constraint_jacobian, squares, weights, costs, norms,
         gradient, hessian, slopes, contested, scratch, counters,

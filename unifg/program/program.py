@@ -45,7 +45,7 @@ WORTH = 150_000  # entries of Jacobians below which threads bring nothing
 
 
 class Reader(NamedTuple):
-    """Who reads a datum.
+    """Reader of a datum.
 
     Attributes:
         bound: terms that have to work something out from it.
@@ -139,7 +139,7 @@ class Program:
 
     @property
     def arrays(self) -> TermArrays:
-        """What compiled loops need to know about the terms, with the present data."""
+        """Arrays of the terms for compiled loops, with the present data."""
         return self.table.arrays
 
     @property
@@ -149,7 +149,7 @@ class Program:
 
     @property
     def fully_compiled(self) -> bool:
-        """Whether a compiled loop can do without Python: every term a kernel, every loss and retraction compiled."""
+        """True if a compiled loop can do without Python: every term a kernel, every loss and retraction compiled."""
         return not (self.batched or self._general or self.table.weighed) and self.retraction.compiled
 
     @property
@@ -164,7 +164,7 @@ class Program:
 
     @property
     def objective_places(self) -> IntArray:
-        """Where the entries of ``hessian`` stand in ``normal``."""
+        """Positions of the entries of ``hessian`` in ``normal``."""
         return self._objective()[1]
 
     # ---------------------------------------------------------------- data and values
@@ -499,7 +499,7 @@ class Program:
         return self.once(_fixed_rows)
 
     def once(self, find: Callable[[Program], T]) -> T:
-        """What a function finds out about this program, found when first asked for and kept as long as the program."""
+        """Result of a function of this program, found when first asked for and kept as long as the program."""
         if find not in self._found:
             self._found[find] = find(self)
         return cast(T, self._found[find])
@@ -574,7 +574,7 @@ class Program:
 
 
 def _placed(program: Program) -> dict[CompiledTerm, tuple[IntArray, IntArray, IntArray, IntArray, IntArray]]:
-    """Where gradient and Hessian blocks of scalar costs go."""
+    """Positions of gradient and Hessian blocks of scalar costs."""
     places = {}
     for term in program.scalar_terms:
         full = np.concatenate(term.columns, axis=1)

@@ -58,7 +58,7 @@ class Retraction:
 
     @property
     def compiled(self) -> bool:
-        """Whether every family has a compiled retraction."""
+        """True if every family has a compiled retraction."""
         return not self._python
 
     def bind(self, which: int, value: Array) -> None:

@@ -62,7 +62,7 @@ class Systems:
         return KktSystem(self.structure(held))
 
     def structure(self, held: BoolArray) -> KktStructure:
-        """What all KKT matrices with these rows held share."""
+        """Structure of all KKT matrices with these rows held."""
         key = held.tobytes()
         with self._lock:
             structure = self._held.pop(key, None) or KktStructure.of(*self._asked, held)
@@ -86,7 +86,7 @@ def _borrowed(spare: list[T], make: Callable[[], T]) -> Iterator[T]:
 
 
 class KktArrays(NamedTuple):
-    """What compiled code needs.
+    """Arrays for compiled code.
 
     Attributes:
         plan: of the elimination.
@@ -111,7 +111,7 @@ class KktArrays(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class KktStructure:
-    """What KKT matrices with the same rows held share.
+    """Structure shared by KKT matrices with the same rows held.
 
     Attributes:
         held: (M,) which rows.

@@ -64,7 +64,7 @@ PYTHON, HELD = -1, -2  # losses whose formulas are Python; HELD: line searches k
 
 
 class TermArrays(NamedTuple):
-    """What compiled loops read.
+    """Arrays for compiled loops.
 
     Attributes:
         fields: (T, FIELDS) one row per term, in the order of the program.
@@ -220,12 +220,12 @@ class TermTable:
             row[PAIRED] = self._paired(row, term, self.arrays.positions)
 
     def pairs_at(self, positions: IntArray) -> bool:
-        """Whether terms whose loops are of fixed size could have them at other places, too."""
+        """Test whether terms whose loops are of fixed size could have them at other places, too."""
         rows = zip(self._fields, self._terms, strict=True)
         return all(self._paired(row, term, positions) == row[PAIRED] for row, term in rows if row[PAIRED])
 
     def _paired(self, row: IntArray, term: CompiledTerm, positions: IntArray) -> int:
-        """How many rows a factor of a term has whose loops are of fixed size; 0 where they are not."""
+        """Rows of a factor of a term whose loops are of fixed size; 0 where they are not."""
         rows, count, width = (int(row[field]) for field in (ROWS, COUNT, WIDTH))
         if row[KIND] != COST or rows not in (PLANE, SPACE) or list(term.dims) != [rows, rows] or row[KEEP] >= 0:
             return 0

@@ -76,7 +76,7 @@ class Gather:
 
 @dataclass
 class Layout:
-    """Where the numbers of a term stand.
+    """Positions of the numbers of a term.
 
     Attributes:
         count, rows: factors and the rows of each; a bound is a factor of one row for each scalar.
@@ -279,7 +279,7 @@ class CompiledTerm:
         return filled if self.trace is None else self.trace.arguments(filled)
 
     def stands(self, values: Values) -> bool:
-        """Whether the trace of a function computes what the function does at a guess; otherwise it is given up.
+        """Test whether the trace of a function computes what the function does at a guess; otherwise it is given up.
 
         Raises:
             GraphError: rows of a factor depend on other factors; or there is no such trace, and the user insists.
@@ -377,7 +377,7 @@ class CompiledTerm:
             self._bind_parameters(data)
 
     def parameters_of(self, handle: Data) -> list[IntArray] | None:
-        """Where the kernel's parameters hold a datum: (rows, numbers) for each argument it is.
+        """Positions of a datum in the kernel's parameters: (rows, numbers) for each argument it is.
 
         None when more than parameters of the kernel are made of it.
         """
@@ -528,7 +528,7 @@ class CompiledTerm:
         return gradient, hessian, rounding
 
     def layout(self, parameters: int) -> Layout:
-        """Where this term's numbers stand, when its parameters begin at ``parameters``."""
+        """Positions of this term's numbers, when its parameters begin at ``parameters``."""
         joined = np.concatenate(self.columns, axis=1)
         starts = [np.broadcast_to(start, (self.count,)) for start in self.starts]
         sizes = [manifold.storage for manifold in self.manifolds]
@@ -581,7 +581,7 @@ class CompiledTerm:
             self._pack(self.kernel)
 
     def _weights(self, data: Bound) -> tuple[int, Array]:
-        """How residuals are whitened, and what by."""
+        """Whitening of the residuals, and its matrices."""
         term, how, by = self.term, 0, np.zeros(0)
         if isinstance(term, Cost) and term.sigma is not None:
             how, by = DIAGONAL, reciprocals(self.name, resolve(term.sigma, data), self.count, self.size)

@@ -98,7 +98,7 @@ class Batch:
             return found
 
     def rows_of(self, filled: Sequence[Any]) -> list[bool]:
-        """Which arguments of a function of one factor have a row for each factor."""
+        """Arguments of a function of one factor that have a row for each factor."""
         found = []
         for argument, value, declared in zip(self.arguments, filled, self.rows, strict=True):
             variable = isinstance(argument, Selection)
@@ -158,24 +158,24 @@ class Trace:
 
     @property
     def layout(self) -> tuple[Any, ...]:
-        """What the numbers of its parameters depend on."""
+        """Dependencies of the parameters' layout."""
         return self.taken, self.kernel.arguments, [array.shape for array in self.reached]
 
     @property
     def constant(self) -> bool:
-        """Whether there is nothing that could change."""
+        """True if there is nothing that could change."""
         return not (self.fixed or self.free or self.lists) and all(r.fixed for r in (self.reach, *self.given))
 
     @property
     def outdated(self) -> bool:
-        """Whether something has changed that is compiled in."""
+        """True if something has changed that is compiled in."""
         if self.reach.changed or _changed(self.fixed) or any(reach.changed for reach in self.given):
             return True
         return any(_listed(value) != content for value, content in self.lists)
 
     @property
     def moved(self) -> bool:
-        """Whether parameters have changed that are no data."""
+        """True if parameters have changed that are no data."""
         return _changed(self.free)
 
     def refreshed(self) -> Trace:
@@ -183,7 +183,7 @@ class Trace:
         return replace(self, free=_contents([array for array, _ in self.free]))
 
     def arguments(self, filled: Sequence[Any]) -> list[Any]:
-        """What the kernel takes, of all arguments of the term."""
+        """Arguments of the kernel, of all arguments of the term."""
         return [*(filled[place] for place in self.taken), *self.reached]
 
     def differs(self, batch: Batch, points: Sequence[Array], theirs: Array | None = None) -> BoolArray:
@@ -210,7 +210,7 @@ class Trace:
         return wrong
 
     def agrees(self, batch: Batch, points: Sequence[Array]) -> bool:
-        """Whether it computes what the function does, at these points and near them.
+        """Test whether it computes what the function does, at these points and near them.
 
         A factor counts as different where it differs twice: at one point a function may stand on the edge of a jump,
         where its roundings decide.
@@ -341,7 +341,7 @@ def _traced(
 def _reached_by(
     given: Sequence[Given], function: Reach
 ) -> tuple[tuple[Reach, ...], tuple[tuple[Any, bytes], ...], str]:
-    """What arguments that are compiled in reach, the content of lists, and what may change with nobody noticing."""
+    """Captured variables of arguments that are compiled in, the content of lists, and values that may change unseen."""
     beyond, lists, refusal = [], [], ""
     for place, part in enumerate(given):
         if not isinstance(part, Fixed) or isinstance(part.value, np.ndarray):
@@ -484,7 +484,7 @@ def _changed(contents: Contents) -> bool:
 
 
 def reach_of_value(value: Any) -> Any:
-    """What tells a constant from others; None if nothing can."""
+    """Key of a constant; None if there is none."""
     reach = reach_of(lambda: value)
     return reach.key
 

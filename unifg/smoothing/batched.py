@@ -1,4 +1,4 @@
-"""What compiled code cannot do by itself: functions of NumPy, losses of a user's own, manifolds moved by NumPy.
+"""Parts of an update that stay in Python: functions of NumPy, losses of a user's own, manifolds moved by NumPy.
 
 A pass over the tree stops where these are needed, and Python evaluates whole statements at once, as a graph does. A
 function therefore sees the batch that was stated, also when some of its factors have been marginalised since: their
@@ -84,7 +84,7 @@ class Batches:
         self._next, self._limit = 1, 64
 
     def __bool__(self) -> bool:
-        """Whether there are any."""
+        """Test whether there are any."""
         return bool(self._held)
 
     def add(self, batch: Batch) -> int:

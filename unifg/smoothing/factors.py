@@ -272,7 +272,7 @@ class Types:
     def _key(
         self, wrapped: Residual, arguments: Sequence[Any], rows: tuple[bool | None, ...], count: int
     ) -> tuple[Any, ...]:
-        """What makes statements share a kernel."""
+        """Key of statements that share a kernel."""
         kernel = wrapped.kernel
         if kernel is None and not wrapped.rows:  # what a trace makes of constants depends on all of this
             stated = [a.manifold if isinstance(a, Selection) else _told(a) for a in arguments]
@@ -295,7 +295,7 @@ class Types:
 
 
 def _places(kernel: Kernel | None) -> tuple[int, int, int]:
-    """Where machine code and table of a kernel stand, and the length of the table."""
+    """Addresses of machine code and table of a kernel, and the length of the table."""
     if kernel is None:
         return 0, NOBODY.ctypes.data, 0
     return kernel.address, kernel.table.ctypes.data, kernel.table.size
@@ -314,13 +314,13 @@ def _by_itself(arguments: Sequence[Any]) -> tuple[Any, ...]:
 
 
 def _compiled_in(trace: Trace, arguments: Sequence[Any]) -> bool:
-    """Whether floats among the arguments are part of a trace and not its parameters."""
+    """Test whether floats among the arguments are part of a trace and not its parameters."""
     others = [argument for place, argument in enumerate(arguments) if place not in trace.taken]
     return any(isinstance(a, Data) or np.asarray(a).dtype.kind == "f" for a in others)
 
 
 def _told(argument: Any) -> Any:
-    """What tells a constant from others that a trace treats differently."""
+    """Key of a constant that a trace treats differently from others."""
     if isinstance(argument, Data):
         return argument.value.shape, argument.value.dtype
     if isinstance(argument, float | np.floating | np.ndarray) and np.asarray(argument).dtype.kind == "f":
@@ -395,5 +395,5 @@ class Parts:
         return place
 
     def by_python(self, place: tuple[int, int]) -> bool:
-        """Whether NumPy moves a manifold."""
+        """Test whether NumPy moves a manifold."""
         return self.fields[place[0]][0] == BY_PYTHON

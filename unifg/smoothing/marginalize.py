@@ -135,7 +135,7 @@ def _unite(memory: Address, c: int) -> None:
 
 @compiled
 def _covers(memory: Address, a: int, b: int) -> bool:
-    """Whether all variables of the separator of b are in that of a."""
+    """Test whether all variables of the separator of b are in that of a."""
     state = opened(memory)
     cliques, lists = state.cliques, state.lists
     for q in range(cliques[b].list + cliques[b].pivots, cliques[b].list + cliques[b].count):

@@ -100,5 +100,5 @@ def _rewrite(memory: Address, c: int, v: int, scratch: Array) -> None:
 
 @compiled
 def _upper(stride: int, i: int, j: int) -> int:
-    """Where entry (i, j) of a symmetric matrix stands, of which the upper triangle is stored."""
+    """Position of entry (i, j) of a symmetric matrix of which the upper triangle is stored."""
     return i * stride + j if i < j else j * stride + i

@@ -24,7 +24,7 @@ Key = tuple[Any, ...]
 
 
 class Kind(NamedTuple):
-    """What single factors of one kind share.
+    """Data shared by single factors of one kind.
 
     Attributes:
         number: of their type.
@@ -58,7 +58,7 @@ class Kind(NamedTuple):
 def key_of(
     function: Any, arguments: Sequence[Any], sigma: Any, information: Any, robust: Loss | None, name: str | None
 ) -> Key | None:
-    """What makes single factors one kind; None where a statement has to be looked at."""
+    """Key of the kind of single factors; None where a statement has to be looked at."""
     whitening, form = whitening_of(sigma, information), None if robust is None else form_of(robust)
     if whitening < 0 or (form is None and robust is not None):
         return None

@@ -1,4 +1,4 @@
-"""What incremental and fixed-lag smoothing share: families, statements, updates, and what may be asked afterwards."""
+"""Base of incremental and fixed-lag smoothing: families, statements, updates, and queries."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ UPDATES, SCRATCH = PLACE["updates"], PLACE["scratch"]
 
 
 class Effort(NamedTuple):
-    """What one update did.
+    """Work of one update.
 
     Attributes:
         eliminated: variables eliminated anew.

@@ -1,4 +1,4 @@
-"""What a smoother keeps between updates: tables of records, and two arenas that everything of varying length lives in.
+"""State of a smoother between updates: tables of records, and two arenas for everything of varying length.
 
 Compiled code takes the address of a description of all arrays, so an update is one call. A clique is a group of
 variables that are eliminated together; it keeps its whole front: rows of the factor, and the update matrix it passed to

@@ -10,7 +10,7 @@ from unifg.typing import IntArray
 
 
 def enough(state: State, variable: int) -> bool:
-    """Whether as many rows as unknowns, one of them from a single variable, speak of all that a variable is tied to.
+    """Test whether as many rows as unknowns, one of them from a single variable, touch all neighbours of a variable.
 
     That does not prove that they determine it, but where it does not hold they cannot.
 

@@ -1,4 +1,4 @@
-"""How one draws: on a scene, where it stays, or on one frame of it."""
+"""Drawing: on a scene, where it stays, or on one frame of it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _HAIRS, _STRIPS = 300_000, 60_000
 
 
 class Canvas:
-    """What is drawn alike on a scene, where it stays, and on a frame of it.
+    """Drawing common to a scene and a frame of it.
 
     Each method takes the name first: a line of the legend, which switches it off and on, and what tells later frames
     that it is the same thing. ``colour`` is a name of `unifg.style.colours.COLOURS` or ``#rrggbb``, by default the next
@@ -277,7 +277,7 @@ class Canvas:
         self._drawn[name] = Thing(things.draw_mesh, given, np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
 
     def colour(self, name: str) -> str:
-        """What a layer is drawn in."""
+        """Colour of a layer."""
         return self._content.layers[name].colour
 
     def _places(self, name: str, points: ArrayLike) -> tuple[Array, bool]:
@@ -292,7 +292,7 @@ class Canvas:
 
 
 class Frame(Shot, Canvas):
-    """What is seen while its turn lasts; made by :meth:`Scene.frame`.
+    """Content of one frame; made by :meth:`Scene.frame`.
 
     As a context it is shown, live, when the block ends.
     """

@@ -1,4 +1,4 @@
-"""What a scene consists of, before anybody shows it."""
+"""Content of a scene, before it is shown."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Layer:
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a body is: position (3,) [m], attitude (w, x, y, z), and how it is stretched along its axes."""
+    """Place of a body: position (3,) [m], attitude (w, x, y, z), and scale along its axes."""
 
     position: Array
     attitude: Array

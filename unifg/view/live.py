@@ -42,7 +42,7 @@ _CONNECT = "; connect-src 'self' ws:"
 
 @dataclass
 class Known:
-    """What a browser has been sent.
+    """Objects that a browser has been sent.
 
     Attributes:
         drawn: what it has, by path.
@@ -120,7 +120,7 @@ class Live:
         self.close()
 
     def __repr__(self) -> str:
-        """Where it is."""
+        """Address of the page."""
         return f"<Live at {self.url}, {self.watching} watching>"
 
     def _remember(self, shot: Shot) -> None:
@@ -169,7 +169,7 @@ class Live:
                 self.write(page_text(live._first(), [], connect=_CONNECT, live=tag))
 
         class Wire(WebSocketHandler):
-            """What a browser is sent; tornado refuses those that come from pages of other hosts."""
+            """Connection to a browser; tornado refuses those that come from pages of other hosts."""
 
             ended = False
 
@@ -227,7 +227,7 @@ class Live:
             await server.close_all_connections()
 
     def _first(self) -> dict[str, Any]:
-        """What the page knows before it is told anything."""
+        """First message of the page."""
         return {
             "live": True, "title": self._content.title, "outcome": "", "good": True, "facts": [], "legend": [],
             "labels": [], "readouts": [], "plots": [], "speeds": [], "counts": "live", "numbers": [0], "ticks": [0],
@@ -238,7 +238,7 @@ class Live:
         }  # fmt: skip
 
     def _message(self, known: Known) -> str | None:
-        """What a browser lacks; None while there is nothing to show."""
+        """Objects that a browser lacks; None while there is nothing to show."""
         content = self._content
         with self._lock:
             shot = self._latest
@@ -317,7 +317,7 @@ class Live:
             known.drawn[path] = now
 
     def _words(self, shot: Shot, ground: Ground) -> dict[str, Any]:
-        """What the panel says now."""
+        """Text of the panel."""
         content = self._content
         clock = f"{content.counts} {shot.number}" if content.dt is None else f"{content.dt * shot.number:.2f} s"
         plots = []

@@ -1,4 +1,4 @@
-"""What can be drawn of the members of a family: where they are, how they are turned, how sure that is."""
+"""Members of a family as drawn: positions, orientations, uncertainties."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _STEP = 1e-5  # of differences, in the tangent space
 
 @dataclass(frozen=True)
 class Reading:
-    """How the members of a family are read.
+    """Reading of the members of a family.
 
     Attributes:
         name: of the family, with its component.
@@ -87,7 +87,7 @@ class Reading:
 
 
 def reading_of(selection: Selection, position: Position | None) -> Reading:
-    """How a family or a part of it is read.
+    """Reading of a family or a part of it.
 
     Args:
         selection: the family, some of its members, or a component.

@@ -1,4 +1,4 @@
-"""What the page around a scene says: title, facts, legend, labels, numbers of the moment, plots, and views."""
+"""Page around a scene: title, facts, legend, labels, numbers of the moment, plots, and views."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Plot:
 
 @dataclass
 class View:
-    """Where the camera stands, with a button: it looks from ``direction`` at everything, or at something that moves.
+    """Camera with a button: it looks from ``direction`` at everything, or at something that moves.
 
     Attributes:
         name: in the address of a picture, ``#t=12.5&view=NAME``.

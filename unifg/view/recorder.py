@@ -24,7 +24,7 @@ _UUID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
 
 class Command(Protocol):
-    """What meshcat sends to its window."""
+    """Command that meshcat sends to its window."""
 
     def lower(self) -> dict[str, object]:
         """The command as nested dictionaries."""

@@ -27,7 +27,7 @@ _AROUND = 0.3  # of the size of what is looked at: how much more a view of every
 
 @dataclass(frozen=True)
 class Ground:
-    """Where a scene lies and how large it is.
+    """Extent and centre of a scene.
 
     Attributes:
         low, high: (3,) corners of everything [m].
@@ -102,7 +102,7 @@ def recorded(content: Content) -> Stage:
 
 
 def ground_of(content: Content, shots: list[Shot]) -> Ground:
-    """Where the things of a scene lie.
+    """Extent of the things of a scene.
 
     Raises:
         ViewError: there are none.
@@ -201,7 +201,7 @@ def _box(content: Content, shots: list[Shot]) -> tuple[Array, Array] | None:
 
 
 def _turns(stage: Stage, shots: list[Shot], name: str) -> list[tuple[int, int | None, Thing]]:
-    """What a layer shows, each from a tick to another; what stays the same is one thing."""
+    """Things of a layer, each from a tick to another; equal ones are one thing."""
     runs: list[tuple[int, int | None, Thing]] = []
     for tick, following in stage.turns():
         thing = shots[tick].things.get(name)

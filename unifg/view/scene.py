@@ -251,7 +251,7 @@ class Scene(Content, Canvas):
         return recorded(self).html()
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: the page in a frame."""
+        """HTML of a notebook: the page in a frame."""
         frame = 'style="width: 100%; height: 520px; border: 0" allowfullscreen'
         return f'<iframe srcdoc="{escape(self.html())}" {frame}></iframe>'
 
@@ -306,7 +306,7 @@ class Scene(Content, Canvas):
     def _members(
         self, solution: Solution, recipe: Recipe, body: str | Mapping[Family, str] | None, size: float | None
     ) -> None:
-        """What is there stays; a body goes along each family that is a way."""
+        """Draw the members of families; a body goes along each family that is a way."""
         values = solution.values
         recipe.draw(self, values, solution, solution)
         ways: dict[str, Array] = {}

@@ -1,4 +1,4 @@
-"""What is drawn of a solution: its families, how sure they are, and its factors as lines between what they touch."""
+"""Drawing of a solution: its families, their uncertainties, and its factors as lines between variables."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Shown:
 
     @property
     def joined(self) -> bool:
-        """Whether its members are a way: those of a family of bare points are not."""
+        """True if its members are a way: those of a family of bare points are not."""
         return self.reading.kind != "points" or self.reading.position is not None or bool(self.selection.component)
 
     def of(self, values: Values) -> Array:
@@ -52,7 +52,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class Recipe:
-    """What to draw of every solution of a graph.
+    """Drawing recipe of every solution of a graph.
 
     Attributes:
         shown: families, in order.
@@ -142,7 +142,7 @@ def recipe_of(
     terms: Sequence[str],
     position: Position | None,
 ) -> Recipe:
-    """What to draw of a solution.
+    """Drawing recipe of a solution.
 
     Args:
         solution: of the graph.

@@ -111,7 +111,7 @@ class Stage:
 
     @contextmanager
     def around(self) -> Iterator[None]:
-        """What is sent meanwhile has its places around the origin of something that moves."""
+        """Place what is sent meanwhile around the origin of something that moves."""
         self._here = np.zeros(3)
         yield
         self._here = self.origin

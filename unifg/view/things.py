@@ -1,4 +1,4 @@
-"""What a scene can hold, kept as numbers and drawn when it is shown: ways, poses, points, ellipses, discs, boxes, maps.
+"""Things of a scene, kept as numbers and drawn when it is shown: ways, poses, points, ellipses, discs, boxes, maps.
 
 Every thing is drawn by a function of this file that is given a stage, a path on it, and how many of its members may be
 drawn at most. Things in the plane lie in layers, one a little above the other, so that none hides another by chance.
@@ -59,7 +59,7 @@ class Thing:
     slack: float = 0.0
 
     def same(self, other: Thing | None) -> bool:
-        """Whether another one looks the same."""
+        """Test whether another one looks the same."""
         if other is None or self.draw is not other.draw or self.given.keys() != other.given.keys():
             return False
         return all(self._alike(value, other.given[name]) for name, value in self.given.items())

@@ -65,6 +65,6 @@ def every_way(tape: Tape, run: Callable[[], Sequence[int]]) -> list[int]:
 
 
 def at_zero(tape: Tape, condition: int) -> bool | None:
-    """Whether a condition holds where all tangent coordinates are zero; None where that alone does not say."""
+    """Test whether a condition holds where all tangent coordinates are zero; None where that alone does not say."""
     rest, (node,) = tape.at_rest([condition])
     return rest.value[node] != 0.0 if rest.is_constant(node) else None

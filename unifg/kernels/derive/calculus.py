@@ -93,7 +93,7 @@ def hessian(tape: Tape, outputs: Sequence[int], width: int) -> dict[tuple[int, i
 
 
 def bent(tape: Tape, outputs: Sequence[int]) -> list[bool]:
-    """Which outputs have second derivatives: those that are not made of linear pieces."""
+    """Outputs with second derivatives: those that are not made of linear pieces."""
     degree = dict[int, int]()  # 0 constant, 1 made of linear pieces, 2 neither
     for i in tape.live(outputs):
         op, a, b = tape.op[i], tape.a[i], tape.b[i]
@@ -121,7 +121,7 @@ def bent(tape: Tape, outputs: Sequence[int]) -> list[bool]:
 
 @dataclass(frozen=True)
 class _Waists:
-    """Where the outputs' dependence on the tangent coordinates is narrow, and derivatives between those places.
+    """Narrow places in the outputs' dependence on the tangent coordinates, and derivatives between them.
 
     Most nodes depend on all tangent coordinates by way of one or two others, as all of a power series on its argument.
     Their derivatives by these are worked out once, and only the waists are swept.
@@ -323,7 +323,7 @@ def _vanishing_length(tape: Tape, i: int) -> tuple[float, int] | None:
 
 
 def _squares(t: Tape, a: int) -> bool:
-    """Whether a node is a sum of squares: its root is a norm, whose slope at zero is taken for zero, as that of abs."""
+    """Test whether a node is a sum of squares: its root is a norm, whose slope at zero is taken for zero."""
     if t.op[a] == Op.ADD:
         return _squares(t, t.a[a]) and _squares(t, t.b[a])
     return t.op[a] == Op.MULTIPLY and t.a[a] == t.b[a]

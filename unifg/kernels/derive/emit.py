@@ -60,7 +60,7 @@ class _Line:
         self._liberty = ""
 
     def generated(self, arguments: tuple[object, ...]) -> bytes:
-        """What is written, as object code."""
+        """Object code of the expression."""
         declarations = [
             f"declare double @{called}({', '.join(['double'] * count)}) nounwind readnone"
             for called, count in self._called.items()

@@ -74,7 +74,7 @@ class Expression:
 
     @cached_property
     def linear_rows(self) -> tuple[bool, ...]:
-        """Which rows have no second derivatives, being linear in the tangent coordinates or made of linear pieces."""
+        """Rows without second derivatives, being linear in the tangent coordinates or made of linear pieces."""
         return tuple(not row for row in bent(self.tape, self.rows))
 
     @cached_property

@@ -284,7 +284,7 @@ def _se3_act(x: Numbers, p: Numbers) -> list[Any]:
 
 
 def _twice(form: Callable[..., list[Any]]) -> Callable[..., list[Any]]:
-    """What SE_2(3) does, of what SE(3) does."""
+    """Operations of SE_2(3) from those of SE(3)."""
     return lambda *arguments: _one(*(form(*parts) for parts in zip(*map(_two, arguments), strict=True)))
 
 
@@ -371,7 +371,7 @@ KINDS = {type(group) for group in GROUPS}
 
 
 def closed_form(manifold: Manifold, name: str) -> Callable[..., Any] | None:
-    """What a manifold does with single elements, where that is written here."""
+    """Closed-form operations of a manifold on single elements, where there are some."""
     if isinstance(manifold, Rn):
         forms = _VECTORS
     elif type(manifold) in KINDS:

@@ -118,7 +118,7 @@ def _over(one: Callable[..., Any], given: Sequence[Any]) -> Any:
 
 
 def operate(manifold: Manifold, name: str, source: Source, *arguments: Numbers) -> Any:
-    """What a method of a manifold returns for single elements, as a list or as a list of rows.
+    """Result of a method of a manifold for single elements, as a list or as a list of rows.
 
     Args:
         manifold: any.
@@ -267,7 +267,7 @@ def _at_rest(tape: Tape, entries: dict[tuple[int, int], int], shape: tuple[int, 
 
 
 def _is_right(manifold: Manifold, way: Callable[..., list[Any]], source: Source) -> bool:
-    """Whether points moved this way have the derivatives that differences of the manifold's own retraction have."""
+    """Test whether points moved this way have the derivatives that the manifold's own retraction has."""
     dim, storage = manifold.dim, manifold.storage
     tape = Tape()
     step = [Symbol(tape, tape.leaf(Op.TANGENT, k)) for k in range(dim)]

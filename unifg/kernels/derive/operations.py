@@ -6,7 +6,7 @@ from enum import IntEnum, auto
 
 
 class Op(IntEnum):
-    """What a node of a tape computes from its arguments a, b, c."""
+    """Operation of a node of a tape on its arguments a, b, c."""
 
     CONSTANT = 0
     VARIABLE = auto()  # a-th number of the variables' storage

@@ -1,4 +1,4 @@
-"""How fast a result changes as its arguments set out: a derivative that is part of a function, itself differentiated.
+"""Rate of a result along a direction: a derivative that is part of a function, itself differentiated.
 
 What a barrier asks for is d/ds f(x(s)) at s = 0, and whoever solves with it asks for two derivatives more. While a
 function is traced the parameter s is a leaf of the tape like a tangent coordinate: the result is differentiated by it,

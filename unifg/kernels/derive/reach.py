@@ -37,7 +37,7 @@ _PLAIN = (bool, int, float, complex, str, bytes, type(None), type(Ellipsis), ran
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """What a function reaches.
+    """Captured variables of a function.
 
     Attributes:
         key: equal for functions that compute the same; None where that cannot be said.
@@ -69,7 +69,7 @@ class Reach:
 
     @property
     def changed(self) -> bool:
-        """Whether a name means something else by now, or an array holds other numbers."""
+        """True if a name means something else by now, or an array holds other numbers."""
         if self._elsewhere:
             return True
         for cell, value in self._cells:
@@ -89,7 +89,7 @@ class Reach:
 
     @property
     def fixed(self) -> bool:
-        """Whether there is nothing that could change."""
+        """True if there is nothing that could change."""
         watched = self._cells or self._names or self._arrays or self._functions or self._containers
         return not (watched or self._elsewhere)
 
@@ -148,11 +148,11 @@ class _Walk:
 
     @property
     def complete(self) -> bool:
-        """Whether all of them were known from the beginning."""
+        """True if all of them were known from the beginning."""
         return len(self._attributes) == self._asked
 
     def named_value(self, value: Any, where: str) -> Hashable:
-        """What tells the value of a name from others."""
+        """Key of the value of a name."""
         if type(value) is np.ndarray and value.dtype == np.float64 and value.ndim:
             self.named[id(value)] = value
             if id(value) in self._given:
@@ -163,7 +163,7 @@ class _Walk:
         self.refusal = self.refusal or why
 
     def value(self, value: Any, where: str) -> Hashable:
-        """What tells a value from others."""
+        """Key of a value."""
         if isinstance(value, _PLAIN) and type(value) in _PLAIN:
             return type(value).__name__, repr(value)
         if isinstance(value, np.generic):
@@ -323,7 +323,7 @@ class _Walk:
 
 @dataclass(frozen=True)
 class _Scan:
-    """What the instructions of a function say: names of globals, of attributes, and what speaks against a trace."""
+    """Names of globals and attributes in the instructions of a function, and what prevents a trace."""
 
     names: frozenset[str]
     attributes: frozenset[str]
@@ -395,7 +395,7 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 
 
 def _written(function: FunctionType) -> tuple[Any, ...]:
-    """What notebooks replace when a module is loaded again."""
+    """Parts of a function that notebooks replace when a module is loaded again."""
     return function.__code__, function.__defaults__, function.__kwdefaults__
 
 

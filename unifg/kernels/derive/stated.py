@@ -27,7 +27,7 @@ class StatedKernel(Kernel):
 
     @property
     def expression(self) -> Expression:
-        """What it computes; one for all threads, for it owns the machine code."""
+        """Expression; one for all threads, for it owns the machine code."""
         with generating:
             found = self.__dict__.get("_expression")
             if found is None:

@@ -375,7 +375,7 @@ for _name in (
 
 
 def holds_symbols(array: Any) -> bool:
-    """Whether an array holds numbers that are not known."""
+    """Test whether an array holds numbers that are not known."""
     array = plain(array)
     return isinstance(array, np.ndarray) and array.dtype == object and any(isinstance(x, Symbol) for x in array.flat)
 

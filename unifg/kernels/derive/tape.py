@@ -70,7 +70,7 @@ class Tape:
         self.minus_one = self.constant(-1.0)
 
     def __len__(self) -> int:
-        """How many nodes there are."""
+        """Number of nodes."""
         return len(self.op)
 
     # ---------------------------------------------------------------- leaves
@@ -88,7 +88,7 @@ class Tape:
         return self._node(op, place)
 
     def table(self, numbers: Array) -> int:
-        """Where a flat array begins among the tables; it is kept once."""
+        """Start of a flat array among the tables; it is kept once."""
         begin = 0
         for known in self.tables:
             if known is numbers:
@@ -99,11 +99,11 @@ class Tape:
 
     @property
     def size(self) -> int:
-        """How many numbers the tables hold."""
+        """Length of the tables."""
         return sum(len(known) for known in self.tables)
 
     def is_constant(self, i: int) -> bool:
-        """Whether a node is a number."""
+        """Test whether a node is a number."""
         return self.op[i] == Op.CONSTANT
 
     # ---------------------------------------------------------------- operations
@@ -196,7 +196,7 @@ class Tape:
         return self._node(Op.MULTIPLY, a, b) if a < b else self._node(Op.MULTIPLY, b, a)
 
     def _never_negative(self, i: int) -> bool:
-        """Whether the form of an expression says that it is no negative number: a square, a sum of such, a length."""
+        """Test whether the form of an expression rules out negative values: a square, a sum of such, a length."""
         op, a, b = self.op[i], self.a[i], self.b[i]
         if op == Op.CONSTANT:
             return self.value[i] >= 0.0

@@ -106,7 +106,7 @@ def _line(function: Callable[..., Any]) -> str:
 
 
 def _installed(path: str) -> bool:
-    """Whether a file belongs to a package that somebody has installed, or to what is compiled."""
+    """Test whether a file belongs to a package that somebody has installed, or to what is compiled."""
     return "site-packages" in path or "dist-packages" in path or path.endswith(".pyx")
 
 
@@ -246,7 +246,7 @@ class Rebound:
         return stand_in
 
     def thing(self, thing: Any) -> Any:
-        """What a name means while a function is traced."""
+        """Stand-in of a value while a function is traced."""
         if id(thing) in self.given:
             return self.given[id(thing)]
         if thing is np:
@@ -282,7 +282,7 @@ class Rebound:
 
 
 def _varies(argument: Argument) -> bool:
-    """Whether an argument of a kernel is a variable."""
+    """Test whether an argument of a kernel is a variable."""
     return not isinstance(argument, int | tuple)
 
 
@@ -293,7 +293,7 @@ def _side_by_side(kernel: Kernel, row: Sequence[Any], varying: bool) -> Any:
 
 
 def _written(kernel: Kernel, called: Callable[..., Any], v: Any, p: Any, size: int) -> list[Any]:
-    """What a compiled kernel writes for one factor, whichever way it goes."""
+    """Output of a compiled kernel for one factor, on both branches."""
     tape = next((entry.tape for entry in (*v, *p) if isinstance(entry, Symbol)), None)
 
     def once() -> Any:
