@@ -1,7 +1,8 @@
 # Everything needs only make and Python >= 3.11: the first target you call builds a virtual environment in .venv.
 #
 #   make demo     drive a robot through the shipped building, write out/demo/scene.html
-#   make test     run the tests
+#   make test     run the tests; of large tables of cases a draw, another one for each commit
+#   make test-all run the tests with all cases
 #   make test-lowest    the same with the lowest versions of all packages that pyproject.toml allows, in .venv-lowest
 #   make processes    graphs and solutions in other processes, however these begin, with joblib and dask (a minute)
 #   make fuzz     mutated files for every reader, a minute each
@@ -35,7 +36,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Matrices here are small: more threads per process only make the processes wait for each other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: docs kernels performance notebooks help demo test fuzz test-lowest processes lint style types mypy pyright bench results stale release-build release-pages release-kernels release-check mutants fences clean offsets examples
+.PHONY: docs kernels performance notebooks help demo test test-all fuzz test-lowest processes lint style types mypy pyright bench results stale release-build release-pages release-kernels release-check mutants fences clean offsets examples
 .DELETE_ON_ERROR:
 
 help:
@@ -48,6 +49,9 @@ demo: $(VENV)/ready
 test: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/unifg warmup
 	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(PYTEST)
+
+test-all: $(VENV)/ready
+	$(MAKE) test PYTEST="--all $(PYTEST)"
 
 # What is old calls what is new in ways that have since been deprecated.
 test-lowest: $(VENV)-lowest/ready

@@ -1,6 +1,13 @@
-"""Fixtures every test may use: the shared data beside the checkout, and reproducible randomness."""
+"""Fixtures every test may use: the shared data beside the checkout, and reproducible randomness.
+
+A test marked ``product(n)`` is a large table, of which n cases are drawn; another commit draws others. ``--all`` runs
+the whole, ``UNIFG_TEST_SEED`` repeats a draw.
+"""
 
 import os
+import random
+import subprocess
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -43,3 +50,41 @@ def shared_reference() -> Path:
 def rng() -> np.random.Generator:
     """Return a random generator that starts from the same seed in every test."""
     return np.random.default_rng(20260101)
+
+
+def _seed() -> str:
+    """Seed of the drawn cases: $UNIFG_TEST_SEED, else the commit."""
+    if named := os.environ.get("UNIFG_TEST_SEED"):
+        return named
+    found = subprocess.run(
+        ["git", "rev-parse", "--short=8", "HEAD"], cwd=CHECKOUT, capture_output=True, text=True, check=False
+    )
+    return found.stdout.strip() or "0"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add ``--all``."""
+    parser.addoption("--all", action="store_true", help="run every case of the tests marked as products")
+
+
+def pytest_report_header(config: pytest.Config) -> str:
+    """Say how to repeat the draw."""
+    return "all cases" if config.getoption("--all") else f"products drawn with UNIFG_TEST_SEED={_seed()}"
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Keep the drawn cases of products, but for cases that are named on the command line."""
+    if config.getoption("--all") or any("::" in argument for argument in config.args):
+        return
+    products = defaultdict[str, list[pytest.Item]](list)
+    for item in items:
+        if item.get_closest_marker("product"):
+            products[item.nodeid.partition("[")[0]].append(item)
+    dropped = set[pytest.Item]()
+    for name, cases in products.items():
+        marker = cases[0].get_closest_marker("product")
+        assert marker is not None
+        kept = random.Random(f"{_seed()} {name}").sample(cases, min(len(cases), marker.args[0]))
+        dropped |= {*cases} - {*kept}
+    config.hook.pytest_deselected(items=list(dropped))
+    items[:] = [item for item in items if item not in dropped]
