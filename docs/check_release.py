@@ -130,7 +130,7 @@ def named() -> list[str]:
 
 
 def candidates(minor: str) -> Iterator[str]:
-    """Where a Python may be: this one, the path, pyenv's and uv's."""
+    """Candidates for a Python interpreter: this one, the path, pyenv's and uv's."""
     yield sys.executable
     yield f"python{minor}"
     for place in (f"~/.pyenv/versions/{minor}.*", f"~/.local/share/uv/python/cpython-{minor}.*"):
@@ -198,7 +198,7 @@ def evened(archive: bytes, epoch: int) -> bytes:
 
 
 def too_large(sizes: dict[str, int]) -> Iterator[str]:
-    """What is said of files, by name, that have more bytes than docs/releases.md allows."""
+    """Messages on files, by name, that have more bytes than docs/releases.md allows."""
     for name, size in sizes.items():
         kind = "wheel" if name.endswith(".whl") else "sdist"
         if size > 1e6 * allowed(kind):

@@ -24,12 +24,12 @@ BACKENDS: dict[str, Any] = {name: backend(name) for name in TABLE if name != "gn
 
 
 def curved(x: Array, goal: Array) -> Array:
-    """How far from the goal, on a bent floor."""
+    """Offset from the goal, on a bent floor."""
     return np.asarray(0.1 * np.sin(x) + x - goal)
 
 
 def low(x: Array) -> Array:
-    """What must stay below a limit."""
+    """Value that must stay below a limit."""
     return np.asarray(x[:, :1] + 0.3 * x[:, 1:] ** 2)
 
 
@@ -70,7 +70,7 @@ def goal_of(number: int) -> Array:
 
 
 def solved_elsewhere(name: str, number: int) -> fg.Solution:
-    """What a process is asked for."""
+    """Solution that a process computes for one of many goals."""
     return Walk(name).solved(name, number)
 
 

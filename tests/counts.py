@@ -17,7 +17,7 @@ from unifg.typing import Array
 
 @dataclass
 class Count:
-    """What became of the subproblems of one row.
+    """Routes and iterations by which the subproblems of one row were solved.
 
     Attributes:
         routes: name of the route that solved each.

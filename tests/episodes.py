@@ -103,5 +103,5 @@ def episode(ticks: int = 40, obstacles: int = 2, *, map_yaw: float = 0.0, seed: 
 
 
 def _seen(obstacles: Array, tick: int) -> Array:
-    """What a tracker would report: nothing at first, then the first obstacle."""
+    """Output of a simulated tracker: nothing at first, then the first obstacle."""
     return obstacles[: min(1, tick // 5)].copy()

@@ -46,7 +46,7 @@ class Numbers:
 
 @dataclass(frozen=True)
 class Peer:
-    """What a solver of casadi made of the problem.
+    """Result of a CasADi solver for the problem.
 
     Attributes:
         status: in its own word.
@@ -67,7 +67,7 @@ class Peer:
 
 @dataclass(frozen=True)
 class Least:
-    """What minimising the violation reached.
+    """Result of minimising the violation.
 
     Attributes:
         before, after: sums of all violations.
@@ -82,7 +82,7 @@ class Least:
 
     @property
     def feasible(self) -> bool:
-        """Whether a point that keeps the constraints was found."""
+        """True if a point that keeps the constraints was found."""
         return self.largest <= FEASIBLE
 
 
@@ -128,7 +128,7 @@ class Judge:
         )
 
     def slope_of_violation(self, values: dict[fg.Family, Array]) -> float:
-        """How far from stationary a point is for 1/2 |violation|^2, bounds of unknowns blocking; 0 is stationary.
+        """Distance from stationarity for 1/2 |violation|^2, bounds of unknowns blocking; 0 is stationary.
 
         Relative to the largest violation and the largest entry of the Jacobian, if that exceeds one.
         """

@@ -71,6 +71,6 @@ def fences(path: Path) -> Iterator[Fence]:
 
 
 def _closes(line: str, mark: str) -> bool:
-    """Whether a line closes the fence that was opened by `mark`."""
+    """Test whether a line closes the fence that was opened by `mark`."""
     text = line.strip()
     return len(text) >= len(mark) and set(text) == {mark[0]}

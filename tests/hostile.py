@@ -100,7 +100,7 @@ PGM = b"P5\n4 3\n255\n" + bytes([0, 254, 205, 0] * 3)
 
 @dataclass(frozen=True)
 class Reader:
-    """What reads a kind of files.
+    """Reader of one kind of files.
 
     Attributes:
         read: the function.
@@ -207,7 +207,7 @@ def at_most(seconds: int) -> Iterator[None]:
 
 
 def trouble(reader: Reader, folder: Path, number: int) -> str:
-    """What a mutation makes of a reader that should either read or refuse; empty where it does."""
+    """Description of a reader's fault on a mutated file; empty if it reads or refuses the file correctly."""
     for name, content in reader.files.items():
         (folder / name).write_bytes(mutated(content, number) if name in reader.mutated else content)
     first = folder / next(iter(reader.files))
@@ -226,7 +226,7 @@ def trouble(reader: Reader, folder: Path, number: int) -> str:
 
 
 def _finite(found: Any) -> bool:
-    """Whether all numbers in it are, but for what may be infinite."""
+    """Test whether all numbers in it are finite, except those that may be infinite."""
     if isinstance(found, np.ndarray):
         return found.dtype.kind != "f" or bool(np.isfinite(found).all())
     if isinstance(found, float):

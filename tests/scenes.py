@@ -23,7 +23,7 @@ def without_viewer(page: str) -> str:
 
 
 def data_of(page: str) -> dict[str, Any]:
-    """What the script of a page knows."""
+    """Data in the script of a page."""
     found = re.search(r"^const DATA = (.*);$", page, re.MULTILINE)
     assert found
     data: dict[str, Any] = json.loads(found.group(1))

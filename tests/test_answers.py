@@ -1,4 +1,4 @@
-"""What a solution answers: priors of what leaves, covariances, reactions, shifted guesses, the worst row, checks."""
+"""Answers of a solution: priors of what leaves, covariances, reactions, shifted guesses, the worst row, checks."""
 
 from __future__ import annotations
 

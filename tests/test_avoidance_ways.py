@@ -1,4 +1,4 @@
-"""Which way of avoiding things the controller takes, and what it states of it."""
+"""Choice of the controller's way of avoidance, and the terms it states for it."""
 
 from __future__ import annotations
 

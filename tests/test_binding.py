@@ -1,4 +1,4 @@
-"""What a solve takes from outside, tick after tick: data that change or do not, and guesses that were touched."""
+"""Inputs of a solve, tick after tick: data that change or do not, and guesses that were touched."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def bindings(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
 
 def expected(start: Array, wanted: Array, sigma: float, limit: float, on: bool = True) -> Array:
-    """By hand: a weighted mean, cut off at the limit (diagonal Hessian)."""
+    """Solution by hand: a weighted mean, cut off at the limit (diagonal Hessian)."""
     weight = on / sigma**2
     return np.asarray(np.minimum((weight * wanted[1] + start) / (weight + 1.0), limit))
 

@@ -1,4 +1,4 @@
-"""What stands in the way without being a disc, ways that are too narrow, and goals that are given up by name."""
+"""Obstacles that are not discs, ways that are too narrow, and goals that are given up by name."""
 
 from __future__ import annotations
 

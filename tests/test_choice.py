@@ -1,4 +1,4 @@
-"""Who names no backend gets one that fits, a second one where that fails, and is told of both."""
+"""Choice of a backend if none is named: one that fits, a second one where that fails, a report of both."""
 
 from __future__ import annotations
 

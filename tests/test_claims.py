@@ -1,4 +1,4 @@
-"""What backends claim about a few of the problems stated twice, judged by casadi's exact derivatives."""
+"""Claims of backends about a few of the problems stated twice, judged by casadi's exact derivatives."""
 
 from __future__ import annotations
 

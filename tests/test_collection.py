@@ -59,7 +59,7 @@ AIMS = {"InteriorPoint": 0.95, "SQP": 0.95, "AugmentedLagrangian": 0.90}
 
 
 def takes(name: str, graph: fg.Graph) -> bool:
-    """Whether a backend claims the class of a graph."""
+    """Test whether a backend claims the class of a graph."""
     equalities, inequalities, scalars = CLASSES[name]
     program = graph.compile()
     if program.scalar_terms and not scalars:
@@ -238,7 +238,7 @@ def test_an_objective_without_minimum_is_unbounded(name: str, bounded: bool) -> 
 
 @pytest.mark.parametrize("name", BACKENDS)
 def test_a_claim_without_multipliers_is_still_a_kkt_point(name: str) -> None:
-    """Where the constraints are not qualified a backend may fail, but what it claims holds to the tolerance."""
+    """Claims hold to the tolerance where the constraints are not qualified, though a backend may fail there."""
     for case in CASES.values():
         if case.qualified:
             continue

@@ -51,7 +51,7 @@ def twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[float], 
 
 
 def read_from_cache(function: Any) -> bool:
-    """Whether the last call's machine code came from the disk."""
+    """Test whether the last call's machine code came from the disk."""
     return bool(function.stats.cache_hits)
 
 

@@ -85,7 +85,7 @@ def test_the_robot_makes_way_for_one_who_does_not_wait(controller: Controller, s
 
 
 def test_the_way_out_is_rest_unless_somebody_comes_into_it(controller: Controller) -> None:
-    """Who passes at a distance, stands, or never moved gives no cause to leave; who comes on does."""
+    """Obstacles that come on give cause to leave; those that pass at a distance, stand, or never moved do not."""
     s, reference = SETTINGS, np.tile(OPEN, (SETTINGS.horizon + 1, 1))
     coming = tracks((OPEN[0] + 0.9, OPEN[1], 0.2), velocity=(-0.6, 0.0), mover=True)
     for others, evades in (
@@ -118,7 +118,7 @@ def test_the_way_out_is_rest_unless_somebody_comes_into_it(controller: Controlle
 def test_nobody_is_evaded_into_a_wall(
     controller: Controller, pose: tuple[float, ...], bearing: float, distance: float, speed: float
 ) -> None:
-    """Who is pressed towards a wall takes the way that leaves it, even where another would leave a little more room."""
+    """Robots pressed towards a wall take the way that leaves it, even where another would leave a little more room."""
     towards = np.array([np.cos(bearing), np.sin(bearing)])
     place = np.array(pose[:2]) + distance * towards
     others = tracks((place[0], place[1], 0.2), velocity=tuple(-speed * towards), mover=True)
@@ -222,7 +222,7 @@ def test_limits_are_no_stricter_than_the_way_out(field: DistanceMap) -> None:
 
 
 def driven_through(field: DistanceMap, place: float, heading: float, squeeze: float) -> tuple[float, float]:
-    """How far a robot gets in two seconds between two discs it finds itself beside, and the least gap on the way."""
+    """Distance a robot covers in two seconds between two discs beside it, and the least gap on the way."""
     settings = replace(SETTINGS, squeeze=squeeze, discs=2)
     controller, pose = Controller(field, "sqp", settings), OPEN + np.array([0.0, 0.0, heading])
     aside, least = HULL + 0.2 + 0.045, np.inf  # 0.045 m on either side, where 0.06 m are to be kept
@@ -240,7 +240,7 @@ def driven_through(field: DistanceMap, place: float, heading: float, squeeze: fl
 def test_squeezing_lets_a_robot_out_of_a_gap_that_is_too_narrow(
     field: DistanceMap, place: float, heading: float
 ) -> None:
-    """Where tracks say that it stands too near to two discs already, it may pass between them; else it must go back."""
+    """Robots already too near to two discs, by their tracks, may pass between them if squeezing; else must go back."""
     way, least = driven_through(field, place, heading, SETTINGS.squeeze)
     assert way > 1.2
     assert least > SETTINGS.squeeze - 2e-3

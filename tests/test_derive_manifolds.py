@@ -257,7 +257,7 @@ def test_a_retraction_too_short_for_second_derivatives_is_refused() -> None:
 
 @pytest.mark.parametrize("manifold", OWN, ids=lambda manifold: manifold.name)
 def test_manifolds_that_know_nothing_of_tracing(manifold: fg.Manifold) -> None:
-    """Where points go, and their local coordinates: fourth-order differences along the manifold's own retraction."""
+    """Retraction and local coordinates agree with fourth-order differences along the manifold's own retraction."""
     rng = np.random.default_rng(6)
     x = manifold.random(rng, (3,))
     y = manifold.retract(x, 0.3 * rng.normal(size=(3, manifold.dim)))

@@ -1,4 +1,4 @@
-"""What NumPy offers, traced: values to the last digits, first and second derivatives by differences of the first."""
+"""NumPy functions, traced: values to the last digits, first and second derivatives by differences of the first."""
 
 import math
 from collections.abc import Callable

@@ -354,7 +354,7 @@ def decay(x: Array, y: Array, t: Array, dt: Array, *spheres: Array) -> Any:
 
 
 def apart(p: Array, v: Array, t: Array, centre: Array, velocity: Array, radius: Array) -> Any:
-    """Where spheres are seen from, relative velocity, distance from their centres, and how fast that grows."""
+    """Positions relative to spheres, relative velocities, distances from their centres, and the rates of the latter."""
     to, by = p[:, None, :] - centre - t[:, None, None] * velocity, v[:, None, :] - velocity
     d = np.linalg.norm(to, axis=2)
     return to, by, d, np.sum(to * by, axis=2) / d
@@ -656,7 +656,7 @@ class Batch:
 
 
 def in_casadi(thing: Any, seen: dict[int, Any]) -> Any:
-    """What a function of this file, of test problems or of models computes, in CasADi's numbers."""
+    """Copy of a function of this file, of test problems or of models that computes in CasADi's numbers."""
     if thing is np:
         return C
     if thing is wrap_angle:

@@ -1,4 +1,4 @@
-"""What a base makes of its commands, each effect against its closed form, alone and in the simulated world."""
+"""Response of a base to its commands, each effect against its closed form, alone and in the simulated world."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def open_floor(*patches: tuple[float, float, float], **drivetrain: Any) -> World
 
 
 def driven(wheels: Wheels, command: tuple[float, float], time: float) -> tuple[float, float]:
-    """How far the wheels go in a time under one command [m, rad]."""
+    """Distances that the wheels cover in a time under one command [m, rad]."""
     wheels.tell(command)
     means = np.array([wheels.advance(SUBSTEP) for _ in range(round(time / SUBSTEP))])
     return tuple((SUBSTEP * means.sum(axis=0)).tolist())

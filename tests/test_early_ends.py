@@ -1,4 +1,4 @@
-"""What a solve returns that ends early: after a few steps the last, else the iterate of least merit."""
+"""Result of a solve that ends early: after a few steps the last iterate, else the one of least merit."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def arrives_as_converged(name: str, drive: Callable[[Loop], Array], feasible: bo
 
 @cache
 def converged_end(name: str, feasible: bool) -> Array:
-    """Where the loop ends that solves every tick."""
+    """End of the loop that solves every tick."""
     return Loop(limits="kkt" not in name).drive(BACKENDS[name](200), feasible)[-1, :2]
 
 

@@ -1,4 +1,4 @@
-"""What the interior point does where its equalities cannot be met, or not along the way it first takes."""
+"""Behaviour of the interior point where its equalities cannot be met, or not along the way it first takes."""
 
 from __future__ import annotations
 

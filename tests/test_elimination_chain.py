@@ -129,7 +129,7 @@ def dense_solution(pattern: Symmetric, data: Array) -> Array:
 
 
 def test_free_end_is_noticed_in_a_chain(rng: np.random.Generator) -> None:
-    """What a front adds to the next is not taken for its original diagonal."""
+    """Contributions of a front to the next are not taken for the latter's original diagonal."""
     n = 120
     weight = rng.uniform(0.1, 10.0, size=n - 1)
     pattern = Symmetric(n, [(np.arange(n - 1), np.arange(1, n))])

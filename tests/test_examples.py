@@ -51,7 +51,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 
 
 def right(graph: fg.Graph, solution: fg.Solution) -> bool:
-    """Whether the KKT conditions hold, by derivatives taken apart from the library's."""
+    """Test whether the KKT conditions hold, by derivatives taken apart from the library's."""
     return bool(solution.converged and judge(graph, solution).worst() < 2e-6)
 
 

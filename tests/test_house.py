@@ -109,7 +109,7 @@ def imports(tree: ast.AST, package: str = "") -> Iterator[tuple[int, str]]:
 
 
 def is_in(module: str, package: str) -> bool:
-    """Whether a module is a package or lies inside it."""
+    """Test whether a module is a package or lies inside it."""
     return module == package or module.startswith(package + ".")
 
 

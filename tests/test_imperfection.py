@@ -1,4 +1,4 @@
-"""What the robot is not told: scans that take time and lie, maps that are wrong; each against its law."""
+"""Errors unknown to the robot: scans that take time, false returns, maps that are wrong; each against its law."""
 
 from __future__ import annotations
 

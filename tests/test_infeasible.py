@@ -1,4 +1,4 @@
-"""What backends say where constraints contradict each other, and where they only seem to."""
+"""Statuses of backends where constraints contradict each other, and where they only seem to."""
 
 from __future__ import annotations
 

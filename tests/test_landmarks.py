@@ -1,4 +1,4 @@
-"""What the quadrotor senses: bearings and ranges in the ground plane, height, and the vertical."""
+"""Measurements of the quadrotor: bearings and ranges in the ground plane, height, and the vertical."""
 
 from __future__ import annotations
 

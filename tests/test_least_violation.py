@@ -1,4 +1,4 @@
-"""Where solves end that cannot keep everything: bounds hold, and the squares of all other violations are least."""
+"""Ends of solves that cannot keep everything: bounds hold, and the squares of all other violations are least."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ BEHIND = [InteriorPoint(), SQP(), SQP(hessian="exact"), AugmentedLagrangian()]
 @pytest.mark.parametrize("solver", BEHIND, ids=["ipm", "sqp", "sqp-exact", "alm"])
 @pytest.mark.parametrize("count", [15, 20, 25])
 def test_a_hard_goal_past_a_disc_dead_ahead_is_reached(solver: fg.Solver, count: int) -> None:
-    """By symmetry every step goes through the disc, to a saddle of the violation, which is none of its minima."""
+    """Steps all go through the disc by symmetry, to a saddle of the violation, which is none of its minima."""
     graph = fg.Graph()
     x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
     graph.fix(x[0], [0.0, 0.0, 0.0])

@@ -30,7 +30,7 @@ Message = dict[str, Any]
 
 
 def browser(live: Live, then: Callable[[Callable[[], Awaitable[Message]]], Awaitable[Any]], **headers: str) -> Any:
-    """What comes of listening, as a browser does."""
+    """Result of listening to the server as a browser does."""
 
     async def listen() -> Any:
         from tornado.httpclient import HTTPRequest
@@ -55,7 +55,7 @@ def browser(live: Live, then: Callable[[Callable[[], Awaitable[Message]]], Await
 
 
 def commands(message: Message) -> list[tuple[str, str]]:
-    """What a message asks of the viewer: kind and path below /meshcat/."""
+    """Commands to the viewer in a message: kind and path below /meshcat/."""
     plain = [umsgpack.unpackb(base64.b64decode(text)) for text in message["commands"]]
     return [(c["type"], c["path"].removeprefix("/meshcat/")) for c in plain if c["path"].startswith("/meshcat/")]
 

@@ -230,7 +230,7 @@ def test_one_failed_solve_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_rescued_tick_is_no_emergency_and_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the backend that was asked for fails for good, the second drives: nothing is lost but time."""
+    """Failure of the requested backend for good: the second drives, and nothing is lost but time."""
     episode = Episode(replace(CORRIDOR, solver="alm", seed=3))
     loop = episode.pilot.controller.loop
     failing = Failing(loop.warm, 10)

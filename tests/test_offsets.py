@@ -45,7 +45,7 @@ def drive_rounded(x: Array, y: Array, u: Array, centre: Array, r: Array) -> None
 
 @numba.njit  # type: ignore[untyped-decorator]
 def fly(x: Array, y: Array, u: Array, centre: Array, r: Array) -> None:
-    """Where y is seen from x, and a clearance that turns with y."""
+    """Residual of y as seen from x, and of a clearance that turns with y."""
     w, a, b, c = x[3], -x[4], -x[5], -x[6]
     px, py, pz = y[0] - x[0], y[1] - x[1], y[2] - x[2]
     cx, cy, cz = 2.0 * (b * pz - c * py), 2.0 * (c * px - a * pz), 2.0 * (a * py - b * px)
@@ -230,7 +230,7 @@ def test_a_moved_world_is_the_same_problem(asked: str) -> None:
 
 
 def test_the_gradient_of_a_logarithm_near_zero() -> None:
-    """Where four points at a step of 1e-4 are wrong by 2e-4, and two at a sixteenth of it by 2e-5."""
+    """Accuracy where four points at a step of 1e-4 are wrong by 2e-4, and two at a sixteenth of it by 2e-5."""
     x = np.array([[7e-4], [3e-3], [0.2], [5.0]])
     gradient, hessian, _ = gradient_and_hessian(lambda p: p[:, 0] * np.log(p[:, 0]), [x], [fg.Rn(1)])
     exact = 1.0 + np.log(x)

@@ -237,7 +237,7 @@ class Chain:
         self.graph.minimize(fg.difference, self.x[:-1], self.x[1:], sigma=SMOOTH)
 
     def apart(self, x: Array, y: Array) -> Array:
-        """What ``prior`` and ``difference`` are, on a group whatever its steps."""
+        """Value of ``prior`` and ``difference``, on a group whatever its steps."""
         leaves = fg.Product(m=self.manifold).components["m"].manifold
         if isinstance(leaves, fg.Product):
             parts = [

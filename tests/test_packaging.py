@@ -1,4 +1,4 @@
-"""What a user installs: the wheel built from the sdist holds everything, works, and adds only `unifg`."""
+"""Installation by a user: the wheel built from the sdist holds everything, works, and adds only `unifg`."""
 
 import os
 import re
@@ -223,7 +223,7 @@ def test_console_script(clean: Path) -> None:
 @pytest.mark.parametrize("installed", [False, True], ids=["not installed", "installed"])
 @pytest.mark.parametrize("links", ["text files", "missing"])
 def test_a_checkout_without_links_finds_its_side_folders(links: str, installed: bool, tmp_path: Path) -> None:
-    """Where Git or an archive makes no symbolic links, a checkout still imports everything."""
+    """Imports from a checkout work even where Git or an archive makes no symbolic links."""
     ignored = shutil.ignore_patterns("__pycache__", *SIDES)
     checkout = tmp_path / "checkout"
     shutil.copytree(CHECKOUT / "unifg", checkout / "unifg", ignore=ignored)

@@ -52,7 +52,7 @@ def web(group: LieGroup, seed: int, **options: Any) -> tuple[fg.Graph, dict[fg.F
 
 
 def both(program: Program, guess: dict[fg.Family, Array]) -> tuple[list[Array], list[Array]]:
-    """What a program says with and without loops of fixed size."""
+    """Linearizations of a program with and without loops of fixed size."""
     fields = program.arrays.fields
     kept = fields[:, PAIRED].copy()
     found = program.linearize(guess)

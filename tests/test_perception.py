@@ -1,4 +1,4 @@
-"""What lidar alone tells of obstacles that are not on the map: where they are and how they move."""
+"""Perception of obstacles that are not on the map, by lidar alone: their positions and their motion."""
 
 from __future__ import annotations
 

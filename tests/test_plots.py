@@ -92,7 +92,7 @@ def edges(figure: Figure) -> Array:
 
 
 def near(place: Array, places: list[tuple[float, float]]) -> int:
-    """Which of the places this one is."""
+    """Index of the place that equals this one."""
     away = np.abs(np.array(places) - place).max(axis=1)
     assert away.min() < 1e-9
     return int(away.argmin())

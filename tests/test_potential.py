@@ -34,7 +34,7 @@ def test_values_of_equation_9() -> None:
 
 
 def test_slope_jumps_at_both_thresholds_and_is_flat_inside() -> None:
-    """What the papers page warns of: corners, and no push below the lower threshold."""
+    """Slopes have the defects that the papers page warns of: corners, and no push below the lower threshold."""
     push = potential(disc_clearance)
     assert push.jacobian is not None
     steps = [-0.1, NEAR - 1e-6, NEAR + 1e-6, FAR - 1e-6, FAR + 1e-6]
@@ -55,7 +55,7 @@ def test_walls_push_towards_the_room() -> None:
 
 @pytest.mark.parametrize("vortex", [1.0, 0.4, -0.7])
 def test_vortex_is_tangent_to_the_contours(vortex: float) -> None:
-    """What is added is perpendicular to the gradient, ``vortex`` times as long, counter-clockwise when positive."""
+    """Vectors of a vortex: perpendicular to the gradient, ``vortex`` times as long, counter-clockwise if positive."""
     angle = np.linspace(-3.0, 3.0, 13)
     x = np.stack([0.6 * np.cos(angle), 0.6 * np.sin(angle), 2.0 * angle], axis=1)
     push = potential(disc_clearance, vortex=vortex)

@@ -152,7 +152,7 @@ def test_a_rehearsal_that_fails_fails_nothing() -> None:
 
 
 def said(source: str, *words: str) -> object:
-    """What a script prints, of which only the last line counts."""
+    """Last line that a script prints, decoded from JSON."""
     done = subprocess.run(
         [sys.executable, "-c", source, *words], cwd=CHECKOUT, capture_output=True, text=True, check=False
     )

@@ -164,7 +164,7 @@ def _values(solution: fg.Solution) -> dict[str, Array]:
 
 
 def snapshot(graph: fg.Graph, guess: Guess) -> Any:
-    """What a solve must not change."""
+    """Copies of what a solve must not change."""
     limits = [(term.name, term.count, repr(getattr(term, "lower", None))) for term in graph.terms]
     return limits, list(graph.families), {family: array.copy() for family, array in guess.items()}
 

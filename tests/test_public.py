@@ -1,4 +1,4 @@
-"""What is public: the names of unifg, and whatever the documentation imports."""
+"""Public names: the names of unifg, and whatever the documentation imports."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_help_speaks_of_the_residual_and_not_of_its_class() -> None:
     assert all(word in between for word in ("Log(measured^-1 x^-1 y)", "Args:", "(n, storage)", "m, m, rad", "Raises:"))
 
     def mine(x: object, y: object) -> object:
-        """How far the ball is from the bat [m]."""
+        """Distance of the ball from the bat [m]."""
         return x
 
     assert "from the bat" in pydoc.render_doc(fg.residual(mine))  # type: ignore[arg-type]

@@ -33,7 +33,7 @@ def test_solves_by_name(name: str, problem: Problem) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_named_solver_does_the_work(name: str) -> None:
-    """By itself, without ours behind it, beside a disc; and on bounds alone, where signs show."""
+    """Solve with the named solver alone, without ours behind it, beside a disc; on bounds alone, where signs show."""
     graph, guess = short_drive()
     solution = SQP(qp=name, fallback=None).solve(graph, guess)
     assert solution.converged, solution.report()

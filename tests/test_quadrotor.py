@@ -249,7 +249,7 @@ def test_dynamics_is_disturbed_dynamics_without_noise() -> None:
 
 
 def slope(column: int, x: Array, u: Array) -> Array:
-    """How the defects of a flight react to one argument, one number per row."""
+    """Derivatives of the defects of a flight by one argument, one row per defect."""
     assert quadrotor.disturbed_dynamics.jacobian is not None
     given = x[:-1], u, np.zeros((len(u), 6)), *spread(REAL, len(u)), x[1:]
     return np.asarray(quadrotor.disturbed_dynamics.jacobian(*given, 0.05)[column]).reshape(len(u) * 9, -1)

@@ -198,7 +198,7 @@ class Told:
         self.controller = Controller(TARGET, WALLS, settings=replace(SETTINGS, **changes), bounds=BOUNDS)
 
     def judge(self, controls: Array, present: Array, *, defect: float = 0.0, discs: Landmarks | None = None) -> Any:
-        """What is flown for such an answer of the solver, whose states are off by ``defect`` [m] at the end."""
+        """Decision on such an answer of the solver, whose states are off by ``defect`` [m] at the end."""
         c, s = self.controller, self.controller.settings
         states = quadrotor.rollout(present, controls, s.dt, quadrotor.Parameters())
         states[-1, 0] += defect

@@ -55,7 +55,7 @@ class Past:
         return joint_controller(self.estimator, self.layout, solver, settings, joint)
 
     def pulled(self, believed: Belief) -> dict[str, Array]:
-        """How far a belief is from what the past says, in standard deviations."""
+        """Deviation of a belief from that of the past, in standard deviations."""
         past = self.belief
         known = past.parameters_sigma > 0.0
         sigma = np.sqrt(np.diagonal(past.landmarks.covariances, axis1=1, axis2=2))
@@ -86,7 +86,7 @@ def compilations(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
 
 
 def latest(controller: Controller) -> Belief:
-    """What the last joint solve says."""
+    """Belief of the last joint solve."""
     assert isinstance(controller.past, SharedFlight)
     return controller.past.latest
 

@@ -318,7 +318,7 @@ def test_tracks_find_velocities(association: str) -> None:
 
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])
 def test_a_gust_is_no_motion_of_the_vehicle(coupling: str) -> None:
-    """What pushes and is felt does not bend the velocity that is believed."""
+    """Gusts that push and are felt do not bend the believed velocity."""
     log = run_flight(short(2.0, coupling=coupling, faults=(Fault("gust", 0.5, 1.5),)))
     assert "a gust pushes" in log.causes
     assert np.abs(log.believed[:, 7:9] - log.truth[:, 7:9]).max() < 0.3
@@ -366,7 +366,7 @@ def test_what_turns_out_to_move_leaves_the_map() -> None:
 
 
 def chosen(*words: str) -> FlightSettings:
-    """What the command line makes of the scenario's own words."""
+    """Settings that the command line makes of the scenario's own words."""
     parser = argparse.ArgumentParser()
     add_options(parser, FlightSettings)
     return settings_of(FlightSettings, parser.parse_args(["--seed", "7", *words]), solver="sqp")

@@ -141,7 +141,7 @@ def test_pure_pursuit_waits_before_a_disc_on_its_arc() -> None:
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_mover_that_will_have_gone_is_no_hindrance_and_one_that_comes_is(name: str) -> None:
-    """What crosses is met where it will be, not where it is."""
+    """Clearance from crossing movers is that from their future positions, not from their present ones."""
     now = Situation(START, np.zeros(2), straight(START), discs((3.0, 2.0, 0.2), velocity=(0.0, 1.0)), hall(), SETTINGS)
     ahead = np.array([[3.0, 2.0]])
     assert now.clearance(ahead, 0.0)[0] < 0.0 < now.clearance(ahead, 1.0)[0]
@@ -157,7 +157,7 @@ def test_a_robot_too_near_may_leave_but_not_come_nearer() -> None:
 
 
 def test_an_uncertain_robot_keeps_farther_off() -> None:
-    """By as many standard deviations as the controller, of the axis that is known least."""
+    """Margin of as many standard deviations as the controller's, of the axis that is known least."""
     heard: list[float] = []
 
     class Noting(PurePursuit):

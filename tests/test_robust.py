@@ -278,7 +278,7 @@ def test_right_closures_left_out_by_drift_are_taken_back(seed: int) -> None:
 
 
 def test_what_a_measurement_would_be_without_itself() -> None:
-    """By how much the cost falls, and the residual left, when one closure after the other is taken out for real."""
+    """Decrease of the cost, and the residual left, when one closure after the other is actually removed."""
     sim = manhattan(60, seed=3)
     pose_graph = sim.pose_graph.with_poses(sim.truth)
     graph, _, guess = pose_graph.graph(robust=fg.TruncatedLeastSquares(50.0))

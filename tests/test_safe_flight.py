@@ -102,7 +102,7 @@ def test_errors_of_the_attitude_are_turned_back(axis: tuple[float, float, float]
 
 
 def weighed(seconds: float, noise: float, truth: quadrotor.Parameters) -> Weighing:
-    """What the past says after flying an eight blindly beside it."""
+    """Weighing that observed an eight flown without use of its results."""
     books = Airframe()
     plant, model = (
         BodyRatePlant(

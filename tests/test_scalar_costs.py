@@ -153,7 +153,7 @@ def test_every_backend_that_takes_them_agrees() -> None:
 
 
 def test_a_trial_leaves_the_present_iterate_alone() -> None:
-    """What a rejected step has found must not come into the next direction."""
+    """Results of a rejected step must not enter the next direction."""
     graph, guess = repelled("trace")
     p = graph.families["p"]
     graph.minimize(fg.prior, p, np.zeros(3), robust=fg.Cauchy(0.3), name="robust")

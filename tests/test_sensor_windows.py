@@ -209,7 +209,7 @@ def test_nothing_of_the_last_episode_comes_back() -> None:
 
 
 def test_a_sensor_serves_one_window_or_says_so() -> None:
-    """What has left with the nodes of one is gone for the other; windows that keep step may share."""
+    """Measurements that left with the nodes of one window are gone for another; windows in step may share."""
     sensor = fixes_of()
     ahead, behind, same = (
         Window(POINT, 3, [Dynamics(drift, H, sigma=0.01), sensor], start=np.zeros(2), sigma=0.2) for _ in range(3)

@@ -28,7 +28,7 @@ def twice(x):
 
 
 def module(path: Path, source: str) -> Any:
-    """What a file holds, imported anew under its own name."""
+    """Module held by a file, imported anew under its own name."""
     path.parent.mkdir(exist_ok=True)
     path.write_text(source, encoding="utf-8")
     spec = importlib.util.spec_from_file_location("doubling", path)
@@ -61,7 +61,7 @@ def archive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def first_use(tmp_path: Path, source: str = SOURCE, how: Callable[..., Any] = compiled) -> Tally:
-    """What a first use in a new folder, which has no cache, takes."""
+    """Tally of a first use in a new folder, which has no cache."""
     with counting() as counted:
         assert how(module(tmp_path / "here" / "doubling.py", source).twice)(3.0) == 6.0
     return counted

@@ -106,7 +106,7 @@ WEIGHTS: dict[str, Callable[[slice], dict[str, Any]]] = {
 
 
 def state_pose(statement: Any, x: Any, points: Any, k: int, residual: Any, weights: Any, robust: Any) -> None:
-    """What arrives with one pose: odometry, and what is seen of three points."""
+    """State the terms that arrive with one pose: odometry, and sightings of three points."""
     if k == 0:
         statement.minimize(fg.prior, x[0], POSES[0], sigma=0.01)
         statement.minimize(fg.prior, points[np.arange(3)], POINTS, sigma=0.5)
@@ -171,7 +171,7 @@ BODY = fg.Product(pose=fg.SE2, velocity=fg.Rn(2))
 
 
 def advance(pose: Array, velocity: Array, after: Array, dt: float) -> Array:
-    """Where a velocity of the body leads."""
+    """Deviation of the next pose from the one reached with a velocity of the body."""
     step = np.concatenate([dt * velocity, np.zeros((len(velocity), 1))], axis=1)
     return fg.SE2.local(fg.SE2.compose(pose, fg.SE2.exp(step)), after)
 

@@ -19,7 +19,7 @@ RATE, STEP, END, FIX = 100.0, 0.5, 120.0, 0.05
 
 
 class Flight(NamedTuple):
-    """What was true, and what sensors said.
+    """True states of a flight, and measurements of its sensors.
 
     Attributes:
         times: (n,) of the nodes [s].

@@ -39,7 +39,7 @@ IDS += ["kkt", "kkt-full", "kkt-lm", "penalty"]
 
 
 def takes(solver: fg.Solver, problem: Problem) -> bool:
-    """Which class of problem a backend claims."""
+    """Test whether a backend claims the class of a problem."""
     if isinstance(solver, SQP | InteriorPoint):
         return True
     if isinstance(solver, AugmentedLagrangian | Penalty):

@@ -1,4 +1,4 @@
-"""What SQP decides between subproblems: when violation alone counts, what a price is, which answers it takes."""
+"""Decisions of SQP between subproblems: when violation alone counts, what a price is, which answers it takes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What SQP does to make full steps good ones: the second-order correction, and the curvature a secant sees."""
+"""Corrections that make full steps of SQP good ones: the second-order correction, and the curvature a secant sees."""
 
 from __future__ import annotations
 

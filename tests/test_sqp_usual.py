@@ -24,7 +24,7 @@ from unifg.typing import Array
 
 @contextmanager
 def watched() -> Iterator[list[str]]:
-    """How iterations went: "taken", "answered" (by the subproblem, and no more) or "untouched"."""
+    """Record of iterations: "taken", "answered" (by the subproblem, and no more) or "untouched"."""
     went: list[str] = []
     take = UsualSubproblems.take
 
@@ -99,7 +99,7 @@ def test_a_point_that_cannot_be_evaluated_is_not_taken(correction: bool) -> None
 
 
 def test_an_answer_at_hand_is_not_found_twice() -> None:
-    """What is left to Python after the subproblem goes on from its answer."""
+    """Iterations left to Python after the subproblem go on from its answer."""
     solve, solved = GraphRoute.solve, []
 
     def counting(route: GraphRoute, *given: Any) -> Any:

@@ -202,7 +202,7 @@ def test_rows_for_each_factor_may_change(derivatives: Any) -> None:
 
 @pytest.mark.parametrize("derivatives", ["differences", "trace"])
 def test_a_term_may_be_straight_at_one_point_and_bent_at_another(derivatives: Any) -> None:
-    """What was straight is looked at again: a hinge that does not bite at the guess bends later."""
+    """Straight terms are examined again: a hinge that is inactive at the guess bends later."""
     graph = fg.Graph()
     x = graph.variables("x", fg.Rn(3), 4)
     hinge = fg.residual(lambda x: np.maximum(x[:, :1] - 1.0, 0.0) * x[:, 1:2], derivatives=derivatives)

@@ -522,7 +522,7 @@ def test_functions_of_one_factor_are_refused() -> None:
 
 @pytest.mark.parametrize("solver", [GaussNewton, LevenbergMarquardt])
 def test_untraceable_errors_still_work(solver: Callable[[], fg.Solver]) -> None:
-    """What branches on numbers is left to Python, empty slots among them."""
+    """Functions that branch on numbers are left to Python, empty slots among them."""
 
     def odd(x: Array, z: Array) -> Array:
         return x[:, :2] - z if float(z[0, 0]) < 1e9 else x[:, :2]

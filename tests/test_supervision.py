@@ -1,4 +1,4 @@
-"""What robots do when something is the matter: samples that are none, signals that get worse, faults in a drive."""
+"""Reactions of robots to trouble: invalid samples, signals that get worse, faults in a drive."""
 
 from __future__ import annotations
 
@@ -324,7 +324,7 @@ def building() -> tuple[Any, DistanceMap]:
 
 
 def searched(search: Relocaliser, sample: Scan) -> tuple[Found, int]:
-    """What a search finds, and in how many portions."""
+    """Result of a search, and the number of its portions."""
     search.begin(sample)
     for ticks in range(1, 1000):
         found = search.search()
@@ -530,7 +530,7 @@ def test_a_detector_that_sees_ghosts_is_not_followed() -> None:
 
 
 def test_the_watch_counts_what_the_vehicle_recognises_and_not_what_the_world_calls_it() -> None:
-    """Where association is unknown the names are those of its own tracks, and what has none is no stranger."""
+    """Names under unknown association are those of own tracks; a landmark without a track does not count as new."""
     watch, pilot = FlightWatch(0.05, SPREAD), LineTracker(association="unknown")
     for tick in range(12):  # the world's names change at every tick, the places do not
         seen = watch.admit(reading(ids=np.arange(3) + 100 * tick), 0.05 * tick, HOVERED, believed())

@@ -46,7 +46,7 @@ def test_what_is_not_installed_is_not_left_off_the_page(monkeypatch: pytest.Monk
 
 
 def test_packages_of_other_platforms_are_not_on_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whether colorama was listed depended on who else had installed it."""
+    """Regression test: the listing of colorama depended on which other package had installed it."""
     monkeypatch.setattr(licences, "stated", lambda: {"numpy": "unifg", "scipy": "unifg"})
     needs = {"scipy": ["numpy>=1", "colorama; sys_platform == 'beos'", "tqdm; extra == 'nice'"], "numpy": []}
     monkeypatch.setattr(metadata, "requires", needs.__getitem__)

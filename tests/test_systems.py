@@ -44,7 +44,7 @@ def analyses(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
 
 
 def advance(a: Array, b: Array) -> Array:
-    """How far the second pose is ahead of the first."""
+    """Distance of the second pose ahead of the first."""
     ahead: Array = b[:, :1] - a[:, :1]
     return ahead
 

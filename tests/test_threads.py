@@ -32,7 +32,7 @@ def restless() -> Iterator[None]:
 
 
 def at_once(work: Callable[[int], Any], threads: int = THREADS) -> list[Any]:
-    """What threads return, or raise, that begin together."""
+    """Results of threads that begin together: values returned, or exceptions raised."""
     begin, found = threading.Barrier(threads), [None] * threads
 
     def run(number: int) -> None:

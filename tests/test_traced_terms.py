@@ -42,7 +42,7 @@ def stated(function: Any, *arguments: Any, manifold: Any = None, count: int = N)
 
 
 def solved(function: Any, *arguments: Any, **options: Any) -> tuple[str, Array]:
-    """How the one term was evaluated after a solve, and the answer."""
+    """Route by which the one term was evaluated after a solve, and the answer."""
     graph, x = stated(function, *arguments, **options)
     start = np.tile(x.manifold.identity(), (x.count, 1))
     solution = GaussNewton().solve(graph, {x: x.manifold.retract(start, np.full((x.count, x.manifold.dim), 0.1))})
@@ -592,7 +592,7 @@ def from_offset(x: Array) -> Array:
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda thing: pickle.loads(pickle.dumps(thing))])
 def test_programs_with_traces_are_copied(copied: Function, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What they watch is watched still; a copy in another process finds its own names."""
+    """Names watched by a program are watched by its copies too; a copy in another process finds its own names."""
     graph, x = stated(from_offset)
     prepared = GaussNewton().prepare(graph)
     solution = prepared.solve({x: np.zeros((N, 3))})

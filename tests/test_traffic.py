@@ -56,7 +56,7 @@ def world(*things: Person | Cart | Door, start: tuple[float, float, float] = (1.
 
 
 def to_and_fro(speed: float, length: float, time: Array) -> Array:
-    """How far from its beginning something is."""
+    """Distance of something from its beginning."""
     along: Array = length - np.abs((speed * time) % (2.0 * length) - length)
     return along
 

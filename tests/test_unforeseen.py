@@ -57,7 +57,7 @@ def sweep(obstacle: Obstacle, count: int = 60) -> Array:
 
 
 def joined(occupancy: OccupancyMap, start: Array, goals: Array, discs: list[Array], clearance: float) -> bool:
-    """Whether a disc gets from start to every goal: a flood fill of its own. For maps without yaw."""
+    """Test whether a disc gets from start to every goal: a flood fill of its own. For maps without yaw."""
     # Half a cell's diagonal of slack: the grid is not to forbid what the continuum allows.
     least = clearance - 0.036
     room = field(occupancy).values >= least
@@ -115,7 +115,7 @@ def test_promises_hold_over_many_seeds() -> None:
 
 
 def test_narrow_doors_are_left_open() -> None:
-    """Where a door lets nothing pass beside an obstacle, no obstacle stands in it."""
+    """Doors that let nothing pass beside an obstacle get no obstacle."""
     occupancy = floor(door=0.8)
     path = route(occupancy, START, GOALS)
     for seed in range(10):

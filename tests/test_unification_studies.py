@@ -1,4 +1,4 @@
-"""What the studies of unification count, and that each still measures."""
+"""Counts of the studies of unification, and a test that each study still measures."""
 
 from __future__ import annotations
 

@@ -179,7 +179,7 @@ def test_where_nothing_is_traced_nothing_is_left_unchecked() -> None:
 
 @pytest.mark.parametrize("prepared_by", ["prepare", "bound"])
 def test_a_fault_that_begins_to_matter_late_is_found(wrong_above: Function, prepared_by: str) -> None:
-    """Where a comparison comes out otherwise, the answer is verified at once; else within a hundred solves."""
+    """Answers are verified at once where a comparison comes out otherwise; else within a hundred solves."""
     wrong_above(1.2)
     graph, x, target = stated(lambda x: np.tanh(x), constrained=False)
     solver = GaussNewton()

@@ -6,7 +6,7 @@ FILES, HAND_OVERS = 48, 168  # four look at a term, sixteen at the guess; two tu
 
 
 def spelled(walk: Walk) -> str:
-    """What to look at when the numbers grow."""
+    """Message for the case that the numbers grow: calls by count, the most frequent first."""
     return "\n".join(f"{count} {' '.join(call)}" for call, count in walk.calls.most_common())
 
 

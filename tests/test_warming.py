@@ -16,7 +16,7 @@ from unifg.scenarios.commands import warm
 
 @pytest.fixture
 def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What has been done by jobs that leave one file in a cache of their own."""
+    """List of the jobs done, each of which leaves one file in a cache of its own."""
     monkeypatch.setattr(warming, "folder_of", lambda function: tmp_path / "cache")
     return []
 

@@ -1,4 +1,4 @@
-"""What users write, for type checkers: `make types` finds no fault in it, and no test runs it."""
+"""Idioms of users, for type checkers: `make types` finds no fault in it, and no test runs it."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def worked() -> dict[str, Any]:
-    """What the README's script leaves behind."""
+    """Variables that the README's script leaves behind."""
     scope: dict[str, Any] = {}
     for block in fences(CHECKOUT / "README.md"):
         if block.language == "python":
@@ -322,7 +322,7 @@ def discs(ax: Axes, log: EpisodeLog, tick: int) -> None:
 
 
 def limits(log: EpisodeLog, axis: int) -> tuple[float, float]:
-    """What is occupied, with a little room."""
+    """Limits of the occupied area along an axis, with a margin of 0.3 m."""
     cells = np.argwhere(log.occupancy.occupied)[:, ::-1]
     corners = log.occupancy.grid_to_world(np.stack([cells.min(axis=0), cells.max(axis=0) + 1]).astype(np.float64))
     return float(corners[0, axis] - 0.3), float(corners[1, axis] + 0.3)
@@ -380,7 +380,7 @@ def bayes_tree() -> Any:
 
 
 def _places(parent: IntArray) -> dict[int, Point]:
-    """Where to draw the nodes of a tree: leaves side by side, parents above the middle of their children."""
+    """Positions of the nodes of a tree: leaves side by side, parents above the middle of their children."""
     children: dict[int, list[int]] = {s: [] for s in range(-1, len(parent))}
     for s in range(len(parent)):
         children[int(parent[s])].append(s)

@@ -81,7 +81,7 @@ def step(ax: Any, start: Point, end: Point, rho: Point, *, past: bool) -> None:
 
 
 def line(ax: Any, start: Point, end: Point) -> None:
-    """What is like its neighbours."""
+    """Draw a line for a step that is like its neighbours."""
     ax.plot([start[0], end[0]], [start[1], end[1]], color="#666666", lw=1.2, zorder=1)
 
 

@@ -76,7 +76,7 @@ def closure() -> dict[str, str]:
 
 
 def licence(name: str) -> str:
-    """What the metadata of a package say: the expression, the classifier, the first words of the field."""
+    """Licence in the metadata of a package: the expression, the classifier, the first words of the field."""
     about = metadata.metadata(name)
     if "License-Expression" in about:
         return str(about["License-Expression"])

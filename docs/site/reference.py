@@ -65,19 +65,19 @@ def public() -> dict[str, list[str]]:
 
 
 def folder(module: str) -> Path:
-    """Where the files of a package are."""
+    """Path of a package's folder, or of a module without its suffix."""
     return CHECKOUT.joinpath(*module.split("."))
 
 
 @cache
 def tree_of(module: str) -> ast.Module:
-    """What a module says."""
+    """Syntax tree of a module."""
     path = folder(module)
     return ast.parse((path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text())
 
 
 def names_of(module: str) -> list[str]:
-    """What a module lists, or the public names that it defines."""
+    """Names that a module lists, or the public names that it defines."""
     tree = tree_of(module)
     for node in tree.body:
         if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
@@ -95,7 +95,7 @@ def summary(module: str) -> str:
 
 
 def entry(module: str, name: str) -> str:
-    """What the reference says of a name: its docstring, or the text that a residual was given for ``help``."""
+    """Entry of a name in the reference: its docstring, or the text that a residual was given for ``help``."""
     text = told(module, name)
     return f"::: {module}.{name}\n" if text is None else f"## {name}\n\n{_markdown(text)}\n"
 
@@ -150,5 +150,5 @@ def _markdown(text: str) -> str:
 
 
 def _item(line: str) -> bool:
-    """Whether a line begins the description of an argument."""
+    """Test whether a line begins the description of an argument."""
     return line.startswith("    ") and not line.startswith("     ") and ":" in line

@@ -174,7 +174,7 @@ def clear(x: Array, centre: Array, radius: Array, margin: Array) -> Array:
 
 
 def beyond(x: Array, place: Array, within: Array) -> Array:
-    """By how much poses are farther from a place than they may be: (n, 1) [m]."""
+    """Excess of the distance of poses from a place over the permitted one: (n, 1) [m]."""
     offset = x[:, :2] - place
     distance: Array = np.sqrt(np.sum(offset * offset, axis=1) + uncertainty.NEAR**2)
     return distance[:, None] - within[:, None]

@@ -40,7 +40,7 @@ UNQUALIFIED_COST = 1e-2
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a backend made of a problem.
+    """Result of a backend on a problem.
 
     Attributes:
         verdict: "optimum" (the known one), "other" (a KKT point listed with the problem), "degenerate" (said so at an
@@ -56,7 +56,7 @@ class Outcome:
 
     @property
     def right(self) -> bool:
-        """Whether the backend did what can be asked of it."""
+        """True if the backend did what can be asked of it."""
         return self.verdict in RIGHT
 
 

@@ -184,7 +184,7 @@ class Problem(ABC):
 
 
 class Formulated(Protocol):
-    """What can be stated as a factor graph: a problem, or one way to state it."""
+    """Interface of anything that can be stated as a factor graph: a problem, or one way to state it."""
 
     def formulation(self) -> Stated:
         """As a factor graph."""

@@ -63,7 +63,7 @@ class Case:
 
     @property
     def feasible(self) -> bool:
-        """Whether an answer exists."""
+        """True if an answer exists."""
         return not math.isnan(self.best)
 
     def build(self) -> tuple[fg.Graph, dict[fg.Family, Array]]:

@@ -42,7 +42,7 @@ class LieCase:
 
     @property
     def feasible(self) -> bool:
-        """Whether an answer exists."""
+        """True if an answer exists."""
         return not math.isnan(self.best)
 
     def build(self) -> Built:

@@ -99,7 +99,7 @@ class Row:
 
     @property
     def same(self) -> bool:
-        """Whether moving the world changed nothing."""
+        """True if moving the world changed nothing."""
         asked = len(self.status) - ("rounded" in self.case)
         counts = max(abs(count - self.iterations[0]) for count in self.iterations[:asked])
         return len(set(self.status[:asked])) == 1 and counts <= ITERATIONS and max(self.apart) <= SAME
@@ -209,7 +209,7 @@ def clear_batch(x: Array, centre: Array, radius: Array) -> Array:
 
 @dataclass(frozen=True)
 class Space:
-    """Where a state lives, and who moves it.
+    """State space of a vehicle, with its motion and its clearance.
 
     Attributes:
         manifold: of a state.

@@ -173,7 +173,7 @@ class Twin:
         return [ca.SX(exact(*(self._argument(a, k) for a in arguments))) for k in range(count)]
 
     def _argument(self, argument: Any, factor: int) -> Any:
-        """What the factor sees: a column of a variable, its row of a two-axis constant, any other constant whole."""
+        """Argument of one factor: a column of a variable, its row of a two-axis constant, any other constant whole."""
         if is_variable(argument):
             selection = as_selection(argument)
             index = int(selection.indices[factor if len(selection) > 1 else 0])
