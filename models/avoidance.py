@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from unifg.errors import GraphError, ModelError
 from unifg.kernels.kernel import Kernel
 from unifg.kernels.residuals import Residual, residual
 from unifg.lie import Rn
-from unifg.machine.jit import compiled
+from unifg.machine.jit import compiled, inlined
 from unifg.models.profile import of_distance
 from unifg.typing import Array
 
@@ -36,27 +37,31 @@ __all__ = [
     "sphere_clearance",
 ]
 
+Towards: TypeAlias = tuple[float, float, float, bool]
+
 NEAR = 1e-9  # below this distance the direction is undefined; gradient and curvature are taken as zero
 
 
-@compiled
-def _direction(x: float, y: float) -> tuple[float, float, float]:
-    """Return length and direction of a vector in the plane."""
-    distance = math.sqrt(x * x + y * y)
-    per = 1.0 / max(distance, NEAR)
-    return distance, per * x, per * y
+@inlined
+def _length(x: float, y: float, z: float) -> float:
+    return math.sqrt(x * x + y * y + z * z)
 
 
 @compiled
-def _bend(distance: float, x: float, y: float, weight: float, S: Array) -> None:
-    """Add to the first 2 by 2 entries the Hessian of a weighted distance, given its direction."""
-    if distance < NEAR:
+def _bend(x: float, y: float, z: float, space: bool, weight: float, S: Array) -> None:
+    """Add to the upper triangle of S the Hessian of the weighted length of a vector, in the plane or in space."""
+    square = x * x + y * y + z * z
+    length = math.sqrt(square)
+    if length < NEAR:
         return
-    scale = weight / distance
-    S[0, 0] += scale * y * y
+    scale = weight / (square * length)
+    S[0, 0] += scale * (y * y + z * z)
     S[0, 1] -= scale * x * y
-    S[1, 0] -= scale * x * y
-    S[1, 1] += scale * x * x
+    S[1, 1] += scale * (x * x + z * z)
+    if space:
+        S[0, 2] -= scale * x * z
+        S[1, 2] -= scale * y * z
+        S[2, 2] += scale * (x * x + y * y)
 
 
 @compiled
@@ -66,26 +71,50 @@ def _clear(S: Array) -> None:
             S[i, k] = 0.0
 
 
+def _clearance(
+    name: str, towards: Callable[..., Towards], space: bool, shape: tuple[int, ...], rows: Callable[..., int]
+) -> Kernel:
+    """Distance of a position to many things, less a margin for each.
+
+    Args:
+        name: for messages.
+        towards: compiled; of position, parameters and the number of a thing, the vector from its nearest point to the
+            position, and whether that point stays where it is as the position moves.
+        space: whether things stand in space; in the ground plane the vector has no third entry.
+        shape: of the numbers that stand for a thing; margins come after all things.
+        rows: from the shapes of both to the number of things.
+    """
+    width = math.prod(shape)
+
+    @compiled
+    def first(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+        count = len(r)
+        for k in range(count):
+            x, y, z, _ = towards(v, p, k)
+            length = _length(x, y, z)
+            r[k] = length - p[width * count + k]
+            if len(J):
+                per = 1.0 / max(length, NEAR)
+                J[k, 0], J[k, 1], J[k, 2] = per * x, per * y, per * z
+
+    @compiled
+    def second(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
+        _clear(S)
+        for k in range(len(w)):
+            x, y, z, fixed = towards(v, p, k)
+            if fixed:
+                _bend(x, y, z, space, w[k], S)
+        S[1, 0], S[2, 0], S[2, 1] = S[0, 1], S[0, 2], S[1, 2]
+
+    return Kernel(first, (Rn(3), 1 + len(shape), 1), rows, name=name, second=second)
+
+
 # ---------------------------------------------------------------- cylinders
 
 
-@compiled
-def _cylinder(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-    """Parameters: M centres, then M radii."""
-    count = len(r)
-    for k in range(count):
-        distance, x, y = _direction(v[0] - p[2 * k], v[1] - p[2 * k + 1])
-        r[k] = distance - p[2 * count + k]
-        if len(J):
-            J[k, 0], J[k, 1], J[k, 2] = x, y, 0.0
-
-
-@compiled
-def _cylinder_second(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
-    _clear(S)
-    for k in range(len(w)):
-        distance, x, y = _direction(v[0] - p[2 * k], v[1] - p[2 * k + 1])
-        _bend(distance, x, y, w[k], S)
+@inlined
+def _to_cylinder(v: Array, p: Array, k: int) -> Towards:
+    return v[0] - p[2 * k], v[1] - p[2 * k + 1], 0.0, True
 
 
 def _round(name: str, dimension: int) -> Callable[..., int]:
@@ -103,9 +132,7 @@ def _round(name: str, dimension: int) -> Callable[..., int]:
 
 
 cylinder_clearance = residual(
-    Kernel(
-        _cylinder, (Rn(3), 2, 1), _round("cylinder clearance", 2), name="cylinder clearance", second=_cylinder_second
-    ),
+    _clearance("cylinder clearance", _to_cylinder, False, (2,), _round("cylinder clearance", 2)),
     about="""``cylinder_clearance(p, centre, radius)``: |(p_x, p_y) - c| - radius [m], one column per cylinder, (n, M).
 
 p: (n, 3) positions. centre: (M, 2), or (n, M, 2) for moving ones. radius: (M,) or (n, M), with the vehicle's added.
@@ -118,17 +145,20 @@ p: (n, 3) positions. centre: (M, 2), or (n, M, 2) for moving ones. radius: (M,) 
 
 @compiled
 def _landmark(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-    distance, x, y = _direction(v[0] - v[3], v[1] - v[4])
-    r[0] = distance - p[0]
+    x, y = v[0] - v[3], v[1] - v[4]
+    length = _length(x, y, 0.0)
+    r[0] = length - p[0]
     if len(J):
+        per = 1.0 / max(length, NEAR)
+        x, y = per * x, per * y
         J[0, 0], J[0, 1], J[0, 2], J[0, 3], J[0, 4] = x, y, 0.0, -x, -y
 
 
 @compiled
 def _landmark_second(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
     _clear(S)
-    distance, x, y = _direction(v[0] - v[3], v[1] - v[4])
-    _bend(distance, x, y, w[0], S)
+    _bend(v[0] - v[3], v[1] - v[4], 0.0, False, w[0], S)
+    S[1, 0] = S[0, 1]
     for i in range(2):
         for k in range(2):
             S[3 + i, 3 + k] = S[i, k]
@@ -148,40 +178,17 @@ p: (n, 3) positions. l: (n, 2) centres of cylinders, variables of the map or con
 
 
 @compiled
-def _to_segment(v: Array, p: Array, k: int) -> tuple[float, float, bool]:
-    """Return the vector from the nearest point of segment k to the position, and whether that is an end of it."""
+def _to_segment(v: Array, p: Array, k: int) -> Towards:
     ax, ay, bx, by = p[4 * k], p[4 * k + 1], p[4 * k + 2], p[4 * k + 3]
     ex, ey, x, y = bx - ax, by - ay, v[0] - ax, v[1] - ay
     square = ex * ex + ey * ey
     along = ex * x + ey * y
     if not along > 0.0 or square == 0.0:
-        return x, y, True
+        return x, y, 0.0, True
     if along >= square:
-        return v[0] - bx, v[1] - by, True
+        return v[0] - bx, v[1] - by, 0.0, True
     across = (ex * y - ey * x) / square  # what is along the wall cancels without a remainder
-    return -across * ey, across * ex, False
-
-
-@compiled
-def _segment(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-    """Parameters: W segments, then W margins."""
-    count = len(r)
-    for k in range(count):
-        dx, dy, _ = _to_segment(v, p, k)
-        distance, x, y = _direction(dx, dy)
-        r[k] = distance - p[4 * count + k]
-        if len(J):
-            J[k, 0], J[k, 1], J[k, 2] = x, y, 0.0
-
-
-@compiled
-def _segment_second(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
-    _clear(S)
-    for k in range(len(w)):
-        dx, dy, end = _to_segment(v, p, k)
-        if end:
-            distance, x, y = _direction(dx, dy)
-            _bend(distance, x, y, w[k], S)
+    return -across * ey, across * ex, 0.0, False
 
 
 def _segments(segments: tuple[int, ...], margin: tuple[int, ...]) -> int:
@@ -194,7 +201,7 @@ def _segments(segments: tuple[int, ...], margin: tuple[int, ...]) -> int:
 
 
 segment_clearance = residual(
-    Kernel(_segment, (Rn(3), 3, 1), _segments, name="segment clearance", second=_segment_second),
+    _clearance("segment clearance", _to_segment, False, (2, 2), _segments),
     about="""
 ``segment_clearance(p, segments, margin)``: distance to walls less a margin [m], one column per wall, (n, W).
 
@@ -207,39 +214,13 @@ no sign: a wall holds between nodes only if no step is longer than twice the mar
 # ---------------------------------------------------------------- spheres
 
 
-@compiled
-def _sphere(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-    """Parameters: M centres, then M radii."""
-    count = len(r)
-    for k in range(count):
-        x, y, z = v[0] - p[3 * k], v[1] - p[3 * k + 1], v[2] - p[3 * k + 2]
-        distance = math.sqrt(x * x + y * y + z * z)
-        r[k] = distance - p[3 * count + k]
-        if len(J):
-            per = 1.0 / max(distance, NEAR)
-            J[k, 0], J[k, 1], J[k, 2] = per * x, per * y, per * z
-
-
-@compiled
-def _sphere_second(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
-    _clear(S)
-    for j in range(len(w)):
-        x, y, z = v[0] - p[3 * j], v[1] - p[3 * j + 1], v[2] - p[3 * j + 2]
-        distance = math.sqrt(x * x + y * y + z * z)
-        if distance < NEAR:
-            continue
-        x, y, z, scale = x / distance, y / distance, z / distance, w[j] / distance
-        S[0, 0] += scale * (1.0 - x * x)
-        S[0, 1] -= scale * x * y
-        S[0, 2] -= scale * x * z
-        S[1, 1] += scale * (1.0 - y * y)
-        S[1, 2] -= scale * y * z
-        S[2, 2] += scale * (1.0 - z * z)
-    S[1, 0], S[2, 0], S[2, 1] = S[0, 1], S[0, 2], S[1, 2]
+@inlined
+def _to_sphere(v: Array, p: Array, k: int) -> Towards:
+    return v[0] - p[3 * k], v[1] - p[3 * k + 1], v[2] - p[3 * k + 2], True
 
 
 sphere_clearance = residual(
-    Kernel(_sphere, (Rn(3), 2, 1), _round("sphere clearance", 3), name="sphere clearance", second=_sphere_second),
+    _clearance("sphere clearance", _to_sphere, True, (3,), _round("sphere clearance", 3)),
     about="""
 ``sphere_clearance(p, centre, radius)``: |p - c| - radius [m] in space, (n, M), for centres (M, 3), radii (M,).""",
 )

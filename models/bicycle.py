@@ -19,7 +19,7 @@ import numpy as np
 from unifg.kernels.residuals import Residual
 from unifg.lie import SE2, Product, Rn
 from unifg.models import rkmk
-from unifg.models.rkmk_batch import Field
+from unifg.models.rkmk import Field
 from unifg.typing import Array
 
 STATE = Product(pose=SE2, speed=Rn(1))

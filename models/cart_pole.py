@@ -17,7 +17,7 @@ import numpy as np
 from unifg.kernels.residuals import Residual
 from unifg.lie import SO2, Product, Rn
 from unifg.models import rkmk
-from unifg.models.rkmk_batch import Field
+from unifg.models.rkmk import Field
 from unifg.typing import Array
 
 STATE = Product(cart=Rn(1), pole=SO2, rates=Rn(2))

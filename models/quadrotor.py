@@ -28,7 +28,7 @@ from unifg.kernels.residuals import residual
 from unifg.lie import SO3, Product, Rn
 from unifg.models import quadrotor_dynamics, quadrotor_second
 from unifg.models.quadrotor_dynamics import GRAVITY
-from unifg.models.rkmk_batch import alike
+from unifg.models.rkmk import alike
 from unifg.typing import Array, ArrayLike
 
 __all__ = [

@@ -27,29 +27,28 @@ trapezoid's own error: both are of second order. All methods are exact where F d
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from unifg.errors import ModelError, UnifgError
 from unifg.kernels.derive.derived import DerivedKernel, derived
 from unifg.kernels.derive.reach import reach_of
-from unifg.kernels.derive.rows import Each, Given
+from unifg.kernels.derive.rows import Each
 from unifg.kernels.derive.symbols import TraceError
+from unifg.kernels.differences import jacobian
 from unifg.kernels.residuals import Residual, residual
-from unifg.lie import LieGroup, Rn
+from unifg.lie import LieGroup
 from unifg.lie.functions import functions_of
 from unifg.machine.calls import RETRACTION, address, call_residual, call_retraction, vector
 from unifg.machine.jit import compiled
-from unifg.models.compiled_field import CompiledField
-from unifg.models.rkmk_batch import Field, FieldJacobian, StepJacobian, step_defect, travel
 from unifg.models.tableau import METHODS, Tableau
 from unifg.typing import Array, ArrayLike
 
-logger = logging.getLogger("unifg")
+Field: TypeAlias = Callable[..., Array]
+Rows: TypeAlias = Sequence[Sequence[float]]
 Form: TypeAlias = Literal["full", "simplified"]
 Method: TypeAlias = (
     Literal[
@@ -63,14 +62,13 @@ Method: TypeAlias = (
     ]
     | Tableau
 )
+WEIGHT, END, FLAT, BEFORE = 0, 1, 2, 3  # columns of Tableau.rows
 FEW = 100  # steps that a simulation takes in NumPy: machine code for its step costs more
 NEWTON_STEPS = 30
 ENOUGH = 1e-13  # of the last Newton step, relative to the state: what rounding leaves
 
 
-def integrator(
-    group: LieGroup, field: Field, method: Method = "full trapezoid", jacobian: FieldJacobian | None = None
-) -> Residual:
+def integrator(group: LieGroup, field: Field, method: Method = "full trapezoid") -> Residual:
     """``integrator(group, F)(x, u, x_next, h)``: defect xi - h Phi of one step, (n, dim).
 
     Use it with ``constrain(..., lower=0, upper=0)`` or, soft, with ``minimize``. A field of several inputs,
@@ -81,47 +79,31 @@ def integrator(
     Args:
         group: of the states x and x_next, (n, storage).
         field: F(x, u, ...), velocities in the body frame, (n, dim), for states (n, storage) and inputs (n, k). It is
-            traced with all stages; a :class:`CompiledField`, whose lengths are known, at once: a kernel.
+            traced with all stages; where it cannot be, the step is differenced.
         method: its name, or a :class:`Tableau` of your own.
-        jacobian: (n, dim, dim) and, for each input, (n, dim, k) derivatives of F along the right perturbation of x and
-            along the input, where F cannot be traced; by differences when absent. A compiled field brings its own.
 
     Raises:
-        ModelError: on an unknown method, or a compiled field whose dimension is not that of the group.
+        ModelError: on an unknown method.
     """
     tableau = _tableau(method)
-    if isinstance(field, CompiledField):
-        if field.dim != group.dim:
-            raise ModelError(f"{tableau.name}: the field has {field.dim} velocities, {group.name} takes {group.dim}")
-        if jacobian in (None, field.jacobian):
-            step = partial(step_defect, group, field.for_one(), tableau.numbers)
-            given: list[Given] = [group, *(Rn(length) for length in field.lengths), group, Each(())]
-            try:
-                return residual(derived(step, given, reach_of(step), name=tableau.name, limit=False))
-            except TraceError as error:
-                logger.info("%s: the field is not traced: %s", tableau.name, error)
-        jacobian = jacobian or (field.jacobian if field.derivative is not None else None)
-    blocks = StepJacobian(group, field, tableau.numbers, jacobian)
-    step = partial(step_defect, group, field, tableau.numbers)
-    return residual(step, blocks, tableau.name, derivatives="trace first")
+    return residual(partial(step_defect, group, field, tableau.numbers), name=tableau.name)
 
 
-def trapezoid(group: LieGroup, field: Field, form: Form = "full", jacobian: FieldJacobian | None = None) -> Residual:
+def trapezoid(group: LieGroup, field: Field, form: Form = "full") -> Residual:
     """``trapezoid(group, F)(x, u, x_next, h)``: :func:`integrator` with one of Ta's two trapezoids.
 
     Args:
         group: as there.
         field: as there.
         form: "full" with dexp_inv, "simplified" without; both of second order in the step h [s].
-        jacobian: as there.
 
     Raises:
-        ModelError: on an unknown form, or a compiled field whose dimension is not that of the group.
+        ModelError: on an unknown form.
     """
     if form == "full":
-        return integrator(group, field, "full trapezoid", jacobian)
+        return integrator(group, field, "full trapezoid")
     if form == "simplified":
-        return integrator(group, field, "simplified trapezoid", jacobian)
+        return integrator(group, field, "simplified trapezoid")
     raise ModelError(f"trapezoid: form must be 'full' or 'simplified', found {form!r}")
 
 
@@ -133,6 +115,72 @@ def _tableau(method: Method) -> Tableau:
     except KeyError:
         known = ", ".join(f"'{name}'" for name in METHODS)
         raise ModelError(f"method must be a Tableau or one of {known}; found {method!r}") from None
+
+
+# ---------------------------------------------------------------- one step
+
+
+def step_defect(group: LieGroup, field: Field, rows: Rows, x: Array, *rest: Any) -> Array:
+    """Xi - h Phi of (x, inputs, x_next, h), (n, dim).
+
+    Args:
+        group: of x and x_next.
+        field: F(x, inputs), (n, dim).
+        rows: of the method's :class:`~unifg.models.tableau.Tableau`.
+        x: (n, storage).
+        rest: inputs (n, k) each, x_next (n, storage), h one or (n,).
+    """
+    *inputs, after, step = rest
+    x, after, *inputs = alike(x, after, *inputs)
+    xi = group.local(x, after)
+    defect = xi
+    for part in _parts(group, field, rows, x, inputs, np.reshape(step, (-1, 1)), xi, after):
+        defect = defect - part
+    return defect
+
+
+def travel(group: LieGroup, field: Field, rows: Rows, x: Array, *rest: Any) -> Array:
+    """H Phi of (x, inputs, h), (n, dim), for an explicit method."""
+    *inputs, step = rest
+    x, *inputs = alike(x, *inputs)
+    total: Array = sum(_parts(group, field, rows, x, inputs, np.reshape(step, (-1, 1))))  # type: ignore[assignment]
+    return total
+
+
+def alike(*parts: Array) -> list[Array]:
+    """The same arrays, those of a single row repeated."""
+    count = max(len(part) for part in parts)
+    return [np.broadcast_to(part, (count, part.shape[1])) for part in parts]
+
+
+def _parts(
+    group: LieGroup,
+    field: Field,
+    rows: Rows,
+    x: Array,
+    inputs: Sequence[Array],
+    h: Array,
+    xi: Array | float = 0.0,
+    after: Array | None = None,
+) -> Iterator[Array]:
+    """H b k of every stage, (n, dim)."""
+    speeds: list[Array] = []
+    for row in rows:
+        before = row[BEFORE : BEFORE + len(speeds)]
+        inside = any(before) or row[END] not in (0.0, 1.0)
+        sigma = row[END] * xi + h * sum(a * k for a, k in zip(before, speeds, strict=True))
+        point = group.retract(x, sigma) if inside else after if row[END] else x
+        speed = field(point, *inputs)
+        if (inside or row[END]) and not row[FLAT]:
+            speed = times(group.right_jacobian_inverse(sigma), speed)
+        speeds.append(speed)
+        yield h * row[WEIGHT] * speed
+
+
+def times(matrices: Array, vectors: Array) -> Array:
+    """(n, d) products of (n, d, d) matrices and (n, d) vectors."""
+    product: Array = np.einsum("nij,nj->ni", matrices, vectors)
+    return product
 
 
 # ---------------------------------------------------------------- simulation
@@ -153,9 +201,9 @@ def advance(group: LieGroup, field: Field, x: Array, *inputs: Array, h: ArrayLik
 
     Raises:
         UnifgError: when Newton's method does not converge: the step is too long.
-        ModelError: on an unknown method, or a field or inputs that do not fit.
+        ModelError: on an unknown method.
     """
-    return _advance(group, field, integrator(group, field, method), _tableau(method), x, inputs, h)
+    return _advance(group, field, _tableau(method), x, inputs, h)
 
 
 def rollout(
@@ -182,7 +230,7 @@ def rollout(
 
     Raises:
         UnifgError: when Newton's method does not converge in a step of an implicit method.
-        ModelError: on an unknown method, or a field or inputs that do not fit.
+        ModelError: on an unknown method.
     """
     tableau = _tableau(method)
     parts = [np.atleast_2d(np.asarray(part, dtype=np.float64)) for part in inputs]
@@ -197,11 +245,10 @@ def rollout(
         u = np.concatenate([*parts, np.empty((count, 0))], axis=1)
         _follow(code, retraction, u, h / substeps, substeps, np.empty(group.dim), states)
         return states
-    defect = integrator(group, field, method)
     for n in range(count):
         x, held = states[n : n + 1], [part[n : n + 1] for part in parts]
         for _ in range(substeps):
-            x = _advance(group, field, defect, tableau, x, held, h / substeps)
+            x = _advance(group, field, tableau, x, held, h / substeps)
         states[n + 1] = x[0]
     return states
 
@@ -210,10 +257,10 @@ def _stepping(
     group: LieGroup, field: Field, tableau: Tableau, start: Array, inputs: Sequence[Array], h: float
 ) -> DerivedKernel | None:
     """An explicit step as a kernel; None where its field cannot be traced."""
-    step = partial(travel, group, field.for_one() if isinstance(field, CompiledField) else field, tableau.numbers)
+    step = partial(travel, group, field, tableau.numbers)
     first = [start[None], *(part[:1] for part in inputs), np.array([h])]
     reach = reach_of(step)
-    if reach.refusal and not isinstance(field, CompiledField):
+    if reach.refusal:
         return None
     try:
         kernel = derived(step, [Each(part.shape[1:]) for part in first], reach, name=tableau.name)
@@ -240,26 +287,21 @@ def _follow(where: int, retraction: int, u: Array, h: float, substeps: int, move
         states[n + 1] = x
 
 
-def _advance(
-    group: LieGroup,
-    field: Field,
-    defect: Residual,
-    tableau: Tableau,
-    x: Array,
-    inputs: Sequence[Array],
-    h: ArrayLike,
-) -> Array:
+def _advance(group: LieGroup, field: Field, tableau: Tableau, x: Array, inputs: Sequence[Array], h: ArrayLike) -> Array:
     """Solve for the end of the step."""
     count = max(len(part) for part in (x, *inputs))
     x = np.array(np.broadcast_to(x, (count, x.shape[1])), dtype=np.float64)
     if tableau.explicit:
         return group.retract(x, travel(group, field, tableau.numbers, x, *inputs, h))
-    assert defect.jacobian is not None
-    after, value = x, defect(x, *inputs, x, h)
+
+    def defect(end: Array) -> Array:
+        return step_defect(group, field, tableau.numbers, x, *inputs, end, h)
+
+    after, value = x, defect(x)
     for _ in range(NEWTON_STEPS):
-        move = np.linalg.solve(defect.jacobian(x, *inputs, after, h)[-1], value[:, :, None])[:, :, 0]
+        move = np.linalg.solve(jacobian(defect, [after], [group])[0], value[:, :, None])[:, :, 0]
         after = group.retract(after, -move)
-        value = defect(x, *inputs, after, h)
+        value = defect(after)
         if np.abs(move).max() <= ENOUGH * (1.0 + np.abs(x).max()):
             return after
     raise UnifgError(

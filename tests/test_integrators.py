@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from moving import FLYER, Carried, compiled_carried, drag_and_thrust, with_held_rate
+from moving import FLYER, Carried, drag_and_thrust, with_held_rate
 from unifg.kernels.differences import jacobian
 from unifg.lie import so3
 from unifg.lie.functions import functions_of
 from unifg.models import rkmk
 from unifg.models.rkmk import Method
-from unifg.models.rkmk_batch import StepJacobian
 from unifg.models.tableau import METHODS, Tableau
 from unifg.typing import Array
 
@@ -34,7 +33,7 @@ EVERY_METHOD = pytest.mark.parametrize("method", NAMES)
 @EVERY_GROUP
 def test_order_of_convergence(group: fg.LieGroup, method: Method) -> None:
     """Against the exact motion, at steps that halve."""
-    field, order = compiled_carried(group, True), METHODS[cast(str, method)].order
+    field, order = Carried(group), METHODS[cast(str, method)].order
     rng = np.random.default_rng(5)
     x, u, w = group.random(rng), rng.uniform(-0.9, 0.9, group.dim), rng.uniform(-0.9, 0.9, group.dim)
     exact = Carried(group).after(x[None], u[None], w[None], 0.5)[0]
@@ -114,7 +113,7 @@ def test_a_held_body_rate_makes_the_trapezoids_one() -> None:
 @pytest.mark.parametrize("method", ["explicit euler", "rk4"])
 @pytest.mark.parametrize("group", [fg.SO3, fg.SE3, GROUPS[3]], ids=lambda g: g.name)
 def test_a_long_way_stays_on_the_group(group: fg.LieGroup, method: Method) -> None:
-    field, turns = compiled_carried(group, True), 50_000
+    field, turns = Carried(group), 50_000
     u, w = np.full(group.dim, 0.3), np.linspace(-0.5, 0.5, group.dim)
     states = rkmk.rollout(group, field, group.random(RNG), u, w, h=0.05, method=method, count=turns)
     assert states.shape == (turns + 1, group.storage)
@@ -138,26 +137,18 @@ def step_of(group: fg.LieGroup, count: int = 6) -> tuple[list[Array], list[fg.Ma
 @pytest.mark.parametrize("method", [*NAMES, HEUN], ids=str)
 @EVERY_GROUP
 def test_jacobians(group: fg.LieGroup, method: Method) -> None:
-    """In NumPy and compiled, with and without the derivatives of F: against differences of the defect."""
+    """Traced in a graph: against differences of the defect."""
     points, manifolds = step_of(group)
-    field = Carried(group)
-    cases = {
-        "batched, differences": rkmk.integrator(group, field, method),
-        "batched": rkmk.integrator(group, field, method, field.derivative),
-        "compiled, differences": rkmk.integrator(group, compiled_carried(group, False), method),
-        "compiled": rkmk.integrator(group, compiled_carried(group, True), method),
-    }
-    exact = cases["batched"]
-    numerical = jacobian(lambda *p: exact(*p, 0.3), points, manifolds)
-    assert exact.jacobian is not None
-    blocks = exact.jacobian(*points, 0.3)
-    for case, defect in cases.items():
-        assert (defect.kernel is not None) == case.startswith("compiled")
-        assert defect.jacobian is not None
-        np.testing.assert_allclose(defect(*points, 0.3), exact(*points, 0.3), atol=1e-14 * 30, err_msg=case)
-        for block, found, reference in zip(defect.jacobian(*points, 0.3), blocks, numerical, strict=True):
-            np.testing.assert_allclose(block, reference, atol=1e-8, err_msg=case)
-            np.testing.assert_allclose(block, found, atol=1e-9 if "differences" in case else 1e-11, err_msg=case)
+    defect = rkmk.integrator(group, Carried(group), method)
+    numerical = np.concatenate(jacobian(lambda *p: defect(*p, 0.3), points, manifolds), axis=2)
+    graph = fg.Graph()
+    families = [graph.variables(f"x{k}", manifold, len(points[0])) for k, manifold in enumerate(manifolds)]
+    graph.minimize(defect, *families, 0.3)
+    program = graph.compile()
+    assert program.terms[0].route.endswith("derivatives exact")
+    lin = program.linearize(dict(zip(families, points, strict=True)))
+    np.testing.assert_allclose(lin.residual.reshape(-1, group.dim), defect(*points, 0.3), atol=1e-14 * 30)
+    np.testing.assert_allclose(lin.jacobian.reshape(numerical.shape), numerical, atol=1e-8)
 
 
 @pytest.mark.parametrize("group", [*GROUPS, fg.SO2, fg.Rn(2)], ids=lambda g: g.name)
@@ -165,14 +156,13 @@ def test_the_bend_of_dexp_inv(group: fg.LieGroup) -> None:
     """In closed form, against differences of fourth order; on both sides of where series take over."""
     functions = functions_of(group)
     assert functions is not None
-    differences = StepJacobian(group, Carried(group), METHODS["rk4"].numbers, None)
     for length in (0.0, 1e-3, 0.49, 0.51, 1.0, 3.0):
         tangent, velocity, found = RNG.normal(size=group.dim), RNG.normal(size=group.dim), np.empty((group.dim,) * 2)
         if group in (fg.SE2, fg.SO3, fg.SE3):
             turn = tangent[2:] if group == fg.SE2 else tangent[-3:]
             turn *= length / np.linalg.norm(turn)
         functions.bend(tangent, velocity, found)
-        np.testing.assert_allclose(found, differences._bend(tangent[None], velocity[None])[0], atol=2e-12)
+        np.testing.assert_allclose(found, fg.LieGroup.bend(group, tangent, velocity), atol=2e-12)
 
 
 def test_the_bend_is_in_the_algebra_over_dual_numbers() -> None:
@@ -189,12 +179,9 @@ def test_steps_may_differ_and_inputs_be_shared() -> None:
     group, field = fg.SE3, Carried(fg.SE3)
     (x, u, w, after), _ = step_of(group)
     h = RNG.uniform(0.1, 0.4, len(x))
-    for defect in (rkmk.integrator(group, field, "rk4"), rkmk.integrator(group, compiled_carried(group, True), "rk4")):
-        assert defect.jacobian is not None
-        together, blocks = defect(x, u, w[:1], after, h), defect.jacobian(x, u, w[:1], after, h)
-        for i in range(len(x)):
-            one = [part[i : i + 1] for part in (x, u)]
-            alone = defect(*one, w[:1], after[i : i + 1], float(h[i]))
-            np.testing.assert_allclose(together[i], alone[0], atol=1e-15)
-            for block, single in zip(blocks, defect.jacobian(*one, w[:1], after[i : i + 1], float(h[i])), strict=True):
-                np.testing.assert_allclose(block[i], single[0], atol=1e-14)
+    defect = rkmk.integrator(group, field, "rk4")
+    together = defect(x, u, w[:1], after, h)
+    for i in range(len(x)):
+        one = [part[i : i + 1] for part in (x, u)]
+        alone = defect(*one, w[:1], after[i : i + 1], float(h[i]))
+        np.testing.assert_allclose(together[i], alone[0], atol=1e-15)

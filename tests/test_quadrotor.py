@@ -14,8 +14,7 @@ from unifg.errors import GraphError
 from unifg.kernels.derive.stated import StatedKernel
 from unifg.models import quadrotor, rkmk
 from unifg.models.quadrotor import CONTROL, DRAG, GRAVITY, MASS, STATE, UPDRAFT, WIND, Parameters
-from unifg.models.rkmk import Method
-from unifg.models.rkmk_batch import step_defect
+from unifg.models.rkmk import Method, step_defect
 from unifg.models.tableau import METHODS
 from unifg.solvers import GaussNewton, InteriorPoint
 from unifg.typing import Array

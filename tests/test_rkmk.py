@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import pickle
 from typing import Any
 
@@ -10,9 +9,8 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.machine.jit import compiled
+from unifg.kernels.differences import jacobian
 from unifg.models import rkmk, unicycle
-from unifg.models.compiled_field import CompiledField
 from unifg.models.rkmk import Form
 from unifg.solvers import SQP, LevenbergMarquardt
 from unifg.typing import Array
@@ -36,16 +34,10 @@ def current(x: Array, u: Array) -> Array:
 
 def implicit_step(form: Form, x: Array, u: Array, h: float) -> Array:
     """Solve the trapezoid for the next state by Newton's method."""
-    defect = rkmk.trapezoid(fg.SE2, current, form)
-    assert defect.jacobian is not None
-    after = fg.SE2.retract(x, h * current(x, u))
-    for _ in range(20):
-        value = defect(x, u, after, h)
-        move = -np.linalg.solve(defect.jacobian(x, u, after, h)[2], value[:, :, None])[:, :, 0]
-        after = fg.SE2.retract(after, move)
-        if np.abs(move).max() < 1e-15:
-            break
-    assert np.abs(defect(x, u, after, h)).max() < 1e-13
+    after = rkmk.advance(
+        fg.SE2, current, x, u, h=h, method="full trapezoid" if form == "full" else "simplified trapezoid"
+    )
+    assert np.abs(rkmk.trapezoid(fg.SE2, current, form)(x, u, after, h)).max() < 1e-13
     return after
 
 
@@ -209,50 +201,6 @@ def test_unknown_form_is_refused_and_residuals_pickle() -> None:
     assert np.isfinite(copy(START, CONTROL, START, 0.1)).all()
 
 
-# ---------------------------------------------------------------- compiled fields
-
-
-@compiled
-def spiral(x: Array, u: Array, out: Array) -> None:
-    """A velocity on any group, from the storage of the state and one control."""
-    for i in range(len(out)):
-        out[i] = u[0] * math.cos(0.3 * i) + 0.4 * math.sin(x[i % len(x)] + 0.5 * i)
-
-
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("group", [*GROUPS, fg.SO3, fg.SE3], ids=lambda g: g.name)
-def test_compiled_fields_agree_with_batched_ones(group: fg.LieGroup, form: Form) -> None:
-    field = CompiledField(spiral, group.dim, 1)
-    mine = rkmk.trapezoid(group, field, form)
-    reference = rkmk.trapezoid(group, lambda x, u: field(x, u), form)
-    assert mine.kernel is not None and reference.kernel is None
-    assert mine.jacobian is not None and reference.jacobian is not None
-    x = group.random(RNG, (20,))
-    arguments = (x, RNG.normal(size=(20, 1)), group.retract(x, 0.7 * RNG.normal(size=(20, group.dim))), 0.3)
-    np.testing.assert_allclose(mine(*arguments), reference(*arguments), atol=1e-13)
-    for block, expected in zip(mine.jacobian(*arguments), reference.jacobian(*arguments), strict=True):
-        np.testing.assert_allclose(block, expected, atol=1e-9)
-
-
-def test_compiled_fields_with_derivatives_of_somebody_else_are_batched() -> None:
-    field = CompiledField(spiral, 3, 1)
-    exact = rkmk.trapezoid(fg.SE2, lambda x, u: field(x, u))
-    assert rkmk.trapezoid(fg.SE2, field, jacobian=exact.jacobian).kernel is None
-    assert rkmk.trapezoid(fg.SE2, field).kernel is not None
-
-
-def test_compiled_fields_are_checked_and_pickle() -> None:
-    field = CompiledField(spiral, 4, 1)
-    with pytest.raises(fg.ModelError, match="the field has 4 velocities, SE2 takes 3"):
-        rkmk.trapezoid(fg.SE2, field)
-    with pytest.raises(fg.ModelError, match="no derivative"):
-        field.jacobian(START, CONTROL)
-    with pytest.raises(fg.ModelError, match=r"controls have shape \(1, 2\), expected \(n, 1\)"):
-        field(START, CONTROL)
-    copy = pickle.loads(pickle.dumps(rkmk.trapezoid(fg.SE2, rkmk.unicycle_field)))
-    np.testing.assert_allclose(copy(START, CONTROL, START, 0.1), [[-0.1, 0.0, -0.08]], rtol=1e-15)
-
-
 # ---------------------------------------------------------------- traced
 
 
@@ -271,7 +219,9 @@ class Turning:
         return turning(x, u)
 
 
-@pytest.mark.parametrize(("field", "route"), [(turning, "traced, its derivatives exact"), (Turning(), "attached")])
+@pytest.mark.parametrize(
+    ("field", "route"), [(turning, "traced, its derivatives exact"), (Turning(), "by differences")]
+)
 def test_steps_are_traced_and_differenced_where_f_cannot_be(field: Any, route: str) -> None:
     rng = np.random.default_rng(3)
     x, u = fg.SE2.random(rng, (5,)), rng.normal(size=(4, 1))
@@ -283,8 +233,8 @@ def test_steps_are_traced_and_differenced_where_f_cannot_be(field: Any, route: s
     program = graph.compile()
     assert route in program.terms[0].route
     lin = program.linearize({poses: x, controls: u})
-    assert defect.jacobian is not None
-    blocks = np.concatenate(defect.jacobian(x[:-1], u, x[1:], 0.3), axis=2)
+    manifolds: list[fg.Manifold] = [fg.SE2, fg.Rn(1), fg.SE2]
+    blocks = np.concatenate(jacobian(lambda *p: defect(*p, 0.3), [x[:-1], u, x[1:]], manifolds), axis=2)
     np.testing.assert_allclose(lin.residual.reshape(4, 3), defect(x[:-1], u, x[1:], 0.3), atol=1e-15)
     np.testing.assert_allclose(lin.jacobian.reshape(4, 3, 7), blocks, atol=1e-9)
 

@@ -16,7 +16,7 @@ from unifg.typing import Array
 
 Function: TypeAlias = Callable[..., Array]
 JacobianFunction: TypeAlias = Callable[..., Sequence[Array]]
-Derivatives: TypeAlias = Literal["trace", "trace first", "differences"]
+Derivatives: TypeAlias = Literal["trace", "differences"]
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,7 @@ class Residual:
         kernel: ``function`` and ``jacobian`` for one factor, compiled; graphs run it in one loop with all others.
         search_kernel: the same with ``search`` in the place of the Jacobian.
         rows: m, of a ``function`` that a user has compiled for one factor.
-        derivatives: "trace" to insist on exact ones, "trace first" to prefer them to the Jacobian, "differences" to
-            refuse them, empty for what is possible.
+        derivatives: "trace" to insist on exact ones, "differences" to refuse them, empty for what is possible.
         elements: place and manifold of arguments that are elements of one, where a kernel does not say so.
     """
 
@@ -82,15 +81,14 @@ def residual(
             exactly and made into machine code) where that is possible, and differenced where it is not, which
             ``graph.check`` and the log say. "trace" makes the second an error, and also traces functions
             that reach what cannot be watched (its present content is compiled in) and those with a Jacobian, which
-            then only serves comparison. "trace first" uses the Jacobian where there is no trace.
-            "differences" leaves the function as it is.
+            then only serves comparison. "differences" leaves the function as it is.
         about: what ``help`` says of the residual; defaults to the docstring of the function.
 
     Raises:
         GraphError: for a compiled function without ``rows``.
     """
-    if derivatives not in (None, "trace", "trace first", "differences"):
-        raise GraphError(f"derivatives must be 'trace', 'trace first' or 'differences', found {derivatives!r}")
+    if derivatives not in (None, "trace", "differences"):
+        raise GraphError(f"derivatives must be 'trace' or 'differences', found {derivatives!r}")
     search_kernel = search if isinstance(search, Kernel) else None
     looked_in = search.jacobian if isinstance(search, Kernel) else search
     own = is_compiled(function)

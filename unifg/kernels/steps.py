@@ -99,12 +99,6 @@ def _parts_of(keys: tuple[Hashable, ...]) -> tuple[tuple[Part, Manifold], ...]:
     return tuple(parts)
 
 
-def compiled_parts(manifolds: Sequence[Manifold]) -> list[Part]:
-    """The parts of several variables; nothing when one of them moves by a retraction of its own."""
-    parts = [part for part, _ in parts_of(*manifolds)]
-    return [] if any(part.kind == OTHER for part in parts) else parts
-
-
 def movable_parts(manifolds: Sequence[Manifold]) -> list[tuple[int, ...]]:
     """The parts of several variables, each with the address of its retraction, 0 for those that :func:`move` moves.
 

@@ -188,7 +188,7 @@ class CompiledTerm:
         why = "it has a search Jacobian" if own.search else ""
         if own.derivatives == "differences":
             why = "as it was asked to be"
-        taken = not why and (not attached or asked or own.derivatives == "trace first")
+        taken = not why and (not attached or asked)
         if taken or unclear_places(self._arguments, self.term.rows, self.count):
             found, reason = find(self.batch, own.function, asked)  # also for how arrays as long as the batch are read
             self._each = None if found is None else found.each
