@@ -102,7 +102,7 @@ performance: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/unifg bench --quick --strict
 
 mutants: $(VENV)/ready
-	$(ONE_THREAD) $(BIN)/python -m benchmarks.mutants $(FILES)
+	$(ONE_THREAD) $(BIN)/python -m tools.mutants $(FILES)
 
 offsets: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/python -m benchmarks.offsets
