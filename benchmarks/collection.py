@@ -9,6 +9,8 @@ and infeasible ones, and problems on Lie groups. A backend takes what its class 
 
 from __future__ import annotations
 
+import random
+import re
 from collections import Counter
 from importlib.util import find_spec
 
@@ -30,6 +32,7 @@ from problems.collection import (
 from problems.hock_schittkowski import Case
 
 PEER = "IPOPT"
+DRAWN = 2  # cells of a sample
 
 
 def measure() -> dict[str, dict[str, Outcome]]:
@@ -50,6 +53,35 @@ def render(results: dict[str, dict[str, Outcome]]) -> str:
     for title, cases in GROUPS.items():
         parts += [f"## Iterations: {title}", _iterations(results, cases)]
     return "\n\n".join(parts)
+
+
+def repeated(page: str, seed: str) -> bool:
+    """Repeat some cells of the tables of iterations; True if all lie where the page says a repeated count lies.
+
+    Args:
+        page: the Markdown.
+        seed: of the draw.
+    """
+    known: dict[tuple[str, str], str] = {}
+    for part in page.split("## Iterations: ")[1:]:
+        head, _, *lines = (
+            [word.strip() for word in line.split("|")[1:-1]] for line in part.splitlines() if "|" in line
+        )
+        known |= {(line[0], name): cell for line in lines for name, cell in zip(head[1:], line[1:], strict=True)}
+    cells = [place for place, cell in known.items() if cell != "-" and place[1] in BACKENDS and place[0] in CASES]
+    good = True
+    for case, name in random.Random(seed).sample(cells, DRAWN):
+        now, then = _cell(attempt(case, BACKENDS[name])), known[case, name]
+        same = _alike(now, then)
+        print(f"{case}, {name}: {then} on the page, {now} now{'' if same else ': not the same'}")
+        good = good and same
+    return good
+
+
+def _alike(now: str, then: str) -> bool:
+    """True for cells with the same mark whose counts differ by two or a tenth at most."""
+    (count, *mark), (expected, *other) = (re.split(r"(?<=\d)(?=\D|$)", cell) for cell in (now, then))
+    return mark == other and abs(int(count) - int(expected)) <= max(2.0, 0.1 * int(expected))
 
 
 def _summary(results: dict[str, dict[str, Outcome]]) -> str:

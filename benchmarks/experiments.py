@@ -332,8 +332,7 @@ def main(arguments: list[str] | None = None) -> int:
         if folder.is_dir():
             write_manifest(folder, whole, code_of_scenario("navigation"))  # not of this command's part alone
             sheets[name] = load(folder, options.any_code, failed_too=True)
-    codes = {sheet.code for sheet in sheets.values()}
-    publish("experiments", rendered(sheets), None if codes == {code_of_scenario("navigation")} else codes)
+    publish("experiments", rendered(sheets))
     return 0
 
 

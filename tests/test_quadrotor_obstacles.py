@@ -198,7 +198,6 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert command.main([*words, "--solver", "ipm", "--avoidance", "hard", "--seed", "1003"]) == 0
     assert "obstacle course 1003" in capsys.readouterr().out
     assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "inputs.json",
         "iterates.png",
         "metrics.json",
         "scene.html",
