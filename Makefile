@@ -82,7 +82,7 @@ results: $(VENV)/ready-bench
 	$(BIN)/python -m benchmarks.pages measure $(PAGE)
 
 sample: $(VENV)/ready
-	@$(ONE_THREAD) $(BIN)/python -m benchmarks.pages sample
+	@$(ONE_THREAD) $(BIN)/python -m benchmarks.collection --sample
 
 release-build: $(VENV)/ready
 	$(BIN)/python docs/check_release.py $(RELEASE)

@@ -18,11 +18,11 @@ from typing import Any, TypeAlias
 import numpy as np
 
 import unifg as fg
+from benchmarks.comparison import Key, Row
 from benchmarks.report import OUT, command, commit, listing, machine, publish, table
 from benchmarks.runs import options, recorded
 from exact_judge import AGREED, Answer, Judge, Peer, answer, disagreement
 from problems.twins import KINDS
-from unifg.scenarios.campaigns.comparison import Key, Row
 from variants import CONSTRAINED, EQUALITIES_ONLY
 
 TOLERANCE = 1e-6

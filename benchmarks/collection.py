@@ -1,6 +1,7 @@
 """Every backend on a collection of small problems with known answers; IPOPT beside them.
 
     python -m benchmarks.collection
+    python -m benchmarks.collection --sample [DAY]   repeats two cells of the page, drawn by the date
 
 The problems are those of the tests (tests/problems/collection.py): Hock and Schittkowski's, least squares, degenerate
 and infeasible ones, and problems on Lie groups. A backend takes what its class allows. What it returns is judged by
@@ -9,11 +10,13 @@ and infeasible ones, and problems on Lie groups. A backend takes what its class 
 
 from __future__ import annotations
 
+import datetime
 import random
 import re
 from collections import Counter
 from importlib.util import find_spec
 
+from benchmarks.pages import PAGES
 from benchmarks.report import command, machine, publish, table
 from problems.collection import (
     BACKENDS,
@@ -122,8 +125,13 @@ def _cell(outcome: Outcome | None) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Solve everything and write the tables."""
-    command(__doc__).parse_args(arguments)
+    """Solve everything and write the tables, or repeat some cells; 1 if one of these differs."""
+    parser = command(__doc__)
+    today = datetime.datetime.now(datetime.UTC).date().isoformat()
+    parser.add_argument("--sample", nargs="?", const=today, metavar="DAY", help="repeat two cells, drawn by the date")
+    chosen = parser.parse_args(arguments)
+    if chosen.sample is not None:
+        return 0 if repeated(PAGES["collection"].path.read_text(encoding="utf-8"), chosen.sample) else 1
     publish("collection", render(measure()))
     return 0
 

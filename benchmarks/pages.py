@@ -1,16 +1,14 @@
-"""The pages with measured tables: the module that measures each, and a sample that repeats some of their figures.
+"""The pages with measured tables, and the module that measures each.
 
     python -m benchmarks.pages                      names the pages
     python -m benchmarks.pages measure PAGE ...     measures pages again, ``all`` for every one
-    python -m benchmarks.pages sample [--date DAY]  repeats two cells of a page, drawn by the date
 
-``make results PAGE=...`` and ``make bench`` measure, the checks of a change take a sample.
+``make results PAGE=...`` and ``make bench`` measure.
 """
 
 from __future__ import annotations
 
 import argparse
-import datetime
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -95,27 +93,15 @@ def measure(pages: list[Page]) -> int:
     return worst
 
 
-def sample(date: str) -> int:
-    """Repeat two cells of the page of small problems and compare counts, not times; 1 if one differs."""
-    from benchmarks import collection
-
-    return 0 if collection.repeated(PAGES["collection"].path.read_text(encoding="utf-8"), date) else 1
-
-
 def main(arguments: list[str] | None = None) -> int:
     """See the module's docstring."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.pages", description=__doc__.split("\n")[0])
     actions = parser.add_subparsers(dest="action")
     again = actions.add_parser("measure", help="measure pages again")
     again.add_argument("pages", nargs="+", choices=["all", *PAGES], metavar="PAGE", help=", ".join(PAGES))
-    drawn = actions.add_parser("sample", help="repeat two cells of a page")
-    today = datetime.datetime.now(datetime.UTC).date().isoformat()
-    drawn.add_argument("--date", default=today, metavar="DAY", help="seed of the draw (default: today)")
     options = parser.parse_args(arguments)
     if options.action == "measure":
         return measure(list(PAGES.values()) if "all" in options.pages else [PAGES[name] for name in options.pages])
-    if options.action == "sample":
-        return sample(options.date)
     for page in PAGES.values():
         print(f"{page.name:20} {page.module:30} about {page.hours:g} h")
     return 0

@@ -16,9 +16,9 @@ from typing import Any, ClassVar, Protocol, TypeVar
 
 from tqdm import tqdm
 
+from benchmarks.comparison import Key, Row
 from benchmarks.report import OUT, commit
 from unifg.errors import UnifgError
-from unifg.scenarios.campaigns.comparison import Key, Row
 from unifg.scenarios.campaigns.dispatch import finished
 from unifg.scenarios.campaigns.journal import Journal, lines_of
 from unifg.scenarios.workers import Inline, Workers

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import collection, pages, report, runs
+from benchmarks import collection, report, runs
+from benchmarks.comparison import Key
 from benchmarks.pages import CHECKOUT, PAGES
 from benchmarks.report import BEGIN, put_results
-from unifg.scenarios.campaigns.comparison import Key
 
 
 def marked() -> dict[str, str]:
@@ -39,7 +39,7 @@ def test_results_replace_what_stands_between_the_markers(tmp_path: Path) -> None
 
 def test_a_sample_compares_counts_with_the_page(capsys: pytest.CaptureFixture[str]) -> None:
     page = "## Iterations: some\n\n| problem | SQP |\n|---|---:|\n| HS23 | {} |\n| HS35 | {} |\n"
-    assert pages.main(["sample", "--date", "2026-11-24"]) == 0
+    assert collection.main(["--sample", "2026-11-24"]) == 0
     assert not collection.repeated(page.format("90", "3 (no)"), "any")
     assert capsys.readouterr().out.count("not the same") == 2
 

@@ -13,9 +13,9 @@ import pytest
 from scipy import stats
 
 from benchmarks import quadrotor_flights, quadrotor_tables, report, runs
+from benchmarks.comparison import against, paired, share
 from benchmarks.quadrotor_flights import SOLVERS, STUDIES, Job, jobs_of
 from unifg.errors import ScenarioError
-from unifg.scenarios.campaigns.comparison import against, paired, share
 from unifg.scenarios.campaigns.journal import lines_of
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.log.flight_log import FlightLog

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from benchmarks.comparison import share
 from benchmarks.obstacle_courses import METHODS, Method, Outcome, distinct, lowest, render
 from judge import judge
 from unifg.errors import BackendError, ScenarioError
 from unifg.models import avoidance, quadrotor
 from unifg.scenarios import command
 from unifg.scenarios import course as obstacles
-from unifg.scenarios.campaigns.comparison import share
 from unifg.scenarios.commands.courses import course_metrics, summary
 from unifg.scenarios.course import (
     AVOIDANCES,
