@@ -9,6 +9,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
 import pandas as pd
 
 from unifg.scenarios.campaigns.campaign import EPISODES, manifest_of
@@ -73,7 +74,7 @@ class Sheet:
         """(n,) numbers of a measure, of all episodes or of those that ended in one way."""
         mine = self.of(combination)
         mine = mine if outcome is None else mine[mine["outcome"] == outcome]
-        found: Array = self.by_episode(measure).reindex(mine.index).dropna().to_numpy(dtype=float)
+        found: Array = np.asarray(self.by_episode(measure).reindex(mine.index).dropna(), dtype=np.float64)
         return found
 
     def by_episode(self, measure: str) -> pd.Series[float]:
@@ -93,7 +94,7 @@ class Sheet:
     def measures(self) -> list[str]:
         """All of them: those that were stated, then those that differ from episode to episode."""
         first = [name for name in self.stated if name in self.values]
-        return [*first, *(name for name in self.values if name not in first and self.values[name].nunique() > 1)]
+        return [*first, *(str(name) for name in self.values if name not in first and self.values[name].nunique() > 1)]
 
 
 def load(folder: Path, any_code: bool = False, failed_too: bool = False) -> Sheet:
