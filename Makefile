@@ -9,10 +9,10 @@
 #   make lint     check style (ruff) and types (mypy; what users write with pyright, too)
 #   make performance  time what the library does against the record of the checkout; fails for a loss of 15 % (half a minute)
 #   make bench    measure everything again and rewrite the tables in docs/ (long)
+#   make sample   repeat two figures of a page, drawn by the date: counts, not times
 #   make results PAGE=control-cases    measure one page of docs/ again; without PAGE, list them
-#   make stale    name the pages of docs/ whose tables were measured on other sources
 #   make release-build    build sdist and wheel twice, compare, try the wheel with every Python here (some minutes each)
-#   make release-check    the same, and fail for stale pages and kernels; with -k, go on to the end
+#   make release-check    the same, and fail for kernels that are out of date
 #   make kernels  compile everything anew into unifg/machine/kernels.zip, which spares a first use most of it (minutes)
 #   make mutants  change decisions one at a time and see whether a test notices (hours; FILES='scenarios/driving/drive_past.py')
 #   make examples run all scripts of examples/ and draw the pictures of docs/examples.md again
@@ -36,7 +36,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Matrices here are small: more threads per process only make the processes wait for each other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: docs kernels performance notebooks help demo test test-all fuzz test-lowest processes lint style types mypy pyright bench results stale release-build release-pages release-kernels release-check mutants fences clean offsets examples
+.PHONY: docs kernels performance notebooks help demo test test-all fuzz test-lowest processes lint style types mypy pyright bench results sample release-build release-kernels release-check mutants fences clean offsets examples
 .DELETE_ON_ERROR:
 
 help:
@@ -85,19 +85,16 @@ results: $(VENV)/ready-bench
 	@test -n "$(PAGE)" || { $(BIN)/python -m benchmarks.pages; echo "Choose: make results PAGE=name"; exit 2; }
 	$(BIN)/python -m benchmarks.pages measure $(PAGE)
 
-stale: $(VENV)/ready
-	@$(BIN)/python -m benchmarks.pages stale
+sample: $(VENV)/ready
+	@$(ONE_THREAD) $(BIN)/python -m benchmarks.collection --sample
 
 release-build: $(VENV)/ready
 	$(BIN)/python docs/check_release.py $(RELEASE)
 
-release-pages: $(VENV)/ready
-	@$(BIN)/python -m benchmarks.pages stale --strict
-
 release-kernels: $(VENV)/ready
 	@$(BIN)/unifg warmup --check
 
-release-check: release-build release-pages release-kernels
+release-check: release-build release-kernels
 
 kernels: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/unifg warmup --ship
@@ -106,7 +103,7 @@ performance: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/unifg bench --quick --strict
 
 mutants: $(VENV)/ready
-	$(ONE_THREAD) $(BIN)/python -m benchmarks.mutants $(FILES)
+	$(ONE_THREAD) $(BIN)/python -m tools.mutants $(FILES)
 
 offsets: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/python -m benchmarks.offsets

@@ -17,11 +17,11 @@ import numpy as np
 
 import unifg as fg
 from benchmarks import runs
+from benchmarks.comparison import Row, where
 from benchmarks.covariance_plans import difference, mean
 from benchmarks.report import command, machine, publish, table
 from problems import belief_plans
 from problems.belief_plans import SENSOR, Guess, Layout, Plan, Planner
-from unifg.scenarios.campaigns.comparison import Row, where
 
 MARGIN = 0.3  # from discs, of all plans [m]
 WEIGHTS = (3.0, 10.0, 30.0)  # of the deviation at the goal [s/m]

@@ -18,11 +18,11 @@ from typing import Any, TypeAlias
 import numpy as np
 
 import unifg as fg
-from benchmarks.report import OUT, code_digest, command, listing, machine, publish, table
+from benchmarks.comparison import Key, Row
+from benchmarks.report import OUT, command, commit, listing, machine, publish, table
 from benchmarks.runs import options, recorded
 from exact_judge import AGREED, Answer, Judge, Peer, answer, disagreement
 from problems.twins import KINDS
-from unifg.scenarios.campaigns.comparison import Key, Row
 from variants import CONSTRAINED, EQUALITIES_ONLY
 
 TOLERANCE = 1e-6
@@ -194,7 +194,7 @@ def main(arguments: list[str] | None = None) -> int:
     chosen.fresh |= not all_backends
     store = OUT / ("claims.jsonl" if all_backends else "claims-some.jsonl")
     asked = jobs(chosen.parkings, chosen.seeds, chosen.kinds, chosen.backends)
-    rows = recorded(solve, asked, store, code_digest("benchmarks.claims"), chosen)
+    rows = recorded(solve, asked, store, commit(), chosen)
     cases = [restored(row) for row in rows if all_backends or row["key"] in asked]
     whole = all_backends and set(chosen.kinds) == set(kinds)
     publish("claims", render(cases), {row["code"] for row in rows}, docs=whole and not chosen.quick)

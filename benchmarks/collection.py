@@ -1,6 +1,7 @@
 """Every backend on a collection of small problems with known answers; IPOPT beside them.
 
     python -m benchmarks.collection
+    python -m benchmarks.collection --sample [DAY]   repeats two cells of the page, drawn by the date
 
 The problems are those of the tests (tests/problems/collection.py): Hock and Schittkowski's, least squares, degenerate
 and infeasible ones, and problems on Lie groups. A backend takes what its class allows. What it returns is judged by
@@ -9,9 +10,13 @@ and infeasible ones, and problems on Lie groups. A backend takes what its class 
 
 from __future__ import annotations
 
+import datetime
+import random
+import re
 from collections import Counter
 from importlib.util import find_spec
 
+from benchmarks.pages import PAGES
 from benchmarks.report import command, machine, publish, table
 from problems.collection import (
     BACKENDS,
@@ -30,6 +35,7 @@ from problems.collection import (
 from problems.hock_schittkowski import Case
 
 PEER = "IPOPT"
+DRAWN = 2  # cells of a sample
 
 
 def measure() -> dict[str, dict[str, Outcome]]:
@@ -50,6 +56,35 @@ def render(results: dict[str, dict[str, Outcome]]) -> str:
     for title, cases in GROUPS.items():
         parts += [f"## Iterations: {title}", _iterations(results, cases)]
     return "\n\n".join(parts)
+
+
+def repeated(page: str, seed: str) -> bool:
+    """Repeat some cells of the tables of iterations; True if all lie where the page says a repeated count lies.
+
+    Args:
+        page: the Markdown.
+        seed: of the draw.
+    """
+    known: dict[tuple[str, str], str] = {}
+    for part in page.split("## Iterations: ")[1:]:
+        head, _, *lines = (
+            [word.strip() for word in line.split("|")[1:-1]] for line in part.splitlines() if "|" in line
+        )
+        known |= {(line[0], name): cell for line in lines for name, cell in zip(head[1:], line[1:], strict=True)}
+    cells = [place for place, cell in known.items() if cell != "-" and place[1] in BACKENDS and place[0] in CASES]
+    good = True
+    for case, name in random.Random(seed).sample(cells, DRAWN):
+        now, then = _cell(attempt(case, BACKENDS[name])), known[case, name]
+        same = _alike(now, then)
+        print(f"{case}, {name}: {then} on the page, {now} now{'' if same else ': not the same'}")
+        good = good and same
+    return good
+
+
+def _alike(now: str, then: str) -> bool:
+    """True for cells with the same mark whose counts differ by two or a tenth at most."""
+    (count, *mark), (expected, *other) = (re.split(r"(?<=\d)(?=\D|$)", cell) for cell in (now, then))
+    return mark == other and abs(int(count) - int(expected)) <= max(2.0, 0.1 * int(expected))
 
 
 def _summary(results: dict[str, dict[str, Outcome]]) -> str:
@@ -90,8 +125,13 @@ def _cell(outcome: Outcome | None) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Solve everything and write the tables."""
-    command(__doc__).parse_args(arguments)
+    """Solve everything and write the tables, or repeat some cells; 1 if one of these differs."""
+    parser = command(__doc__)
+    today = datetime.datetime.now(datetime.UTC).date().isoformat()
+    parser.add_argument("--sample", nargs="?", const=today, metavar="DAY", help="repeat two cells, drawn by the date")
+    chosen = parser.parse_args(arguments)
+    if chosen.sample is not None:
+        return 0 if repeated(PAGES["collection"].path.read_text(encoding="utf-8"), chosen.sample) else 1
     publish("collection", render(measure()))
     return 0
 

@@ -13,9 +13,9 @@ from functools import partial
 from itertools import product
 
 from benchmarks import runs
+from benchmarks.comparison import Read, Row, comparison, digits, interval, paired, where
 from benchmarks.navigation import DEPARTMENT, Case, Drive, drive
 from benchmarks.report import command, machine, publish
-from unifg.scenarios.campaigns.comparison import Read, Row, comparison, digits, interval, paired, where
 
 VARIANTS = {
     "sequential": ("sequential", 1.0),

@@ -19,10 +19,10 @@ import numpy as np
 
 import unifg as fg
 from benchmarks import runs
+from benchmarks.comparison import Row, digits, interval, where
 from benchmarks.report import command, machine, publish, table
 from problems import belief_plans
 from problems.belief_plans import Guess, Plan
-from unifg.scenarios.campaigns.comparison import Row, digits, interval, where
 
 RESERVE = 0.05  # margin of those plans that keep standard deviations [m]: the robot cuts corners between nodes
 DEVIATIONS = (1.0, 2.0, 2.5, 3.0, 3.5)

@@ -16,11 +16,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks import runs
+from benchmarks.comparison import Row, where
+from benchmarks.comparison import interval as bootstrap
+from benchmarks.comparison import share as rate
 from benchmarks.report import command, listing, machine, publish
 from benchmarks.routes import drawn
-from unifg.scenarios.campaigns.comparison import Row, where
-from unifg.scenarios.campaigns.comparison import interval as bootstrap
-from unifg.scenarios.campaigns.comparison import share as rate
 from unifg.scenarios.driving.drive_settings import AVOIDANCES, ControllerSettings
 from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import NavigationSettings, run_navigation

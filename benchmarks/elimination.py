@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks import chains, growth, gtsam_peer, large_fronts, marginals, own_residuals, pose_graphs, two_threads
-from benchmarks.report import CHECKOUT, code_digest, command, listing, machine, publish
+from benchmarks.report import CHECKOUT, command, commit, listing, machine, publish
 from benchmarks.section import Result, Section, met
 from benchmarks.timing import number, pin, shown
 
@@ -44,7 +44,7 @@ def record(store: Result, name: str, result: Result, seconds: float, code: str) 
         name: of the section.
         result: what it measured.
         seconds: it took.
-        code: digest of the package that was measured.
+        code: commit that was measured.
     """
     before = store.get(name)
     store[name] = {
@@ -130,7 +130,7 @@ def main(arguments: list[str] | None = None) -> int:
     if not gtsam_peer.available():
         print("gtsam is not installed: no comparison, and the page in docs/ is left alone.")
     pin()
-    store, code = load(STORE), code_digest("benchmarks.elimination")
+    store, code = load(STORE), commit()
     goals: list[Result] = []
     chosen = options.only or list(SECTIONS)
     for name in chosen:

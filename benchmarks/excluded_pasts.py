@@ -18,10 +18,10 @@ import numpy as np
 
 import unifg as fg
 from benchmarks import impossible_states, runs
+from benchmarks.comparison import Row, digits, interval, where
 from benchmarks.report import command, machine, publish, table
 from unifg.lie import SE2
 from unifg.models import landmarks, obstacles
-from unifg.scenarios.campaigns.comparison import Row, digits, interval, where
 from unifg.solvers import GaussNewton, InteriorPoint
 from unifg.typing import Array, IntArray
 

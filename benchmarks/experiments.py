@@ -19,14 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.comparison import interval, share
 from benchmarks.kept_rows import ROWS, keep, restore
 from benchmarks.large_maps import CAMPAIGNS
 from benchmarks.printed import numbers, pairs
 from benchmarks.report import OUT, command, machine, publish, table
-from unifg.scenarios.campaigns.account import differences
+from unifg.scenarios.campaigns.account import PAIRED, differences
 from unifg.scenarios.campaigns.campaign import EPISODES, code_of_scenario, replay_command, run_campaign, write_manifest
-from unifg.scenarios.campaigns.comparison import interval, share
-from unifg.scenarios.campaigns.document import Heading, Table, Words
 from unifg.scenarios.campaigns.performed import OK
 from unifg.scenarios.campaigns.sheet import Combination, Sheet, load
 from unifg.scenarios.campaigns.statement import Statement, read
@@ -113,7 +112,7 @@ class Driver:
 def drivers(sheet: Sheet, name: str) -> list[Driver]:
     """Who has driven which leg of a campaign."""
     found = []
-    for combination in sheet.outcomes:
+    for combination in sheet.combinations:
         labels = dict(zip(sheet.axes, combination, strict=True))
         planner = labels.get("planner", f"ours, {labels['coupling']}")
         found.append(Driver(planner, f"{'I' if name == 'department' else 'II'} {labels['leg']}", sheet, combination))
@@ -182,19 +181,19 @@ def _relative(drives: Sequence[Driver], measure: str) -> str:
 
 def _times(drives: Sequence[Driver]) -> dict[tuple[str, int | None], float]:
     """Durations of the drives that succeeded, by leg and seed."""
-    return {
-        (drive.leg, seed): duration
-        for drive in drives
-        for seed, duration in drive.sheet.values.get(DURATION, {}).get(drive.combination, {}).items()
-        if drive.sheet.outcomes[drive.combination][seed] == OK
-    }
+    found = dict[tuple[str, int | None], float]()
+    for drive in drives:
+        mine = drive.sheet.of(drive.combination).join(drive.sheet.by_episode(DURATION).rename("duration"))
+        mine = mine[mine["outcome"] == OK].dropna(subset="duration")
+        found |= {(drive.leg, row["seed"]): row["duration"] for row in mine.to_dict("records")}
+    return found
 
 
 def lengths(sheet: Sheet, paper: Mapping[str, Reported]) -> str:
     """Path length, mean, standard deviation and the same in per cent."""
     head = ("leg", "coupling", "runs", "succeeded", "path length [m]", "95 % interval", "paper: his [m]", "ROS [m]")
     rows = []
-    for coupling, leg in sheet.outcomes:
+    for coupling, leg in sheet.combinations:
         his, ros = paper[leg].length, paper[leg].ros_length
         rows.append((*_begin(sheet, (coupling, leg), LENGTH), _pair(his), _pair(ros)))
     return table(head, rows, 2)
@@ -205,7 +204,7 @@ def durations(sheet: Sheet, paper: Mapping[str, Reported]) -> str:
     head = ("leg", "coupling", "runs", "succeeded", "duration [s]", "95 % interval", "paper: his [s]", "ROS [s]")
     rows = [
         (*_begin(sheet, (coupling, leg), DURATION), _pair(paper[leg].duration), _pair(paper[leg].ros_duration))
-        for coupling, leg in sheet.outcomes
+        for coupling, leg in sheet.combinations
     ]
     return table(head, rows, 2)
 
@@ -236,29 +235,19 @@ def _pair(pair: Pair) -> str:
 def _compared(sheet: Sheet) -> list[str]:
     """The two couplings, pair by pair, where both succeeded."""
     measures = [m for m in sheet.stated if m in sheet.values]
-    values = {
-        measure: {
-            combination: {seed: value for seed, value in found.items() if sheet.outcomes[combination][seed] == OK}
-            for combination, found in sheet.values[measure].items()
-        }
-        for measure in measures
-    }
-    found = list[str]()
-    for block in differences(replace(sheet, values=values), measures):
-        if isinstance(block, Words):
-            found.append(block.text)
-        elif isinstance(block, Table):
-            found.append(table(block.head, block.rows, block.text))
-        else:
-            assert isinstance(block, Heading)
-    return found
+    good = replace(sheet, values=sheet.values[sheet.episodes["outcome"] == OK])
+    return [
+        text
+        for axis, found in differences(good, measures).items()
+        for text in (PAIRED.format(axis=axis), table(*found))
+    ]
 
 
 def _failed(sheet: Sheet) -> list[str]:
-    lines = [f"{len(sheet.failures)} of {sum(map(len, sheet.outcomes.values()))} drives failed."]
-    for f in sheet.failures[:20]:
-        where = replay_command(Path("out/benchmarks/campaigns") / sheet.folder.name, f.key)
-        lines.append(f"- {', '.join(f.combination)}, seed {f.seed}: {f.why or f.outcome}; `{where}`")
+    lines = [f"{len(sheet.failures)} of {len(sheet.episodes)} drives failed."]
+    for f in sheet.failures.head(20).to_dict("records"):
+        where = replay_command(Path("out/benchmarks/campaigns") / sheet.folder.name, f["key"])
+        lines.append(f"- {', '.join(f['combination'])}, seed {f['seed']}: {f['why'] or f['outcome']}; `{where}`")
     return ["\n".join(lines)]
 
 
@@ -267,14 +256,14 @@ def together(sheets: Sequence[Sheet]) -> str:
     spreads: dict[str, list[float]] = {LENGTH: [], DURATION: []}
     simulated, drives, runs = 0.0, 0, Counter[int]()
     for sheet in sheets:
-        for combination in sheet.outcomes:
+        for combination in sheet.combinations:
             for measure, found in spreads.items():
                 values = sheet.column(measure, combination, OK)
                 if len(values) > 1:
                     found.append(100.0 * float(values.std(ddof=1) / values.mean()))
             simulated += float(sheet.column(DURATION, combination).sum())
-            drives += len(sheet.outcomes[combination])
-            runs[len(sheet.outcomes[combination])] += 1
+            drives += len(sheet.of(combination))
+            runs[len(sheet.of(combination))] += 1
     seconds = sum(sheet.cpu_seconds for sheet in sheets)
     least, most = min(runs, default=0), max(runs, default=0)
     many = f"{least} to {most}" if least < most else str(most)
@@ -332,8 +321,7 @@ def main(arguments: list[str] | None = None) -> int:
         if folder.is_dir():
             write_manifest(folder, whole, code_of_scenario("navigation"))  # not of this command's part alone
             sheets[name] = load(folder, options.any_code, failed_too=True)
-    codes = {sheet.code for sheet in sheets.values()}
-    publish("experiments", rendered(sheets), None if codes == {code_of_scenario("navigation")} else codes)
+    publish("experiments", rendered(sheets))
     return 0
 
 

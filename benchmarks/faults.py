@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 from benchmarks import runs
+from benchmarks.comparison import Row
 from benchmarks.report import command, machine, publish, table
-from unifg.scenarios.campaigns.comparison import Row
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.flying.braking import braking_control
 from unifg.scenarios.log.drive_metrics import episode_metrics

@@ -20,9 +20,9 @@ from itertools import count
 import numpy as np
 
 from benchmarks import runs
+from benchmarks.comparison import Row, share, where
 from benchmarks.report import command, listing, machine, publish
 from benchmarks.routes import Place, drawn
-from unifg.scenarios.campaigns.comparison import Row, share, where
 from unifg.scenarios.driving.drive_pilot import COUPLINGS
 from unifg.scenarios.fleet import run_fleet
 from unifg.scenarios.log.drive_metrics import episode_metrics

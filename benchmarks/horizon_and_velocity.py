@@ -19,8 +19,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from benchmarks.comparison import digits, interval
 from benchmarks.report import command, machine, publish, table
-from unifg.scenarios.campaigns.comparison import digits, interval
 from unifg.scenarios.safe_flight import SafeSettings, flights
 from unifg.scenarios.safety.cascade import CascadeSettings
 from unifg.scenarios.safety.keeper import KeeperSettings

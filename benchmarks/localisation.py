@@ -20,6 +20,7 @@ import numpy as np
 from scipy import ndimage
 
 from benchmarks import runs
+from benchmarks.comparison import Row, interval, where
 from benchmarks.printed import texts
 from benchmarks.report import command, listing, machine, publish, shared
 from benchmarks.routes import drawn
@@ -28,7 +29,6 @@ from unifg.files.ros_map import OccupancyMap
 from unifg.lie import SE2, wrap_angle
 from unifg.models import lidar
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.campaigns.comparison import Row, interval, where
 from unifg.scenarios.driving.drive_pilot import Estimator
 from unifg.scenarios.driving.localiser import Localiser
 from unifg.scenarios.navigation import INITIAL_SIGMA, Episode, NavigationSettings

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import runs
+from benchmarks.comparison import Row, where
 from benchmarks.report import command, machine, publish, shared, table
-from unifg.scenarios.campaigns.comparison import Row, where
 from unifg.scenarios.driving.drive_pilot import COUPLINGS
 from unifg.scenarios.driving.drive_settings import ControllerSettings
 from unifg.scenarios.log.drive_metrics import episode_metrics

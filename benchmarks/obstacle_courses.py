@@ -22,9 +22,9 @@ import numpy as np
 from scipy.stats import binomtest
 
 from benchmarks import runs
+from benchmarks.comparison import Row, crossed, share
 from benchmarks.report import command, listing, machine, publish, table, words
 from benchmarks.timing import pin
-from unifg.scenarios.campaigns.comparison import Row, crossed, share
 from unifg.scenarios.course import (
     AVOIDANCES,
     HESSIANS,

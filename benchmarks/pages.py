@@ -1,27 +1,21 @@
-"""The pages with measured tables: what measures each, and whether it still describes the code.
+"""The pages with measured tables, and the module that measures each.
 
-    python -m benchmarks.pages                      names the pages and whether they are up to date
-    python -m benchmarks.pages stale [--strict]     names the stale ones; with --strict that is an error
+    python -m benchmarks.pages                      names the pages
     python -m benchmarks.pages measure PAGE ...     measures pages again, ``all`` for every one
 
-``make results PAGE=...`` and ``make bench`` measure, ``make release-check`` is strict. A page is stale when the digest
-it carries is not that of the sources it depends on now (:mod:`benchmarks.sources`).
+``make results PAGE=...`` and ``make bench`` measure.
 """
 
 from __future__ import annotations
 
 import argparse
-import re
 import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.sources import CHECKOUT, digest
-
+CHECKOUT = Path(__file__).resolve().parent.parent
 DOCS = CHECKOUT / "docs"
-DIGEST_LINE = "Digest of the sources: {}."
-CARRIED = re.compile(r"^Digest of the sources: (?P<digests>`[0-9a-f]{12}`(?: and `[0-9a-f]{12}`)*)\.$", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -33,7 +27,7 @@ class Page:
         title: of the page.
         module: measures and writes it.
         arguments: given to the module.
-        hours: about how long on two cores, for those who wait.
+        hours: about how long on two cores.
     """
 
     name: str
@@ -46,23 +40,6 @@ class Page:
     def path(self) -> Path:
         """The file."""
         return DOCS / f"{self.name}.md"
-
-    @property
-    def digest(self) -> str:
-        """Of the sources as they are now."""
-        return digest([self.module])
-
-    @property
-    def carried(self) -> frozenset[str]:
-        """The digests the page carries: of every state of the code that its rows were measured on."""
-        text = self.path.read_text(encoding="utf-8") if self.path.is_file() else ""
-        found = CARRIED.search(text)
-        return frozenset(re.findall("[0-9a-f]{12}", found["digests"])) if found else frozenset()
-
-    @property
-    def current(self) -> bool:
-        """Whether every row was measured on the sources as they are now."""
-        return self.carried == {self.digest}
 
 
 PAGES = {
@@ -106,17 +83,6 @@ PAGES = {
 }
 
 
-def stale() -> list[Page]:
-    """Pages that carry another digest than that of their sources, or none."""
-    return [page for page in PAGES.values() if not page.current]
-
-
-def sentence(page: Page) -> str:
-    """What is wrong with a stale page and what to do."""
-    carried = f"measured on {' and '.join(sorted(page.carried))}" if page.carried else "carries no digest"
-    return f"docs/{page.name}.md: {carried}, the sources are {page.digest}: make results PAGE={page.name}"
-
-
 def measure(pages: list[Page]) -> int:
     """Measure pages one after the other; the worst exit code."""
     worst = 0
@@ -131,20 +97,13 @@ def main(arguments: list[str] | None = None) -> int:
     """See the module's docstring."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.pages", description=__doc__.split("\n")[0])
     actions = parser.add_subparsers(dest="action")
-    check = actions.add_parser("stale", help="name the pages that no longer describe the code")
-    check.add_argument("--strict", action="store_true", help="fail if there are any")
     again = actions.add_parser("measure", help="measure pages again")
     again.add_argument("pages", nargs="+", choices=["all", *PAGES], metavar="PAGE", help=", ".join(PAGES))
     options = parser.parse_args(arguments)
     if options.action == "measure":
         return measure(list(PAGES.values()) if "all" in options.pages else [PAGES[name] for name in options.pages])
-    if options.action == "stale":
-        wrong = stale()
-        for page in wrong:
-            print(sentence(page))
-        return 1 if wrong and options.strict else 0
     for page in PAGES.values():
-        print(f"{page.name:20} {page.module:30} {'up to date' if page.current else 'stale'}")
+        print(f"{page.name:20} {page.module:30} about {page.hours:g} h")
     return 0
 
 

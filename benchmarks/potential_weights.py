@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks import runs
+from benchmarks.comparison import Row, against, where
 from benchmarks.report import command, listing, machine, publish
-from unifg.scenarios.campaigns.comparison import Row, against, where
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.log.flight_metrics import flight_metrics
 

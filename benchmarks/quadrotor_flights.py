@@ -17,9 +17,9 @@ from itertools import product
 import numpy as np
 
 from benchmarks import runs
+from benchmarks.comparison import Row
 from benchmarks.quadrotor_tables import HEADLINE, render
 from benchmarks.report import command, machine, publish
-from unifg.scenarios.campaigns.comparison import Row
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.flying.flight_pilot import COUPLINGS
 from unifg.scenarios.flying.flight_settings import Avoidance

@@ -18,10 +18,10 @@ from itertools import product
 import numpy as np
 
 from benchmarks import runs
+from benchmarks.comparison import Row, against, digits, where
 from benchmarks.quadrotor_flights import SOLVERS
 from benchmarks.report import command, listing, machine, publish
 from unifg.models import quadrotor
-from unifg.scenarios.campaigns.comparison import Row, against, digits, where
 from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.flying.flight_joint import JointSettings
 from unifg.scenarios.flying.flight_pilot import make_pilot

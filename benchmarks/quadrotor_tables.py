@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from benchmarks.comparison import Read, Row, comparison, share, where
 from benchmarks.report import listing, table
-from unifg.scenarios.campaigns.comparison import Read, Row, comparison, share, where
 from unifg.typing import Array
 
 MEDIAN_MS, P99_MS, LEAST_TICKS = 15.0, 40.0, 5000  # limits of a tick

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import datetime
 import os
 import platform
 import re
+import subprocess
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TypeVar
 
 import unifg
-from benchmarks.pages import DIGEST_LINE, PAGES
-from benchmarks.sources import CHECKOUT as CHECKOUT
-from benchmarks.sources import digest
+from benchmarks.pages import CHECKOUT as CHECKOUT
+from benchmarks.pages import PAGES
 from unifg.scenarios.campaigns.markdown import table as table
 
 T = TypeVar("T")
@@ -49,17 +51,21 @@ def listing(head: Sequence[str], groups: Mapping[Words, T], columns: Mapping[str
 
 
 def machine(*packages: str) -> str:
-    """One sentence: processor, cores, Python and the versions of the packages that matter."""
+    """One sentence: commit, date, processor, cores, Python and the versions of the packages that matter."""
+    today = datetime.datetime.now(datetime.UTC).date().isoformat()
+    where = f"{platform.system()} {platform.machine()} ({_processor()}, {os.cpu_count()} cores; one BLAS thread)"
     versions = ", ".join(f"{name} {_version(name)}" for name in packages)
-    return (
-        f"Measured on {platform.system()} {platform.machine()} ({_processor()}, {os.cpu_count()} cores; one BLAS "
-        f"thread), {platform.python_implementation()} {platform.python_version()}, {versions}."
-    )
+    python = f"{platform.python_implementation()} {platform.python_version()}"
+    return f"Measured at commit `{commit()}`, {today}, on {where}, {python}, {versions}."
 
 
-def code_digest(module: str) -> str:
-    """A short digest of what a measuring module depends on: results of two states of the code are never mixed."""
-    return digest([module])
+@cache
+def commit() -> str:
+    """The commit of the checkout, with a plus sign where files differ from it: the state of the code measured."""
+    git = partial(subprocess.run, cwd=CHECKOUT, capture_output=True, text=True, check=False)
+    name = git(["git", "rev-parse", "--short=9", "HEAD"]).stdout.strip()
+    changed = git(["git", "status", "--porcelain", "--untracked-files=no", "--", "*.py"]).stdout.strip()
+    return f"{name or 'unknown'}{'+' if changed else ''}"
 
 
 def publish(name: str, text: str, codes: Iterable[str] | None = None, docs: bool = True) -> None:
@@ -68,32 +74,27 @@ def publish(name: str, text: str, codes: Iterable[str] | None = None, docs: bool
     Args:
         name: of the text; of a page in docs/ if :data:`benchmarks.pages.PAGES` lists it.
         text: Markdown.
-        codes: digests of the states of the code that were measured, when that was not now.
+        codes: commits whose rows are shown, when these are not all of the present one.
         docs: False leaves docs/ alone, for runs that measured less than the page shows.
     """
+    others = sorted(set(codes or ()) - {commit()})
+    if others:
+        text = f"{text.strip()}\n\nRows measured at commit {', '.join(f'`{code}`' for code in others)} are among these."
     print(text)
     OUT.mkdir(parents=True, exist_ok=True)
     (OUT / f"{name}.md").write_text(text + "\n", encoding="utf-8", newline="\n")
     if docs and name in PAGES:
-        put_results(PAGES[name].path, PAGES[name].title, text, codes)
+        put_results(PAGES[name].path, PAGES[name].title, text)
 
 
-def put_results(page: Path, title: str, text: str, codes: Iterable[str] | None = None) -> None:
+def put_results(page: Path, title: str, text: str) -> None:
     """Replace what stands between the markers of a page; a missing page is begun, missing markers are appended.
-
-    The digest of the sources goes with it, by which :mod:`benchmarks.pages` knows whether the page is up to date.
 
     Args:
         page: to write.
         title: of a new page.
         text: Markdown.
-        codes: digests of the states of the code that were measured, when that was not now; mixed ones make a page that
-            counts as stale.
     """
-    known = PAGES.get(page.stem)
-    if known is not None and known.path == page:
-        measured = set(codes if codes is not None else [known.digest])
-        text = f"{text.strip()}\n\n{DIGEST_LINE.format(' and '.join(f'`{code}`' for code in sorted(measured)))}"
     old = page.read_text(encoding="utf-8") if page.is_file() else f"# {title}\n"
     if BEGIN not in old:
         old = f"{old.rstrip()}\n\n{BEGIN}\n{END}\n"

@@ -16,9 +16,9 @@ from typing import Any, ClassVar, Protocol, TypeVar
 
 from tqdm import tqdm
 
-from benchmarks.report import OUT, code_digest
+from benchmarks.comparison import Key, Row
+from benchmarks.report import OUT, commit
 from unifg.errors import UnifgError
-from unifg.scenarios.campaigns.comparison import Key, Row
 from unifg.scenarios.campaigns.dispatch import finished
 from unifg.scenarios.campaigns.journal import Journal, lines_of
 from unifg.scenarios.workers import Inline, Workers
@@ -79,7 +79,7 @@ def episodes(
         batch = {key: job for key, job in keyed.items() if alone(job) is single}
         how = argparse.Namespace(**{**vars(chosen), "workers": workers})
         task = partial(_episode, episode, workers)
-        rows = recorded(task, batch, OUT / f"{name}.jsonl", code_digest(f"benchmarks.{name}"), how)
+        rows = recorded(task, batch, OUT / f"{name}.jsonl", commit(), how)
     if not rows:
         raise SystemExit(f"Nothing on file in {OUT / name}.jsonl for this state of the code.")
     return rows
@@ -111,7 +111,7 @@ def recorded(
         task: returns what JSON can hold; can be pickled.
         jobs: its settings; a key holds strings and numbers.
         store: the file, one JSON object a line.
-        code: digest of what the task depends on; rows of another one are not used.
+        code: commit that is measured; rows of another one are not used.
         chosen: of :func:`options`; ``report`` runs nothing, and like ``any_code`` uses rows of any state of the code.
             One worker is this process, which is the only way to times that mean something.
 

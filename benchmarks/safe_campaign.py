@@ -21,10 +21,10 @@ from typing import cast
 import numpy as np
 
 from benchmarks import runs
+from benchmarks.comparison import Row, digits, interval
 from benchmarks.flight_floor import floor
 from benchmarks.report import CHECKOUT, command, machine, publish, table
 from unifg.models.quadrotor import GRAVITY
-from unifg.scenarios.campaigns.comparison import Row, digits, interval
 from unifg.scenarios.log.safe_log import SafeLog, safe_metrics
 from unifg.scenarios.safe_flight import Controller, Knowledge, SafeFlight, SafeSettings, flights, run_safe_flights
 from unifg.scenarios.safety.oracle import Answer, Authority, Threat, exists_among

@@ -19,10 +19,10 @@ from functools import partial
 import numpy as np
 
 from benchmarks import runs
+from benchmarks.comparison import Row, digits, interval, paired, where
 from benchmarks.report import command, listing, machine, publish
 from unifg.horizon import Plan
 from unifg.models import quadrotor
-from unifg.scenarios.campaigns.comparison import Row, digits, interval, paired, where
 from unifg.scenarios.episode import silent
 from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.flying.estimator import STILL, DeadReckoning, Dynamics, Estimator, EstimatorSettings

@@ -21,6 +21,7 @@ import numpy as np
 
 import unifg as fg
 from benchmarks import runs
+from benchmarks.comparison import Row
 from benchmarks.gtsam_peer import Peer, as_array, available
 from benchmarks.kept_rows import ROWS, keep, restore
 from benchmarks.report import OUT, command, listing, machine, publish, shared
@@ -29,7 +30,6 @@ from unifg.files.g2o import read_g2o
 from unifg.kernels.robust import Loss
 from unifg.lie import SE2
 from unifg.pose_graphs import PoseGraph, manhattan, pairwise_consistent, sphere
-from unifg.scenarios.campaigns.comparison import Row
 from unifg.solvers import GaussNewton, GraduatedNonConvexity
 from unifg.typing import Array
 

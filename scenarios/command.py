@@ -18,7 +18,7 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
@@ -50,7 +50,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _join_negative(list(sys.argv[1:] if argv is None else argv))
     try:
         chosen = _parser(arguments).parse_args(arguments)
-        chosen.words = arguments
     except ModuleNotFoundError as error:  # of the scenario that is named
         return _refuse(f"scenarios need {error.name}: pip install 'unifg[scenarios]'")
     except SystemExit as stop:  # argparse has said what is wrong, or has printed help
@@ -150,15 +149,12 @@ def _add_campaigns(commands: Any) -> None:
     said.add_argument(
         "--any-code", action="store_true", help="episodes that other states of the code have run count, too"
     )
-    about = (
-        "Run again what a folder holds the results of, and say whether all numbers are the same to the last bit and, "
-        "if not, from where on; or one episode of a campaign."
-    )
-    one = commands.add_parser("replay", help="a run again, to the bit", description=about, allow_abbrev=False)
+    about = "Run one episode of a campaign again, with scene, pictures and metrics."
+    one = commands.add_parser("replay", help="an episode again", description=about, allow_abbrev=False)
     one.set_defaults(name="replay")
-    one.add_argument("folder", type=Path, metavar="DIR", help="of a run, or of the campaign")
-    one.add_argument("key", nargs="?", metavar="KEY", help="of the episode, as the report names it; of a run, none")
-    one.add_argument("--out", type=Path, metavar="DIR2", help="folder for results (default: DIR/replay[/KEY])")
+    one.add_argument("folder", type=Path, metavar="DIR", help="of the campaign")
+    one.add_argument("key", metavar="KEY", help="of the episode, as the report names it")
+    one.add_argument("--out", type=Path, metavar="DIR2", help="folder for results (default: DIR/replay/KEY)")
     one.add_argument("--live", action="store_true", help="show it in a browser while it runs; says where")
 
 
@@ -195,43 +191,12 @@ def _report(chosen: argparse.Namespace) -> int:
 
 
 def _replay(chosen: argparse.Namespace) -> int:
-    """Run an episode of a campaign as ``unifg run`` would, or a run again."""
-    if chosen.key is None:
-        return _repeat(chosen)
+    """Run an episode of a campaign as ``unifg run`` would."""
     from unifg.scenarios.campaigns.replay import episode_of
 
     module, settings = episode_of(chosen.folder, chosen.key)
     chosen.out = chosen.out or chosen.folder / "replay" / chosen.key
     return _run_settings(chosen, module, settings, chosen.key)
-
-
-def _repeat(chosen: argparse.Namespace) -> int:
-    """Run again what a folder holds, and compare."""
-    from unifg.scenarios.commands import repetition
-
-    before, folder = repetition.read_inputs(chosen.folder), chosen.out or chosen.folder / "replay"
-    if folder.resolve() == chosen.folder.resolve():
-        return _refuse(f"--out {folder}: would write over the run that it is compared with")
-    repetition.require_files(before)
-    words = [*before.words, "--out", str(folder), *(["--live"] if chosen.live else [])]
-    try:
-        again = _parser(words).parse_args(words)
-    except SystemExit:
-        return _refuse(f"{chosen.folder}: its words are no longer understood: unifg {shlex.join(before.words)}")
-    again.words = words
-    status = _run(again)
-    if status == INTERRUPTED:
-        return status
-    for sentence in before.changed(repetition.read_inputs(folder)):
-        print(f"note: {sentence}")
-    if repetition.ended_early(chosen.folder):
-        print("note: its user ended the first run early, and this one went on")
-    count, found = repetition.differences(chosen.folder, folder)
-    for sentence in found:
-        print(f"differs: {sentence}")
-    if not found:
-        print(f"the same to the last bit: {count} rows of numbers, those told by clocks aside")
-    return FAILED if found else SUCCEEDED
 
 
 def _mcap(chosen: argparse.Namespace) -> int:
@@ -307,18 +272,12 @@ def _bench(chosen: argparse.Namespace) -> int:
 
 def _run(chosen: argparse.Namespace) -> int:
     """Run the chosen scenario, write what it left and say how it went."""
-    from unifg.scenarios.campaigns.sources import fingerprint
-    from unifg.scenarios.commands import repetition
-
     settings = settings_of(chosen.module.SETTINGS, chosen, solver=chosen.solver)
-    went_in = repetition.inputs(chosen.words, settings, __version__, fingerprint())
-    return _run_settings(chosen, chosen.module, settings, chosen.name, partial(repetition.write_inputs, found=went_in))
+    return _run_settings(chosen, chosen.module, settings, chosen.name)
 
 
-def _run_settings(
-    chosen: argparse.Namespace, module: Any, settings: Any, name: str, note: Callable[[Path], Path] | None = None
-) -> int:
-    """The same for settings that are known; ``note`` writes what went in."""
+def _run_settings(chosen: argparse.Namespace, module: Any, settings: Any, name: str) -> int:
+    """The same for settings that are known."""
     folder: Path = chosen.out
     try:
         folder.mkdir(parents=True, exist_ok=True)  # better refused now than after the run
@@ -329,7 +288,7 @@ def _run_settings(
         outcome: Outcome = module.run(settings, progress, **watched)
         try:
             # whole, whoever asks for an end meanwhile
-            files = [*outcome.write(folder), *([note(folder)] if note else [])]
+            files = outcome.write(folder)
         except OSError as error:
             return _refuse(f"--out {folder}: cannot write the results ({error})")
         except KeyboardInterrupt:

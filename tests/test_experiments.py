@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 import pytest
@@ -17,30 +19,38 @@ from unifg.files.carmen import read_carmen
 from unifg.scenarios.campaigns.campaign import EPISODES
 from unifg.scenarios.campaigns.journal import Journal, lines_of
 from unifg.scenarios.campaigns.performed import FAILED, OK
-from unifg.scenarios.campaigns.sheet import Combination, Failure, Sheet
+from unifg.scenarios.campaigns.sheet import Combination, Sheet, sheet_of
 from unifg.scenarios.campaigns.statement import read
 from unifg.scenarios.navigation import INITIAL_SIGMA
 from unifg.scenarios.ways.polyline import path_length
+
+Row: TypeAlias = dict[str, Any]
 
 SEEDS = (1, 2, 3)
 LEGS = ["AC", "CB"]
 
 
-def sheet(name: str, drives: dict[Combination, list[tuple[str, float, float, int]]]) -> Sheet:
+def rows(axes: dict[str, list[str]], drives: dict[Combination, list[tuple[str, float, float, int]]]) -> Iterator[Row]:
+    for combination, found in drives.items():
+        for seed, (outcome, duration, clearance, contacts) in zip(SEEDS, found, strict=False):
+            metrics = {
+                "duration_s": duration, "min_clearance_m": clearance, "collisions": contacts,
+                "path_length_m": 10.0 * duration, "tick_ms": {"p50": 2.0},
+            }  # fmt: skip
+            labels = dict(zip(axes, combination, strict=True))
+            key = f"{combination}, {seed}"
+            yield {"key": key, "labels": labels, "seed": seed, "outcome": outcome, "metrics": metrics}
+
+
+def sheet(name: str, drives: dict[Combination, list[tuple[str, float, float, int]]], error: str | None = None) -> Sheet:
     """A campaign of drives: outcome, duration [s], least clearance [m], contacts, for each seed."""
     axes = {"coupling": ["sequential"], "leg": LEGS}
     if name.endswith("others"):
         axes["planner"] = ["teb"]
-    made = Sheet(Path(name), name, axes, ["leg"], ["coupling"], ["duration_s"], False, "now", 6)
-    for combination, found in drives.items():
-        made.outcomes[combination] = {seed: drive[0] for seed, drive in zip(SEEDS, found, strict=False)}
-        for k, measure in enumerate(("duration_s", "min_clearance_m", "collisions"), start=1):
-            column: dict[int | None, float] = {seed: float(drive[k]) for seed, drive in zip(SEEDS, found, strict=False)}
-            made.values.setdefault(measure, {})[combination] = column
-        durations = made.values["duration_s"][combination]
-        made.values.setdefault("path_length_m", {})[combination] = {seed: 10.0 * s for seed, s in durations.items()}
-        made.values.setdefault("tick_ms.p50", {})[combination] = dict.fromkeys(column, 2.0)
-    return made
+    given = {"title": name, "measures": ["duration_s"]}
+    kept = {"campaign": given, "axes": axes, "compare": ["coupling"], "code": "now", "keys": range(6)}
+    found = [row if row["outcome"] == OK or error is None else {**row, "error": error} for row in rows(axes, drives)]
+    return sheet_of(Path(name), kept, found)
 
 
 OURS = sheet(
@@ -50,13 +60,11 @@ OURS = sheet(
         ("sequential", "CB"): [(OK, 20.0, 0.3, 0), (FAILED, 90.0, -0.001, 2), (OK, 22.0, 0.2, 0)],
     },
 )
-THEIRS = sheet(
-    "department-others",
-    {
-        ("sequential", "AC", "teb"): [(OK, 13.0, 0.15, 0), (FAILED, 99.0, 0.01, 0), (OK, 15.0, 0.2, 0)],
-        ("sequential", "CB", "teb"): [(OK, 25.0, 0.1, 0), (OK, 26.0, 0.1, 1)],
-    },
-)
+THEIR_DRIVES: dict[Combination, list[tuple[str, float, float, int]]] = {
+    ("sequential", "AC", "teb"): [(OK, 13.0, 0.15, 0), (FAILED, 99.0, 0.01, 0), (OK, 15.0, 0.2, 0)],
+    ("sequential", "CB", "teb"): [(OK, 25.0, 0.1, 0), (OK, 26.0, 0.1, 1)],
+}
+THEIRS = sheet("department-others", THEIR_DRIVES)
 
 
 def cells(text: str, *first: str) -> list[str]:
@@ -89,8 +97,8 @@ def test_a_page_without_other_planners_has_no_table_of_them() -> None:
     assert "other planners" not in alone and "| CB | sequential | 3 | 2 | 210.00 ± 14.14 (6.73 %)" in alone
     both = rendered({"department": OURS, "department-others": THEIRS})
     assert "### The same legs with other planners" in both
-    THEIRS.failures.append(Failure("abc", ("sequential", "AC", "teb"), 2, FAILED, "timed out"))
-    assert "AC, teb, seed 2: timed out; `unifg replay" in rendered({"department": OURS, "department-others": THEIRS})
+    late = sheet("department-others", THEIR_DRIVES, "timed out")
+    assert "AC, teb, seed 2: timed out; `unifg replay" in rendered({"department": OURS, "department-others": late})
 
 
 def test_others_drive_the_same_legs_on_the_same_seeds() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import golden
+from tools import golden
 
 BEFORE = golden.Row("CONVERGED", 7, 2.5, "0123456789abcdef")
 

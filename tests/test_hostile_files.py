@@ -293,5 +293,5 @@ def test_numbers_need_nothing_but_the_library(tmp_path: Path) -> None:
     run = subprocess.run(command, capture_output=True, text=True, cwd=CHECKOUT, timeout=120)
     assert run.returncode == 0, run.stderr
     written = sorted(p.name for p in (tmp_path / "out").iterdir())
-    assert written == ["graph.g2o", "inputs.json", "metrics.json", "trajectory.tum"]
+    assert written == ["graph.g2o", "metrics.json", "trajectory.tum"]
     assert "pip install 'unifg[view]'" in run.stderr and "Traceback" not in run.stderr

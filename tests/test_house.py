@@ -36,6 +36,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("unifg",),  # the names of the user's script, gathered
     ("scenarios",),
     ("benchmarks",),
+    ("tools",),
 )
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 # Inside scenarios/, where "" are the files that lie in no room: one per scenario.
@@ -67,10 +68,10 @@ def sources(folder: Path) -> list[Path]:
 
 LIBRARY = [(package, path) for package, folder in FOLDERS.items() for path in sources(folder)]
 EVERYTHING = [path for _, path in LIBRARY] + [
-    path for name in ("tests", "docs", "benchmarks", "examples") for path in sources(CHECKOUT / name)
+    path for name in ("tests", "docs", "benchmarks", "tools", "examples") for path in sources(CHECKOUT / name)
 ]
-BENCHMARKS = CHECKOUT / "benchmarks"
-HOUSE = [*LIBRARY, *(("benchmarks", path) for path in sources(BENCHMARKS))]
+MEASURING = {name: CHECKOUT / name for name in ("benchmarks", "tools")}
+HOUSE = [*LIBRARY, *((name, path) for name, folder in MEASURING.items() for path in sources(folder))]
 
 
 @cache
@@ -115,7 +116,7 @@ def is_in(module: str, package: str) -> bool:
 
 def module_of(top: str, path: Path) -> str:
     """Return the import name of a file, of a package for its ``__init__``."""
-    parts = [top, *path.relative_to(FOLDERS.get(top, BENCHMARKS)).with_suffix("").parts]
+    parts = [top, *path.relative_to((FOLDERS | MEASURING)[top]).with_suffix("").parts]
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
@@ -223,7 +224,8 @@ def test_tests_and_their_problems_know_no_measurements() -> None:
     knowing = {
         path.name
         for path in sources(CHECKOUT / "tests")
-        if any(is_in(module, "benchmarks") for _, module in imports(parsed(path)))
+        for _, module in imports(parsed(path))
+        if is_in(module, "benchmarks") or is_in(module, "tools")
     }
     assert knowing == OF_MEASUREMENTS
 

@@ -261,7 +261,7 @@ def test_command_writes_its_files(solver: str, tmp_path: Path, capsys: pytest.Ca
 
 def test_command_runs_one_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main(["run", "manoeuvres", "--case", "behind", "--out", str(tmp_path)]) == 0
-    assert {file.name for file in tmp_path.iterdir()} == {"behind.html", "behind.png", "inputs.json", "metrics.json"}
+    assert {file.name for file in tmp_path.iterdir()} == {"behind.html", "behind.png", "metrics.json"}
     assert command.main(["run", "manoeuvres", "--help"]) == 0
     assert "{" + ",".join([*CASES, "both"]) + "}" in capsys.readouterr().out
 
@@ -282,7 +282,7 @@ def test_an_interrupt_ends_the_run_and_writes_what_there_is(tmp_path: Path, monk
 
     monkeypatch.setattr(manoeuvres, "run_manoeuvre", stopped)
     assert command.main(["run", "manoeuvres", "--out", str(tmp_path)]) == command.INTERRUPTED
-    assert {file.name for file in tmp_path.iterdir()} == {"behind.html", "behind.png", "inputs.json", "metrics.json"}
+    assert {file.name for file in tmp_path.iterdir()} == {"behind.html", "behind.png", "metrics.json"}
 
 
 def test_command_refuses_other_cases_and_seeds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

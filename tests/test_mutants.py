@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.mutants import CHECKOUT, SURVIVORS, TARGETS
-from benchmarks.mutations import mutations
+from tools.mutants import CHECKOUT, SURVIVORS, TARGETS
+from tools.mutations import mutations
 
 SOURCE = '''"""A file."""
 
@@ -91,9 +91,9 @@ def test_every_excuse_belongs_to_a_file_that_is_searched_and_gives_a_reason() ->
 HUNTED = """
 import json, sys
 from pathlib import Path
-from benchmarks.mutants import Hunt
-from benchmarks.mutant_tests import touched
-from benchmarks.mutations import mutations
+from tools.mutants import Hunt
+from tools.mutant_tests import touched
+from tools.mutations import mutations
 import pytest
 scratch, tests = Path(sys.argv[1]), ["tests/test_gate.py"]
 seen = touched(scratch, "gate.py", tests)
@@ -105,7 +105,8 @@ print(json.dumps([said, seen.tests([9]), (scratch / "gate.py").read_text() == hu
 
 def test_a_hunt_tells_what_is_noticed_from_what_is_not(tmp_path: Path) -> None:
     (tmp_path / "tests").mkdir()
-    shutil.copytree(CHECKOUT / "benchmarks", tmp_path / "benchmarks", ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in ("benchmarks", "tools"):
+        shutil.copytree(CHECKOUT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "gate.py").write_text(
         '''"""A gate."""
 

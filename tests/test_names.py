@@ -72,7 +72,7 @@ def test_a_short_name_stands_in_no_second_table() -> None:
     checkout = Path(__file__).resolve().parent.parent
     found = [
         path.name
-        for folder in ("solvers", "scenarios", "benchmarks", "tests")
+        for folder in ("solvers", "scenarios", "benchmarks", "tools", "tests")
         for path in (checkout / folder).rglob("*.py")
         if path != Path(__file__).resolve() and '"ipm": InteriorPoint' in path.read_text(encoding="utf-8")
     ]

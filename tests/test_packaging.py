@@ -20,7 +20,7 @@ CHECKOUT = Path(__file__).resolve().parent.parent
 pytestmark = pytest.mark.xdist_group("packaging")
 SIDES = ("solvers", "models", "scenarios")
 # Only the extra `scenarios` installs these; the language, the backends and the models must do without.
-EXTRAS = ("matplotlib", "meshcat", "PIL", "pymunk", "tqdm", "yaml")
+EXTRAS = ("matplotlib", "meshcat", "pandas", "PIL", "pymunk", "tqdm", "yaml")
 
 
 def config() -> dict[str, Any]:

@@ -13,9 +13,9 @@ import pytest
 from scipy import stats
 
 from benchmarks import quadrotor_flights, quadrotor_tables, report, runs
+from benchmarks.comparison import against, paired, share
 from benchmarks.quadrotor_flights import SOLVERS, STUDIES, Job, jobs_of
 from unifg.errors import ScenarioError
-from unifg.scenarios.campaigns.comparison import against, paired, share
 from unifg.scenarios.campaigns.journal import lines_of
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.log.flight_log import FlightLog
@@ -72,13 +72,13 @@ def test_finished_flights_are_not_repeated(monkeypatch: pytest.MonkeyPatch, tmp_
     monkeypatch.setattr(quadrotor_flights, "fly", fly)
     monkeypatch.setattr(runs, "OUT", tmp_path)
     monkeypatch.setattr(report, "OUT", tmp_path)
-    monkeypatch.setattr(runs, "code_digest", lambda _: "now")
+    monkeypatch.setattr(runs, "commit", lambda: "now")
     store = tmp_path / "quadrotor_flights.jsonl"
     assert run() == 12
     assert [job.study for job in flown] == ["flights"] * 6 + ["timing"] * 6
     store.write_text(store.read_text() + '{"cut off')
     assert run() == 0
-    monkeypatch.setattr(runs, "code_digest", lambda _: "later")
+    monkeypatch.setattr(runs, "commit", lambda: "later")
     assert run("--any-code") == run("--report") == 0
     assert run() == 12
     assert run("--fresh", "--solvers", "alm") == 12

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from benchmarks.comparison import share
 from benchmarks.obstacle_courses import METHODS, Method, Outcome, distinct, lowest, render
 from judge import judge
 from unifg.errors import BackendError, ScenarioError
 from unifg.models import avoidance, quadrotor
 from unifg.scenarios import command
 from unifg.scenarios import course as obstacles
-from unifg.scenarios.campaigns.comparison import share
 from unifg.scenarios.commands.courses import course_metrics, summary
 from unifg.scenarios.course import (
     AVOIDANCES,
@@ -198,7 +198,6 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert command.main([*words, "--solver", "ipm", "--avoidance", "hard", "--seed", "1003"]) == 0
     assert "obstacle course 1003" in capsys.readouterr().out
     assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "inputs.json",
         "iterates.png",
         "metrics.json",
         "scene.html",

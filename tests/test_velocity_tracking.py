@@ -305,7 +305,6 @@ def test_an_interrupt_writes_what_there_is(tmp_path: Path, monkeypatch: pytest.M
         "scene.html",
         "velocity_tracking.png",
         "metrics.json",
-        "inputs.json",
     }
 
 

@@ -1,6 +1,6 @@
-"""The way of a lambda into a front, counted as ``benchmarks.walks`` counts; it may get shorter, and not longer."""
+"""The way of a lambda into a front, counted as ``tools.walks`` counts; it may get shorter, and not longer."""
 
-from benchmarks.walks import Walk, front, guess
+from tools.walks import Walk, front, guess
 
 FILES, HAND_OVERS = 48, 168  # four look at a term, sixteen at the guess; two turn threads away, two count them
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.comparison import where
 from benchmarks.potential_weights import HARD, WEIGHTS
 from benchmarks.report import OUT
-from unifg.scenarios.campaigns.comparison import where
 from unifg.scenarios.campaigns.journal import lines_of
 from unifg.style.colours import css
 from unifg.style.figures import new_figure, write_figure

@@ -20,7 +20,7 @@ from unifg.scenarios.campaigns.cluster import cluster
 from unifg.scenarios.campaigns.dispatch import died, finished
 from unifg.scenarios.campaigns.journal import Journal, lines_of
 from unifg.scenarios.campaigns.performed import ERROR, FAILED, LOST, OK, Order, lost, perform
-from unifg.scenarios.campaigns.sources import fingerprint, library
+from unifg.scenarios.campaigns.sources import fingerprint
 from unifg.scenarios.campaigns.statement import Statement, module_of, read
 from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.workers import Workers
@@ -138,9 +138,8 @@ def run_campaign(
 
 
 def code_of_scenario(scenario: str) -> str:
-    """Digest of the sources an episode depends on."""
-    module = module_of(scenario).__name__
-    return library(module).digest([module])
+    """Digest of the library, and of the package of a scenario that is not of it."""
+    return fingerprint(module_of(scenario).__name__)
 
 
 def manifest_of(folder: Path) -> dict[str, Any]:

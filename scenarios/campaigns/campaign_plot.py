@@ -24,7 +24,7 @@ _LONGEST = 60  # lines of a picture; beyond that they cannot be read
 
 def outcomes_picture(sheet: Sheet) -> Figure:
     """The share of episodes that succeeded, with its 95 % interval (Wilson)."""
-    shown = list(sheet.outcomes)[:_LONGEST]
+    shown = sheet.combinations[:_LONGEST]
     with new_figure((_WIDE, _REST + _LINE * len(shown)), len(shown)) as figure:
         ax = figure.subplots()
         for line, combination in enumerate(shown):
@@ -41,7 +41,7 @@ def outcomes_picture(sheet: Sheet) -> Figure:
 
 def values_picture(sheet: Sheet, measure: str) -> Figure:
     """Every episode, and the mean with its 95 % interval."""
-    shown = [c for c in sheet.outcomes if len(sheet.column(measure, c))][:_LONGEST]
+    shown = [c for c in sheet.combinations if len(sheet.column(measure, c))][:_LONGEST]
     with new_figure((_WIDE, _REST + _LINE * max(1, len(shown))), max(1, len(shown))) as figure:
         ax = figure.subplots()
         rng = np.random.default_rng(0)

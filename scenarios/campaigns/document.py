@@ -1,67 +1,17 @@
-"""A document of headings, words, tables and pictures: as Markdown, and as one HTML file that needs nothing else."""
+"""A report as Markdown and as one HTML file that needs nothing else: headings, words, tables and pictures."""
 
 from __future__ import annotations
 
 import base64
 import html
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeAlias
 
 from unifg.scenarios.campaigns.markdown import cell, table
 
-__all__ = ["Block", "Command", "Fold", "Heading", "Picture", "Table", "Words", "as_html", "as_markdown"]
-
-
-@dataclass(frozen=True)
-class Heading:
-    """A heading below the title."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class Words:
-    """A paragraph."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class Command:
-    """What a user types."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table whose first columns, ``text`` of them, are words, and the others numbers."""
-
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    text: int = 1
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A PNG file."""
-
-    path: Path
-    text: str
-
-
-@dataclass(frozen=True)
-class Fold:
-    """Blocks that only some readers want to see."""
-
-    title: str
-    blocks: Sequence[Block]
-
-
-Block: TypeAlias = Heading | Words | Command | Table | Picture | Fold
+__all__ = ["Document"]
 
 _CODE, _AS_CODE = re.compile("`([^`]+)`"), r"<code>\1</code>"
 _STYLE = """
@@ -79,64 +29,64 @@ img { max-width: 100%; } details { margin: 1rem 0; } summary { cursor: pointer; 
 """
 
 
-def as_markdown(title: str, blocks: Sequence[Block], folder: Path) -> str:
-    """The document; pictures are named relative to a folder."""
-    return "\n\n".join([f"# {cell(title)}", *_markdown(blocks, folder)]) + "\n"
+class Document:
+    """A document that grows block by block.
 
+    Attributes:
+        markdown: its text so far; pictures are named relative to its folder.
+    """
 
-def as_html(title: str, blocks: Sequence[Block]) -> str:
-    """The document, pictures and all."""
-    head = (
-        '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{html.escape(title)}</title>\n<style>{_STYLE}</style>\n<h1>{html.escape(title)}</h1>\n"
-    )
-    return head + "\n".join(_html(blocks)) + "\n</html>\n"
+    def __init__(self, title: str, folder: Path) -> None:
+        """Begin with a title.
 
+        Args:
+            title: of the document.
+            folder: that the Markdown file will lie in.
+        """
+        self._title, self._folder = html.escape(title), folder
+        self.markdown, self._html = f"# {cell(title)}\n", list[str]()
 
-def _markdown(blocks: Sequence[Block], folder: Path) -> list[str]:
-    parts = list[str]()
-    for block in blocks:
-        match block:
-            case Heading(text):
-                parts.append(f"## {cell(text)}")
-            case Words(text):
-                parts.append(text)
-            case Command(text):
-                parts.append(f"```sh\n{text}\n```")
-            case Table(head, rows, text):
-                parts.append(table([cell(word) for word in head], [[cell(word) for word in row] for row in rows], text))
-            case Picture(path, text):
-                parts.append(f"![{cell(text)}]({path.relative_to(folder).as_posix()})")
-            case Fold(name, inner):
-                parts += [f"### {cell(name)}", *_markdown(inner, folder)]
-    return parts
+    def heading(self, text: str) -> None:
+        """Add a heading below the title."""
+        self._add(f"## {cell(text)}", f"<h2>{html.escape(text)}</h2>")
 
+    def words(self, text: str) -> None:
+        """Add a paragraph."""
+        self._add(text, f"<p>{_CODE.sub(_AS_CODE, html.escape(text))}</p>")
 
-def _html(blocks: Sequence[Block]) -> list[str]:
-    parts = list[str]()
-    for block in blocks:
-        match block:
-            case Heading(text):
-                parts.append(f"<h2>{html.escape(text)}</h2>")
-            case Words(text):
-                parts.append(f"<p>{_CODE.sub(_AS_CODE, html.escape(text))}</p>")
-            case Command(text):
-                parts.append(f"<p><code>{html.escape(text)}</code></p>")
-            case Table(head, rows, text):
-                kinds = ["" if k < text else ' class="n"' for k in range(len(head))]
-                first = "".join(f"<th{kind}>{html.escape(w)}</th>" for kind, w in zip(kinds, head, strict=True))
-                lines = (
-                    "<tr>" + "".join(f"<td{k}>{html.escape(w)}</td>" for k, w in zip(kinds, row, strict=True)) + "</tr>"
-                    for row in rows
-                )
-                body = "\n".join(lines)
-                parts.append(f'<div class="wide"><table>\n<tr>{first}</tr>\n{body}\n</table></div>')
-            case Picture(path, text):
-                data = base64.b64encode(path.read_bytes()).decode()
-                parts.append(f'<p><img alt="{html.escape(text)}" src="data:image/png;base64,{data}"></p>')
-            case Fold(name, inner):
-                parts.append(f"<details><summary>{html.escape(name)}</summary>")
-                parts += _html(inner)
-                parts.append("</details>")
-    return parts
+    def table(self, head: Sequence[str], rows: Sequence[Sequence[str]], text: int) -> None:
+        """Add a table whose first columns, ``text`` of them, are words, and the others numbers."""
+        kinds = ["" if k < text else ' class="n"' for k in range(len(head))]
+        marked = [
+            "".join(f"<{tag}{kind}>{html.escape(word)}</{tag}>" for kind, word in zip(kinds, row, strict=True))
+            for tag, row in (("th", head), *(("td", row) for row in rows))
+        ]
+        lines = "\n".join(f"<tr>{line}</tr>" for line in marked)
+        plain = table([cell(word) for word in head], [[cell(word) for word in row] for row in rows], text)
+        self._add(plain, f'<div class="wide"><table>\n{lines}\n</table></div>')
+
+    def picture(self, path: Path, text: str) -> None:
+        """Add a PNG file below the folder."""
+        data = base64.b64encode(path.read_bytes()).decode()
+        plain = f"![{cell(text)}]({path.relative_to(self._folder).as_posix()})"
+        self._add(plain, f'<p><img alt="{html.escape(text)}" src="data:image/png;base64,{data}"></p>')
+
+    @contextmanager
+    def fold(self, title: str) -> Iterator[None]:
+        """Fold away what is added meanwhile."""
+        self._add(f"### {cell(title)}", f"<details><summary>{html.escape(title)}</summary>")
+        yield
+        self._html.append("</details>")
+
+    def html(self) -> str:
+        """The HTML file, pictures and all."""
+        head = (
+            '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n'
+            '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+            f"<title>{self._title}</title>\n<style>{_STYLE}</style>\n<h1>{self._title}</h1>\n"
+        )
+        return head + "\n".join(self._html) + "\n</html>\n"
+
+    def _add(self, plain: str, marked: str) -> None:
+        self.markdown += f"\n{plain}\n"
+        self._html.append(marked)

@@ -1,37 +1,27 @@
-"""The rows of a campaign as columns of numbers, one for each measure, by combination of the axes and seed."""
+"""Episodes of a campaign as tables of pandas: one row each, with labels, outcome and every measure that is a number."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+import pandas as pd
 
 from unifg.scenarios.campaigns.campaign import EPISODES, manifest_of
 from unifg.scenarios.campaigns.journal import lines_of
 from unifg.scenarios.campaigns.performed import ERROR, FAILED, LOST, OK
 from unifg.typing import Array
 
-__all__ = ["OUTCOMES", "Combination", "Failure", "Sheet", "load"]
+__all__ = ["OUTCOMES", "Combination", "Sheet", "load", "sheet_of"]
 
 OUTCOMES = (OK, FAILED, ERROR, LOST)
 Combination: TypeAlias = tuple[str, ...]
 """A label for each axis."""
-Seed: TypeAlias = int | None
-
-
-@dataclass(frozen=True)
-class Failure:
-    """An episode that did not do what was asked."""
-
-    key: str
-    combination: Combination
-    seed: Seed
-    outcome: str
-    why: str
 
 
 @dataclass
@@ -42,16 +32,13 @@ class Sheet:
         folder: it was read from.
         title: of it.
         axes: names with their labels.
-        bundles: axes whose values stand for several settings.
         compare: axes whose values are compared.
         stated: measures that come first.
-        succeeded_only: whether numbers are those of episodes that are ok.
         code: digest of the code that ran it last.
         expected: number of episodes it has.
-        outcomes: of every episode, by combination and seed.
-        keys: likewise.
-        values: of every measure that is a number, by combination and seed.
-        failures: what did not go well, in the order of the file.
+        episodes: "combination", "seed", "key", "outcome" and "why" of each, in the order of the file.
+        values: of every measure that is a number, by the same index; NaN where an episode has none.
+        succeeded_only: whether numbers are those of episodes that are ok.
         seconds: of all episodes together, by the clocks of their machines.
         cpu_seconds: the same by their processors.
         others: rows that were left out because other code ran them.
@@ -61,45 +48,57 @@ class Sheet:
     folder: Path
     title: str
     axes: dict[str, list[str]]
-    bundles: list[str]
     compare: list[str]
     stated: list[str]
-    succeeded_only: bool
     code: str
     expected: int
-    outcomes: dict[Combination, dict[Seed, str]] = field(default_factory=dict)
-    keys: dict[tuple[Combination, Seed], str] = field(default_factory=dict)
-    values: dict[str, dict[Combination, dict[Seed, float]]] = field(default_factory=dict)
-    failures: list[Failure] = field(default_factory=list)
+    episodes: pd.DataFrame
+    values: pd.DataFrame
+    succeeded_only: bool = False
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     others: int = 0
-    unreadable: int = 0
+    unreadable: list[int] = field(default_factory=list)
+
+    @property
+    def combinations(self) -> list[Combination]:
+        """Combinations of labels that have episodes, in the order of the axes."""
+        found = set(self.episodes["combination"])
+        return [labels for labels in product(*self.axes.values()) if labels in found]
+
+    def of(self, combination: Combination) -> pd.DataFrame:
+        """Episodes of a combination."""
+        return self.episodes[self.episodes["combination"] == combination]
 
     def column(self, measure: str, combination: Combination, outcome: str | None = None) -> Array:
         """(n,) numbers of a measure, of all episodes or of those that ended in one way."""
-        ends = self.outcomes.get(combination, {})
-        found = self.values.get(measure, {}).get(combination, {})
-        return np.array([value for seed, value in found.items() if outcome in (None, ends.get(seed))])
+        mine = self.of(combination)
+        mine = mine if outcome is None else mine[mine["outcome"] == outcome]
+        found: Array = np.asarray(self.by_episode(measure).reindex(mine.index).dropna(), dtype=np.float64)
+        return found
+
+    def by_episode(self, measure: str) -> pd.Series[float]:
+        """Numbers of a measure by episode; empty for one that no episode has."""
+        return self.values[measure] if measure in self.values else pd.Series(dtype=float)
 
     def counts(self, combination: Combination) -> Counter[str]:
-        """How episodes of a combination ended."""
-        return Counter(self.outcomes[combination].values())
+        """Endings of the episodes of a combination."""
+        return Counter(self.of(combination)["outcome"])
+
+    @property
+    def failures(self) -> pd.DataFrame:
+        """Episodes that did not do what was asked."""
+        return self.episodes[self.episodes["outcome"] != OK]
 
     @property
     def measures(self) -> list[str]:
         """All of them: those that were stated, then those that differ from episode to episode."""
         first = [name for name in self.stated if name in self.values]
-        rest = [name for name in self.values if name not in first and len(set(self._all(name))) > 1]
-        return [*first, *rest]
-
-    def _all(self, measure: str) -> Iterator[float]:
-        for found in self.values[measure].values():
-            yield from found.values()
+        return [*first, *(str(name) for name in self.values if name not in first and self.values[name].nunique() > 1)]
 
 
 def load(folder: Path, any_code: bool = False, failed_too: bool = False) -> Sheet:
-    """Read a campaign, row by row.
+    """Read a campaign.
 
     Args:
         folder: of the campaign.
@@ -110,46 +109,44 @@ def load(folder: Path, any_code: bool = False, failed_too: bool = False) -> Shee
         ScenarioError: there is none.
     """
     kept = manifest_of(folder)
-    given = kept["campaign"]
-    keys = set(kept["keys"])
-    sheet = Sheet(
-        folder, str(given.get("title", folder.name)), kept["axes"], kept["bundles"], kept["compare"],
-        list(given.get("measures", [])), not failed_too and bool(given.get("succeeded_only", False)), kept["code"],
-        len(keys),
-    )  # fmt: skip
-    unreadable: list[int] = []
-    failures: dict[str, Failure] = {}
-    for row in lines_of(folder / EPISODES, unreadable):
-        key = str(row.get("key"))
-        if key not in keys:
-            continue
-        if row.get("code") != sheet.code and not any_code:
-            sheet.others += 1
-            continue
-        failures.pop(key, None)
-        _take(sheet, key, row, failures)
-    sheet.failures, sheet.unreadable = list(failures.values()), len(unreadable)
-    order = {labels: k for k, labels in enumerate(_combinations(sheet.axes))}
-    sheet.outcomes = dict(sorted(sheet.outcomes.items(), key=lambda item: order.get(item[0], len(order))))
+    keys, unreadable = set(kept["keys"]), list[int]()
+    rows = [row for row in lines_of(folder / EPISODES, unreadable) if row.get("key") in keys]
+    mine = [row for row in rows if any_code or row.get("code") == kept["code"]]
+    sheet = sheet_of(folder, kept, mine, failed_too)
+    sheet.others, sheet.unreadable = len(rows) - len(mine), unreadable
     return sheet
 
 
-def _take(sheet: Sheet, key: str, row: Mapping[str, Any], failures: dict[str, Failure]) -> None:
-    combination, seed = tuple(str(row["labels"].get(axis, "")) for axis in sheet.axes), row.get("seed")
-    outcome = str(row.get("outcome"))
-    sheet.outcomes.setdefault(combination, {})[seed] = outcome
-    sheet.keys[combination, seed] = key
-    sheet.seconds += float(row.get("seconds", 0.0))
-    sheet.cpu_seconds += float(row.get("cpu_seconds", 0.0))
-    metrics = row.get("metrics") or {}
-    for found in sheet.values.values():
-        found.get(combination, {}).pop(seed, None)  # of an earlier row of the same episode
-    if outcome == OK or (outcome == FAILED and not sheet.succeeded_only):
-        for name, value in _numbers(metrics):
-            sheet.values.setdefault(name, {}).setdefault(combination, {})[seed] = value
-    if outcome != OK:
-        why = str(row.get("error") or _complaints(metrics, sheet.stated))
-        failures[key] = Failure(key, combination, seed, outcome, why)
+def sheet_of(folder: Path, kept: Mapping[str, Any], rows: list[dict[str, Any]], failed_too: bool = False) -> Sheet:
+    """Tables of a campaign's rows.
+
+    Args:
+        folder: of the campaign.
+        kept: what its manifest holds.
+        rows: as its file holds them; the later of two with one key counts.
+        failed_too: as in :func:`load`.
+    """
+    given, axes = kept["campaign"], kept["axes"]
+    stated = list(given.get("measures", []))
+    succeeded_only = not failed_too and bool(given.get("succeeded_only", False))
+    measured = (OK,) if succeeded_only else (OK, FAILED)
+    episodes = pd.DataFrame(
+        {
+            "combination": [tuple(str(row["labels"].get(axis, "")) for axis in axes) for row in rows],
+            "seed": pd.Series([row.get("seed") for row in rows], dtype=object),
+            "key": [str(row["key"]) for row in rows],
+            "outcome": [str(row.get("outcome")) for row in rows],
+            "why": [str(row.get("error") or _complaints(row.get("metrics") or {}, stated)) for row in rows],
+        }
+    )
+    numbers = [dict(_numbers(row.get("metrics") or {})) if row.get("outcome") in measured else {} for row in rows]
+    last = ~episodes.duplicated("key", keep="last")
+    values = pd.DataFrame(numbers, index=episodes.index)[last].dropna(axis="columns", how="all")
+    seconds, cpu = (sum(float(row.get(name, 0.0)) for row in rows) for name in ("seconds", "cpu_seconds"))
+    return Sheet(
+        folder, str(given.get("title", folder.name)), axes, list(kept["compare"]), stated, kept["code"],
+        len(kept["keys"]), episodes[last], values, succeeded_only, seconds, cpu,
+    )  # fmt: skip
 
 
 def _numbers(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
@@ -165,7 +162,7 @@ def _numbers(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
 
 
 def _complaints(metrics: Mapping[str, Any], stated: list[str]) -> str:
-    """What the metrics of a failed episode say: flags that are off, things that were hit, measures that were stated."""
+    """Metrics that explain a failure: flags that are off, things that were hit, measures that were stated."""
     said = list[str]()
     for name, value in metrics.items():
         if name == "outcomes" or (value is False and name not in ("succeeded", "interrupted")):
@@ -173,9 +170,3 @@ def _complaints(metrics: Mapping[str, Any], stated: list[str]) -> str:
         elif name in ("collisions", "goals_reached", "status") or (name in stated and isinstance(value, str)):
             said.append(f"{name}: {value}")
     return ", ".join(said)
-
-
-def _combinations(axes: Mapping[str, list[str]]) -> Iterator[Combination]:
-    from itertools import product
-
-    yield from product(*axes.values())

@@ -35,6 +35,7 @@ NEEDED = ("numpy", "scipy", "numba", "llvmlite", "osqp", "piqp", "qpsolvers")
 OPTIONAL = {  # package: what imports it, and what it is for
     "matplotlib": ("matplotlib", "pictures: unifg[view]"),
     "meshcat": ("meshcat", "scenes: unifg[view]"),
+    "pandas": ("pandas", "reports of campaigns: unifg[scenarios]"),
     "pymunk": ("pymunk", "driving scenarios: unifg[scenarios]"),
     "pillow": ("PIL", "maps and scenarios: unifg[scenarios]"),
     "pyyaml": ("yaml", "ROS maps: unifg[scenarios]"),

@@ -1,7 +1,7 @@
 """What every solve of a fixed set ends with, to the last bit: recorded before the code is moved, compared after.
 
-    python -m benchmarks.golden record [--parts PART ...] [--file FILE]
-    python -m benchmarks.golden compare [--parts PART ...] [--file FILE]
+    python -m tools.golden record [--parts PART ...] [--file FILE]
+    python -m tools.golden compare [--parts PART ...] [--file FILE]
 
 A row is one solve, update or episode: its status, its iterations, its cost and a digest of all its values. Code that
 only moves changes nothing here, not the last bit; code that is meant to change something changes the rows it is meant
@@ -261,7 +261,7 @@ def measured(parts: Iterable[str]) -> dict[str, Row]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Record or compare; 1 if something that is no rounding has changed."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.golden", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m tools.golden", description=__doc__.split("\n")[0])
     parser.add_argument("action", choices=("record", "compare"))
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART", help=", ".join(PARTS))
     parser.add_argument("--file", type=Path, default=OUT / "golden.json", help="where the rows are")

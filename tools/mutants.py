@@ -1,13 +1,13 @@
 """Do the tests notice when a decision is changed? Mutants of the decisions' files, each run against its tests.
 
-    python -m benchmarks.mutants                            every file of TARGETS (hours)
-    python -m benchmarks.mutants scenarios/driving/drive_past.py   one file
-    python -m benchmarks.mutants --share 0.3 --seed 1 ...   a drawn share of the mutants of each file
+    python -m tools.mutants                            every file of TARGETS (hours)
+    python -m tools.mutants scenarios/driving/drive_past.py   one file
+    python -m tools.mutants --share 0.3 --seed 1 ...   a drawn share of the mutants of each file
 
 Everything happens in a scratch copy of the checkout. The tests of a file run once with every line they touch recorded;
 a mutant is then given to the tests that touch its line, the quickest first, and what survives these to all other tests
 of the file. Functions under Numba run unseen: their mutants are given to all tests, and compiled. Those that may
-survive stand in ``benchmarks/survivors.toml``, each with its reason, and are not run; the run ends with exit code 1
+survive stand in ``tools/survivors.toml``, each with its reason, and are not run; the run ends with exit code 1
 when there are others.
 
 Tools of this kind that are at hand do not fit: they rename or wrap the functions they mutate, which Numba cannot
@@ -30,11 +30,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.mutant_tests import Touched, touched
-from benchmarks.mutations import Mutation, mutations
+from tools.mutant_tests import Touched, touched
+from tools.mutations import Mutation, mutations
 
 CHECKOUT = Path(__file__).resolve().parent.parent
-SURVIVORS = CHECKOUT / "benchmarks" / "survivors.toml"
+SURVIVORS = CHECKOUT / "tools" / "survivors.toml"
 LEFT_OUT = (".git", ".venv", "out", "build", "dist", ".mypy_cache", ".ruff_cache", ".pytest_cache", ".hypothesis")
 PATIENCE = 4.0  # times as long as the tests took, and a minute: what takes longer has been noticed
 EARLY = 60.0  # [s]
@@ -302,7 +302,7 @@ def hunt(scratch: Path, path: str, share: float, seed: int, skip_compiled: bool,
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.mutants", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python -m tools.mutants", description=__doc__.splitlines()[0])
     parser.add_argument("files", nargs="*", metavar="FILE", help="of TARGETS; all when none is named")
     parser.add_argument("--share", type=float, default=1.0, help="of the mutants of each file that is drawn")
     parser.add_argument("--seed", type=int, default=0, help="of the draw")

@@ -1,6 +1,6 @@
 """How far it is from what a user states to where the work is done: files on the way, and calls from file to file.
 
-    python -m benchmarks.walks [WALK ...] [--list]
+    python -m tools.walks [WALK ...] [--list]
 
 A hand-over is a call of a function in one file of the project by a function in another one; compiled functions call
 each other unseen, and what happens while a module is imported does not count. The files of a walk are those at both

@@ -49,7 +49,7 @@ def touched(scratch: Path, path: str, tests: list[str]) -> Touched:
         RuntimeError: when a test fails though nothing has been changed.
     """
     store = scratch / "touched.json"
-    command = [sys.executable, "-m", "benchmarks.mutant_tests", path, str(store), *tests]
+    command = [sys.executable, "-m", "tools.mutant_tests", path, str(store), *tests]
     done = subprocess.run(
         command, cwd=scratch, env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}, capture_output=True, text=True
     )
