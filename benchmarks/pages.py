@@ -61,7 +61,6 @@ PAGES = {
         Page("navigation", "Drives, sequential coupling", "benchmarks.navigation", hours=0.05),
         Page("joint-drives", "Drives, joint coupling", "benchmarks.navigation", ("--coupling", "joint"), hours=0.06),
         Page("experiments", "Experiments", "benchmarks.experiments", hours=3.0),
-        Page("fleet", "Many robots in one building", "benchmarks.fleet", hours=0.15),
         Page("joint", "What the joint graph buys", "benchmarks.coupling", hours=0.8),
         Page("covariance-plans", "Covariance in the plan", "benchmarks.covariance_plans"),
         Page("active-perception", "Plans that go where they learn", "benchmarks.active_perception"),

@@ -41,7 +41,7 @@ from unifg.scenarios.rivals.choices import (
 from unifg.scenarios.seeing.readings import Scan
 from unifg.scenarios.ways.polyline import path_length
 from unifg.scenarios.worlds.building import DEMO_GOALS, DEMO_START, building_map
-from unifg.scenarios.worlds.drivetrain import Drivetrain, draw_patches
+from unifg.scenarios.worlds.drivetrain import Drivetrain
 from unifg.scenarios.worlds.faults import DRIVE_FAULTS, DriveFaults, Fault, one_of
 from unifg.scenarios.worlds.imperfection import Imperfection, imperfect
 from unifg.scenarios.worlds.placement import PlacementRules, place_obstacles
@@ -77,8 +77,7 @@ class NavigationSettings:
         obstacles: number of obstacles that are not on the map; one in three moves.
         obstacle_radius: least and greatest radius of them [m]; the robot expects what the default says.
         mover_speed: speed of those that move [m/s], which the robot is not told.
-        courteous: whether they, people and carts mind the robot; else they go on through it.
-        traffic: people, carts and doors.
+        traffic: people.
         seed: of everything random.
         controller: weights and limits.
         drivetrain: of the base; the controller is told the accelerations on its data sheet.
@@ -100,7 +99,6 @@ class NavigationSettings:
     obstacles: int = option(0, text=partial(count, most=200), metavar="K")
     obstacle_radius: tuple[float, float] = option((0.15, 0.25), text=pair, metavar="LO,HI")
     mover_speed: float = option(0.3, text=positive, metavar="M/S")
-    courteous: bool = option(False)
     traffic: Traffic = field(default_factory=Traffic)
     seed: int = option(0, metavar="S")
     controller: ControllerSettings = field(default_factory=ControllerSettings)
@@ -129,11 +127,7 @@ def run_navigation(settings: NavigationSettings, progress: Progress | None = Non
 
 
 class Episode:
-    """World, robot and goals of one run.
-
-    Attributes:
-        carried: (3,) pose that a fault has put the robot down at in the last tick [m, m, rad]; None without one.
-    """
+    """World, robot and goals of one run."""
 
     def __init__(self, settings: NavigationSettings, *, rehearsal: bool = False) -> None:
         """Load the map, plan the legs, place the obstacles, wake the robot, and rehearse unless this is a rehearsal."""
@@ -157,7 +151,7 @@ class Episode:
         self.goals = np.array([_pose(goal, None, "goal") for goal in goals])
         if not len(self.goals):
             raise ScenarioError("at least one goal is needed")
-        placement, sensors, belief, floor, drawn, wrong, about = np.random.default_rng(settings.seed).spawn(7)
+        placement, sensors, belief, _, drawn, wrong, about = np.random.default_rng(settings.seed).spawn(7)
         self.occupancy, true = imperfect(self.occupancy, settings.imperfection, self.start, self.goals, wrong)
         self.distance_map = _field(self.occupancy)
         legs = zip([self.start, *self.goals[:-1]], self.goals, strict=True)
@@ -173,20 +167,15 @@ class Episode:
             goals=self.goals,
             rules=PlacementRules(radius=settings.obstacle_radius, speed=settings.mover_speed),
         )
-        traffic = draw_traffic(
-            settings.traffic, true, _field(true) if settings.imperfection != Imperfection() else self.distance_map,
-            self.path, self.goals, about, settings.courteous,
-        )  # fmt: skip
+        walls = _field(true) if settings.imperfection != Imperfection() else self.distance_map
         self.world = World(
             true, self.start, discs, sensors, robot_radius=control.robot_radius, lidar=settings.lidar,
-            odometry=settings.odometry,
-            drivetrain=settings.drivetrain, patches=draw_patches(settings.drivetrain, self.path, floor),
-            courteous=settings.courteous, traffic=traffic,
+            odometry=settings.odometry, drivetrain=settings.drivetrain, yields=False,
+            people=draw_traffic(settings.traffic, walls, self.path, about),
         )  # fmt: skip
         sigma = np.array(INITIAL_SIGMA)
         believed = self.start + sigma * belief.standard_normal(3)
         self.faults = DriveFaults(settings.faults, settings.seed)
-        self.carried: Array | None = None
         self._right, self._drawn = (self.occupancy, self.distance_map), drawn
         self.pilot = self._pilot(believed, sigma)
         if not rehearsal:
@@ -271,10 +260,8 @@ class Episode:
         """Move on from the last tick, scan, decide and record; the control to be driven, None at the last goal."""
         dt, goal, now = self.settings.controller.dt, self._goal, self.world.time
         faults = self.faults
-        self.carried = None
         if faults.carries(now):
-            self.carried = faults.elsewhere(self._right[1], self._free_places(), self.world.pose)
-            self.world.carry(self.carried)
+            self.world.carry(faults.elsewhere(self._right[1], self._free_places(), self.world.pose))
         self._swap_maps(now)
         odometry = None
         if number:
@@ -388,7 +375,6 @@ class Episode:
             horizon=plan.states,
             scan=scan.ranges,
             obstacles=world.obstacle_states()[:, :3],
-            boxes=world.boxes(),
             detected=np.column_stack([pilot.tracks.centre, pilot.tracks.radius]),
             solve_ms=took["localise_ms"] + took["plan_ms"],
             **took,

@@ -74,7 +74,6 @@ def episode(ticks: int = 40, obstacles: int = 2, *, map_yaw: float = 0.0, seed: 
         scan=scan,
         scan_angles=np.linspace(-np.pi, np.pi, BEAMS, endpoint=False),
         obstacles=places,
-        boxes=np.zeros((ticks, 0, 5)),
         detected=[_seen(places[k], k) for k in range(ticks)],
         solve_ms=solve,
         localise_ms=solve * 0.25,

@@ -11,7 +11,7 @@ import pytest
 
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
-from unifg.scenarios.worlds.drivetrain import PATCH_RADIUS, Drivetrain, Wheels, draw_patches
+from unifg.scenarios.worlds.drivetrain import Drivetrain, Wheels
 from unifg.scenarios.worlds.plane import LidarModel, OdometryModel, World
 
 QUIET, EXACT = LidarModel(sigma=0.0, dropout=0.0), OdometryModel(scale_sigma=0.0, noise_sigma=0.0)
@@ -19,14 +19,12 @@ SUBSTEP = 0.005
 IDEAL: dict[str, Any] = {"acceleration": math.inf, "turning": math.inf}
 
 
-def open_floor(*patches: tuple[float, float, float], **drivetrain: Any) -> World:
+def open_floor(**drivetrain: Any) -> World:
     """A floor without walls, without noise, the robot at its origin, heading along x."""
     nothing = np.zeros((10, 10), dtype=bool)
     empty = OccupancyMap(nothing, ~nothing, 0.05, (0.0, 0.0, 0.0), "empty")
     base = Drivetrain(**(IDEAL | drivetrain))
-    return World(
-        empty, (0.0, 0.0, 0.0), lidar=QUIET, odometry=EXACT, drivetrain=base, patches=np.array(patches).reshape(-1, 3)
-    )
+    return World(empty, (0.0, 0.0, 0.0), lidar=QUIET, odometry=EXACT, drivetrain=base)
 
 
 def driven(wheels: Wheels, command: tuple[float, float], time: float) -> tuple[float, float]:
@@ -151,36 +149,11 @@ def test_a_turning_base_drifts_outwards() -> None:
     assert straight.pose == pytest.approx([0.08, 0.0, 0.0], abs=1e-9)
 
 
-def test_patches_slip_more_where_they_lie() -> None:
-    """A patch of one metre is passed at half the speed; beside it nothing is lost, and the greater slip counts."""
-    world = open_floor((1.0, 0.0, 0.5), slip=0.1, patch_slip=0.5)
-    ways = []
-    for _ in range(40):
-        before = world.pose[0]
-        world.step(1.0, 0.0)
-        ways.append(world.pose[0] - before)
-        assert world.odometry()[0] == pytest.approx(1.0, abs=1e-5)
-    assert min(ways) == pytest.approx(0.05) and max(ways) == pytest.approx(0.09)
-    time = 4.0 - 1.0 / 0.5  # the rest of the time off the patch
-    assert world.pose[0] == pytest.approx(1.0 + 0.9 * time, abs=0.01)
-
-
-def test_patches_lie_on_the_path_and_repeat() -> None:
-    path = np.column_stack([np.linspace(0.0, 9.0, 50), np.zeros(50), np.zeros(50)])
-    base = Drivetrain(patches=40)
-    drawn, again = (draw_patches(base, path, np.random.default_rng(4)) for _ in range(2))
-    assert np.array_equal(drawn, again) and drawn.shape == (40, 3)
-    assert not drawn[:, 1].any() and drawn[:, 0].min() >= 0.0 and drawn[:, 0].max() <= 9.0
-    assert drawn[:, 0].std() > 2.0
-    assert drawn[:, 2].min() >= PATCH_RADIUS[0] and drawn[:, 2].max() <= PATCH_RADIUS[1]
-    assert draw_patches(Drivetrain(), path, np.random.default_rng(4)).shape == (0, 3)
-
-
 @pytest.mark.parametrize(
     ("field", "value"),
     [
         ("acceleration", 0.0), ("turning", -1.0), ("acceleration", math.nan), ("load", -0.1), ("lag", math.inf),
-        ("latency", -0.01), ("slip", 1.0), ("patch_slip", 1.5), ("skid", math.nan), ("patches", -1),
+        ("latency", -0.01), ("slip", 1.0), ("skid", math.nan),
     ],
 )  # fmt: skip
 def test_what_is_no_base_is_refused(field: str, value: float) -> None:

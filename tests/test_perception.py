@@ -179,7 +179,7 @@ def test_a_mover_that_turns_round_is_believed_soon(speed: float) -> None:
     for seed in range(3):
         begin = np.array([3.8 + 0.2 * seed, 5.3])
         mover = Obstacle(begin, 0.2, begin + np.array([length, 0.0]), speed)
-        world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(seed), courteous=False)
+        world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(seed), yields=False)
         tracker, rng = DiscTracker(field(occupancy)), np.random.default_rng(seed)
         turn = math.ceil(length / speed / DT - 1e-9)
         watch(world, tracker, turn - 10, np.zeros(3), rng)
@@ -233,7 +233,7 @@ def test_a_mover_that_has_stood_for_long_stands(waits: float) -> None:
 def test_one_who_goes_to_and_fro_stays_a_mover(speed: float) -> None:
     occupancy = hall()
     mover = Obstacle(np.array([4.0, 5.5]), 0.2, np.array([4.8, 5.5]), speed)
-    world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(4), courteous=False)
+    world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(4), yields=False)
     tracker, rng = DiscTracker(field(occupancy)), np.random.default_rng(5)
     watch(world, tracker, 60, np.zeros(3), rng)
     assert all(watch(world, tracker, 10, np.zeros(3), rng).mover.all() for _ in range(20))

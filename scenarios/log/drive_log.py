@@ -83,8 +83,6 @@ class EpisodeLog:
     """Lidar ranges; NaN is a dropout, +inf no return."""
     obstacles: Array = column("m", None, 3)
     """True unforeseen obstacles and people: x, y, radius."""
-    boxes: Array = column("m, m, rad, m, m", None, 5)
-    """True carts and leaves of doors: x, y, angle, length, width."""
     detected: list[Array] = ragged("m", 3)
     """Tracked obstacles: x, y, radius."""
     solve_ms: Array = column("ms")
@@ -158,12 +156,6 @@ class EpisodeLog:
     def obstacles_first(self) -> Array:
         """(K, 3) the obstacles at the beginning."""
         first: Array = self.obstacles[0]
-        return first
-
-    @property
-    def boxes_first(self) -> Array:
-        """(B, 5) carts and leaves of doors at the beginning."""
-        first: Array = self.boxes[0]
         return first
 
     def save(self, path: str | os.PathLike[str]) -> None:

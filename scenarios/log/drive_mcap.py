@@ -102,15 +102,14 @@ def _messages(log: EpisodeLog) -> Iterator[tuple[float, Message]]:
         if shown is None or not np.array_equal(log.route[k], shown):
             shown = log.route[k]
             yield moment, ("/route", _poses(shown, moment))
-        true = [*_cylinders(log.obstacles[k]), *_cubes(log.boxes[k])]
-        yield moment, ("/obstacles", _scene("true", true, moment))
+        yield moment, ("/obstacles", _scene("true", _cylinders(log.obstacles[k]), moment))
         yield moment, ("/tracked", _scene("tracked", _cylinders(log.detected[k]), moment))
         yield moment, ("/tick", {name: strict(np.asarray(getattr(log, name)[k]).tolist()) for name in _plain(log)})
 
 
 def _plain(log: EpisodeLog) -> list[str]:
     """Columns that no other topic shows."""
-    drawn = {"route", "horizon", "scan", "obstacles", "boxes", "detected"}
+    drawn = {"route", "horizon", "scan", "obstacles", "detected"}
     return [name for name in columns(log) if name not in drawn]
 
 
@@ -195,13 +194,6 @@ def _cylinders(discs: Array) -> Iterator[tuple[str, dict[str, Any]]]:
         yield "cylinders", {"pose": pose, "size": size, "bottom_scale": 1.0, "top_scale": 1.0}
 
 
-def _cubes(boxes: Array) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Boxes (n, 5): x, y, angle, length, width."""
-    for x, y, angle, length, width in boxes[np.isfinite(boxes).all(axis=1)]:
-        size = {"x": float(length), "y": float(width), "z": _HEIGHT}
-        yield "cubes", {"pose": _pose((x, y, angle), _HEIGHT / 2), "size": size}
-
-
 def _pose(planar: Array | tuple[float, float, float], height: float = 0.0) -> dict[str, Any]:
     x, y, angle = (float(value) for value in planar)
     return {
@@ -243,12 +235,11 @@ _VECTOR = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
 _QUATERNION = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
 _POSE = _object(position=_VECTOR, orientation=_QUATERNION)
 _COLOUR = _object(r=_NUMBER, g=_NUMBER, b=_NUMBER, a=_NUMBER)
-_CUBE = _object(pose=_POSE, size=_VECTOR, color=_COLOUR)
 _CYLINDER = _object(pose=_POSE, size=_VECTOR, bottom_scale=_NUMBER, top_scale=_NUMBER, color=_COLOUR)
 _ENTITY = _object(
     timestamp=_TIME, frame_id=_STRING, id=_STRING, lifetime=_TIME, frame_locked=_BOOLEAN,
     metadata=_array(_object(key=_STRING, value=_STRING)),
-    **{kind: _array({"cubes": _CUBE, "cylinders": _CYLINDER}.get(kind, _object())) for kind in _SHAPES},
+    **{kind: _array({"cylinders": _CYLINDER}.get(kind, _object())) for kind in _SHAPES},
 )  # fmt: skip
 _SCHEMAS = {
     "foxglove.FrameTransforms": _object(

@@ -122,9 +122,7 @@ def plot_controls(log: EpisodeLog, ax: tuple[Axes, Axes] | None = None) -> tuple
 
 
 def _obstacles(log: EpisodeLog, ax: Axes) -> None:
-    """Discs and boxes at their last place; discs that move also at places passed, fading into the past."""
-    from matplotlib.patches import Rectangle
-
+    """Discs at their last place; discs that move also at places passed, fading into the past."""
     moving = log.obstacle_moves
     style: dict[str, Any] = {"edgecolor": "none", "zorder": 2}
     if len(log.obstacles[-1, ~moving]):
@@ -136,16 +134,6 @@ def _obstacles(log: EpisodeLog, ax: Axes) -> None:
             discs(ax, place, fc=css("moving"), alpha=0.1 + 0.3 * rank / len(shown), **style)
     name = "moving obstacle (fading into the past)"
     discs(ax, log.obstacles[-1, moving], name, fc=css("moving"), alpha=0.95, **style)
-    for k, (x, y, angle, length, width) in enumerate(log.boxes[-1].tolist()):
-        corner, turn = (x - 0.5 * length, y - 0.5 * width), np.degrees(angle)
-        ax.add_patch(
-            Rectangle(
-                corner, length, width, angle=turn, rotation_point="center", fc=css("moving"), alpha=0.95,
-                label="cart or door" if k == 0 else None, **style,
-            )
-        )  # fmt: skip
-    for places in log.boxes.transpose(1, 0, 2):
-        ax.plot(*places[:, :2].T, color=css("moving"), lw=0.8, zorder=2)
 
 
 def _apart(places: Array) -> Array:

@@ -122,8 +122,6 @@ def drive_frame(frame: Frame, log: Any, tick: int, frames: int = 1) -> None:
         frame.mesh("detected", shapes.merge(rings))
     for index in np.flatnonzero(log.obstacle_moves).tolist():
         frame.place(f"obstacle {index}", [*log.obstacles[tick][index][:2], 0.0])
-    for index, box in enumerate(log.boxes[tick]):
-        frame.place(f"box {index}", box[:3])
     _touch(frame, log, tick)
     _say(frame, log, tick)
 
@@ -209,11 +207,6 @@ def _obstacles(scene: Scene, log: Any) -> None:
         words = "obstacle that moves" if first is None else ""
         scene.body(name, [Part("body", mesh, "moving")], colour="moving", legend=words, like=first)
         first = first or name
-    for index, box in enumerate(log.boxes_first):
-        name, size = f"box {index}", [float(box[3]), float(box[4]), _WALL]
-        words = "cart or door" if index == 0 else ""
-        part = Part("body", shapes.box([0.0, 0.0, 0.5 * _WALL], size), "moving")
-        scene.body(name, [part], colour="moving", swatch="block", legend=words, like="box 0" if index else None)
 
 
 def _touch(frame: Frame, log: Any, tick: int) -> None:

@@ -2,7 +2,7 @@
 
 A command acts after the latency. The motors follow it with a lag of first order, dv/dt = (command - v) / lag, but they
 change the wheels' velocities no faster than their accelerations allow, divided by what the base carries besides itself.
-The floor takes a share of what the wheels do (longitudinal slip, more of it on patches), and lets a base that turns
+The floor takes a share of what the wheels do (longitudinal slip), and lets a base that turns
 drift outwards in proportion to its lateral acceleration. Wheels feel neither.
 """
 
@@ -16,13 +16,9 @@ import numpy as np
 
 from unifg.errors import ScenarioError
 from unifg.scenarios.options import not_negative, option, positive, share
-from unifg.scenarios.ways.polyline import arc_lengths, at_stations
 from unifg.typing import Array
 
-__all__ = ["Drivetrain", "Wheels", "draw_patches", "slip_at"]
-
-PATCH_RADIUS = (0.3, 0.6)
-"""Least and greatest radius of a slippery patch [m]."""
+__all__ = ["Drivetrain", "Wheels"]
 
 
 @dataclass(frozen=True)
@@ -40,8 +36,6 @@ class Drivetrain:
         latency: from a command, or from what it was computed of, to its effect [s].
         slip: share of the wheels' motion that the floor takes.
         skid: outward drift of a base that turns, per lateral acceleration [(m/s)/(m/s^2)].
-        patches: number of slippery patches on the planned path.
-        patch_slip: share of the wheels' motion that a patch takes.
     """
 
     acceleration: float = option(2.5, text=positive, metavar="M/S2")
@@ -51,8 +45,6 @@ class Drivetrain:
     latency: float = option(0.0, text=not_negative, metavar="S")
     slip: float = option(0.0, text=share, metavar="SHARE")
     skid: float = option(0.0, text=not_negative, metavar="S")
-    patches: int = option(0, metavar="K")
-    patch_slip: float = option(0.5, text=share, metavar="SHARE")
 
     def __post_init__(self) -> None:
         """Refuse what is no base.
@@ -63,7 +55,7 @@ class Drivetrain:
         for field in fields(self):
             value = getattr(self, field.name)
             least_excluded = field.name in ("acceleration", "turning")
-            most = 1.0 if field.name in ("slip", "patch_slip") else math.inf
+            most = 1.0 if field.name == "slip" else math.inf
             inside = (0.0 < value <= most) if least_excluded else (0.0 <= value < most)
             if not inside:
                 bounds = f"{'above zero' if least_excluded else 'zero or more'}{' and below 1' if most == 1.0 else ''}"
@@ -120,19 +112,3 @@ class Wheels:
             easy = np.abs(wanted) <= self._most * dt
             mean = np.where(easy, self._told - wanted * lag / dt, 0.5 * (before + self.velocity))
         return float(mean[0]), float(mean[1])
-
-
-def slip_at(drivetrain: Drivetrain, patches: Array, place: tuple[float, float]) -> float:
-    """Share of the wheels' motion that the floor takes at a place (x, y) [m], patches (K, 3) x, y, radius [m]."""
-    if len(patches) and (np.hypot(patches[:, 0] - place[0], patches[:, 1] - place[1]) < patches[:, 2]).any():
-        return max(drivetrain.slip, drivetrain.patch_slip)
-    return drivetrain.slip
-
-
-def draw_patches(drivetrain: Drivetrain, path: Array, rng: np.random.Generator) -> Array:
-    """(K, 3) x, y, radius [m] of the slippery patches, their middles uniform along a path (P, 2) or (P, 3)."""
-    drawn = rng.uniform(size=(drivetrain.patches, 2))
-    arc = arc_lengths(path[:, :2])
-    places = at_stations(path[:, :2], arc, drawn[:, 0] * arc[-1])
-    low, high = PATCH_RADIUS
-    return np.column_stack([places, low + (high - low) * drawn[:, 1]])

@@ -12,7 +12,7 @@ into walls already touched.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,10 +22,10 @@ from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
 from unifg.scenarios.options import not_negative, option, positive, share
 from unifg.scenarios.seeing.readings import Scan
-from unifg.scenarios.worlds.drivetrain import Drivetrain, Wheels, slip_at
+from unifg.scenarios.worlds.drivetrain import Drivetrain, Wheels
 from unifg.scenarios.worlds.rectangles import wall_rectangles
 from unifg.scenarios.worlds.space import OTHERS, Obstacle, Space
-from unifg.scenarios.worlds.traffic import Cart, Door, Fellow, Person, moved
+from unifg.scenarios.worlds.traffic import Person
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["ROBOT_RADIUS", "LidarModel", "OdometryModel", "World"]
@@ -108,9 +108,8 @@ class World:
         lidar: LidarModel | None = None,
         odometry: OdometryModel | None = None,
         drivetrain: Drivetrain | None = None,
-        patches: Array | None = None,
-        courteous: bool = True,
-        traffic: Sequence[Person | Cart | Door] = (),
+        yields: bool = True,
+        people: Sequence[Person] = (),
     ) -> None:
         """Build the walls, place the obstacles and the robot.
 
@@ -123,9 +122,8 @@ class World:
             lidar: lidar to simulate; None for 360 beams, 12 m, 0.02 m, 1 % dropouts.
             odometry: wheel odometry to simulate; None for 5 % scale error and 2 % noise.
             drivetrain: what the base makes of its commands; None for a base that follows them at once.
-            patches: (K, 3) x, y, radius [m] of slippery patches on the floor.
-            courteous: whether movers wait for a robot at rest, or go on through it.
-            traffic: who else goes about.
+            yields: obstacles that move stop before a robot at rest instead of going on through it.
+            people: walk about by social forces.
 
         Raises:
             ScenarioError: if the start is not a finite pose, or the robot would stand in a wall or an
@@ -145,17 +143,16 @@ class World:
         self._measured = np.zeros(2)
         self._angles = self.lidar.angles
         self._drivetrain = drivetrain or Drivetrain.ideal()
-        self.patches: Array = np.zeros((0, 3)) if patches is None else np.array(patches, dtype=np.float64)
         self._wheels = Wheels(self._drivetrain)
         self._command = (0.0, 0.0)
         self._left, self._spun, self._gripped = 0, 0.0, 0.0
-        self._space = Space(pose, robot_radius, courteous)
+        self._space = Space(pose, robot_radius, yields)
         self._add_walls()
         for index, obstacle in enumerate(self.obstacles):
             self._space.add_disc(obstacle, index)
-        self._traffic: list[Person | Cart | Door | Fellow] = []
-        for thing in traffic:
-            self._let_in(thing)
+        self._people = tuple(people)
+        for index, person in enumerate(self._people, start=len(self.obstacles)):
+            self._space.add_thing(person, index)
         self._robot = self._space.vehicle
         self._trail: list[tuple[float, tuple[float, float, float]]] = [
             (self.time, (*self._robot.position, self._robot.angle))
@@ -168,14 +165,6 @@ class World:
                 f"it would overlap a wall or an obstacle by {-self.clearance():.2f} m; "
                 f"choose a start in free space of map {occupancy.name!r}"
             )
-
-    def _let_in(self, thing: Person | Cart | Door | Fellow) -> None:
-        self._space.add_thing(thing, len(self.obstacles) + len(self._traffic))
-        self._traffic.append(thing)
-
-    def meet(self, other: World) -> None:
-        """Let in the robot of another world, which goes here where it goes there, a substep late at the most."""
-        self._let_in(Fellow(other._robot, other.robot_radius))
 
     def _add_walls(self) -> None:
         rectangles = wall_rectangles(self.occupancy.occupied)
@@ -206,11 +195,6 @@ class World:
         Raises:
             ScenarioError: if a command or the duration is not a usable number.
         """
-        for _ in self.stepping(v, omega, dt):
-            pass
-
-    def stepping(self, v: float, omega: float, dt: float = 0.1) -> Iterator[None]:
-        """The same substep by substep, each when it is asked for, so that several worlds can go on side by side."""
         if not (math.isfinite(v) and math.isfinite(omega)):
             raise ScenarioError(
                 f"the control (v, omega) = ({v}, {omega}) is not finite; stop the robot, do not drive on it"
@@ -225,16 +209,11 @@ class World:
                 self._start_tick(pause)
             self._space.step(pause, resting=self._robot.velocity.length < _REST_SPEED)
             self._trail.append((self.time, (*self._robot.position, self._robot.angle)))
-            yield
         self._measure(before, heading_before, dt, self._gripped / self._spun if self._spun > 0.0 else 1.0)
-
-    def _grip(self, body: pymunk.Body) -> float:
-        """Share of the wheels' motion that the floor gives the base where it is."""
-        return 1.0 - slip_at(self._drivetrain, self.patches, body.position)
 
     def _drive(self, body: pymunk.Body, gravity: tuple[float, float], damping: float, dt: float) -> None:
         """Velocity for the coming substep, along its midpoint heading: the chord of the arc."""
-        grip = self._grip(body)
+        grip = 1.0 - self._drivetrain.slip
         if self._left:  # the engine asks once more after the last substep of a tick
             self._left -= 1
             self._command = self._wheels.advance(dt)
@@ -351,9 +330,6 @@ class World:
         return math.inf
 
     def obstacle_states(self) -> Array:
-        """(K, 4) x, y, radius [m] of obstacles, people and other robots, and 1 for those that move, else 0."""
-        return np.concatenate([self._space.discs(), moved(self._traffic)[0]])
-
-    def boxes(self) -> Array:
-        """(B, 5) x, y [m], angle [rad], length and width [m] of the carts and the leaves of doors now."""
-        return moved(self._traffic)[1]
+        """(K, 4) x, y, radius [m] of obstacles and people, and 1 for those that move, else 0."""
+        people = [(*person.body.position, person.radius, 1.0) for person in self._people]
+        return np.concatenate([self._space.discs(), np.array(people).reshape(-1, 4)])

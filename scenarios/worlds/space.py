@@ -17,9 +17,9 @@ import pymunk
 from unifg.errors import ScenarioError
 from unifg.typing import Array
 
-__all__ = ["COURTESY_GAP", "OTHERS", "Obstacle", "Space", "Thing"]
+__all__ = ["OTHERS", "YIELD_GAP", "Obstacle", "Space", "Thing"]
 
-COURTESY_GAP = 0.1
+YIELD_GAP = 0.1
 """Gap a mover keeps between its hull and that of a resting robot [m]."""
 
 _SUBSTEP = 0.005  # [s]; at 1 m/s a first contact overlaps by at most 5 mm
@@ -90,8 +90,8 @@ class Space:
         collisions: contact events so far; contacts with one owner less than 0.5 s apart are one.
     """
 
-    def __init__(self, place: Array, radius: float, courteous: bool = True) -> None:
-        """Stand at ``place`` (2,) or (3,), x, y and heading [m, m, rad], alone; ``courteous`` movers wait for rest."""
+    def __init__(self, place: Array, radius: float, yields: bool = True) -> None:
+        """Stand at ``place`` (2,) or (3,), x, y and heading [m, m, rad], alone; ``yields``: movers wait at rest."""
         self.engine = pymunk.Space()
         self.engine.collision_slop = 1e-4  # the default lets shapes overlap by 0.1 m
         self.engine.collision_bias = 1e-6
@@ -99,7 +99,7 @@ class Space:
         self.vehicle.position = (float(place[0]), float(place[1]))
         self.vehicle.angle = float(place[2]) if len(place) > 2 else 0.0
         self.radius = radius
-        self._courteous = courteous
+        self._yields = yields
         self.obstacles: list[Obstacle] = []
         self.time = 0.0
         self.collisions = 0
@@ -171,9 +171,9 @@ class Space:
             yield dt / count
 
     def step(self, pause: float, resting: bool = False) -> None:
-        """Move everything for a substep [s]; courteous movers wait for a vehicle that is ``resting``."""
+        """Move everything for a substep [s]; movers that yield wait for a vehicle that is ``resting``."""
         for mover in self._movers.values():
-            mover.advance(self.vehicle, self.radius, resting and self._courteous, pause)
+            mover.advance(self.vehicle, self.radius, resting and self._yields, pause)
         for thing in self._things:
             thing.advance(self.vehicle, self.radius, resting, pause)
         self.engine.step(pause)
@@ -258,7 +258,7 @@ class _Mover:
         if resting:
             hulls = robot_radius + self.radius
             gap = target.get_distance(robot.position) - hulls
-            if gap < COURTESY_GAP and gap < self.body.position.get_distance(robot.position) - hulls:
+            if gap < YIELD_GAP and gap < self.body.position.get_distance(robot.position) - hulls:
                 self.body.velocity = (0.0, 0.0)
                 return
         self.along, self.sense = along, sense
